@@ -1,0 +1,63 @@
+"""obsynth: designs, proves and runs observers and fault-estimation filters for descriptor systems."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from obsynth.errors import (
+        InfeasibleError,
+        ObsynthError,
+        PreconditionError,
+        SolverError,
+        SpecError,
+        VerificationError,
+    )
+    from obsynth.models.descriptor import DescriptorSystem
+    from obsynth.observers.linear import Estimates, LinearObserver, RunningObserver
+    from obsynth.pipeline import design, fault_estimation_filter, fault_estimation_filter_from_gains
+    from obsynth.results.design import Certificate, ObserverDesign
+    from obsynth.results.report import Check, VerificationReport
+    from obsynth.results.serialise import load
+    from obsynth.verification import verify
+
+__version__ = "0.1.0"
+
+# Names are imported when they are first used, so that `import obsynth` stays fast.
+_HOMES = {
+    "Certificate": "obsynth.results.design",
+    "Check": "obsynth.results.report",
+    "DescriptorSystem": "obsynth.models.descriptor",
+    "Estimates": "obsynth.observers.linear",
+    "InfeasibleError": "obsynth.errors",
+    "LinearObserver": "obsynth.observers.linear",
+    "ObserverDesign": "obsynth.results.design",
+    "ObsynthError": "obsynth.errors",
+    "PreconditionError": "obsynth.errors",
+    "RunningObserver": "obsynth.observers.linear",
+    "SolverError": "obsynth.errors",
+    "SpecError": "obsynth.errors",
+    "VerificationError": "obsynth.errors",
+    "VerificationReport": "obsynth.results.report",
+    "analyse_structure": "obsynth.analysis.structure",
+    "design": "obsynth.pipeline",
+    "discretise": "obsynth.analysis.transformations",
+    "eliminate_algebraic_states": "obsynth.analysis.transformations",
+    "fault_estimation_filter": "obsynth.pipeline",
+    "fault_estimation_filter_from_gains": "obsynth.pipeline",
+    "load": "obsynth.results.serialise",
+    "verify": "obsynth.verification",
+}
+
+__all__ = sorted(_HOMES)
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOMES:
+        return getattr(import_module(_HOMES[name]), name)
+    raise AttributeError(f"module 'obsynth' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

@@ -1,0 +1,57 @@
+"""Existence conditions as named facts, so that each can be shown, checked again, or raised."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from obsynth.errors import PreconditionError
+
+
+@dataclass(frozen=True)
+class Condition:
+    """One existence condition and whether the plant meets it.
+
+    Parameters
+    ----------
+    name : str
+        Short name, as in the paper where it has one.
+    claim : str
+        What must hold, in words.
+    holds : bool
+        The verdict.
+    value, bound : float
+        The deciding number and what it is compared with.
+    source : str
+        Paper and equation, or the finding it rests on.
+    detail : str
+        The evidence (singular-value gap, the eigenvalue) and, when it fails, what to do.
+    mode : complex or None
+        The eigenvalue or zero at which it fails.
+    signals : tuple of str
+        Names of the signals involved.
+    """
+
+    name: str
+    claim: str
+    holds: bool
+    value: float
+    bound: float
+    source: str
+    detail: str = ""
+    mode: complex | None = None
+    signals: tuple[str, ...] = ()
+
+    def require(self) -> None:
+        """Raise `PreconditionError` when the condition fails."""
+        if not self.holds:
+            raise PreconditionError(
+                f"No filter exists: {self.claim} is needed ({self.source}). {self.detail}",
+                condition=self.name, mode=self.mode, signals=self.signals,
+            )  # fmt: skip
+
+
+def require_all(conditions: Iterable[Condition]) -> None:
+    """Raise `PreconditionError` for the first condition that fails."""
+    for condition in conditions:
+        condition.require()

@@ -1,0 +1,152 @@
+"""Structure of a plant: regularity, index, eigenvalues, observability, each with its evidence."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+
+from obsynth.analysis.zeros import are_outside
+from obsynth.models.descriptor import DescriptorSystem
+from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.numerics.pencils import FiniteZeros, finite_zeros, pencil_structure
+from obsynth.numerics.ranks import RankDecision, decide_rank
+from obsynth.numerics.scaling import equilibrate_pencil
+
+
+@dataclass(frozen=True, eq=False)
+class Structure:
+    """What kind of plant this is.
+
+    Parameters
+    ----------
+    regular : bool
+        ``det (A - z E)`` is not identically zero: inputs and initial state determine the trajectory.
+    index : int or None
+        Size of the largest block at infinity, 0 for nonsingular ``E``; None when not regular.
+    finite_eigenvalues : ComplexArray
+        ``(k,)``, finite zeros of ``A - z E``.
+    infinite_block_sizes : tuple of int
+        Sizes of the blocks at infinity, largest first.
+    impulse_free : bool
+        Regular with index at most 1 (causal, for a sampled plant).
+    stable : bool
+        Regular, and every finite eigenvalue is strictly inside the stability region.
+    admissible : bool
+        Regular, impulse-free and stable.
+    observability_normal_rank : int
+        Rank of ``[A - z E; C]`` at almost every ``z``; below ``nx`` the plant hides a whole trajectory.
+    unobservable_modes : tuple of complex
+        Points where ``[A - z E; C]`` loses rank.
+    undetectable_modes : tuple of complex
+        Those of them on or outside the boundary of stability.
+    finitely_observable, detectable : bool
+        No unobservable, or no undetectable, mode (and full normal rank).
+    impulse_observable : bool
+        ``rank [E A; 0 E; 0 C] = nx + rank E``.
+    causally_observable : bool
+        ``rank [E; C] = nx``.
+    rank_of_E : RankDecision
+        The number of dynamic states.
+    decisions : mapping of str to RankDecision
+        Every rank decided on the way, by name, read-only.
+    """
+
+    regular: bool
+    index: int | None
+    finite_eigenvalues: ComplexArray
+    infinite_block_sizes: tuple[int, ...]
+    impulse_free: bool
+    stable: bool
+    admissible: bool
+    observability_normal_rank: int
+    unobservable_modes: tuple[complex, ...]
+    undetectable_modes: tuple[complex, ...]
+    finitely_observable: bool
+    detectable: bool
+    impulse_observable: bool
+    causally_observable: bool
+    rank_of_E: RankDecision
+    decisions: Mapping[str, RankDecision]
+
+    @property
+    def unclear(self) -> tuple[str, ...]:
+        """Names of the rank decisions without a clear gap."""
+        return tuple(name for name, decision in self.decisions.items() if not decision.clear)
+
+
+def analyse_structure(plant: DescriptorSystem) -> Structure:
+    """Analyse regularity, index, stability and observability of ``plant``.
+
+    Parameters
+    ----------
+    plant : DescriptorSystem
+        ``E, A (nx, nx)``, ``C (ny, nx)``, either time.
+
+    Returns
+    -------
+    Structure
+        Never raises for a strange plant: a singular one has ``regular`` False.
+
+    Notes
+    -----
+    Eigenvalues on the boundary count as unstable, multiple ones included (see `are_outside`).
+
+    References
+    ----------
+    .. [Dai1989] L. Dai, "Singular Control Systems", 1989, chapters 1 and 2.
+    """
+    E, A, C = plant.E, plant.A, plant.C
+    pencil = pencil_structure(E, A)
+    poles = FiniteZeros(pencil.finite_eigenvalues, pencil.normal_rank, pencil.decisions)
+    unstable = _selected(poles.values, are_outside(E, A, poles, plant.dt))
+    stable = pencil.regular and not unstable
+    impulse_free = pencil.index is not None and pencil.index <= 1
+
+    tall_e, tall_a = np.vstack([E, np.zeros_like(C)]), np.vstack([A, C])
+    hidden = finite_zeros(tall_e, tall_a)
+    modes = tuple(complex(value) for value in hidden.values)
+    undetectable = _selected(modes, are_outside(tall_e, tall_a, hidden, plant.dt))
+    seen = hidden.normal_rank == plant.nx
+
+    rank_e = decide_rank(E, expected=plant.nx)
+    impulse = decide_rank(_impulse_matrix(E, A, C), expected=plant.nx + rank_e.rank)
+    causal = decide_rank(np.vstack([E, C]), expected=plant.nx)
+    decisions = {"rank E": rank_e, "rank [E; C]": causal, "rank [E A; 0 E; 0 C]": impulse}
+    decisions |= {f"pencil A - zE, step {i + 1}": decision for i, decision in enumerate(pencil.decisions)}
+    decisions |= {f"pencil [A - zE; C], step {i + 1}": decision for i, decision in enumerate(hidden.decisions)}
+    tall = equilibrate_pencil(tall_e, tall_a)
+    decisions |= {
+        f"rank [A - zE; C] at z = {mode:.6g}": decide_rank(tall.A - mode * tall.E, expected=plant.nx)
+        for mode in unstable
+        if mode.imag >= 0.0
+    }
+    return Structure(
+        regular=pencil.regular,
+        index=pencil.index,
+        finite_eigenvalues=pencil.finite_eigenvalues,
+        infinite_block_sizes=pencil.infinite_block_sizes,
+        impulse_free=impulse_free,
+        stable=stable,
+        admissible=stable and impulse_free,
+        observability_normal_rank=hidden.normal_rank,
+        unobservable_modes=modes,
+        undetectable_modes=undetectable,
+        finitely_observable=seen and not modes,
+        detectable=seen and not undetectable,
+        impulse_observable=impulse.full,
+        causally_observable=causal.full,
+        rank_of_E=rank_e,
+        decisions=MappingProxyType(decisions),
+    )
+
+
+def _selected(values: Iterable[complex], chosen: Iterable[bool]) -> tuple[complex, ...]:
+    return tuple(complex(value) for value, keep in zip(values, chosen, strict=True) if keep)
+
+
+def _impulse_matrix(E: FloatArray, A: FloatArray, C: FloatArray) -> FloatArray:
+    zero = np.zeros_like(E)
+    return np.block([[E, A], [zero, E], [np.zeros_like(C), C]])

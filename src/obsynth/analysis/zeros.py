@@ -1,0 +1,264 @@
+"""Invariant zeros with their directions, and whether they lie outside the stability region."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.models.descriptor import DescriptorSystem
+from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.numerics.pencils import FiniteZeros, finite_zeros
+from obsynth.numerics.ranks import (
+    BOUNDARY_NEIGHBOURHOOD,
+    BOUNDARY_RANK_TOLERANCE,
+    BOUNDARY_TOLERANCE,
+    CLUSTER_TOLERANCE,
+    NAMED_SHARE,
+    NEGLIGIBLE_INPUT,
+    RANK_TOLERANCE,
+    RankDecision,
+)
+from obsynth.numerics.scaling import EquilibratedPencil, equilibrate_pencil
+
+#: Points without meaning, tried as generic ones; the clearest of them is used.
+_GENERIC_POINTS = (0.7391, -1.3247, 1.9561, -0.4142)
+#: Where a pencil is tested between a zero and the nearest point of the stability boundary.
+_PATH_TO_BOUNDARY = (1.0, 0.75, 0.5, 0.25)
+
+
+@dataclass(frozen=True, eq=False)
+class Zero:
+    """An invariant zero and the direction that stays invisible there.
+
+    Parameters
+    ----------
+    value : complex
+        The point where the pencil loses rank.
+    state_direction, input_direction : ComplexArray
+        ``(nx,)`` and ``(nu,)``: together of unit norm and in the null space of the pencil at ``value``.
+    input_share : float
+        Size of the input part when the pencil is equilibrated, so that units do not matter.
+    """
+
+    value: complex
+    state_direction: ComplexArray
+    input_direction: ComplexArray
+    input_share: float
+
+    @property
+    def is_unobservable_mode(self) -> bool:
+        """Whether the input takes no part: the zero is a mode that the outputs never show."""
+        return self.input_share <= NEGLIGIBLE_INPUT
+
+
+@dataclass(frozen=True, eq=False)
+class FaultZeros:
+    """What faults a plant can hide from its outputs.
+
+    Parameters
+    ----------
+    zeros : tuple of Zero
+        Invariant zeros of ``[A - z E, Bf; C, Df]``.
+    outside : tuple of Zero
+        Those on or outside the boundary of stability: such a fault grows or persists unseen.
+    normal_rank_full : bool
+        Whether the pencil has rank ``nx + nf`` at almost every ``z``; if not, some combination of
+        faults never shows at all.
+    hidden_direction : FloatArray or None
+        ``(nf,)``, the fault part of the never-visible direction at a generic point, where there is one.
+    hidden_faults : tuple of str
+        Names of the faults that take part in such directions.
+    decisions : tuple of RankDecision
+        Every rank decided on the way.
+    """
+
+    zeros: tuple[Zero, ...]
+    outside: tuple[Zero, ...]
+    normal_rank_full: bool
+    hidden_direction: FloatArray | None
+    hidden_faults: tuple[str, ...]
+    decisions: tuple[RankDecision, ...]
+
+
+def is_outside(value: complex, dt: float) -> bool:
+    """Whether an eigenvalue or zero counts as not strictly stable, by its distance alone.
+
+    True when its modulus is at least ``1 - BOUNDARY_TOLERANCE`` (``dt > 0``) or its real part at least
+    ``-BOUNDARY_TOLERANCE max(1, abs(value))`` (``dt == 0``).
+    """
+    if dt > 0.0:
+        return bool(abs(value) >= 1.0 - BOUNDARY_TOLERANCE)
+    return bool(complex(value).real >= -BOUNDARY_TOLERANCE * max(1.0, abs(value)))
+
+
+def are_outside(E: FloatArray, A: FloatArray, zeros: FiniteZeros, dt: float) -> tuple[bool, ...]:
+    """Decide for each finite zero of ``A - z E`` whether it counts as not strictly stable.
+
+    A zero of multiplicity k moves by ``eps^(1/k)`` under rounding, so distance alone may put a double
+    zero on the boundary safely inside.  Near the boundary a zero therefore also counts as outside when
+    the pencil itself is singular to working precision all the way to the nearest boundary point.
+
+    Parameters
+    ----------
+    E, A : FloatArray
+        ``(m, n)``, the pencil.
+    zeros : FiniteZeros
+        What `finite_zeros` found for it.
+    dt : float
+        Seconds between samples, 0 for continuous time.
+    """
+    pencil = equilibrate_pencil(E, A)
+    return tuple(
+        is_outside(value, dt) or _reaches_boundary(pencil, value, dt, zeros.normal_rank)
+        for value in map(complex, zeros.values)
+    )
+
+
+def invariant_zeros(
+    E: FloatArray, A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray | None = None
+) -> tuple[Zero, ...]:
+    """Return the finite zeros of ``[A - z E, B; C, D]`` with multiplicity, each with its direction.
+
+    Parameters
+    ----------
+    E, A : FloatArray
+        ``(nx, nx)``.
+    B : FloatArray
+        ``(nx, nu)``.
+    C : FloatArray
+        ``(ny, nx)``.
+    D : FloatArray, optional
+        ``(ny, nu)``, zero by default.
+
+    Returns
+    -------
+    tuple of Zero
+        Where several directions share one zero, those with the smallest input part come first.
+    """
+    wide_e, wide_a = _system_pencil(E, A, B, C, D)
+    return _with_directions(wide_e, wide_a, finite_zeros(wide_e, wide_a), nx=E.shape[0])
+
+
+def fault_zeros(plant: DescriptorSystem) -> FaultZeros:
+    """Return the invariant zeros from the faults of ``plant`` to its outputs.
+
+    Parameters
+    ----------
+    plant : DescriptorSystem
+        ``Bf (nx, nf)``, ``Df (ny, nf)``, either time; disturbances are left out.
+
+    Returns
+    -------
+    FaultZeros
+        The zeros, and whether every fault shows in the outputs at all.
+    """
+    e, a = _system_pencil(plant.E, plant.A, plant.Bf, plant.C, plant.Df)
+    found = finite_zeros(e, a)
+    zeros = _with_directions(e, a, found, nx=plant.nx)
+    outside = tuple(zero for zero, out in zip(zeros, are_outside(e, a, found, plant.dt), strict=True) if out)
+    missing = plant.nx + plant.nf - found.normal_rank
+    direction, names = _hidden(e, a, plant, missing=missing) if missing else (None, ())
+    return FaultZeros(zeros, outside, missing == 0, direction, names, found.decisions)
+
+
+def _system_pencil(
+    E: FloatArray, A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray | None
+) -> tuple[FloatArray, FloatArray]:
+    feedthrough = np.zeros((C.shape[0], B.shape[1])) if D is None else D
+    padded = np.zeros((E.shape[0] + C.shape[0], E.shape[1] + B.shape[1]))
+    padded[: E.shape[0], : E.shape[1]] = E
+    return padded, np.block([[A, B], [C, feedthrough]])
+
+
+def _reaches_boundary(pencil: EquilibratedPencil, value: complex, dt: float, normal_rank: int) -> bool:
+    distance = abs(abs(value) - 1.0) if dt > 0.0 else abs(value.real)
+    if distance > BOUNDARY_NEIGHBOURHOOD * max(1.0, abs(value)):
+        return False
+    point = value / abs(value) if dt > 0.0 else complex(0.0, value.imag)
+    # All the way to the boundary: another zero that lies there is no evidence about this one.
+    path = [value + fraction * (point - value) for fraction in _PATH_TO_BOUNDARY]
+    singular_values = np.array([np.linalg.svd(pencil.A - z * pencil.E, compute_uv=False) for z in path])
+    return bool(np.all(singular_values[:, normal_rank - 1] <= BOUNDARY_RANK_TOLERANCE * singular_values[:, 0]))
+
+
+def _with_directions(E: FloatArray, A: FloatArray, found: FiniteZeros, *, nx: int) -> tuple[Zero, ...]:
+    pencil = equilibrate_pencil(E, A)
+    values = [complex(value) for value in found.values]
+    zeros: list[Zero] = []
+    for i, value in enumerate(values):
+        if value.imag < 0.0:
+            zeros.append(_conjugate(zeros[-1]))  # pairs follow each other and are exact
+            continue
+        kernel = _kernel(pencil, value, least=pencil.A.shape[1] - found.normal_rank + 1)
+        basis = _smallest_part_first(kernel, slice(nx, None))
+        twins = sum(abs(value - other) <= CLUSTER_TOLERANCE * max(1.0, abs(value)) for other in values[:i])
+        zeros.append(_zero_along(basis[:, min(twins, basis.shape[1] - 1)], value, pencil.columns, nx=nx))
+    return tuple(zeros)
+
+
+def _kernel(pencil: EquilibratedPencil, value: complex, *, least: int) -> NDArray[Any]:
+    """Return an orthonormal null basis of the pencil at ``value``, with ``least`` columns or more."""
+    matrix = pencil.A - (value if value.imag else value.real) * pencil.E
+    _, singular_values, right = np.linalg.svd(matrix)
+    kept = int(np.sum(singular_values > RANK_TOLERANCE * singular_values[0])) if singular_values.size else 0
+    return np.asarray(right[min(kept, matrix.shape[1] - least) :].conj().T)
+
+
+def _smallest_part_first(basis: NDArray[Any], part: slice) -> NDArray[Any]:
+    """Rotate an orthonormal basis so that the columns' rows in ``part`` grow from first to last."""
+    if basis.shape[1] == 1 or basis[part].size == 0:
+        return basis
+    _, _, rotation = np.linalg.svd(basis[part])
+    return np.asarray(basis @ rotation.conj().T[:, ::-1])
+
+
+def _zero_along(direction: NDArray[Any], value: complex, scale: FloatArray, *, nx: int) -> Zero:
+    original = scale * direction
+    leading = original[np.argmax(np.abs(original))]
+    original = original * (abs(leading) / leading / np.linalg.norm(original))
+    share = float(np.linalg.norm(direction[nx:]))
+    return Zero(value, _frozen(original[:nx]), _frozen(original[nx:]), share)
+
+
+def _conjugate(zero: Zero) -> Zero:
+    return Zero(
+        zero.value.conjugate(),
+        _frozen(zero.state_direction.conj()),
+        _frozen(zero.input_direction.conj()),
+        zero.input_share,
+    )
+
+
+def _frozen(vector: NDArray[Any]) -> ComplexArray:
+    copy = np.array(vector, dtype=np.complex128)
+    copy.setflags(write=False)
+    return copy
+
+
+def _hidden(
+    E: FloatArray, A: FloatArray, plant: DescriptorSystem, *, missing: int
+) -> tuple[FloatArray, tuple[str, ...]]:
+    """Return the direction in the null space at a generic point with the largest fault part."""
+    pencil = equilibrate_pencil(E, A)
+    kernels = []
+    for point in _GENERIC_POINTS:
+        _, singular_values, right = np.linalg.svd(pencil.A - point * pencil.E)
+        kernels.append((float(singular_values[plant.nx + plant.nf - missing - 1]), right[-missing:].T))
+    _, kernel = max(kernels, key=lambda pair: pair[0])
+    ordered = _smallest_part_first(kernel, slice(plant.nx, None))
+    direction = pencil.columns[plant.nx :] * ordered[plant.nx :, -1]
+    size = float(np.linalg.norm(direction))
+    names = leading_names(np.linalg.norm(ordered[plant.nx :], axis=1), plant.fault_names)
+    result = np.array(direction / size if size > 0.0 else direction)
+    result.setflags(write=False)
+    return result, names
+
+
+def leading_names(shares: FloatArray, names: Sequence[str]) -> tuple[str, ...]:
+    """Return the names whose share ``(n,)``, never negative, is not small beside the largest one."""
+    least = NAMED_SHARE * float(np.max(shares, initial=0.0))
+    return tuple(name for name, share in zip(names, shares, strict=True) if 0.0 < share >= least)

@@ -1,0 +1,171 @@
+"""The verbs: thin, each one call into the package and one report."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from obsynth.cli.output import print_json, progress, stdout_console
+from obsynth.errors import PreconditionError, SpecError, VerificationError
+
+if TYPE_CHECKING:
+    from obsynth.analysis.structure import Structure
+    from obsynth.results.design import ObserverDesign
+    from obsynth.spec import Spec
+
+
+def run_design(options: argparse.Namespace) -> int:
+    """Run ``design``: spec in, report and gain set out.
+
+    Parameters
+    ----------
+    options : argparse.Namespace
+        ``system``, ``output``, ``json``, ``quiet``.
+
+    Returns
+    -------
+    int
+        0; every failure is an error.
+
+    Raises
+    ------
+    ObsynthError
+        As its exit code says; nothing is written then.
+    """
+    from obsynth.results.serialise import design_as_dict
+
+    with progress(quiet=options.quiet) as report_stage:
+        report_stage(f"reading {options.system}")
+        from obsynth.spec import load_spec
+
+        spec = load_spec(options.system)
+        target = _output_file(options.output, spec)
+        design = _designed(spec, report_stage)
+        file = design.save(target)
+    if options.json:
+        print_json({
+            "command": "design", "spec": str(spec.path), "file": str(file), "passed": design.report.passed,
+            "gain_set": design_as_dict(design),
+        })  # fmt: skip
+        return 0
+    from obsynth.report import design_report
+
+    design_report(design, console=stdout_console(), file=file)
+    return 0
+
+
+def _designed(spec: Spec, report_stage: Any) -> ObserverDesign:
+    from obsynth.pipeline import design
+
+    recovery = None if spec.transformation is None else spec.transformation.recovery
+    return design(
+        spec.plant, spec.method, name=spec.name, recovery=recovery, progress=report_stage, **dict(spec.options)
+    )
+
+
+def _output_file(wanted: Path | None, spec: Spec) -> Path:
+    """Return where to write; refuse a hopeless place before any work is done."""
+    target = wanted if wanted is not None else Path(f"{spec.name}.gains.json")
+    if target.is_dir():
+        raise SpecError(f"{target} is a folder: give the name of a file to --output.", path=str(target))
+    if not target.parent.is_dir():
+        raise SpecError(f"The folder {target.parent} does not exist: {target} cannot be written.", path=str(target))
+    if target.exists() and target.samefile(spec.path):
+        raise SpecError(f"{target} is the spec itself: give another file to --output.", path=str(target))
+    return target
+
+
+def run_check(options: argparse.Namespace) -> int:
+    """Run ``check``: structure, and the existence conditions of every method.
+
+    Parameters
+    ----------
+    options : argparse.Namespace
+        ``system``, ``json``.
+
+    Returns
+    -------
+    int
+        0 if the conditions of the spec's own method hold, else 3.
+
+    Raises
+    ------
+    ObsynthError
+        The spec is malformed, or its plant cannot be transformed as asked.
+    """
+    from obsynth.spec import load_spec
+
+    spec = load_spec(options.system)
+    from obsynth.analysis.structure import analyse_structure
+    from obsynth.pipeline import check
+
+    structures = {"as the method sees it": analyse_structure(spec.plant)}
+    if spec.transformation is not None:
+        structures = {"as written": analyse_structure(spec.transformation.source), **structures}
+    done = "" if spec.transformation is None else spec.transformation.description
+    methods = check(spec.plant)
+    passed = methods[spec.method].passed
+    if options.json:
+        print_json({
+            "command": "check", "spec": str(spec.path), "method": spec.method, "passed": passed,
+            "transformation": done,
+            "structure": {name.replace(" ", "_"): _structure_as_dict(found) for name, found in structures.items()},
+            "methods": {name: report.as_dict() for name, report in methods.items()},
+        })  # fmt: skip
+    else:
+        from obsynth.report import check_report
+
+        check_report(spec.plant, structures, methods, console=stdout_console(), transformation=done)
+    return 0 if passed else PreconditionError.exit_code
+
+
+def _structure_as_dict(structure: Structure) -> dict[str, Any]:
+    """Return the structure as plain data, eigenvalues as ``[real, imaginary]``."""
+    facts: dict[str, Any] = {field.name: getattr(structure, field.name) for field in fields(structure)}
+    for name in ("finite_eigenvalues", "unobservable_modes", "undetectable_modes"):
+        facts[name] = [[float(np.real(value)), float(np.imag(value))] for value in facts[name]]
+    facts["rank_of_E"] = structure.rank_of_E.rank
+    facts["decisions"] = {
+        name: {"rank": decision.rank, "expected": decision.expected, "gap": decision.gap, "clear": decision.clear}
+        for name, decision in structure.decisions.items()
+    }
+    return facts
+
+
+def run_verify(options: argparse.Namespace) -> int:
+    """Run ``verify``: recheck a saved gain set without a solver.
+
+    Parameters
+    ----------
+    options : argparse.Namespace
+        ``gains``, ``printed_digits``, ``json``.
+
+    Returns
+    -------
+    int
+        0 if every check holds, else 6.
+
+    Raises
+    ------
+    SpecError
+        The file is no gain set, or was changed.
+    """
+    from obsynth.results.serialise import load
+    from obsynth.verification import verify
+
+    design = load(options.gains)
+    report = verify(design, printed_digits=options.printed_digits)
+    if options.json:
+        print_json({
+            "command": "verify", "file": str(options.gains), "name": design.name, "method": design.method,
+            "passed": report.passed, "report": report.as_dict(),
+        })  # fmt: skip
+    else:
+        from obsynth.report import design_report
+
+        design_report(design.replace(report=report), console=stdout_console(), file=options.gains)
+    return 0 if report.passed else VerificationError.exit_code

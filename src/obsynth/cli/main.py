@@ -1,0 +1,157 @@
+"""The commands ``design`` and ``obsynth``: arguments in, exit code out.
+
+Nothing heavy is imported here, so that ``--help`` answers at once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from obsynth import __version__
+from obsynth.cli.output import print_error, print_json
+from obsynth.errors import ObsynthError
+
+_EXIT_CODES = """\
+exit codes:
+  0  success
+  2  wrong arguments, or a malformed spec, plant or file
+  3  an existence condition fails: no design of this kind exists for this plant
+  4  the matrix inequalities have no solution, and that is proved
+  5  a solver gave up: nothing is known
+  6  a check of the shipped gains failed
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run ``obsynth``.
+
+    Parameters
+    ----------
+    arguments : sequence of str, optional
+        The command line without the program's name; that of the process by default.
+
+    Returns
+    -------
+    int
+        The exit code.
+    """
+    return _run(_parser(), arguments)
+
+
+def design_command(arguments: Sequence[str] | None = None) -> int:
+    """Run ``design``, which is ``obsynth design``.
+
+    Parameters
+    ----------
+    arguments : sequence of str, optional
+        The command line without the program's name; that of the process by default.
+
+    Returns
+    -------
+    int
+        The exit code.
+    """
+    parser = argparse.ArgumentParser(
+        prog="design", description=_DESIGN, epilog=_EXIT_CODES, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    _add_version(parser)
+    _add_design_arguments(parser)
+    return _run(parser, arguments)
+
+
+_DESIGN = "Design an observer from a spec, prove it, print a report and write the gain set."
+_CHECK = "Analyse the plant of a spec, and check for every method whether a design can exist."
+_VERIFY = "Verify a saved gain set again, from the plant and the shipped realisation alone."
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="obsynth", epilog=_EXIT_CODES, formatter_class=argparse.RawDescriptionHelpFormatter,
+        description="Observers and fault-estimation filters for descriptor systems: designed, proved again, and run.",
+    )  # fmt: skip
+    _add_version(parser)
+    verbs = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    _add_design_arguments(verbs.add_parser("design", help=_DESIGN, description=_DESIGN))
+
+    check = verbs.add_parser("check", help=_CHECK, description=_CHECK)
+    _add_system(check)
+    _add_json(check)
+    check.set_defaults(verb="check")
+
+    verify = verbs.add_parser("verify", help=_VERIFY, description=_VERIFY)
+    verify.add_argument("gains", type=Path, metavar="FILE", help="a gain set (JSON) that design wrote")
+    verify.add_argument(
+        "--printed-digits", type=_digits, metavar="N",
+        help="judge the gains as numbers that were printed with N decimals",
+    )  # fmt: skip
+    _add_json(verify)
+    verify.set_defaults(verb="verify")
+    return parser
+
+
+def _add_design_arguments(parser: argparse.ArgumentParser) -> None:
+    _add_system(parser)
+    parser.add_argument(
+        "--output", type=Path, metavar="FILE",
+        help="where to write the gain set (default: <name of the spec>.gains.json in the current folder)",
+    )  # fmt: skip
+    _add_json(parser)
+    parser.add_argument("--quiet", action="store_true", help="print no progress")
+    parser.set_defaults(verb="design")
+
+
+def _add_system(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--system", type=Path, required=True, metavar="FILE", help="the spec (YAML)")
+
+
+def _add_json(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--json", action="store_true", help="print JSON on stdout, for programs; errors too")
+
+
+def _add_version(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--version", action="version", version=f"obsynth {__version__}")
+
+
+def _digits(text: str) -> int:
+    digits = int(text)
+    if not 1 <= digits <= 15:
+        raise argparse.ArgumentTypeError(f"{digits} is not between 1 and 15")
+    return digits
+
+
+def _verb(name: str) -> Callable[[argparse.Namespace], int]:
+    from obsynth.cli import commands
+
+    return {"design": commands.run_design, "check": commands.run_check, "verify": commands.run_verify}[name]
+
+
+def _run(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> int:
+    options = parser.parse_args(arguments)
+    for stream in (sys.stdout, sys.stderr):
+        # A name that the terminal's encoding lacks must not end a run that has succeeded.
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="backslashreplace")
+    try:
+        code = _verb(options.verb)(options)
+        sys.stdout.flush()
+        return code
+    except ObsynthError as error:
+        if options.json:
+            print_json(error.as_dict())
+        print_error(error)
+        return error.exit_code
+    except KeyboardInterrupt:
+        print("Interrupted.", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        # Whoever read our output has left; the interpreter's own flush at exit must not complain.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
+
+
+if __name__ == "__main__":
+    sys.exit(main())

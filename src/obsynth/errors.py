@@ -1,0 +1,156 @@
+"""The errors of obsynth: one type per kind of bad news, each with its exit code.
+
+Every message says what failed, where, and what to do about it.  The attributes hold the same facts
+for programs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from obsynth.results.report import VerificationReport
+
+
+class ObsynthError(Exception):
+    """Base class of every error that obsynth raises on purpose.
+
+    Attributes
+    ----------
+    exit_code : int
+        Exit code of the command line when this error ends it.
+    """
+
+    exit_code = 1
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the error as plain data, for ``--json``."""
+        return {"error": type(self).__name__, "exit_code": self.exit_code, "message": str(self)}
+
+
+class SpecError(ObsynthError):
+    """A document, a matrix or a file is malformed.
+
+    Parameters
+    ----------
+    message : str
+        What is wrong and what to do.
+    path : str, optional
+        Where: a file, or a path inside a document such as ``plant.E``.
+    problems : sequence of str, optional
+        All problems found, when there are several; they are appended to the message.
+    """
+
+    exit_code = 2
+
+    def __init__(self, message: str, *, path: str | None = None, problems: Sequence[str] = ()) -> None:
+        self.path = path
+        self.problems = tuple(problems)
+        lines = [message, *(f"  - {problem}" for problem in self.problems)]
+        super().__init__("\n".join(lines))
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the error as plain data, for ``--json``."""
+        return {**super().as_dict(), "path": self.path, "problems": list(self.problems)}
+
+
+class PreconditionError(ObsynthError):
+    """An existence condition fails: no design of this kind exists, whatever the solver.
+
+    Parameters
+    ----------
+    message : str
+        Which condition fails, where, and what to do.
+    condition : str
+        Short name of the condition, for example ``rank [E; C]``.
+    mode : complex, optional
+        The eigenvalue or zero at which it fails.
+    signals : sequence of str, optional
+        Names of the faults, states or outputs involved.
+    """
+
+    exit_code = 3
+
+    def __init__(
+        self, message: str, *, condition: str, mode: complex | None = None, signals: Sequence[str] = ()
+    ) -> None:
+        self.condition = condition
+        self.mode = mode
+        self.signals = tuple(signals)
+        super().__init__(message)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the error as plain data, for ``--json``."""
+        mode = None if self.mode is None else [complex(self.mode).real, complex(self.mode).imag]
+        return {**super().as_dict(), "condition": self.condition, "mode": mode, "signals": list(self.signals)}
+
+
+class InfeasibleError(ObsynthError):
+    """The matrix inequalities have no solution, and a checked certificate proves it.
+
+    Parameters
+    ----------
+    message : str
+        What was asked, what is proved, and what to do.
+    necessary : bool
+        True if the inequalities are necessary for the design (so none exists); False if they are only
+        sufficient (so another method or choice may still find one).
+    lower_bound : float, optional
+        The proved lower bound on the quantity that was asked for.
+    """
+
+    exit_code = 4
+
+    def __init__(self, message: str, *, necessary: bool, lower_bound: float | None = None) -> None:
+        self.necessary = necessary
+        self.lower_bound = lower_bound
+        super().__init__(message)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the error as plain data, for ``--json``."""
+        return {**super().as_dict(), "necessary": self.necessary, "lower_bound": self.lower_bound}
+
+
+class SolverError(ObsynthError):
+    """A solver ended without an answer that passes our own checks: nothing is known.
+
+    Parameters
+    ----------
+    message : str
+        What was being solved and what to try.
+    record : mapping, optional
+        Solver name, version, status and iterations, as far as known.
+    """
+
+    exit_code = 5
+
+    def __init__(self, message: str, *, record: Mapping[str, Any] | None = None) -> None:
+        self.record = dict(record or {})
+        super().__init__(message)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the error as plain data, for ``--json``."""
+        return {**super().as_dict(), "record": {key: str(value) for key, value in self.record.items()}}
+
+
+class VerificationError(ObsynthError):
+    """Gains exist, but at least one check of the shipped realisation failed.
+
+    Parameters
+    ----------
+    message : str
+        Which checks failed.
+    report : VerificationReport
+        The whole report.
+    """
+
+    exit_code = 6
+
+    def __init__(self, message: str, *, report: VerificationReport) -> None:
+        self.report = report
+        super().__init__(message)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the error as plain data, for ``--json``."""
+        return {**super().as_dict(), "report": self.report.as_dict()}

@@ -1,0 +1,49 @@
+"""Making plain input into checked, read-only float arrays."""
+
+from __future__ import annotations
+
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.errors import SpecError
+
+FloatArray: TypeAlias = NDArray[np.float64]
+ComplexArray: TypeAlias = NDArray[np.complex128]
+
+
+def read_only(array: FloatArray) -> FloatArray:
+    """Return a private copy of ``array`` that nobody can write to."""
+    copy = np.array(array, dtype=np.float64, order="C", copy=True)
+    copy.setflags(write=False)
+    return copy
+
+
+def as_matrix(value: Any, name: str) -> FloatArray:
+    """Convert nested lists or an array to a finite, read-only matrix; raise `SpecError` naming it.
+
+    A scalar is read as a 1-by-1 matrix.  Text, booleans, complex numbers, ragged rows, NaN and
+    infinities are refused.
+    """
+    try:
+        raw = np.asarray(value)
+    except ValueError:
+        raise SpecError(f"{name} has rows of different lengths: give a full matrix.", path=name) from None
+    if raw.dtype.kind not in "fiu":
+        if raw.size == 0:
+            raw = raw.astype(np.float64)
+        else:
+            kind = {"b": "booleans", "c": "complex numbers", "U": "text"}.get(raw.dtype.kind, "entries that are no numbers")
+            raise SpecError(f"{name} holds {kind}: every entry must be a real number.", path=name)
+    if raw.ndim == 0:
+        raw = raw.reshape(1, 1)
+    if raw.ndim != 2:
+        raise SpecError(f"{name} has {raw.ndim} dimension(s): give a matrix (a list of rows).", path=name)
+    matrix = raw.astype(np.float64)
+    bad = np.argwhere(~np.isfinite(matrix))
+    if bad.size:
+        row, column = (int(i) + 1 for i in bad[0])
+        entry = matrix[row - 1, column - 1]
+        raise SpecError(f"{name} has {entry} in row {row}, column {column}: every entry must be finite.", path=name)
+    return read_only(matrix)

@@ -1,0 +1,132 @@
+"""Rank decisions and every tolerance of the package, in one place.
+
+A rank is a decision, not a fact: each one reports the singular values on both sides of the cut, so
+that a reader sees how clear it was.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from obsynth.numerics.arrays import FloatArray, read_only
+
+#: Singular values below this fraction of the largest count as zero (data are balanced first).
+RANK_TOLERANCE = 1e-10
+#: A gap between kept and dropped singular values smaller than this is reported as unclear.
+CLEAR_GAP = 1e3
+#: Distance from the stability boundary below which an eigenvalue or zero counts as lying on it.
+BOUNDARY_TOLERANCE = 1e-8
+#: Relative size below which a Markov parameter of a fault counts as zero.
+MARKOV_TOLERANCE = 1e-9
+#: A chain ``(TA)^k T f`` that shrank below this fraction of its a-priori bound has died out.
+DEAD_CHAIN_TOLERANCE = 1e-13
+#: An eigenvalue this close to the stability boundary is tested for lying on it (a multiple one scatters far).
+BOUNDARY_NEIGHBOURHOOD = 1e-2
+#: Singular value of a pencil, relative to its largest, below which rounding alone may have moved a zero away.
+BOUNDARY_RANK_TOLERANCE = 1e-13
+#: Zeros closer than this, relative to their size, are taken for one multiple zero when directions are assigned.
+CLUSTER_TOLERANCE = 1e-6
+#: Share of the input in a zero direction below which the zero is an unobservable mode.
+NEGLIGIBLE_INPUT = 1e-6
+#: Signals whose share in a null vector is at least this fraction of the largest share are named.
+NAMED_SHARE = 1e-3
+#: Result of a sum or product, relative to the sizes of its terms, below which it is only rounding.
+CANCELLATION_TOLERANCE = 1e-14
+#: Fault zeros of a sampled plant between this radius and 1 make the fault estimate ring for long.
+SLOW_ZERO_RADIUS = 0.98
+
+
+@dataclass(frozen=True, eq=False)
+class RankDecision:
+    """A numerical rank, with the evidence for it.
+
+    Parameters
+    ----------
+    rank : int
+        The decided rank.
+    expected : int
+        Full rank for the purpose at hand (usually the smaller dimension).
+    singular_values : FloatArray
+        All singular values, largest first, of the matrix as decided upon (rows and columns scaled).
+    smallest_kept, largest_dropped : float
+        The singular values on both sides of the cut, relative to the largest (0 where there is none).
+    gap : float
+        ``smallest_kept / largest_dropped``; infinite when nothing, or only an exact zero, was dropped;
+        when the rank is full, the distance to the tolerance instead.
+    """
+
+    rank: int
+    expected: int
+    singular_values: FloatArray
+    smallest_kept: float
+    largest_dropped: float
+    gap: float
+
+    @property
+    def full(self) -> bool:
+        """Whether the decided rank equals the expected one."""
+        return self.rank == self.expected
+
+    @property
+    def clear(self) -> bool:
+        """Whether the gap is large enough to trust the decision without a second look."""
+        return self.gap >= CLEAR_GAP
+
+    def describe(self) -> str:
+        """Return one line for a report, such as ``rank 4 of 4 (gap 2.1e+09)``."""
+        note = "" if self.clear else ", unclear: check the scaling of the data"
+        return f"rank {self.rank} of {self.expected} (gap {self.gap:.1e}{note})"
+
+
+def equilibrate(matrix: FloatArray) -> FloatArray:
+    """Return ``matrix`` with rows, then columns, scaled by powers of two to a largest entry near one."""
+    scaled = np.array(matrix, dtype=np.float64)
+    for axis in (1, 0, 1, 0):
+        if scaled.size == 0:
+            return scaled
+        peak = np.max(np.abs(scaled), axis=axis, keepdims=True)
+        peak[peak == 0.0] = 1.0
+        scaled = scaled / np.exp2(np.floor(np.log2(peak)))
+    return scaled
+
+
+def decide_rank(
+    matrix: FloatArray,
+    *,
+    expected: int | None = None,
+    tolerance: float = RANK_TOLERANCE,
+    scale: float | None = None,
+    equilibrated: bool = True,
+) -> RankDecision:
+    """Decide the rank of ``matrix (rows, cols)`` by its singular values.
+
+    Parameters
+    ----------
+    matrix : FloatArray
+        Any real or complex matrix.
+    expected : int, optional
+        What full rank means here; the smaller dimension by default.
+    tolerance : float, optional
+        Relative to ``scale``.
+    scale : float, optional
+        Reference size; the largest singular value by default.
+    equilibrated : bool, optional
+        Scale rows and columns by powers of two first, so that units do not decide the rank.
+    """
+    work = equilibrate(matrix) if equilibrated and not np.iscomplexobj(matrix) else np.asarray(matrix)
+    values = np.linalg.svd(work, compute_uv=False) if work.size else np.zeros(0)
+    reference = scale if scale is not None else (float(values[0]) if values.size else 0.0)
+    rank = int(np.sum(values > tolerance * reference)) if reference > 0.0 else 0
+    relative = values / reference if reference > 0.0 else values
+    kept = float(relative[rank - 1]) if rank else 0.0
+    dropped = float(relative[rank]) if rank < values.size else 0.0
+    if rank == values.size:
+        gap = kept / tolerance if rank else float("inf")
+    elif dropped == 0.0:
+        gap = float("inf")
+    else:
+        gap = (kept if rank else tolerance) / dropped
+    wanted = min(work.shape) if expected is None else expected
+    return RankDecision(rank, wanted, read_only(values), kept, dropped, gap)

@@ -1,0 +1,177 @@
+"""Balancing by powers of two: exact in floating point, so that mapping back loses nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from obsynth.numerics.arrays import FloatArray, read_only
+
+#: Sweeps of the balancing; each one must improve on the last, so few are ever used.
+MOST_SWEEPS = 10
+
+
+@dataclass(frozen=True, eq=False)
+class Scaling:
+    """Power-of-two factors for the equations, states and outputs of a plant.
+
+    The scaled plant is ``diag(equations) E diag(states)``, ``diag(outputs) C diag(states)`` and so
+    on; its state ``z`` is ``x = diag(states) z``, its output ``diag(outputs) y``.
+
+    Parameters
+    ----------
+    equations : FloatArray
+        ``(nx,)``, multiplies the rows of ``E``, ``A`` and every input-like matrix.
+    states : FloatArray
+        ``(nx,)``, multiplies the columns of ``E``, ``A`` and every output-like matrix.
+    outputs : FloatArray
+        ``(ny,)``, multiplies the rows of the stacked output-like matrices.
+    """
+
+    equations: FloatArray
+    states: FloatArray
+    outputs: FloatArray
+
+    @property
+    def is_identity(self) -> bool:
+        """Whether nothing is scaled."""
+        return all(bool(np.all(factors == 1.0)) for factors in (self.equations, self.states, self.outputs))
+
+    def scale_dynamics(self, matrix: FloatArray) -> FloatArray:
+        """Return ``E`` or ``A`` ``(nx, nx)`` of the scaled plant."""
+        return self.equations[:, None] * matrix * self.states
+
+    def scale_input(self, matrix: FloatArray) -> FloatArray:
+        """Return an input-like matrix ``(nx, *)`` of the scaled plant."""
+        return self.equations[:, None] * matrix
+
+    def scale_output(self, matrix: FloatArray) -> FloatArray:
+        """Return an output-like matrix ``(ny, nx)`` of the scaled plant."""
+        return self.outputs[:, None] * matrix * self.states
+
+    def scale_feedthrough(self, matrix: FloatArray) -> FloatArray:
+        """Return a feedthrough matrix ``(ny, *)`` of the scaled plant."""
+        return self.outputs[:, None] * matrix
+
+
+@dataclass(frozen=True, eq=False)
+class EquilibratedPencil:
+    """A pencil ``A - z E`` with rows and columns scaled to largest entries near one.
+
+    Parameters
+    ----------
+    E, A : FloatArray
+        ``(m, n)``, the scaled pencil ``diag(rows) (A - z E) diag(columns)``.
+    rows, columns : FloatArray
+        ``(m,)`` and ``(n,)``, powers of two.
+    """
+
+    E: FloatArray
+    A: FloatArray
+    rows: FloatArray
+    columns: FloatArray
+
+
+def power_of_two_below(sizes: FloatArray) -> FloatArray:
+    """Return the largest power of two not above each entry of ``sizes``; 1 where that is zero."""
+    # frexp is exact where log2 is not, and floor leaves everything between 1 and 2 alone.
+    _, exponents = np.frexp(sizes)
+    return np.where(sizes > 0.0, np.ldexp(1.0, exponents - 1), 1.0)
+
+
+def equilibrate_pencil(E: FloatArray, A: FloatArray) -> EquilibratedPencil:
+    """Scale the rows, then the columns, of ``A - z E`` by powers of two to largest entries in [1, 2).
+
+    Zeros and Kronecker structure do not change.  One pass is enough: scaling a column up to its
+    largest entry cannot lift an entry above those that already rule their rows.
+
+    Parameters
+    ----------
+    E, A : FloatArray
+        ``(m, n)``, any sizes including zero.
+
+    Returns
+    -------
+    EquilibratedPencil
+        The scaled pencil and its factors.
+    """
+    size = np.maximum(np.abs(E), np.abs(A))
+    rows = 1.0 / power_of_two_below(_row_peaks(size))
+    columns = 1.0 / power_of_two_below(_row_peaks((rows[:, None] * size).T))
+    return EquilibratedPencil(
+        read_only(rows[:, None] * E * columns),
+        read_only(rows[:, None] * A * columns),
+        read_only(rows),
+        read_only(columns),
+    )
+
+
+def balance_system(
+    E: FloatArray, A: FloatArray, inputs: Sequence[FloatArray] = (), outputs: Sequence[FloatArray] = ()
+) -> Scaling:
+    """Find power-of-two factors that bring the largest entries of a plant near one.
+
+    Equations are scaled by the largest entry of the row of ``[E A]`` (of the input-like matrices where
+    that is zero), outputs by their own rows, and states by the column of ``[E; C]``, or of ``A`` where
+    that is zero.  A plant whose rows and columns have largest entries in [1, 2) is left unchanged.
+
+    Parameters
+    ----------
+    E, A : FloatArray
+        ``(nx, nx)``.
+    inputs : sequence of FloatArray, optional
+        Input-like matrices ``(nx, *)``.
+    outputs : sequence of FloatArray, optional
+        Output-like matrices ``(*, nx)``; ``Scaling.outputs`` follows their stacked rows.
+
+    Returns
+    -------
+    Scaling
+        The factors.
+
+    Notes
+    -----
+    A fast state cannot have both ``E`` and ``A`` near one, so repeated sweeps may drift; a sweep is
+    kept only when it improves the columns.
+    """
+    nx = E.shape[0]
+    e, a = np.abs(E), np.abs(A)
+    b = np.abs(np.hstack([np.zeros((nx, 0)), *inputs]))
+    c = np.abs(np.vstack([np.zeros((0, nx)), *outputs]))
+    states = np.ones(nx)
+    best = _scale_rows(e, a, b, c, states)
+    peaks = _state_peaks(e, a, c, best)
+    for _ in range(MOST_SWEEPS):
+        states = states / power_of_two_below(peaks)
+        trial = _scale_rows(e, a, b, c, states)
+        new_peaks = _state_peaks(e, a, c, trial)
+        if not _imbalance(new_peaks) < _imbalance(peaks):
+            break
+        best, peaks = trial, new_peaks
+    return best
+
+
+def _scale_rows(e: FloatArray, a: FloatArray, b: FloatArray, c: FloatArray, states: FloatArray) -> Scaling:
+    own = _row_peaks(np.hstack([e, a]) * np.concatenate([states, states]))
+    equations = np.where(own > 0.0, own, _row_peaks(b))
+    outputs = _row_peaks(c * states)
+    return Scaling(
+        read_only(1.0 / power_of_two_below(equations)),
+        read_only(states),
+        read_only(1.0 / power_of_two_below(outputs)),
+    )
+
+
+def _state_peaks(e: FloatArray, a: FloatArray, c: FloatArray, scaling: Scaling) -> FloatArray:
+    own = _row_peaks(np.vstack([scaling.scale_dynamics(e), scaling.scale_output(c)]).T)
+    return np.where(own > 0.0, own, _row_peaks(scaling.scale_dynamics(a).T))
+
+
+def _imbalance(peaks: FloatArray) -> float:
+    return float(np.sum(np.abs(np.log2(power_of_two_below(peaks)))))
+
+
+def _row_peaks(matrix: FloatArray) -> FloatArray:
+    return np.asarray(np.max(matrix, axis=1, initial=0.0))

@@ -1,0 +1,249 @@
+"""From a plant to a verified design: the only place that goes analyse -> synthesise -> verify."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+from numpy.typing import ArrayLike
+
+from obsynth.analysis.transformations import StateRecovery
+from obsynth.errors import SpecError, VerificationError
+from obsynth.models.descriptor import DescriptorSystem
+from obsynth.results.design import ObserverDesign
+from obsynth.results.report import VerificationReport
+from obsynth.synthesis.methods import REGISTRY, method_module
+from obsynth.synthesis.result import Synthesis
+from obsynth.verification import verify
+from obsynth.verification.plant import condition_rows
+
+
+def _silent(_: str) -> None:
+    """Progress that nobody watches."""
+
+
+def design(
+    plant: DescriptorSystem,
+    method: str = "fault-estimation-filter",
+    *,
+    name: str = "design",
+    recovery: StateRecovery | None = None,
+    progress: Callable[[str], None] | None = None,
+    **options: Any,
+) -> ObserverDesign:
+    """Design an observer and verify what is shipped.
+
+    Parameters
+    ----------
+    plant : DescriptorSystem
+        The plant.
+    method : str, optional
+        Method id; see `fault_estimation_filter` for the options of ``"fault-estimation-filter"``.
+    name : str, optional
+        Name of the design.
+    recovery : StateRecovery, optional
+        Map back to the states of the plant before its transformation, kept with the design.
+    progress : callable, optional
+        Called with a text at the start of each stage.
+    **options
+        Options of the method.
+
+    Returns
+    -------
+    ObserverDesign
+        Verified: every check of its report holds.
+
+    Raises
+    ------
+    SpecError
+        Unknown method or option, or an option out of range.
+    PreconditionError
+        No such observer exists for this plant; the failing condition, mode and signals are named.
+    InfeasibleError
+        A checked certificate proves that what was asked cannot be reached.
+    SolverError
+        The solver gave no usable answer: nothing is known.
+    VerificationError
+        Gains were found, but the shipped realisation fails a check.
+    """
+    report_stage = progress or _silent
+    options = _checked_options(method, options)
+    found = method_module(method).synthesise(plant, progress=report_stage, **options)
+    report_stage("verifying the shipped realisation")
+    return _verified(plant, method, found, name=name, recovery=recovery)
+
+
+def fault_estimation_filter(
+    plant: DescriptorSystem,
+    *,
+    gamma: float | None = None,
+    gamma_search: str = "direct",
+    gamma_margin: float = 0.05,
+    free_residual_weight: bool | None = None,
+    residual_weight_limit: float | None = None,
+    S: ArrayLike | None = None,
+    solver: str = "CLARABEL",
+    tolerance: float = 1e-6,
+    name: str = "design",
+) -> ObserverDesign:
+    r"""Design a fault-estimation filter with a guaranteed l2 gain from the disturbance to the fault error.
+
+    Each fault estimate equals its fault delayed by its detectability index, untouched by the other faults and the
+    state; what is left is the effect of the disturbance, bounded by gamma, and of the initial error, which dies out.
+
+    Parameters
+    ----------
+    plant : DescriptorSystem
+        Discrete time (``dt > 0``), ``E (nx, nx)``, ``C (ny, nx)``, ``Bf (nx, nf)``, ``Bd (nx, nd)``; feedthrough
+        ``D, Df, Dd`` and noise ``Bw, Dw`` allowed.
+    gamma : float, optional, dimensionless
+        Required bound on the l2 gain d -> fault error.  ``None`` ships ``1 + gamma_margin`` times the least one.
+    gamma_search : {"direct", "bisection"}, optional
+        How the least gain is found: one minimisation, or the paper's Algorithm 1 made to end.
+    gamma_margin : float, optional
+        Relative distance to the least gain that buys small gains; the bare optimum is badly conditioned.
+    free_residual_weight : bool, optional
+        Whether W is free within ``W Upsilon = I``.  By default yes when the plant states noise, else no.
+    residual_weight_limit : float, optional
+        Bound on the spectral norm of W (implies a free W).
+    S : array_like, optional
+        The paper's free matrix ``(nx, nx + ny)`` in (17); by default T is nonsingular by construction.
+    solver : {"CLARABEL", "SCS"}, optional
+        Semidefinite solver.
+    tolerance : float, optional
+        Relative width of the bracket at which bisection ends.
+    name : str, optional
+        Name of the design.
+
+    Returns
+    -------
+    ObserverDesign
+        ``gains``: ``T (nx, nx)``, ``N (nx, ny)``, ``L (nx, ny)``, ``W (nf, ny)``, ``Psi (nx, nf)``,
+        ``Upsilon (ny, nf)``, ``R (nx, ny)``, where faults with feedthrough count as further states.
+        ``certificate.claims``: ``gamma`` (proved), ``gamma_min`` (least found), ``state_lag`` (samples).
+
+    Raises
+    ------
+    SpecError
+        An option is out of range or S has the wrong shape.
+    PreconditionError
+        ``rank [E; C] < nx`` (eq. (2)), dependent outputs or faults, a fault that never shows, ``rank Upsilon < nf``
+        (Theorem 2 (i)), or an invariant zero from the faults to the outputs on or outside the unit circle.
+    InfeasibleError
+        No filter of this structure reaches ``gamma``, for this T, N and W.
+    SolverError
+        Nothing is known.
+    VerificationError
+        The shipped realisation fails a check.
+
+    Notes
+    -----
+    Differs from the paper: the sign of the second term of (48), see (60); the zero condition; gamma minimised
+    directly; a second stage for small gains; exact treatment of feedthrough; a state estimate without the fault's
+    bias.  gamma depends on the coordinates of equations and outputs when W is fixed; existence does not.
+
+    References
+    ----------
+    .. [Wang2015] Z. Wang, M. Rodrigues, D. Theilliol, Y. Shen, Fault estimation filter design for discrete-time
+       descriptor systems, IET Control Theory Appl. 9 (10), 2015, Theorem 2, eqs. (45)-(48).
+    """
+    return design(
+        plant, "fault-estimation-filter", name=name, gamma=gamma, gamma_search=gamma_search, gamma_margin=gamma_margin,
+        free_residual_weight=free_residual_weight, residual_weight_limit=residual_weight_limit, S=S, solver=solver,
+        tolerance=tolerance,
+    )  # fmt: skip
+
+
+def fault_estimation_filter_from_gains(
+    plant: DescriptorSystem,
+    *,
+    T: ArrayLike,
+    N: ArrayLike,
+    L: ArrayLike,
+    W: ArrayLike,
+    gamma: float | None = None,
+    name: str = "design from gains",
+) -> ObserverDesign:
+    """Put gains from a paper or another program into a design, with its report; nothing is refused.
+
+    Parameters
+    ----------
+    plant : DescriptorSystem
+        As for `fault_estimation_filter`.
+    T, N, L, W : array_like
+        ``(nx, nx)``, ``(nx, ny)``, ``(nx, ny)``, ``(nf, ny)`` of eq. (23).
+    gamma : float, optional, dimensionless
+        Claimed bound on the l2 gain; needed when the plant has disturbances.
+    name : str, optional
+        Name of the design.
+
+    Returns
+    -------
+    ObserverDesign
+        Its report may hold failed checks: look at ``report.passed``, or call `obsynth.verify` with the number of
+        printed digits.
+
+    Raises
+    ------
+    SpecError
+        A gain has the wrong shape, or gamma is missing.
+    PreconditionError
+        No filter exists for this plant.
+
+    References
+    ----------
+    .. [Wang2015] Fault estimation filter design for discrete-time descriptor systems, eq. (23).
+    """
+    from obsynth.synthesis.methods.fault_estimation_filter import synthesis_from_gains
+
+    if plant.nd and gamma is None:
+        raise SpecError("gamma is needed: the plant has disturbances, and a gain set claims a bound on them.", path="gamma")
+    found = synthesis_from_gains(plant, T=T, N=N, L=L, W=W, gamma=gamma)
+    draft = _draft(plant, "fault-estimation-filter", found, name=name, recovery=None)
+    return draft.replace(report=verify(draft))
+
+
+def check(plant: DescriptorSystem) -> dict[str, VerificationReport]:
+    """Return, for every method, the report of its existence conditions; nothing is designed or raised.
+
+    Parameters
+    ----------
+    plant : DescriptorSystem
+        The plant.
+    """
+    return {
+        method: VerificationReport.of(condition_rows(method_module(method).conditions(plant))) for method in REGISTRY
+    }
+
+
+def _checked_options(method: str, options: dict[str, Any]) -> dict[str, Any]:
+    known = {"fault-estimation-filter": fault_estimation_filter}
+    allowed = set(inspect.signature(known[method]).parameters) - {"plant", "name"} if method in known else set()
+    method_module(method)
+    unknown = sorted(set(options) - allowed)
+    if unknown:
+        raise SpecError(f"{method} has no option {', '.join(map(repr, unknown))}; there are: "
+                        f"{', '.join(sorted(allowed))}.", path="method.options")  # fmt: skip
+    return options
+
+
+def _draft(
+    plant: DescriptorSystem, method: str, found: Synthesis, *, name: str, recovery: StateRecovery | None
+) -> ObserverDesign:
+    return ObserverDesign(
+        name=name, method=method, plant=plant, options=found.options, gains=found.gains, observer=found.observer,
+        certificate=found.certificate, solver=found.solver, notes=found.notes, recovery=recovery,
+    )  # fmt: skip
+
+
+def _verified(
+    plant: DescriptorSystem, method: str, found: Synthesis, *, name: str, recovery: StateRecovery | None
+) -> ObserverDesign:
+    draft = _draft(plant, method, found, name=name, recovery=recovery)
+    report = verify(draft)
+    if not report.passed:
+        failed = "; ".join(f"{row.name} ({row.value:.3g} against {row.bound:.3g})" for row in report.failures)
+        raise VerificationError(f"Gains were found, but the shipped realisation fails: {failed}. Nothing was shipped; "
+                                "rescale the plant, or ask for a larger gamma.", report=report)  # fmt: skip
+    return draft.replace(report=report)

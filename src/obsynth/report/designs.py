@@ -1,0 +1,98 @@
+"""A finished design for people: what it is, what it promises, and where it was written."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from obsynth.analysis.transformations import StateRecovery
+from obsynth.models.descriptor import DescriptorSystem
+from obsynth.report.layout import facts_table, headed_table, name_list, number, print_section
+from obsynth.report.verification import verification_report
+from obsynth.results.design import ObserverDesign
+
+_MEANINGS = {
+    "gamma": "l2 gain from the disturbance to the fault error: shipped, proved",
+    "gamma_min": "least such gain found, for this T, N and W",
+    "gamma_bracket_low": "lower end of the bisection's bracket",
+    "gamma_bracket_high": "upper end of the bisection's bracket",
+    "state_lag": "samples by which the state estimate lags",
+}
+
+
+def plant_facts(plant: DescriptorSystem) -> Iterator[tuple[str, str]]:
+    """Yield label and value of what is known about a plant.
+
+    Parameters
+    ----------
+    plant : DescriptorSystem
+        The plant.
+
+    Yields
+    ------
+    tuple of str
+        Label and value.
+    """
+    yield "time", f"discrete, {plant.dt:g} s between samples" if plant.is_discrete else "continuous"
+    signals = {
+        "states": plant.state_names, "known inputs": plant.input_names, "outputs": plant.output_names,
+        "faults": plant.fault_names, "disturbances": plant.disturbance_names, "noise": plant.noise_names,
+    }  # fmt: skip
+    for label, names in signals.items():
+        yield label, f"{len(names)}: {name_list(names)}" if names else "none"
+
+
+def design_report(design: ObserverDesign, *, console: Console, file: Path | None = None) -> None:
+    """Print a design with its report.
+
+    Parameters
+    ----------
+    design : ObserverDesign
+        A finished design.
+    console : Console
+        Where to print; its width decides the layout.
+    file : Path, optional
+        Where the gain set was written, or read from.
+    """
+    print_section(console, f"Design '{design.name}' by {design.method}", facts_table(plant_facts(design.plant)))
+    print_section(console, "What is promised", facts_table(_promises(design)))
+    if design.observer.fault_names:
+        print_section(console, "Fault estimates", _fault_estimates(design))
+    if design.recovery is not None:
+        print_section(console, "States of the plant as written", facts_table(_recovered_states(design.recovery)))
+    verification_report(design.report, console=console)
+    for note in design.notes:
+        console.print(Text(f"Note: {note}"))
+    if file is not None:
+        # A path must stay in one piece, so that it can be copied.
+        console.print(Text(f"Gain set: {file}"), soft_wrap=True)
+
+
+def _recovered_states(recovery: StateRecovery) -> Iterator[tuple[str, str]]:
+    """Yield how good an estimate of each original state is, with the names, best first."""
+    names_by_flag: dict[str, list[str]] = {}
+    for name, flag in zip(recovery.names, recovery.flags(), strict=True):
+        names_by_flag.setdefault(flag, []).append(name)
+    for flag in sorted(names_by_flag, key=lambda flag: flag != "exact"):
+        yield flag, f"{len(names_by_flag[flag])}: {name_list(names_by_flag[flag])}"
+
+
+def _promises(design: ObserverDesign) -> Iterator[tuple[str, str, str]]:
+    for name, value in design.certificate.claims.items():
+        yield name, number(value, digits=7), _MEANINGS.get(name, "")
+    for check in design.report.checks:
+        if check.name == "H-infinity norm":
+            yield "norm", number(check.value, digits=7), "the same gain recomputed by a second route"
+    yield "observer order", str(design.observer.order), "states of the shipped realisation"
+
+
+def _fault_estimates(design: ObserverDesign) -> Table:
+    observer = design.observer
+    table = headed_table("fault", "delay in samples", "delay in s")
+    for name, delay in zip(observer.fault_names, observer.fault_delays, strict=True):
+        table.add_row(Text(name), str(delay), number(delay * observer.dt))
+    return table

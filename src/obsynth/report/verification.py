@@ -1,0 +1,113 @@
+"""The verification report as a table."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from rich.console import Console, Group, RenderableType
+from rich.padding import Padding
+from rich.rule import Rule
+from rich.table import Table
+from rich.text import Text
+
+from obsynth.report.layout import number, print_section, verdict
+from obsynth.results.report import Check, VerificationReport
+
+#: On narrower terminals the claim stands below the numbers, over the whole width.
+WIDE_ENOUGH = 110
+
+_HEADINGS = ("check", "claim", "value", "bound", "margin", "verdict", "kind")
+_NUMBER_WIDTH = 10
+
+
+def checks_table(checks: Sequence[Check], *, width: int) -> RenderableType:
+    """Return checks as a table.
+
+    Parameters
+    ----------
+    checks : sequence of Check
+        Its rows.
+    width : int
+        Columns of the terminal; below `WIDE_ENOUGH` the claim stands below the numbers.
+
+    Returns
+    -------
+    RenderableType
+        With the columns check, claim, value, bound, margin, verdict and kind.
+    """
+    if width >= WIDE_ENOUGH:
+        table = _grid(width, with_claim=True)
+        table.add_row(*(Text(heading, style="bold") for heading in _HEADINGS))
+        body = _grid(width, with_claim=True)
+        for check in checks:
+            body.add_row(Text(check.name), _claim(check), *_numbers_and_verdict(check))
+        return Group(table, Rule(style="dim", characters="-"), body)
+    head = _grid(width, with_claim=False)
+    head.add_row(*(Text(heading, style="bold") for heading in _HEADINGS if heading != "claim"))
+    return Group(head, Rule(style="dim", characters="-"), *_stacked(checks, width))
+
+
+def _stacked(checks: Sequence[Check], width: int) -> Iterable[RenderableType]:
+    for check in checks:
+        row = _grid(width, with_claim=False)
+        row.add_row(Text(check.name, style="bold"), *_numbers_and_verdict(check))
+        yield row
+        yield Padding(_claim(check), (0, 0, 0, 2))
+
+
+def _grid(width: int, *, with_claim: bool) -> Table:
+    grid = Table.grid(padding=(0, 1, 0, 0))
+    others = 3 * (_NUMBER_WIDTH + 1) + 8 + 9
+    if with_claim:
+        grid.add_column(width=26, overflow="fold")
+        grid.add_column(width=max(width - others - 28, 20), overflow="fold")
+    else:
+        grid.add_column(width=max(width - others - 1, 16), overflow="fold")
+    for _ in range(3):
+        grid.add_column(width=_NUMBER_WIDTH, justify="right", no_wrap=True)
+    grid.add_column(width=7, no_wrap=True)
+    grid.add_column(width=9, no_wrap=True)
+    return grid
+
+
+def _claim(check: Check) -> Text:
+    claim = Text(check.claim)
+    return claim.append(f"; {check.detail}", style="dim") if check.detail else claim
+
+
+def _numbers_and_verdict(check: Check) -> list[Text]:
+    # The verdict of information is its kind already.
+    kind = "" if check.kind == "information" and check.passed else check.kind
+    numbers = [Text(number(value)) for value in (check.value, check.bound, check.margin)]
+    return [*numbers, verdict(check), Text(kind, style="dim")]
+
+
+def verdict_line(report: VerificationReport) -> Text:
+    """Return one line that says whether the whole report holds, and what fails.
+
+    Parameters
+    ----------
+    report : VerificationReport
+        The report.
+    """
+    real = [check for check in report.checks if check.kind != "information"]
+    if report.passed:
+        return Text(f"Verified: all {len(real)} checks hold.", style="green")
+    if not real:
+        return Text("FAILS: the report is empty, so nothing is verified.", style="bold red")
+    failed = ", ".join(check.name for check in report.failures)
+    return Text(f"FAILS: {len(report.failures)} of {len(real)} checks do not hold: {failed}.", style="bold red")
+
+
+def verification_report(report: VerificationReport, *, console: Console) -> None:
+    """Print a verification report.
+
+    Parameters
+    ----------
+    report : VerificationReport
+        The report.
+    console : Console
+        Where to print; its width decides the layout.
+    """
+    print_section(console, "Verification", checks_table(report.checks, width=console.width))
+    console.print(verdict_line(report))

@@ -1,0 +1,137 @@
+"""The result of every method: what was asked, what is shipped, and the proof."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+from obsynth.analysis.transformations import StateRecovery
+from obsynth.models.descriptor import DescriptorSystem
+from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.observers.linear import LinearObserver
+from obsynth.results.report import VerificationReport
+
+if TYPE_CHECKING:
+    import control
+
+
+@dataclass(frozen=True, eq=False)
+class Certificate:
+    """Matrices and claims from which a design can be rechecked without a solver.
+
+    Parameters
+    ----------
+    matrices : mapping of str to FloatArray
+        Witnesses of existence statements, such as the Lyapunov matrix of a matrix inequality.
+    claims : mapping of str to float
+        Numbers that are claimed, such as an l2 gain.
+    """
+
+    matrices: Mapping[str, FloatArray]
+    claims: Mapping[str, float]
+
+    def __post_init__(self) -> None:
+        frozen = {name: read_only(matrix) for name, matrix in self.matrices.items()}
+        object.__setattr__(self, "matrices", MappingProxyType(frozen))
+        object.__setattr__(self, "claims", MappingProxyType(dict(self.claims)))
+
+
+@dataclass(frozen=True, eq=False)
+class ObserverDesign:
+    """A finished design: gains to read, an observer to run, a certificate and a report.
+
+    Parameters
+    ----------
+    name : str
+        Name of the design, from the spec or the caller.
+    method : str
+        Identifier of the method.
+    plant : DescriptorSystem
+        The plant the observer is for (after the transformations a spec asks for).
+    options : mapping
+        Options as resolved, plain data.
+    gains : mapping of str to FloatArray
+        Gains with the paper's letters, for readers; what is shipped is `observer`.
+    observer : LinearObserver
+        What is shipped.
+    certificate : Certificate
+        Enough to recheck every claim without a solver.
+    solver : mapping
+        Name, version, status, settings, iterations and time of each solver run, plain data.
+    notes : tuple of str
+        What a user should know: warnings and limits.
+    recovery : StateRecovery, optional
+        Map from the plant's states back to those of the plant before its transformation.
+    report : VerificationReport
+        The report of this very object.
+    """
+
+    name: str
+    method: str
+    plant: DescriptorSystem
+    options: Mapping[str, Any]
+    gains: Mapping[str, FloatArray]
+    observer: LinearObserver
+    certificate: Certificate
+    solver: Mapping[str, Any]
+    notes: tuple[str, ...] = ()
+    recovery: StateRecovery | None = None
+    report: VerificationReport = field(default_factory=VerificationReport)
+
+    def __post_init__(self) -> None:
+        frozen = {name: read_only(matrix) for name, matrix in self.gains.items()}
+        object.__setattr__(self, "gains", MappingProxyType(frozen))
+        object.__setattr__(self, "options", MappingProxyType(dict(self.options)))
+        object.__setattr__(self, "solver", MappingProxyType(dict(self.solver)))
+
+    def replace(self, **changes: Any) -> ObserverDesign:
+        """Return the design with some fields changed (its report stays until `verify` is run again).
+
+        Parameters
+        ----------
+        **changes
+            Any field.
+        """
+        return replace(self, **changes)
+
+    def save(self, path: str | Path) -> Path:
+        """Write the gain set as one JSON document, atomically.
+
+        Parameters
+        ----------
+        path : str or Path
+            Where to write; an existing file is replaced.
+
+        Returns
+        -------
+        Path
+            The file.
+
+        Raises
+        ------
+        SpecError
+            The file cannot be written.
+        """
+        from obsynth.results.serialise import save
+
+        return save(self, path)
+
+    def to_control(self) -> control.StateSpace:
+        """Return the observer as a ``control.StateSpace`` from ``[u; y]`` to ``[xhat; fhat; r]``, with names."""
+        import control
+        import numpy as np
+
+        observer = self.observer
+        outputs = [
+            *(f"xhat[{name}]" for name in observer.state_names),
+            *(f"fhat[{name}]" for name in observer.fault_names),
+            *(f"r[{name}]" for name in observer.residual_names),
+        ]
+        return control.ss(
+            observer.Az, np.hstack([observer.Bu, observer.By]), observer.Cz, np.hstack([observer.Du, observer.Dy]),
+            observer.dt, inputs=[*observer.input_names, *observer.output_names], outputs=outputs,
+            states=[f"z[{i + 1}]" for i in range(observer.order)], name=self.name,
+        )  # fmt: skip

@@ -1,0 +1,114 @@
+"""The verification report: what was claimed, what was found, and whether it holds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal
+
+CheckKind = Literal["proved", "equality", "computed", "condition", "information"]
+
+
+@dataclass(frozen=True)
+class Check:
+    """One row of a report.
+
+    Parameters
+    ----------
+    name : str
+        Short name, unique in the report.
+    claim : str
+        What is claimed, in words.
+    value : float
+        The number recomputed from the plant and the shipped realisation.
+    bound : float
+        What the number is compared with.
+    margin : float
+        How far the number is on the right side of the bound (negative when the check fails).
+    passed : bool
+        The verdict.
+    source : str
+        Where the claim comes from: paper and equation, or the audit's finding.
+    kind : str
+        ``proved`` (an inequality, rounding errors bounded), ``equality`` (a residual against a bound
+        scaled by the data: never called proved), ``computed`` (a number found by a second route),
+        ``condition`` (an existence condition) or ``information`` (never fails).
+    detail : str, optional
+        One more sentence for the reader.
+    """
+
+    name: str
+    claim: str
+    value: float
+    bound: float
+    margin: float
+    passed: bool
+    source: str
+    kind: CheckKind = "computed"
+    detail: str = ""
+
+
+def upper_bound_check(
+    name: str, claim: str, value: float, bound: float, *, source: str, kind: CheckKind = "computed", detail: str = ""
+) -> Check:
+    """Return a check that passes when ``value <= bound``; NaN fails."""
+    passed = bool(value <= bound) and not math.isnan(value)
+    return Check(name, claim, float(value), float(bound), float(bound - value), passed, source, kind, detail)
+
+
+def lower_bound_check(
+    name: str, claim: str, value: float, bound: float, *, source: str, kind: CheckKind = "computed", detail: str = ""
+) -> Check:
+    """Return a check that passes when ``value >= bound``; NaN fails."""
+    passed = bool(value >= bound) and not math.isnan(value)
+    return Check(name, claim, float(value), float(bound), float(value - bound), passed, source, kind, detail)
+
+
+def information(name: str, claim: str, value: float, *, source: str, detail: str = "") -> Check:
+    """Return a row that informs and cannot fail."""
+    return Check(name, claim, float(value), math.nan, math.nan, True, source, "information", detail)
+
+
+@dataclass(frozen=True)
+class VerificationReport:
+    """All checks of one design; an empty report fails.
+
+    Parameters
+    ----------
+    checks : tuple of Check
+        The rows, in the order of the argument they make.
+    """
+
+    checks: tuple[Check, ...] = field(default_factory=tuple)
+
+    @classmethod
+    def of(cls, checks: Iterable[Check]) -> VerificationReport:
+        """Return a report of ``checks``."""
+        return cls(tuple(checks))
+
+    @property
+    def passed(self) -> bool:
+        """Whether there is at least one real check and all of them hold."""
+        verdicts = [check.passed for check in self.checks if check.kind != "information"]
+        return bool(verdicts) and all(verdicts)
+
+    @property
+    def failures(self) -> tuple[Check, ...]:
+        """The checks that do not hold."""
+        return tuple(check for check in self.checks if not check.passed)
+
+    def __getitem__(self, name: str) -> Check:
+        for check in self.checks:
+            if check.name == name:
+                return check
+        raise KeyError(f"no check named {name!r}; there are: {', '.join(c.name for c in self.checks)}")
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the report as plain data."""
+        return {"passed": self.passed, "checks": [asdict(check) for check in self.checks]}
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> VerificationReport:
+        """Return the report that `as_dict` wrote."""
+        return cls.of(Check(**row) for row in data["checks"])

@@ -1,0 +1,162 @@
+"""Gain sets on disk: one JSON document with a schema version and a digest, floats bit for bit."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import tempfile
+from collections.abc import Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from obsynth.analysis.transformations import StateRecovery
+from obsynth.errors import SpecError
+from obsynth.models.descriptor import DescriptorSystem
+from obsynth.observers.linear import LinearObserver
+from obsynth.results.design import Certificate, ObserverDesign
+from obsynth.results.report import VerificationReport
+
+SCHEMA_VERSION = 1
+_KIND = "obsynth gain set"
+
+
+def plain(value: Any) -> Any:
+    """Return ``value`` as JSON data: arrays as nested lists, NaN as ``"nan"``, infinities as ``"inf"``."""
+    if isinstance(value, np.ndarray):
+        return {"shape": list(value.shape), "data": [plain(x) for x in value.ravel().tolist()]}
+    if isinstance(value, (np.floating, np.integer, np.bool_)):
+        return plain(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return {"float": str(value)}
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    raise SpecError(f"A value of type {type(value).__name__} cannot be saved: only data can.")
+
+
+def restored(value: Any) -> Any:
+    """Return what `plain` wrote, with arrays and special floats restored."""
+    if isinstance(value, dict):
+        if set(value) == {"shape", "data"}:
+            data = [restored(item) for item in value["data"]]
+            return np.array(data, dtype=np.float64).reshape(value["shape"])
+        if set(value) == {"float"}:
+            return float(value["float"])
+        return {key: restored(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [restored(item) for item in value]
+    return value
+
+
+def digest_of(body: Mapping[str, Any]) -> str:
+    """Return the sha256 digest of the canonical JSON of ``body``."""
+    text = json.dumps(body, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def design_as_dict(design: ObserverDesign) -> dict[str, Any]:
+    """Return the whole gain set as JSON data, digest included."""
+    body = plain({
+        "name": design.name, "method": design.method, "plant": design.plant.as_dict(), "options": design.options,
+        "gains": design.gains, "observer": design.observer.as_dict(),
+        "certificate": {"matrices": design.certificate.matrices, "claims": design.certificate.claims},
+        "solver": design.solver, "notes": design.notes,
+        "recovery": None if design.recovery is None else _fields_of(design.recovery),
+        "report": design.report.as_dict(),
+    })  # fmt: skip
+    return {"kind": _KIND, "schema_version": SCHEMA_VERSION, "sha256": digest_of(body), "design": body}
+
+
+def write_atomically(path: str | Path, text: str) -> Path:
+    """Write ``text`` to ``path`` so that the file is there whole or not at all.
+
+    Raises
+    ------
+    SpecError
+        The folder does not exist, the path is a folder, or the system refuses.
+    """
+    target = Path(path)
+    if target.is_dir():
+        raise SpecError(f"{target} is a folder: give the name of a file.", path=str(target))
+    temporary = None
+    try:
+        handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=".part")
+        with os.fdopen(handle, "w", encoding="utf-8") as stream:
+            stream.write(text)
+        # mkstemp makes private files; a result should have the permissions of any new file.
+        mask = os.umask(0)
+        os.umask(mask)
+        os.chmod(temporary, 0o666 & ~mask)
+        os.replace(temporary, target)
+    except OSError as error:
+        if temporary is not None and os.path.exists(temporary):
+            os.unlink(temporary)
+        raise SpecError(f"{target} cannot be written: {error.strerror}.", path=str(target)) from error
+    return target
+
+
+def save(design: ObserverDesign, path: str | Path) -> Path:
+    """Write ``design`` to ``path`` atomically and return the path."""
+    return write_atomically(path, json.dumps(design_as_dict(design), indent=1, allow_nan=False) + "\n")
+
+
+def load(path: str | Path) -> ObserverDesign:
+    """Read a gain set and check its digest.
+
+    Parameters
+    ----------
+    path : str or Path
+        A file written by `ObserverDesign.save`.
+
+    Returns
+    -------
+    ObserverDesign
+        Equal to the saved one, bit for bit; its report is the saved one, run `verify` for a new one.
+
+    Raises
+    ------
+    SpecError
+        The file is missing, is no gain set, has an unknown schema version, or was changed.
+    """
+    source = Path(path)
+    try:
+        document = json.loads(source.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise SpecError(f"{source} cannot be read: {error.strerror}.", path=str(source)) from error
+    except ValueError as error:
+        raise SpecError(f"{source} is no JSON document ({error}).", path=str(source)) from error
+    if not isinstance(document, dict) or document.get("kind") != _KIND:
+        raise SpecError(f"{source} is no gain set of obsynth.", path=str(source))
+    if document.get("schema_version") != SCHEMA_VERSION:
+        version = document.get("schema_version")
+        raise SpecError(f"{source} has schema version {version!r}; this obsynth reads {SCHEMA_VERSION}.", path=str(source))
+    body = document.get("design")
+    if not isinstance(body, dict) or document.get("sha256") != digest_of(body):
+        raise SpecError(f"{source} was changed after it was written: its digest does not match.", path=str(source))
+    try:
+        return _design_from(restored(body))
+    except (KeyError, TypeError, ValueError) as error:
+        raise SpecError(f"{source} is incomplete: {error}.", path=str(source)) from error
+
+
+def _fields_of(record: StateRecovery) -> dict[str, Any]:
+    return {field.name: getattr(record, field.name) for field in fields(record)}
+
+
+def _design_from(data: dict[str, Any]) -> ObserverDesign:
+    return ObserverDesign(
+        name=data["name"], method=data["method"], plant=DescriptorSystem(**data["plant"]), options=data["options"],
+        gains=data["gains"], observer=LinearObserver.from_dict(data["observer"]),
+        certificate=Certificate(**data["certificate"]), solver=data["solver"], notes=tuple(data["notes"]),
+        recovery=None if data["recovery"] is None else StateRecovery(
+            **{**data["recovery"], "names": tuple(data["recovery"]["names"])}),
+        report=VerificationReport.from_dict(data["report"]),
+    )  # fmt: skip

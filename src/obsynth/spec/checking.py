@@ -1,0 +1,232 @@
+"""From raw documents to checked ones: every problem of a document at once, each with its path."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from obsynth.errors import SpecError
+from obsynth.spec.documents import described
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+
+    from obsynth.spec.schema import PlantDocument, SpecDocument
+
+    Model = TypeVar("Model", bound=BaseModel)
+
+#: A document with more problems than this is not read to its end by anybody.
+MAXIMUM_PROBLEMS = 25
+
+
+@dataclass(frozen=True)
+class DocumentProblems:
+    """Collects the problems of one document, to raise them together.
+
+    Parameters
+    ----------
+    source : Path
+        The document.
+    what : str
+        What the document should be, for the message, such as ``spec``.
+    found : list
+        Path and text of each problem so far.
+    """
+
+    source: Path
+    what: str
+    found: list[tuple[str, str]] = field(default_factory=list)
+
+    def add(self, path: str, text: str) -> None:
+        """Note that ``text`` is wrong at ``path``."""
+        if (path, text) not in self.found:
+            self.found.append((path, text))
+
+    def raise_if_any(self) -> None:
+        """Raise one `SpecError` with everything noted, if anything was.
+
+        Raises
+        ------
+        SpecError
+            At least one problem was noted; its ``path`` is that of the first.
+        """
+        if not self.found:
+            return
+        lines = [f"{path}: {text}" if path else text for path, text in self.found]
+        if len(lines) > MAXIMUM_PROBLEMS:
+            lines = [*lines[:MAXIMUM_PROBLEMS], f"and {len(lines) - MAXIMUM_PROBLEMS} more"]
+        head = f"{self.source} is no valid {self.what}:"
+        raise SpecError(head, path=self.found[0][0] or str(self.source), problems=lines)
+
+
+def checked_spec(document: Mapping[str, Any], source: Path) -> tuple[SpecDocument, dict[str, Any]]:
+    """Check a whole spec, and the options of its method.
+
+    Parameters
+    ----------
+    document : mapping
+        Raw data.
+    source : Path
+        Where it comes from, for messages.
+
+    Returns
+    -------
+    checked : SpecDocument
+        The spec.
+    options : dict
+        The options that were given, checked; matrices still as written.
+
+    Raises
+    ------
+    SpecError
+        The document does not fit the schema; all problems at once.
+    """
+    from obsynth.spec.schema import METHOD_OPTIONS, SpecDocument
+
+    problems = DocumentProblems(source, what="spec")
+    _check_version(document, problems)
+    checked = _validated(SpecDocument, document, problems)
+    method = document.get("method")
+    raw_options: Any = {}
+    identifier = None
+    if isinstance(method, dict):
+        identifier, raw_options = method.get("id"), method.get("options", {})
+    options = None
+    if isinstance(identifier, str) and identifier not in METHOD_OPTIONS:
+        close = _suggestion(identifier, list(METHOD_OPTIONS))
+        known = ", ".join(sorted(METHOD_OPTIONS))
+        problems.add("method.id", f"unknown method {identifier!r}; the known methods are: {known}.{close}")
+    elif isinstance(identifier, str) and isinstance(raw_options, dict):
+        options = _validated(METHOD_OPTIONS[identifier], raw_options, problems, prefix="method.options")
+    problems.raise_if_any()
+    if checked is None or options is None:
+        raise SpecError(f"{source} is no valid spec.", path=str(source))
+    return checked, {name: getattr(options, name) for name in options.model_fields_set}
+
+
+def checked_plant(document: Mapping[str, Any], source: Path) -> PlantDocument:
+    """Check a plant in a file of its own.
+
+    Parameters
+    ----------
+    document : mapping
+        Raw data.
+    source : Path
+        Where it comes from, for messages.
+
+    Returns
+    -------
+    PlantDocument
+        The plant's section.
+
+    Raises
+    ------
+    SpecError
+        The document does not fit the schema; all problems at once.
+    """
+    from obsynth.spec.schema import PlantDocument
+
+    problems = DocumentProblems(source, what="plant")
+    _check_version(document, problems)
+    checked = _validated(PlantDocument, document, problems)
+    problems.raise_if_any()
+    if checked is None:
+        raise SpecError(f"{source} is no valid plant.", path=str(source))
+    return checked
+
+
+def _check_version(document: Mapping[str, Any], problems: DocumentProblems) -> None:
+    """Raise at once for another version: the other keys would then mean something else."""
+    from obsynth.spec.schema import SCHEMA_VERSION
+
+    version = document.get("schema_version")
+    if isinstance(version, int) and not isinstance(version, bool) and version != SCHEMA_VERSION:
+        problems.add("schema_version", f"version {version} is unknown; this obsynth reads version {SCHEMA_VERSION}.")
+        problems.raise_if_any()
+
+
+def _validated(
+    model: type[Model], document: Mapping[str, Any], problems: DocumentProblems, *, prefix: str = ""
+) -> Model | None:
+    from pydantic import ValidationError
+
+    try:
+        return model.model_validate(document)
+    except ValidationError as error:
+        for item in error.errors(include_url=False):
+            problems.add(*_explained(item, model, prefix))
+        return None
+
+
+def _explained(item: Any, model: type[BaseModel], prefix: str) -> tuple[str, str]:
+    """Return the path and the message of one of pydantic's errors."""
+    location = [part for part in item["loc"] if not (isinstance(part, str) and re.fullmatch(r"<\w+>", part))]
+    names = [str(part) for part in location if isinstance(part, str) and part != "[key]"]
+    numbers = [part + 1 for part in location if isinstance(part, int)]
+    kind, value, context = item["type"], item["input"], item.get("ctx", {})
+    in_rows = "<rows>" in item["loc"]
+    key = names[-1] if names else ""
+    if kind == "extra_forbidden":
+        known = _known_keys(item["loc"]) if len(names) > 1 else list(model.model_fields)
+        text = f"unknown key.{_suggestion(key, known)}"
+    elif kind == "missing":
+        text = "this key is missing."
+    elif kind == "invalid_key" or "[key]" in location:
+        text, numbers = f"a key must be a non-empty text, not {described(value)}.", []
+    elif kind in ("ragged_rows", "finite_number"):
+        text = f"{item['msg']}." if kind == "ragged_rows" else f"must be a finite number, not {value}."
+    elif kind == "string_pattern_mismatch":
+        text = f"use letters, digits, '.', '_' and '-' only (at most 100), not {described(value)}."
+    else:
+        wanted = "a list of numbers" if in_rows and kind in ("list_type", "too_short") else _wanted(kind, context)
+        wanted = "a list of rows, such as [[1, 0], [0, 1]]" if in_rows and not numbers else wanted
+        text = f"must be {wanted}, not {_found(kind, value)}."
+    place = _position(numbers, in_rows=in_rows)
+    return ".".join([*([prefix] if prefix else []), *names]), f"{place}{text}"
+
+
+def _wanted(kind: str, context: Mapping[str, Any]) -> str:
+    if kind == "literal_error":
+        return f"one of {context['expected']}"
+    limits = {"greater_than": "greater than", "greater_than_equal": "at least", "less_than": "less than"}
+    if kind in limits:
+        limit = next(iter(context.values()))
+        return f"{limits[kind]} {limit:g}"
+    plain = {
+        "float_type": "a number", "int_type": "a whole number", "string_type": "a text", "bool_type": "true or false",
+        "string_too_short": "a non-empty text", "list_type": "a list", "dict_type": "a mapping (key: value)",
+        "model_type": "a mapping (key: value)", "too_short": "a list with at least one entry",
+    }  # fmt: skip
+    return plain.get(kind, f"valid ({kind.replace('_', ' ')})")
+
+
+def _found(kind: str, value: Any) -> str:
+    return "an empty one" if kind in ("too_short", "string_too_short") else described(value)
+
+
+def _position(numbers: Sequence[int], *, in_rows: bool) -> str:
+    words = ("row", "column") if in_rows else ("entry",)
+    place = ", ".join(f"{word} {number}" for word, number in zip(words, numbers, strict=False))
+    return f"{place} " if place else ""
+
+
+def _known_keys(location: Sequence[str | int]) -> list[str]:
+    """Return the keys that the section around the last part of ``location`` may have."""
+    from obsynth.spec import schema
+
+    by_tag: dict[str, type[BaseModel]] = {"<file>": schema.MatrixFile, "<inline>": schema.PlantSection}
+    by_name: dict[str, type[BaseModel]] = {"method": schema.MethodSection, "transform": schema.TransformSection}
+    if "<pick>" in location:
+        return ["outputs" if "C" in location else "states", "file"]
+    around = location[-2]
+    section: type[BaseModel] | None = by_tag.get(str(around)) or by_name.get(str(around))
+    return list(section.model_fields) if section is not None else []
+
+
+def _suggestion(name: str, known: Sequence[str]) -> str:
+    close = difflib.get_close_matches(name, known, n=2)
+    return f" Did you mean {' or '.join(map(repr, close))}?" if close else ""

@@ -1,0 +1,141 @@
+"""Matrices in files beside a spec: ``.mtx``, ``.npz``, ``.mat`` and ``.csv``."""
+
+from __future__ import annotations
+
+import math
+import struct
+import warnings
+import zipfile
+import zlib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from obsynth.errors import SpecError
+from obsynth.numerics.arrays import FloatArray, as_matrix
+from obsynth.spec.documents import existing_file
+
+#: Larger matrices are refused: every computation here is dense.
+MAXIMUM_ENTRIES = 50_000_000
+
+# What the readers of numpy and scipy raise for a damaged file.
+_READING_ERRORS = (
+    OSError, ValueError, TypeError, KeyError, IndexError, EOFError, OverflowError, RuntimeError, MemoryError,
+    AttributeError, UserWarning, struct.error, zlib.error, zipfile.BadZipFile,
+)  # fmt: skip
+
+
+def read_matrix(path: Path, *, variable: str | None = None, where: str) -> FloatArray:
+    """Return the matrix in a file.
+
+    Parameters
+    ----------
+    path : Path
+        ``.mtx`` (Matrix Market, dense or sparse), ``.npz``, ``.mat`` (up to version 7.2) or ``.csv``
+        (numbers, separated by commas, no header; ``#`` starts a comment).
+    variable : str, optional
+        Which array of an ``.npz`` or ``.mat`` file; needed if it holds more than one.
+    where : str
+        The path inside the document that refers to the file, such as ``plant.A``.
+
+    Returns
+    -------
+    FloatArray
+        Dense and read-only.
+
+    Raises
+    ------
+    SpecError
+        The file is missing, damaged, of an unknown kind, or holds no finite real matrix.
+    """
+    readers: dict[str, Callable[[Path], Any]] = {".mtx": _matrix_market, ".csv": _comma_separated}
+    archives: dict[str, Callable[[Path], Mapping[str, Any]]] = {".npz": _numpy_archive, ".mat": _matlab_archive}
+    suffix = path.suffix.lower()
+    if suffix not in readers and suffix not in archives:
+        known = ", ".join(sorted([*readers, *archives]))
+        raise SpecError(f"{path.name} has an unknown suffix: matrices are read from {known} files.", path=where)
+    if variable is not None and suffix in readers:
+        raise SpecError(f"{path.name} holds one matrix only: remove 'variable'.", path=where)
+    existing_file(path, where=where)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", UserWarning)
+            content = readers[suffix](path) if suffix in readers else archives[suffix](path)
+            raw = content if suffix in readers else _selected(content, variable, path, where)
+            dense = _as_dense(raw)
+    except _READING_ERRORS as error:
+        raise SpecError(f"{path} cannot be read as a matrix: {_reason(error)}", path=where) from error
+    try:
+        matrix = as_matrix(dense, path.name)
+    except SpecError as error:
+        raise SpecError(str(error), path=where) from error
+    if matrix.size == 0:
+        raise SpecError(f"{path} holds an empty matrix.", path=where)
+    return matrix
+
+
+def _matrix_market(path: Path) -> FloatArray:
+    from obsynth.spec.matrix_market import read_matrix_market
+
+    return read_matrix_market(path, maximum_entries=MAXIMUM_ENTRIES)
+
+
+def _comma_separated(path: Path) -> Any:
+    import numpy as np
+
+    return np.loadtxt(path, delimiter=",", ndmin=2, encoding="utf-8-sig")
+
+
+def _numpy_archive(path: Path) -> dict[str, Any]:
+    import numpy as np
+
+    # Opened here, because numpy leaves a damaged file open.
+    with path.open("rb") as stream:
+        archive = np.load(stream, allow_pickle=False)
+        if not isinstance(archive, np.lib.npyio.NpzFile):
+            raise ValueError("it is no .npz archive")
+        with archive:
+            return dict(archive)
+
+
+def _matlab_archive(path: Path) -> dict[str, Any]:
+    from scipy.io import loadmat
+    from scipy.io.matlab import MatReadError
+
+    try:
+        content = loadmat(path)
+    except NotImplementedError as error:
+        raise ValueError("MATLAB 7.3 files are not supported, save it with '-v7'") from error
+    except MatReadError as error:
+        raise ValueError(str(error)) from error
+    return {name: value for name, value in content.items() if not name.startswith("__")}
+
+
+def _selected(content: Mapping[str, Any], variable: str | None, path: Path, where: str) -> Any:
+    known = ", ".join(map(repr, content)) or "none"
+    if variable is not None:
+        if variable not in content:
+            raise SpecError(f"{path} has no array {variable!r}; it has: {known}.", path=where)
+        return content[variable]
+    if len(content) != 1:
+        raise SpecError(f"{path} must say which array is meant ('variable: name'); it has: {known}.", path=where)
+    return next(iter(content.values()))
+
+
+def _as_dense(raw: Any) -> Any:
+    """Return an array for whatever a reader gave; a damaged sparse matrix must not reach scipy's loops."""
+    entries = math.prod(int(length) for length in getattr(raw, "shape", ()))
+    if entries > MAXIMUM_ENTRIES:
+        raise ValueError(f"it is too large ({entries:.1e} entries)")
+    if not hasattr(raw, "toarray"):
+        return raw
+    if hasattr(raw, "check_format"):
+        raw.check_format(full_check=True)
+    return raw.toarray()
+
+
+def _reason(error: BaseException) -> str:
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.strerror}."
+    text = str(error).strip().splitlines()
+    return f"{text[0].rstrip('.')}." if text else f"{type(error).__name__}."

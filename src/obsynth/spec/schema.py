@@ -1,0 +1,192 @@
+"""The closed, strict, versioned schema of a spec, and readable messages for what does not fit it.
+
+This module imports pydantic, so it is imported only when a spec is read.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    Tag,
+    ValidationError,
+    ValidatorFunctionWrapHandler,
+    WrapValidator,
+)
+from pydantic_core import InitErrorDetails, PydanticCustomError
+
+SCHEMA_VERSION = 1
+
+# Tags of unions appear in the locations of pydantic's errors; the bracket marks them for removal.
+_ROWS, _FILE, _PICK, _LIST, _INLINE = "<rows>", "<file>", "<pick>", "<list>", "<inline>"
+
+
+def _rectangular(rows: Any, check_entries: ValidatorFunctionWrapHandler) -> Any:
+    """Check that rows have one length, besides their entries, so that both kinds of problem are reported."""
+    listed = [(i, len(row)) for i, row in enumerate(rows, 1) if isinstance(row, list)] if isinstance(rows, list) else []
+    ragged = next(((i, length) for i, length in listed if length != listed[0][1]), None)
+    if ragged is None:
+        return check_entries(rows)
+    problem = PydanticCustomError(
+        "ragged_rows", "row {row} has {found} entries, but row {first} has {expected}",
+        {"row": ragged[0], "found": ragged[1], "first": listed[0][0], "expected": listed[0][1]},
+    )  # fmt: skip
+    others: list[InitErrorDetails] = []
+    try:
+        check_entries(rows)
+    except ValidationError as error:
+        others = [
+            InitErrorDetails(type=item["type"], loc=item["loc"], input=item["input"], ctx=item.get("ctx", {}))
+            for item in error.errors()
+        ]
+    raise ValidationError.from_exception_data("matrix", [*others, InitErrorDetails(type=problem, input=None)])
+
+
+def _kind_of_matrix(value: Any) -> str:
+    if isinstance(value, dict):
+        return _FILE if "file" in value or not value else _PICK
+    return _ROWS
+
+
+def _kind_without_pick(value: Any) -> str:
+    return _FILE if isinstance(value, dict) else _ROWS
+
+
+def _kind_of_names(value: Any) -> str:
+    return _FILE if isinstance(value, dict) else _LIST
+
+
+def _kind_of_plant(value: Any) -> str:
+    return _FILE if isinstance(value, dict) and "file" in value else _INLINE
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, frozen=True)
+
+
+Text = Annotated[str, Field(min_length=1)]
+Positive = Annotated[float, Field(gt=0.0)]
+Rows = Annotated[
+    list[Annotated[list[float], Field(min_length=1)]], Field(min_length=1), WrapValidator(_rectangular), Tag(_ROWS)
+]
+
+
+class MatrixFile(_Section):
+    """A matrix in a file: ``{file: A.mtx}``, or ``{file: plant.mat, variable: A}``."""
+
+    file: Text
+    variable: Text | None = None
+
+
+class NamesFile(_Section):
+    """Names in a JSON file: ``{file: names.json}``."""
+
+    file: Text
+
+
+class OutputPick(_Section):
+    """Outputs by state name: ``{outputs: [omega 1, v 3]}``."""
+
+    outputs: Annotated[list[Text], Field(min_length=1)]
+
+
+class StatePick(_Section):
+    """Equations by state name: ``{states: [tm 1]}``."""
+
+    states: Annotated[list[Text], Field(min_length=1)]
+
+
+Matrix = Annotated[Rows | Annotated[MatrixFile, Tag(_FILE)], Discriminator(_kind_without_pick)]
+EquationMatrix = Annotated[
+    Rows | Annotated[MatrixFile, Tag(_FILE)] | Annotated[StatePick, Tag(_PICK)], Discriminator(_kind_of_matrix)
+]
+OutputMatrix = Annotated[
+    Rows | Annotated[MatrixFile, Tag(_FILE)] | Annotated[OutputPick, Tag(_PICK)], Discriminator(_kind_of_matrix)
+]
+Names = Annotated[Annotated[list[Text], Tag(_LIST)] | Annotated[NamesFile, Tag(_FILE)], Discriminator(_kind_of_names)]
+
+
+class TransformSection(_Section):
+    """What is done to the plant before a method sees it, in this order."""
+
+    eliminate_algebraic_states: bool = False
+    sample_time: Positive | None = None
+
+
+class PlantSection(_Section):
+    """A plant, matrix by matrix."""
+
+    dt: Annotated[float, Field(ge=0.0)]
+    E: Matrix | None = None
+    A: Matrix
+    B: EquationMatrix | None = None
+    C: OutputMatrix
+    D: Matrix | None = None
+    Bf: EquationMatrix | None = None
+    Df: Matrix | None = None
+    Bd: EquationMatrix | None = None
+    Dd: Matrix | None = None
+    Bw: EquationMatrix | None = None
+    Dw: Matrix | None = None
+    state_names: Names | None = None
+    input_names: Names | None = None
+    output_names: Names | None = None
+    fault_names: Names | None = None
+    disturbance_names: Names | None = None
+    noise_names: Names | None = None
+    operating_point: dict[Text, float] | None = None
+    units: dict[Text, str] | None = None
+    sensor_noise: dict[Text, Positive] | None = None
+    transform: TransformSection | None = None
+
+
+class PlantDocument(PlantSection):
+    """A plant in a file of its own."""
+
+    schema_version: int
+
+
+class PlantReference(_Section):
+    """A plant in another file: ``{file: plant.yaml}``."""
+
+    file: Text
+
+
+class MethodSection(_Section):
+    """The method and its options; the options have a schema per method."""
+
+    id: Text
+    options: dict[str, Any] = Field(default_factory=dict)
+
+
+class SpecDocument(_Section):
+    """A whole spec."""
+
+    schema_version: int
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$")]
+    description: str | None = None
+    plant: Annotated[
+        Annotated[PlantReference, Tag(_FILE)] | Annotated[PlantSection, Tag(_INLINE)], Discriminator(_kind_of_plant)
+    ]
+    method: MethodSection
+
+
+class FaultEstimationFilterOptions(_Section):
+    """Options of the method ``fault-estimation-filter``."""
+
+    gamma: Positive | None = None
+    gamma_search: Literal["direct", "bisection"] = "direct"
+    gamma_margin: Positive = 0.05
+    free_residual_weight: bool | None = None
+    residual_weight_limit: Positive | None = None
+    S: Matrix | None = None
+    solver: Literal["CLARABEL", "SCS"] = "CLARABEL"
+    tolerance: Annotated[float, Field(gt=0.0, lt=1.0)] = 1e-6
+
+
+#: Options of every method, by its identifier.
+METHOD_OPTIONS: dict[str, type[_Section]] = {"fault-estimation-filter": FaultEstimationFilterOptions}

@@ -1,0 +1,1 @@
+"""From a plant to gains, a realisation and a certificate."""

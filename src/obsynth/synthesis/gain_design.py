@@ -1,0 +1,255 @@
+r"""Solving a normalised `GainProblem`: least gain, gains of least size at a given gain, feasibility.
+
+The bounded real inequality in P, Y = P R and V, with g the gain level,
+
+.. math::
+    \begin{bmatrix} P & 0 & (PA - YC)^T & (Z + VC)^T \\ & g^2 I & (PB - YD)^T & (Z_d + VD)^T \\
+    & & P & 0 \\ & & & I \end{bmatrix} > 0
+
+is used in two forms.  The *eliminated* form has no Y and V (elimination lemma; N a basis of null [C D],
+G = [A B], H = [Z Zd]):
+
+.. math:: N^T(\mathrm{diag}(P, g^2 I) - G^T P G - H^T H) N > 0, \quad
+          \mathrm{diag}(P, g^2 I) - H^T H > 0 \ (\text{V fixed}), \quad P > 0 \ (\text{V free}),
+
+and its gains come in closed form, so that nothing is lost: they minimise the residual in the Loewner order.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from obsynth.errors import SolverError
+from obsynth.numerics.arrays import FloatArray
+from obsynth.synthesis import lmi
+from obsynth.synthesis.gain_problem import GainProblem, Injection
+
+#: Strictness of the inequalities, in normalised coordinates where every block is of size one.
+MARGIN = 1e-9
+#: Bounds on P in normalised coordinates: they keep P away from singular and the gains from running away.
+P_FLOOR = 1e-4
+P_CEILING = 1e4
+
+
+@dataclass(frozen=True, eq=False)
+class GainSolution:
+    """A solution in normalised coordinates.
+
+    Parameters
+    ----------
+    gain : float
+        The level g of the inequality.
+    P : FloatArray
+        Lyapunov matrix ``(n, n)``.
+    injection : Injection
+        Gains.
+    record : dict
+        Record of the solver run.
+    """
+
+    gain: float
+    P: FloatArray
+    injection: Injection
+    record: dict[str, Any]
+
+
+def null_basis(matrix: FloatArray) -> FloatArray:
+    """Return an orthonormal basis ``(cols, cols - rows)`` of the null space of a matrix of full row rank."""
+    rows, columns = matrix.shape
+    if rows == 0:
+        return np.eye(columns)
+    return np.asarray(np.linalg.qr(matrix.T, mode="complete")[0][:, rows:])
+
+
+@dataclass(frozen=True, eq=False)
+class _Inequality:
+    """The bounded real inequality with its variables; ``y`` and ``v`` are ``None`` in the eliminated form."""
+
+    p: Any
+    y: Any
+    v: Any
+    constraints: list[Any]
+
+    def gains(self, problem: GainProblem, level: float) -> Injection:
+        """Return the gains that the solved variables stand for."""
+        solution = lmi.value_of(self.p)
+        if self.y is None:
+            return injection_for(problem, solution, level)
+        if problem.measured == 0:
+            return Injection(np.zeros((problem.order, 0)), lmi.value_of(self.v))
+        return Injection(np.linalg.solve(solution, lmi.value_of(self.y)), lmi.value_of(self.v))
+
+
+def _inequality(problem: GainProblem, squared: Any) -> _Inequality:
+    """Return the eliminated form, or the full one where the weight has a limit."""
+    p = lmi.symmetric_variable(problem.order)
+    if problem.weight_limit is None:
+        return _Inequality(p, None, None, _eliminated_constraints(problem, p, squared))
+    return _full_inequality(problem, p, squared)
+
+
+def _eliminated_constraints(problem: GainProblem, p: Any, squared: Any) -> list[Any]:
+    n, nd = problem.order, problem.disturbances
+    outputs = np.hstack([problem.Z, problem.Zd])
+    basis = null_basis(np.hstack([problem.C, problem.D]))
+    top, bottom, image = basis[:n], basis[n:], np.hstack([problem.A, problem.B]) @ basis
+    constraints = [lmi.at_least(p, P_FLOOR), lmi.at_most(p, P_CEILING)]
+    if basis.shape[1]:
+        reduced = top.T @ p @ top - image.T @ p @ image - (outputs @ basis).T @ (outputs @ basis)
+        constraints.append(lmi.at_least(reduced + squared * (bottom.T @ bottom) if nd else reduced, MARGIN))
+    if not problem.weight_is_free:
+        weight = lmi.symmetric_blocks([[p], [np.zeros((nd, n)), squared * np.eye(nd)]])
+        constraints.append(lmi.at_least(weight - outputs.T @ outputs, MARGIN))
+    return constraints
+
+
+def _full_inequality(problem: GainProblem, p: Any, squared: Any) -> _Inequality:
+    n, m, q, nd = problem.order, problem.measured, problem.Z.shape[0], problem.disturbances
+    y = lmi.matrix_variable(n, m)
+    v = lmi.matrix_variable(q, m) if problem.weight_is_free else np.zeros((q, m))
+    whole = lmi.symmetric_blocks([
+        [p],
+        [np.zeros((nd, n)), squared * np.eye(nd)],
+        [p @ problem.A - y @ problem.C, p @ problem.B - y @ problem.D, p],
+        [problem.Z + v @ problem.C, problem.Zd + v @ problem.D, np.zeros((q, n)), np.eye(q)],
+    ])  # fmt: skip
+    constraints = [lmi.at_least(p, P_FLOOR), lmi.at_most(p, P_CEILING), lmi.at_least(whole, MARGIN)]
+    limit = problem.weight_limit
+    if limit is not None:
+        weight = limit.fixed / limit.bound + v @ (limit.free / limit.bound)
+        constraints.append(lmi.at_least(lmi.symmetric_blocks([[np.eye(weight.shape[1])], [weight, np.eye(q)]])))
+    return _Inequality(p, y, v, constraints)
+
+
+def injection_for(problem: GainProblem, p: FloatArray, gain: float) -> Injection:
+    """Return the gains that P allows at level ``gain``, in closed form.
+
+    ``(G - R M) S^-1 (G - R M)' < P^-1`` with ``M = [C D]`` is least, in the Loewner order, at
+    ``R = G S^-1 M' (M S^-1 M')^-1``; S is diag(P, g^2 I), less ``H'H`` when V is fixed, and V comes out of
+    the same formula with H stacked under G when it is free.
+    """
+    n, m, q = problem.order, problem.measured, problem.Z.shape[0]
+    if m == 0:
+        return Injection(np.zeros((n, 0)), np.zeros((q, 0)))
+    measured, through = np.hstack([problem.C, problem.D]), np.hstack([problem.A, problem.B])
+    outputs = np.hstack([problem.Z, problem.Zd])
+    weight = np.zeros((n + problem.disturbances,) * 2)
+    weight[:n, :n] = p
+    weight[n:, n:] = gain**2 * np.eye(problem.disturbances)
+    stacked = through
+    if problem.weight_is_free:
+        stacked = np.vstack([through, outputs])
+    else:
+        weight = weight - outputs.T @ outputs
+    lifted = np.linalg.solve(0.5 * (weight + weight.T), measured.T)
+    gains = np.linalg.solve(measured @ lifted, (stacked @ lifted).T).T
+    v = -gains[n:] if problem.weight_is_free else np.zeros((q, m))
+    return Injection(gains[:n], v)
+
+
+def least_gain(problem: GainProblem, *, solver: str) -> GainSolution:
+    """Minimise the gain by the eliminated inequality.
+
+    Parameters
+    ----------
+    problem : GainProblem
+        Normalised.
+    solver : str
+        Name of the solver.
+
+    Raises
+    ------
+    SolverError
+        No usable answer.
+    """
+    squared = lmi.scalar_variable()
+    inequality = _inequality(problem, squared)
+    record = lmi.minimise(squared, inequality.constraints, what="least gain", solver=solver)
+    gain = float(np.sqrt(max(float(lmi.value_of(squared)), 0.0)))
+    return GainSolution(gain, lmi.value_of(inequality.p), inequality.gains(problem, gain), record)
+
+
+def feasible_point(problem: GainProblem, gain: float, *, solver: str) -> GainSolution | None:
+    """Look for a filter at level ``gain`` and return it when its true norm is below; ``None`` otherwise.
+
+    The slack of the inequality is maximised (up to one) instead of asking for bare feasibility, which ends in
+    solver errors below the optimum.
+    """
+    slack = lmi.scalar_variable()
+    # A slack of t is the same as asking for the level g^2 - t in the disturbance block.
+    inequality = _inequality(problem, gain**2 - slack)
+    try:
+        record = lmi.minimise(-slack, inequality.constraints, what=f"feasibility at {gain:.6g}", solver=solver)
+        level = float(np.sqrt(max(gain**2 - float(lmi.value_of(slack)), 0.0)))
+        found = GainSolution(gain, lmi.value_of(inequality.p), inequality.gains(problem, 0.5 * (level + gain)), record)
+    except (SolverError, np.linalg.LinAlgError):
+        return None
+    return found if problem.achieved_gain(found.injection) < gain else None
+
+
+def bisected_gain(
+    problem: GainProblem, start: Injection, *, tolerance: float, solver: str
+) -> tuple[float, float, Injection, list[dict[str, Any]]]:
+    """Return ``(high, low, gains, records)``: the final bracket of a bisection on the gain, and the best filter.
+
+    Algorithm 1 of the paper, made to end: every upper end of the bracket is the true norm of a filter in hand, and
+    the lower end is a level at which none was found.
+
+    Parameters
+    ----------
+    problem : GainProblem
+        Normalised.
+    start : Injection
+        A stable filter: its own norm is the first upper end.
+    tolerance : float
+        Relative width of the bracket at which to stop.
+    solver : str
+        Name of the solver.
+    """
+    best, high, low = start, problem.achieved_gain(start), 0.0
+    records = []
+    while high - low > tolerance * high:
+        middle = 0.5 * (low + high)
+        found = feasible_point(problem, middle, solver=solver)
+        if found is None:
+            low = middle
+        else:
+            best, high = found.injection, min(middle, problem.achieved_gain(found.injection))
+            records.append(found.record)
+    return high, low, best, records
+
+
+def small_gains(problem: GainProblem, gain: float, *, solver: str) -> GainSolution:
+    """Return gains of least size (or least noise) at level ``gain``, by the full inequality.
+
+    Minimises the trace of X, a bound on ``(Bn - R Dn)' P (Bn - R Dn) + (Zn + V Dn)'(Zn + V Dn)``: the variance of
+    xi under the noise of the problem.  Without a noise model the caller gives unit noise on the free
+    measurements, and the objective is then the size of R (and V) itself.
+
+    Parameters
+    ----------
+    problem : GainProblem
+        Normalised, with noise columns.
+    gain : float
+        Level g; of no effect without disturbances.
+    solver : str
+        Name of the solver.
+
+    Raises
+    ------
+    SolverError
+        No usable answer.
+    """
+    n, q, nw = problem.order, problem.Z.shape[0], problem.Bn.shape[1]
+    p, x = lmi.symmetric_variable(n), lmi.symmetric_variable(nw)
+    inequality = _full_inequality(problem, p, gain**2)
+    noise = p @ problem.Bn - inequality.y @ problem.Dn
+    variance = lmi.symmetric_blocks([
+        [x], [noise, p], [problem.Zn + inequality.v @ problem.Dn, np.zeros((q, n)), np.eye(q)],
+    ])  # fmt: skip
+    constraints = [*inequality.constraints, lmi.at_least(variance)]
+    record = lmi.minimise(lmi.trace(x), constraints, what="small gains", solver=solver)
+    return GainSolution(gain, lmi.value_of(p), inequality.gains(problem, gain), record)

@@ -1,0 +1,154 @@
+"""The LMI layer: the only place that writes matrix inequalities and calls a solver.
+
+Three traps are closed here.  ``X >> scalar`` in cvxpy promotes the scalar to a full matrix, so margins are
+always ``margin * I``.  A block matrix that is symmetric only in exact arithmetic gives a different cone, so
+every block is symmetrised.  A solver may end in a panic that is no ``Exception``: whatever it does becomes
+a `SolverError` with a record.
+"""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from obsynth.errors import SolverError
+from obsynth.numerics.arrays import FloatArray
+
+if TYPE_CHECKING:
+    import cvxpy
+
+#: Statuses that come with numbers; whether they count is decided by verification, not here.
+USABLE_STATUSES = ("optimal", "optimal_inaccurate")
+#: Solvers that take semidefinite constraints, and the settings we use.
+SOLVER_SETTINGS: dict[str, dict[str, Any]] = {
+    "CLARABEL": {},
+    "SCS": {"eps_abs": 1e-9, "eps_rel": 1e-9, "max_iters": 100_000},
+}
+
+
+def symmetric_variable(size: int) -> Any:
+    """Return a symmetric matrix variable ``(size, size)``."""
+    import cvxpy
+
+    return cvxpy.Variable((size, size), symmetric=True)
+
+
+def matrix_variable(rows: int, columns: int) -> Any:
+    """Return a matrix variable ``(rows, columns)``; a constant zero block where a dimension is 0."""
+    import cvxpy
+
+    return cvxpy.Variable((rows, columns)) if rows and columns else np.zeros((rows, columns))
+
+
+def scalar_variable() -> Any:
+    """Return a scalar variable that is not negative."""
+    import cvxpy
+
+    return cvxpy.Variable(nonneg=True)
+
+
+def symmetric_blocks(lower: Sequence[Sequence[Any]]) -> Any:
+    """Return the symmetric block matrix whose lower triangle of blocks is ``lower``; empty blocks are dropped.
+
+    Parameters
+    ----------
+    lower : sequence of sequences
+        Row i holds i + 1 blocks (arrays or expressions); diagonal blocks are square.
+    """
+    import cvxpy
+
+    kept = [i for i, row in enumerate(lower) if row[i].shape[0] > 0]
+    rows = [[lower[i][j] if j <= i else lower[j][i].T for j in kept] for i in kept]
+    full = cvxpy.bmat(rows)
+    return 0.5 * (full + full.T)
+
+
+def at_least(expression: Any, margin: float = 0.0) -> Any:
+    """Return the constraint ``expression >= margin * I`` for a square matrix expression."""
+    symmetric = 0.5 * (expression + expression.T)
+    return symmetric >> margin * np.eye(expression.shape[0])
+
+
+def at_most(expression: Any, level: float) -> Any:
+    """Return the constraint ``expression <= level * I`` for a square matrix expression."""
+    symmetric = 0.5 * (expression + expression.T)
+    return symmetric << level * np.eye(expression.shape[0])
+
+
+def trace(expression: Any) -> Any:
+    """Return the trace of a square matrix expression."""
+    import cvxpy
+
+    return cvxpy.trace(expression)
+
+
+def value_of(variable: Any) -> FloatArray:
+    """Return the value of a variable or constant block as an array; raise `SolverError` when there is none."""
+    value = variable if isinstance(variable, np.ndarray) else variable.value
+    if value is None or not np.all(np.isfinite(value)):
+        raise SolverError("The solver returned no finite numbers: nothing is known.")
+    return np.asarray(value, dtype=np.float64)
+
+
+def minimise(objective: Any, constraints: Sequence[Any], *, what: str, solver: str = "CLARABEL") -> dict[str, Any]:
+    """Minimise a linear objective under the constraints and return the record of the run.
+
+    Parameters
+    ----------
+    objective : expression or None
+        Scalar; ``None`` asks for any feasible point.
+    constraints : sequence
+        As made by `at_least` and `at_most`.
+    what : str
+        What is being solved, for messages.
+    solver : str, optional
+        A key of `SOLVER_SETTINGS`.
+
+    Returns
+    -------
+    dict
+        ``what, solver, version, status, iterations, seconds, settings``.
+
+    Raises
+    ------
+    SolverError
+        The solver ended without numbers, or crashed.
+    """
+    import cvxpy
+
+    problem: cvxpy.Problem = cvxpy.Problem(cvxpy.Minimize(0 if objective is None else objective), list(constraints))
+    settings = SOLVER_SETTINGS[solver]
+    record: dict[str, Any] = {"what": what, "solver": solver, "version": _version(solver), "settings": dict(settings)}
+    began = time.perf_counter()
+    try:
+        with warnings.catch_warnings():
+            # "Solution may be inaccurate": every solution is verified, so the warning tells nobody anything.
+            warnings.simplefilter("ignore")
+            problem.solve(solver=solver, **settings)
+    except (KeyboardInterrupt, SystemExit, MemoryError):
+        raise
+    except BaseException as error:  # noqa: BLE001  Clarabel can panic with a BaseException
+        record |= {"status": "crashed", "reason": str(error)}
+        raise SolverError(f"{solver} failed while solving for {what}: nothing is known.", record=record) from error
+    stats = problem.solver_stats
+    record |= {
+        "status": str(problem.status),
+        "iterations": None if stats is None or stats.num_iters is None else int(stats.num_iters),
+        "seconds": time.perf_counter() - began,
+    }
+    if problem.status not in USABLE_STATUSES:
+        raise SolverError(f"{solver} ended with status {problem.status!r} while solving for {what}: nothing is known.", record=record)
+    return record
+
+
+def _version(solver: str) -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version(solver.lower())
+    except PackageNotFoundError:
+        return "unknown"

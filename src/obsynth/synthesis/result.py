@@ -1,0 +1,39 @@
+"""What a method hands to the pipeline: gains, realisation and certificate, not yet verified."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.linear import LinearObserver
+from obsynth.results.design import Certificate
+
+
+@dataclass(frozen=True, eq=False)
+class Synthesis:
+    """The unverified outcome of a method.
+
+    Parameters
+    ----------
+    options : mapping
+        Options as resolved, plain data.
+    gains : mapping
+        Gains with the paper's letters.
+    observer : LinearObserver
+        The realisation.
+    certificate : Certificate
+        Witnesses and claims.
+    solver : mapping
+        Records of the solver runs.
+    notes : tuple of str
+        What a user should know.
+    """
+
+    options: Mapping[str, Any]
+    gains: Mapping[str, FloatArray]
+    observer: LinearObserver
+    certificate: Certificate
+    solver: Mapping[str, Any] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()

@@ -1,0 +1,101 @@
+"""Riccati equations: a rough observer gain, and certificates of a bounded gain in closed form."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.norms import spectral_radius
+
+#: Relative sizes of the fictitious process and measurement noise, tried in turn, that make the equation regular.
+REGULARISATIONS = (1e-6, 1e-4, 1e-2, 1.0)
+#: Eigenvalues of a normalising matrix are kept above this fraction of the largest.
+CONDITION_LIMIT = 1e-12
+
+
+def stabilising_gain(
+    a: FloatArray, c: FloatArray, noise_a: FloatArray, noise_c: FloatArray
+) -> FloatArray | None:
+    """Return R ``(n, m)`` such that ``A - R C`` is Schur stable, by a Kalman filter Riccati equation.
+
+    Parameters
+    ----------
+    a, c : FloatArray
+        ``(n, n)`` and ``(m, n)``.
+    noise_a, noise_c : FloatArray
+        ``(n, k)`` and ``(m, k)``: how one common input enters both equations (may be singular).
+
+    Returns
+    -------
+    FloatArray or None
+        ``None`` when no regularisation gave a stable result.
+    """
+    from scipy.linalg import solve_discrete_are
+
+    n, m = a.shape[0], c.shape[0]
+    if m == 0:
+        return np.zeros((n, 0)) if spectral_radius(a) < 1.0 else None
+    process, cross, measured = noise_a @ noise_a.T, noise_a @ noise_c.T, noise_c @ noise_c.T
+    process_size = max(float(np.linalg.norm(process, 2)), 1e-8 * float(np.linalg.norm(a, 2)) ** 2, 1e-8)
+    for epsilon in REGULARISATIONS:
+        q = process + epsilon * process_size * np.eye(n)
+        r = measured + epsilon * (float(np.linalg.norm(c @ q @ c.T, 2)) + float(np.linalg.norm(measured, 2))) * np.eye(m)
+        try:
+            x = solve_discrete_are(a.T, c.T, q, r, s=cross)
+        except (np.linalg.LinAlgError, ValueError):
+            continue
+        gain = np.linalg.solve(c @ x @ c.T + r, c @ x @ a.T + cross.T).T
+        if np.all(np.isfinite(gain)) and spectral_radius(a - gain @ c) < 1.0:
+            return np.asarray(gain)
+    return None
+
+
+def bounded_real_matrix(
+    a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, level: float, *, slack: float
+) -> FloatArray | None:
+    """Return P > 0 with the bounded real inequality strict at ``level``, or ``None``.
+
+    Solves ``P = A'PA + C'C + slack*I + (A'PB + C'D)(level^2 I - D'D - B'PB)^-1 (A'PB + C'D)'`` for its
+    stabilising solution; the slack makes the inequality strict.
+
+    Parameters
+    ----------
+    a, b, c, d : FloatArray
+        ``(n, n)``, ``(n, m)``, ``(p, n)``, ``(p, m)``, ``a`` Schur stable.
+    level : float
+        Above the H-infinity norm.
+    slack : float
+        Positive.
+    """
+    n = a.shape[0]
+    if n == 0:
+        return np.zeros((0, 0))
+    weight = c.T @ c + slack * np.eye(n)
+    try:
+        with warnings.catch_warnings():
+            # An ill-conditioned equation only makes a worse certificate, which is then not proved.
+            warnings.simplefilter("ignore")
+            p = _riccati_solution(a, b, weight, c.T @ d, d.T @ d - level**2 * np.eye(b.shape[1]))
+    except (np.linalg.LinAlgError, ValueError):
+        return None
+    p = 0.5 * (p + p.T)
+    return p if np.all(np.isfinite(p)) and float(np.linalg.eigvalsh(p)[0]) > 0.0 else None
+
+
+def _riccati_solution(
+    a: FloatArray, b: FloatArray, weight: FloatArray, cross: FloatArray, level: FloatArray
+) -> FloatArray:
+    from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
+
+    if b.shape[1] == 0:
+        return np.asarray(solve_discrete_lyapunov(a.T, weight))
+    return np.asarray(solve_discrete_are(a, b, weight, level, s=cross))
+
+
+def normalising_change(p: FloatArray) -> FloatArray:
+    """Return S ``(n, n)`` with ``S' P S`` close to the identity, of bounded condition."""
+    values, vectors = np.linalg.eigh(0.5 * (p + p.T))
+    floor = CONDITION_LIMIT * max(float(values[-1]), np.finfo(np.float64).tiny)
+    return np.asarray(vectors / np.sqrt(np.maximum(values, floor)))

@@ -1,0 +1,88 @@
+r"""The bounded real inequality of a shipped observer, formed with guaranteed error bounds and proved.
+
+With ``e+ = M e + B d`` and the fault error ``-C e + D d`` taken from the shipped realisation, and the certificate
+P = Q'Q, the gain d -> fault error is below g, and M is Schur stable, if
+
+.. math::
+    \begin{bmatrix} P & 0 & (QM)^T & C^T \\ & g^2 I & (QB)^T & -D^T \\ & & I & 0 \\ & & & I \end{bmatrix} > 0 .
+
+This is the paper's (45) before its Schur complements (Wang 2015), with its P on the third diagonal block divided out,
+and extended by D.  The certificate is the triangular factor Q: P itself, rounded to double precision, would lose
+definiteness where its condition number nears 1e16, and its square root has half the digits to lose.  The first block is
+moved by S, close to the inverse of Q; S is triangular with a nonzero diagonal, so this congruence is one.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from obsynth.models.descriptor import DescriptorSystem
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.balls import Ball, block
+from obsynth.numerics.definiteness import DefinitenessProof, prove_positive_definite
+from obsynth.observers.linear import LinearObserver
+from obsynth.verification.error_system import LaggedPlant
+
+
+def prove_bounded_real(
+    plant: DescriptorSystem, observer: LinearObserver, tracking: FloatArray, factor: FloatArray, gain: float, *, lag: int
+) -> DefinitenessProof:
+    """Try to prove the bounded real inequality for the shipped observer.
+
+    Parameters
+    ----------
+    plant : DescriptorSystem
+        The plant.
+    observer : LinearObserver
+        What is shipped; its leading states, as many as Q has rows, carry the fault estimate.
+    tracking : FloatArray
+        ``(nz, nx (lag + 1))``.
+    factor : FloatArray
+        Certificate Q ``(core, core)``, upper triangular.
+    gain : float
+        Claimed bound g; without disturbances only stability is proved.
+    lag : int
+        Samples of past states appended to the plant.
+
+    Returns
+    -------
+    DefinitenessProof
+        ``proved`` also requires that the other observer states neither act on the core nor on the fault estimate.
+    """
+    core = factor.shape[0]
+    outside = (observer.Az[:core, core:], observer.Cz[observer.fault_rows, core:])
+    # What follows the core must be a chain of delays: strictly lower triangular, hence stable.
+    chain = np.triu(observer.Az[core:, core:])
+    triangular = np.all(np.tril(factor, -1) == 0.0) and np.all(np.diag(factor) != 0.0)
+    if any(np.any(part != 0.0) for part in (*outside, chain)) or not triangular or not gain > 0.0:
+        return DefinitenessProof(False, -np.inf, 0.0)
+    inverse = np.triu(np.linalg.inv(factor))
+    if not np.all(np.isfinite(inverse)) or np.any(np.diag(inverse) == 0.0):
+        return DefinitenessProof(False, -np.inf, 0.0)
+    return prove_positive_definite(_formed(plant, observer, tracking, factor, inverse, gain, lag))
+
+
+def _formed(
+    plant: DescriptorSystem, observer: LinearObserver, tracking: FloatArray, factor: FloatArray, inverse: FloatArray,
+    gain: float, lag: int,
+) -> Ball:  # fmt: skip
+    """Return the matrix of the inequality with the bounds on the errors of forming it."""
+    core, nd = factor.shape[0], plant.nd
+    bd = LaggedPlant.of(plant, lag).input(plant.Bd)
+    q, s = Ball.exact(factor), Ball.exact(inverse)
+    b = Ball.exact(tracking[:core]) @ Ball.exact(bd) - Ball.exact(observer.By[:core]) @ Ball.exact(plant.Dd)
+    qs, qms = q @ s, q @ (Ball.exact(observer.Az[:core, :core]) @ s)
+    cs = Ball.exact(observer.Cz[observer.fault_rows, :core]) @ s
+    d = Ball.exact(observer.Dy[observer.fault_rows]) @ Ball.exact(plant.Dd)
+    level = Ball.exact(gain * np.eye(nd)) @ Ball.exact(gain * np.eye(nd))
+    qb, nf = q @ b, cs.shape[0]
+
+    def zero(rows: int, columns: int) -> Ball:
+        return Ball.exact(np.zeros((rows, columns)))
+
+    return block([
+        [qs.T @ qs, zero(core, nd), qms.T, cs.T],
+        [zero(nd, core), level, qb.T, -d.T],
+        [qms, qb, Ball.exact(np.eye(core)), zero(core, nf)],
+        [cs, -d, zero(nf, core), Ball.exact(np.eye(nf))],
+    ])  # fmt: skip

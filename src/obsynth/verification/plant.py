@@ -1,0 +1,44 @@
+"""Rows about the plant itself: information for the reader, and the existence conditions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+from obsynth.analysis.conditions import Condition
+from obsynth.analysis.structure import analyse_structure
+from obsynth.models.descriptor import DescriptorSystem
+from obsynth.results.report import Check, information
+
+
+def plant_information(plant: DescriptorSystem) -> Iterator[Check]:
+    """Yield rows on regularity, index, eigenvalues and stability of the plant; they inform and never fail."""
+    structure = analyse_structure(plant)
+    source = "the plant"
+    yield information("plant: regular", "det(A - zE) is not identically zero", float(structure.regular), source=source)
+    if not structure.regular:
+        return
+    yield information("plant: index", "index of the pencil (0: E nonsingular)", float(structure.index or 0), source=source)
+    count = len(structure.finite_eigenvalues)
+    yield information("plant: finite eigenvalues", "number of dynamic modes", float(count), source=source,
+                      detail=_eigenvalue_text(structure.finite_eigenvalues))  # fmt: skip
+    yield information("plant: infinite eigenvalues", "number of infinite eigenvalues",
+                      float(sum(structure.infinite_block_sizes)), source=source,
+                      detail=f"block sizes {list(structure.infinite_block_sizes)}" if structure.infinite_block_sizes else "")  # fmt: skip
+    verdict = "admissible" if structure.admissible else "not admissible: an observer may exist all the same"
+    yield information("plant: admissible", "regular, impulse-free and stable", float(structure.admissible),
+                      source=source, detail=verdict)  # fmt: skip
+
+
+def _eigenvalue_text(values: Iterable[complex], most: int = 6) -> str:
+    listed = sorted((complex(value) for value in values), key=abs, reverse=True)
+    shown = [f"{v.real:.4g}" if abs(v.imag) < 1e-12 else f"{v.real:.4g}{v.imag:+.4g}j" for v in listed[:most]]
+    return ", ".join(shown) + (f", and {len(listed) - most} more" if len(listed) > most else "")
+
+
+def condition_rows(conditions: Iterable[Condition]) -> Iterator[Check]:
+    """Yield one row per existence condition."""
+    for condition in conditions:
+        yield Check(
+            f"exists: {condition.name}", condition.claim, condition.value, condition.bound,
+            abs(condition.bound - condition.value), condition.holds, condition.source, "condition", condition.detail,
+        )  # fmt: skip

@@ -1,0 +1,58 @@
+"""`import obsynth` and ``--help`` stay fast: what is heavy is loaded only when it is used."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+HEAVY = ("cvxpy", "control", "slycot", "matplotlib", "pydantic", "scipy.linalg")
+SOURCE = Path(__file__).parents[2] / "src"
+
+IMPORT = "import obsynth"
+DESIGN_HELP = "from obsynth.cli.main import design_command as run; arguments = ['--help']"
+OBSYNTH_HELP = "from obsynth.cli.main import main as run; arguments = ['--help']"
+CHECK_HELP = "from obsynth.cli.main import main as run; arguments = ['check', '--help']"
+VERSION = "from obsynth.cli.main import main as run; arguments = ['--version']"
+RUN = """
+try:
+    run(arguments)
+except SystemExit as end:
+    print('exit code', end.code)
+"""
+SHOW = "import sys; print('LOADED', [name for name in {names!r} if name in sys.modules])"
+
+
+def loaded_modules(program: str, names: tuple[str, ...]) -> str:
+    """Run a program in a fresh interpreter; return the line that says which of ``names`` it loaded."""
+    code = "\n".join([program, SHOW.format(names=names)])
+    path = os.pathsep.join([str(SOURCE), os.environ.get("PYTHONPATH", "")])
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "PYTHONPATH": path},
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()[-1]
+
+
+@pytest.mark.parametrize(
+    "program",
+    [IMPORT, DESIGN_HELP + RUN, OBSYNTH_HELP + RUN, CHECK_HELP + RUN, VERSION + RUN],
+    ids=["import obsynth", "design --help", "obsynth --help", "obsynth check --help", "obsynth --version"],
+)
+def test_nothing_heavy_is_loaded(program: str) -> None:
+    assert loaded_modules(program, HEAVY) == "LOADED []"
+
+
+def test_the_help_was_really_run() -> None:
+    """The probe above sees modules that are loaded, and the programs do end in their help."""
+    assert loaded_modules("import scipy.linalg", HEAVY) == "LOADED ['scipy.linalg']"
+    assert (
+        loaded_modules(DESIGN_HELP + RUN, ("obsynth.cli.main", "argparse")) == "LOADED ['obsynth.cli.main', 'argparse']"
+    )

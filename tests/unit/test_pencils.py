@@ -1,0 +1,212 @@
+"""Kronecker structure and finite zeros of pencils, against planted structure and slycot."""
+
+import numpy as np
+import pytest
+import slycot
+from scipy.linalg import block_diag, eigvals
+
+from obsynth.numerics.pencils import finite_zeros, pencil_structure
+
+
+def nonsingular(size, rng, spread=10.0):
+    left, right = (np.linalg.qr(rng.standard_normal((size, size)))[0] if size else np.eye(0) for _ in range(2))
+    return left * spread ** rng.uniform(-0.5, 0.5, size) @ right
+
+
+def stacked(blocks):
+    """Block diagonal, where blocks may have zero rows or columns."""
+    result = np.zeros((sum(b.shape[0] for b in blocks), sum(b.shape[1] for b in blocks)))
+    row = column = 0
+    for block in blocks:
+        result[row : row + block.shape[0], column : column + block.shape[1]] = block
+        row, column = row + block.shape[0], column + block.shape[1]
+    return result
+
+
+def canonical(eigenvalues=(), infinite=(), right=(), left=()):
+    """Return the Kronecker form (E, A): real or complex-pair eigenvalues, and sizes of the other blocks."""
+    pairs = []
+    for z in map(complex, eigenvalues):
+        pairs.append((np.eye(2), [[z.real, z.imag], [-z.imag, z.real]]) if z.imag else (np.eye(1), [[z.real]]))
+    pairs += [(np.eye(size, k=1), np.eye(size)) for size in infinite]
+    pairs += [(np.eye(size, size + 1), np.eye(size, size + 1, k=1)) for size in right]
+    pairs += [(np.eye(size + 1, size), np.eye(size + 1, size, k=-1)) for size in left]
+    return stacked([np.asarray(e, float) for e, _ in pairs]), stacked([np.asarray(a, float) for _, a in pairs])
+
+
+def disguised(E, A, rng, spread=10.0):
+    P, Q = nonsingular(E.shape[0], rng, spread), nonsingular(E.shape[1], rng, spread)
+    return P @ E @ Q, P @ A @ Q
+
+
+def with_conjugates(values):
+    return [w for z in map(complex, values) for w in ((z, z.conjugate()) if z.imag else (z,))]
+
+
+def mismatch(expected, found):
+    """Return the largest distance in a greedy pairing; infinite when the counts differ."""
+    rest = list(found)
+    if len(expected) != len(rest):
+        return np.inf
+    worst = 0.0
+    for value in expected:
+        nearest = min(range(len(rest)), key=lambda i: abs(rest[i] - value))
+        worst = max(worst, abs(rest.pop(nearest) - value) / max(1.0, abs(value)))
+    return worst
+
+
+@pytest.mark.parametrize(
+    ("infinite", "index"),
+    [((), 0), ((1,), 1), ((1, 1, 1), 1), ((2, 1), 2), ((2, 2), 2), ((3, 1, 1), 3), ((4, 2, 1), 4)],
+)
+@pytest.mark.parametrize("seed", range(5))
+def test_index_and_blocks_of_regular_pencils(infinite, index, seed):
+    rng = np.random.default_rng(seed)
+    eigenvalues = (0.5, -1.25, 0.3 + 0.8j)
+    E, A = disguised(*canonical(eigenvalues, infinite), rng)
+    structure = pencil_structure(E, A)
+    assert structure.regular
+    assert structure.index == index
+    assert structure.infinite_block_sizes == infinite
+    assert structure.normal_rank == E.shape[0]
+    assert mismatch(with_conjugates(eigenvalues), structure.finite_eigenvalues) < 1e-11
+    assert all(decision.clear for decision in structure.decisions)
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize(
+    ("right", "left"), [((0,), (0,)), ((1,), (1,)), ((2,), ()), ((), (2,)), ((0, 3), (1,)), ((1, 1), (0, 2))]
+)
+def test_singular_and_rectangular_pencils(right, left, seed):
+    rng = np.random.default_rng(seed)
+    eigenvalues, infinite = (0.7, -0.2 + 1.1j), (2, 1)
+    E, A = disguised(*canonical(eigenvalues, infinite, right, left), rng)
+    structure = pencil_structure(E, A)
+    assert not structure.regular
+    assert structure.index is None
+    assert structure.infinite_block_sizes == infinite
+    assert structure.normal_rank == 6 + sum(right) + sum(left)
+    zeros = finite_zeros(E, A)
+    assert zeros.normal_rank == structure.normal_rank
+    assert mismatch(with_conjugates(eigenvalues), structure.finite_eigenvalues) < 1e-10
+    assert mismatch(with_conjugates(eigenvalues), zeros.values) < 1e-10
+
+
+def test_500_random_planted_pencils():
+    rng = np.random.default_rng(2024)
+    for trial in range(500):
+        real, pairs = rng.uniform(-2, 2, rng.integers(0, 3)), rng.integers(0, 3)
+        eigenvalues = [*real, *(rng.uniform(-2, 2, pairs) + 1j * rng.uniform(0.1, 2, pairs))]
+        infinite, right, left = (tuple(rng.integers(low, 5 - (low == 0), rng.integers(0, 3))) for low in (1, 0, 0))
+        if trial % 2:
+            right = left = ()
+        E, A = disguised(*canonical(eigenvalues, infinite, right, left), rng, spread=30.0)
+        # units: rows and columns scaled over six decades
+        rows, columns = 10.0 ** rng.uniform(-3, 3, E.shape[0]), 10.0 ** rng.uniform(-3, 3, E.shape[1])
+        E, A = rows[:, None] * E * columns, rows[:, None] * A * columns
+        structure, zeros = pencil_structure(E, A), finite_zeros(E, A)
+        expected = with_conjugates(eigenvalues)
+        assert structure.infinite_block_sizes == tuple(sorted(infinite, reverse=True)), trial
+        assert structure.normal_rank == len(expected) + sum(infinite) + sum(right) + sum(left), trial
+        assert structure.regular == (not right and not left), trial
+        assert mismatch(expected, structure.finite_eigenvalues) < 1e-9, trial
+        assert mismatch(expected, zeros.values) < 1e-9, trial
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_finite_zeros_agree_with_slycot(seed):
+    rng = np.random.default_rng(seed)
+    nx, nu = int(rng.integers(3, 8)), int(rng.integers(1, 3))
+    ny = nu + seed % 2
+    E, A = disguised(*canonical(rng.uniform(-1, 1, nx - 2), (1, 1)), rng)
+    B, C = rng.standard_normal((nx, nu)), rng.standard_normal((ny, nx))
+    D = np.zeros((ny, nu))
+    pencil_e = stacked([E, np.zeros((ny, nu))])
+    found = finite_zeros(pencil_e, np.block([[A, B], [C, D]]))
+    reduced_a, reduced_e, normal_rank, *_ = slycot.ag08bd(nx, nx, nu, ny, A, E, B, C, D, equil="S")
+    assert found.normal_rank == normal_rank
+    expected = eigvals(reduced_a, reduced_e) if reduced_a.size else []
+    assert mismatch(expected, found.values) < 1e-8
+
+
+def test_weak_chain_does_not_hide_an_unobservable_mode():
+    """Sixty states seen through one output: every step is harmless, their product is not."""
+    rng = np.random.default_rng(3)
+    size = 60
+    A = np.diag(np.linspace(-1, 1, size)) + np.diag(np.full(size - 1, 0.02), 1) + np.diag(np.full(size - 1, 0.02), -1)
+    C = np.zeros((1, size))
+    C[0, 0] = 1.0
+    orthogonal = np.linalg.qr(rng.standard_normal((size + 1, size + 1)))[0]
+    A = orthogonal.T @ block_diag(A, [[1.5]]) @ orthogonal
+    C = np.hstack([C, [[0.0]]]) @ orthogonal
+    E = np.vstack([np.eye(size + 1), np.zeros((1, size + 1))])
+    found = finite_zeros(E, np.vstack([A, C]))
+    assert min(abs(found.values - 1.5)) < 1e-9
+
+
+@pytest.mark.parametrize("shape", [(0, 0), (0, 3), (3, 0), (2, 3), (3, 3)])
+def test_zero_and_empty_pencils(shape):
+    structure = pencil_structure(np.zeros(shape), np.zeros(shape))
+    assert structure.normal_rank == 0
+    assert structure.finite_eigenvalues.shape == (0,)
+    assert structure.regular == (shape == (0, 0))
+    assert finite_zeros(np.zeros(shape), np.zeros(shape)).values.shape == (0,)
+
+
+def test_constant_pencil_has_index_one_and_no_eigenvalue():
+    structure = pencil_structure(np.zeros((3, 3)), np.eye(3))
+    assert (structure.index, structure.infinite_block_sizes) == (1, (1, 1, 1))
+    assert structure.finite_eigenvalues.size == 0
+
+
+def test_huge_eigenvalue_is_finite_and_infinite_one_is_not():
+    E, A = np.diag([1e-8, 1.0, 0.0]), np.diag([1.0, 0.5, 1.0])
+    structure = pencil_structure(E, A)
+    assert structure.infinite_block_sizes == (1,)
+    assert mismatch([1e8, 0.5], structure.finite_eigenvalues) < 1e-12
+
+
+def test_defective_eigenvalue_keeps_its_multiplicity():
+    E, A = disguised(np.eye(3), np.eye(3) * 0.5 + np.eye(3, k=1), np.random.default_rng(0))
+    values = pencil_structure(E, A).finite_eigenvalues
+    assert len(values) == 3
+    assert np.max(np.abs(values - 0.5)) < 1e-4
+    assert abs(np.mean(values) - 0.5) < 1e-12
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_conjugate_pairs_are_exact_and_adjacent(seed):
+    rng = np.random.default_rng(seed)
+    values = list(pencil_structure(rng.standard_normal((9, 9)), rng.standard_normal((9, 9))).finite_eigenvalues)
+    while values:
+        value = values.pop(0)
+        assert value.imag >= 0.0
+        if value.imag:
+            assert values.pop(0) == value.conjugate()
+
+
+def test_arguments_are_not_modified_and_results_are_read_only():
+    rng = np.random.default_rng(0)
+    E, A = rng.standard_normal((4, 5)), rng.standard_normal((4, 5))
+    before = E.copy(), A.copy()
+    structure, zeros = pencil_structure(E, A), finite_zeros(E, A)
+    np.testing.assert_array_equal(E, before[0])
+    np.testing.assert_array_equal(A, before[1])
+    assert not structure.finite_eigenvalues.flags.writeable
+    assert not zeros.values.flags.writeable
+
+
+@pytest.mark.parametrize("seed", range(100))
+def test_singular_values_around_the_tolerance_give_a_consistent_answer(seed):
+    """Whatever is decided about doubtful ranks, the blocks must fill the pencil."""
+    rng = np.random.default_rng(seed)
+    left, right = (np.linalg.qr(rng.standard_normal((6, 6)))[0] for _ in range(2))
+    E = left * 10.0 ** rng.uniform(-12, 0, 6) @ right
+    A = left @ np.diag(10.0 ** rng.uniform(-12, 0, 6)) @ np.linalg.qr(rng.standard_normal((6, 6)))[0]
+    structure = pencil_structure(E, A)
+    if structure.regular:
+        assert len(structure.finite_eigenvalues) + sum(structure.infinite_block_sizes) == 6
+        assert structure.index == max(structure.infinite_block_sizes, default=0)
+    assert len(structure.finite_eigenvalues) <= structure.normal_rank <= 6
+    assert np.all(np.isfinite(structure.finite_eigenvalues))
+    assert np.all(np.isfinite(finite_zeros(E, A).values))
