@@ -6,6 +6,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from obsynth.analysis.structure import analyse_structure
+    from obsynth.analysis.transformations import discretise, eliminate_algebraic_states
     from obsynth.errors import (
         InfeasibleError,
         ObsynthError,
@@ -50,7 +52,30 @@ _HOMES = {
     "verify": "obsynth.verification",
 }
 
-__all__ = sorted(_HOMES)
+__all__ = [
+    "Certificate",
+    "Check",
+    "DescriptorSystem",
+    "Estimates",
+    "InfeasibleError",
+    "LinearObserver",
+    "ObserverDesign",
+    "ObsynthError",
+    "PreconditionError",
+    "RunningObserver",
+    "SolverError",
+    "SpecError",
+    "VerificationError",
+    "VerificationReport",
+    "analyse_structure",
+    "design",
+    "discretise",
+    "eliminate_algebraic_states",
+    "fault_estimation_filter",
+    "fault_estimation_filter_from_gains",
+    "load",
+    "verify",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -288,6 +288,19 @@ FILES = [
         "cannot be read as a matrix",
         files=written("A.mtx", "%%MatrixMarket matrix array real general\n4 4\n1\n"),
     ),
+    Case(
+        # scipy's reader crashes the interpreter on this one.
+        "mtx cut within a number",
+        put("plant", "A", {"file": "A.mtx"}),
+        "cannot be read as a matrix",
+        files=written("A.mtx", "%%MatrixMarket matrix array real general\n1 1\n3.64E"),
+    ),
+    Case(
+        "mtx index outside",
+        put("plant", "A", {"file": "A.mtx"}),
+        "an index is outside the matrix",
+        files=written("A.mtx", "%%MatrixMarket matrix coordinate real general\n2 2 1\n3 1 1.0\n"),
+    ),
     Case("mtx empty", put("plant", "A", {"file": "A.mtx"}), "cannot be read as a matrix", files=written("A.mtx", "")),
     Case("mtx complex", put("plant", "A", {"file": "complex.mtx"}), "complex numbers", files=saved_complex),
     Case(
@@ -372,7 +385,7 @@ def eliminated(**changes: Any) -> Callable[[dict[str, Any]], None]:
 
 
 PRECONDITIONS = [
-    impossible("continuous plant", put("plant", "dt", 0), "discrete time", "This plant is continuous"),
+    impossible("continuous plant", put("plant", "dt", 0), "discrete time", "a continuous plant. Sample it first"),
     impossible(
         "not regular",
         plant(E=[[1, 0], [0, 0]], A=[[0.5, 0], [0, 0]], C=[[1, 0]], Bf=[[1], [0]]),
@@ -383,30 +396,30 @@ PRECONDITIONS = [
         "rank [E; C]",
         put("plant", "C", [[0, 1, 0, 0], [0, 0, 1, 0]]),
         "rank [E; C]",
-        "rank [E; C] = 4 is needed",
+        "Needed: rank [E; C] = 4.",
         signals=["x4"],
     ),
     impossible(
         "rank C",
         put("plant", "C", [[0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1], [0, 1, 0, 0]]),
         "rank C",
-        "rank C = 4 is needed",
+        "Needed: rank C = 4.",
     ),
     impossible(
         "rank Bf",
         put("plant", "Bf", [[0.1, 0.1], [1, 1], [-0.1, -0.1], [-1, -1]]),
         "rank F",
-        "rank F = 2 is needed",
+        "Needed: rank F = 2.",
         signals=["f1", "f2"],
     ),
     impossible(
         "fault without effect",
         put("plant", "Bf", [[0.1, 0], [1, 0], [-0.1, 0], [-1, 0]]),
         "rank F",
-        "rank F = 2 is needed",
+        "Needed: rank F = 2.",
         signals=["f2"],
     ),
-    impossible("more faults than outputs", put("plant", "Bf", eye(4)), "nf <= ny", "4 faults need 4 outputs"),
+    impossible("more faults than outputs", put("plant", "Bf", eye(4)), "nf <= ny", "4 faults and 3 output(s)"),
     impossible("no fault", drop("plant", "Bf"), "faults", "at least one fault"),
     impossible(
         "zero on the unit circle",
@@ -596,6 +609,11 @@ BAD_GAINS: list[tuple[str, Callable[[str], str], str]] = [
     ("another document", lambda good: '{"kind": "recipe"}', "is no gain set"),
     ("nested too deeply", lambda good: "[" * 100_000, "is no JSON document"),
     ("another version", lambda good: tampered(good, put("schema_version", 99)), "schema version 99"),
+    (
+        "NaN as a gain",
+        lambda good: tampered(good, put("design", "observer", "By", "data", 0, float("nan"))),
+        "gains.json",
+    ),
     ("a changed gain", lambda good: tampered(good, nudged_gain), "digest does not match"),
     ("a changed name", lambda good: tampered(good, put("design", "name", "other")), "digest does not match"),
     ("no digest", lambda good: tampered(good, drop("sha256")), "digest does not match"),

@@ -140,6 +140,10 @@ class TestDesign:
     def test_smib(self, capsys: pytest.CaptureFixture[str]) -> None:
         assert main(["design", "--system", str(SMIB), "--quiet"]) == 0
         printed = capsys.readouterr().out
+        estimate = next(line for line in printed.splitlines() if line.startswith("tm GENCLS 1 "))
+        delay_in_samples, delay_in_seconds, deviation = estimate.removeprefix("tm GENCLS 1").split()[:3]
+        assert (delay_in_samples, delay_in_seconds) == ("1", "0.02")
+        assert float(deviation) < 0.05
         for text in ("tm GENCLS 1", "active power Bus 3", "0.02", "biased by the disturbance", "Verified: all"):
             assert text in printed
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 from pathlib import Path
 from typing import Any
@@ -12,8 +13,11 @@ import scipy.io
 import scipy.sparse
 
 from obsynth.errors import SpecError
+from obsynth.pipeline import fault_estimation_filter
 from obsynth.spec import load_spec
+from obsynth.spec.matrices import read_matrix
 from obsynth.spec.schema import METHOD_OPTIONS
+from obsynth.synthesis.methods import REGISTRY
 
 DESIGNS = Path(__file__).parents[2] / "designs"
 
@@ -198,6 +202,25 @@ class TestMatrixFiles:
         assert np.array_equal(spec.options["S"], MATRIX)
 
 
+class TestMatrixMarket:
+    """Our reader agrees with scipy's writer, for every kind of file."""
+
+    @pytest.mark.parametrize("sparse", [False, True], ids=["array", "coordinate"])
+    @pytest.mark.parametrize("field", ["real", "integer"])
+    @pytest.mark.parametrize("symmetry", ["general", "symmetric", "skew-symmetric"])
+    def test_round_trip(self, tmp_path: Path, sparse: bool, field: str, symmetry: str) -> None:
+        matrix = np.array([[1.0, 0, 2], [-3, 4, 0], [0, 5, 6]])
+        matrix = {"general": matrix, "symmetric": matrix + matrix.T, "skew-symmetric": matrix - matrix.T}[symmetry]
+        path = tmp_path / "matrix.mtx"
+        scipy.io.mmwrite(path, scipy.sparse.coo_array(matrix) if sparse else matrix, field=field, symmetry=symmetry)
+        assert np.array_equal(read_matrix(path, where="plant.A"), matrix)
+
+    def test_pattern_and_repeated_entries(self, tmp_path: Path) -> None:
+        path = tmp_path / "matrix.mtx"
+        path.write_text("%%MatrixMarket matrix coordinate pattern general\n% note\n\n2 3 3\n1 1\n2 3\n1 1\n", "utf-8")
+        assert read_matrix(path, where="plant.A").tolist() == [[2, 0, 0], [0, 0, 1]]
+
+
 class TestPlantFile:
     def test_one_plant_serves_two_specs(self, tmp_path: Path) -> None:
         (tmp_path / "shared").mkdir()
@@ -327,5 +350,12 @@ class TestShippedDesigns:
                 assert load_spec(path).name.startswith(folder)
 
 
-def test_the_schema_knows_the_options_of_every_method() -> None:
-    assert "fault-estimation-filter" in METHOD_OPTIONS
+class TestMethods:
+    def test_the_schema_knows_every_method(self) -> None:
+        assert set(METHOD_OPTIONS) == set(REGISTRY)
+
+    def test_the_schema_has_the_options_and_defaults_of_the_function(self) -> None:
+        parameters = inspect.signature(fault_estimation_filter).parameters
+        of_function = {name: p.default for name, p in parameters.items() if name not in ("plant", "name")}
+        fields = METHOD_OPTIONS["fault-estimation-filter"].model_fields
+        assert {name: field.default for name, field in fields.items()} == of_function

@@ -126,7 +126,7 @@ class TestElimination:
         result = eliminate_algebraic_states(plant)
         assert result.recovery.flags() == ("exact", "exact", "needs the fault estimate", "biased by the disturbance")
         assert result.plant.state_names == ("x",)
-        assert result.plant.units == {"x": "m"}
+        assert result.plant.units == {"x": "m", "q": "m"}  # q is still an output
         assert result.plant.operating_point == {"x": 2.0}
         np.testing.assert_array_equal(result.plant.Df, [[1.0]])
         np.testing.assert_array_equal(result.plant.Dd, [[0.0]])

@@ -46,9 +46,18 @@ class Condition:
         """Raise `PreconditionError` when the condition fails."""
         if not self.holds:
             raise PreconditionError(
-                f"No filter exists: {self.claim} is needed ({self.source}). {self.detail}",
-                condition=self.name, mode=self.mode, signals=self.signals,
-            )  # fmt: skip
+                f"No such observer exists: the condition {self.name!r} fails ({self.source}). Needed: {self.claim}. "
+                f"Found: {self.detail}{_involved(self.signals, self.detail)}",
+                condition=self.name,
+                mode=self.mode,
+                signals=self.signals,
+            )
+
+
+def _involved(signals: tuple[str, ...], detail: str) -> str:
+    """Name the signals that the detail does not name already."""
+    missing = [repr(name) for name in signals if repr(name) not in detail]
+    return f" Signals involved: {', '.join(missing)}." if missing else ""
 
 
 def require_all(conditions: Iterable[Condition]) -> None:

@@ -72,8 +72,8 @@ def fault_detectability(ta: FloatArray, c: FloatArray, tf: FloatArray) -> FaultD
     lengths = np.linalg.norm(upsilon, axis=0)
     unit = upsilon / np.where(lengths == 0.0, 1.0, lengths)
     values = np.linalg.svd(unit, compute_uv=False) if unit.size else np.ones(1)
-    with np.errstate(divide="ignore"):
-        condition = float(values[0] / values[-1]) if unit.shape[0] >= unit.shape[1] else np.inf
+    invertible = unit.shape[0] >= unit.shape[1] and values[-1] > 0.0
+    condition = float(values[0] / values[-1]) if invertible else np.inf
     rank = decide_rank(unit, expected=tf.shape[1])
     return FaultDetectability(tuple(index for index, _ in results), psi, upsilon, rank, condition)
 
@@ -92,32 +92,43 @@ def _first_visible(ta: FloatArray, c: FloatArray, direction: FloatArray) -> tupl
     return None, np.zeros_like(direction)
 
 
-def detectability_conditions(
-    detectability: FaultDetectability, fault_names: tuple[str, ...]
-) -> tuple[Condition, ...]:
+def detectability_conditions(detectability: FaultDetectability, fault_names: tuple[str, ...]) -> tuple[Condition, ...]:
     """Return the conditions on indexes and matrix: finite indexes, ``rank Upsilon = nf``, its condition number."""
     hidden = tuple(name for name, index in zip(fault_names, detectability.indexes, strict=True) if index is None)
     largest = max((index for index in detectability.indexes if index is not None), default=0)
     finite = Condition(
-        "finite detectability indexes", "that every fault reaches the outputs", not hidden, float(largest),
-        float(detectability.Psi.shape[0]), "Wang 2015, eq. (19)",
-        f"Fault {', '.join(map(repr, hidden))} never shows in any output: measure something it acts on."
-        if hidden else f"indexes {', '.join(map(str, detectability.indexes))}",
+        "finite detectability indexes",
+        "every fault reaches the outputs",
+        not hidden,
+        float(largest),
+        float(detectability.Psi.shape[0]),
+        "Wang 2015, eq. (19)",
+        f"fault {', '.join(map(repr, hidden))} never shows in any output: measure something it acts on."
+        if hidden
+        else f"indexes {', '.join(map(str, detectability.indexes))}",
         signals=hidden,
-    )  # fmt: skip
+    )
     if hidden:
         return (finite,)
     rank = detectability.rank
     usable = rank.full and detectability.condition_number <= REFUSE_CONDITION
     mixed = () if usable else _dependent_faults(detectability.Upsilon, fault_names)
     independent = Condition(
-        "rank Upsilon", "that the faults first reach the outputs in independent directions (rank Upsilon = nf)",
-        usable, detectability.condition_number, REFUSE_CONDITION, "Wang 2015, Theorem 2 (i)",
+        "rank Upsilon",
+        "the faults first reach the outputs in independent directions (rank Upsilon = nf)",
+        usable,
+        detectability.condition_number,
+        REFUSE_CONDITION,
+        "Wang 2015, Theorem 2 (i)",
         f"{rank.describe()}, condition number {detectability.condition_number:.3g}"
-        + (f": the faults {', '.join(map(repr, mixed))} cannot be told apart at first sight. Leave one out, or "
-           "measure another signal." if mixed else "."),
+        + (
+            f"; the faults {', '.join(map(repr, mixed))} cannot be told apart at first sight. Leave one out, or "
+            "measure another signal."
+            if mixed
+            else "."
+        ),
         signals=mixed,
-    )  # fmt: skip
+    )
     return finite, independent
 
 

@@ -76,9 +76,7 @@ def with_sensor_faults_as_states(plant: DescriptorSystem) -> DescriptorSystem:
     PreconditionError
         ``rank [E 0; 0 0; C Df]`` is too small; the faults are named.
     """
-    direct = tuple(
-        name for name, column in zip(plant.fault_names, plant.Df.T, strict=True) if np.any(column != 0.0)
-    )
+    direct = tuple(name for name, column in zip(plant.fault_names, plant.Df.T, strict=True) if np.any(column != 0.0))
     return augment_faults(plant, direct).plant if direct else plant
 
 
@@ -133,64 +131,115 @@ def _form_conditions(plant: DescriptorSystem) -> list[Condition]:
     structure = pencil_structure(plant.E, plant.A)
     return [
         Condition(
-            "discrete time", "a discrete-time plant (dt > 0)", plant.is_discrete, plant.dt, 0.0, "Wang 2015, eq. (1)",
-            "" if plant.is_discrete else "This plant is continuous: sample it first (transform: {sample_time: ...} in "
+            "discrete time",
+            "a discrete-time plant (dt > 0)",
+            plant.is_discrete,
+            plant.dt,
+            0.0,
+            "Wang 2015, eq. (1)",
+            ""
+            if plant.is_discrete
+            else "a continuous plant. Sample it first (transform: {sample_time: ...} in "
             "a spec, obsynth.discretise in Python).",
         ),
         Condition(
-            "faults", "at least one fault", plant.nf > 0, float(plant.nf), 1.0, "Wang 2015, eq. (1)",
-            "" if plant.nf else "Name the fault to estimate in Bf or Df.",
+            "faults",
+            "at least one fault",
+            plant.nf > 0,
+            float(plant.nf),
+            1.0,
+            "Wang 2015, eq. (1)",
+            "" if plant.nf else "none. Name the fault to estimate in Bf or Df.",
         ),
         Condition(
-            "regularity", "a regular pencil (det(A - zE) not identically zero)", structure.regular,
-            float(structure.normal_rank), float(plant.nx), "DESIGN: plants",
+            "regularity",
+            "a regular pencil (det(A - zE) not identically zero)",
+            structure.regular,
+            float(structure.normal_rank),
+            float(plant.nx),
+            "DESIGN: plants",
             f"normal rank {structure.normal_rank} of {plant.nx}"
-            + ("" if structure.regular else ": the equations do not determine the states. Add the missing equation."),
+            + ("" if structure.regular else ": the equations do not determine the states. Add what is missing."),
         ),
-    ]  # fmt: skip
+    ]
 
 
 def _rank_condition(
     name: str, decision: RankDecision, remedy: str, *, source: str, signals: tuple[str, ...] = ()
 ) -> Condition:
     return Condition(
-        name, f"{name} = {decision.expected}", decision.full, float(decision.rank), float(decision.expected), source,
-        decision.describe() + ("" if decision.full else f": {remedy}"), signals=() if decision.full else signals,
-    )  # fmt: skip
+        name,
+        f"{name} = {decision.expected}",
+        decision.full,
+        float(decision.rank),
+        float(decision.expected),
+        source,
+        decision.describe() + ("" if decision.full else f": {remedy}"),
+        signals=() if decision.full else signals,
+    )
 
 
 def _rank_conditions(plant: DescriptorSystem) -> list[Condition]:
     enough = Condition(
-        "nf <= ny", "no more faults than outputs (nf <= ny)", plant.nf <= plant.ny, float(plant.nf), float(plant.ny),
+        "nf <= ny",
+        "no more faults than outputs (nf <= ny)",
+        plant.nf <= plant.ny,
+        float(plant.nf),
+        float(plant.ny),
         "Wang 2015, below eq. (1)",
-        "" if plant.nf <= plant.ny else f"{plant.nf} faults need {plant.nf} outputs or more.",
+        ""
+        if plant.nf <= plant.ny
+        else f"{plant.nf} faults and {plant.ny} output(s). Measure more, or leave a fault out.",
         signals=() if plant.nf <= plant.ny else plant.fault_names,
-    )  # fmt: skip
+    )
     faults = decide_rank(np.vstack([plant.Bf, plant.Df]), expected=plant.nf)
     ranks = [
         enough,
-        _rank_condition("rank F", faults, "some faults act in the same direction and cannot be told apart.",
-                        source="Wang 2015, below eq. (1)", signals=_dependent_columns(plant)),
-    ]  # fmt: skip
+        _rank_condition(
+            "rank F",
+            faults,
+            "some faults act nowhere, or in the same direction as others, and cannot be told apart.",
+            source="Wang 2015, below eq. (1)",
+            signals=_dependent_columns(plant),
+        ),
+    ]
     if not all(condition.holds for condition in ranks):
         return ranks
     try:
         work = with_sensor_faults_as_states(plant)
     except PreconditionError as error:
-        return [*ranks, Condition(error.condition, "sensor faults that can be told from the states", False, np.nan,
-                                  np.nan, "Wang 2015, eq. (2), with the fault as a state", str(error),
-                                  signals=error.signals)]  # fmt: skip
+        return [
+            *ranks,
+            Condition(
+                error.condition,
+                "sensor faults can be told from the states",
+                False,
+                np.nan,
+                np.nan,
+                "Wang 2015, eq. (2), with the fault as a state",
+                str(error),
+                signals=error.signals,
+            ),
+        ]
     outputs = decide_rank(work.C, expected=work.ny)
     stacked = np.vstack([work.E, work.C])
     ranks += [
-        _rank_condition("rank C", outputs, "some outputs repeat others: leave them out.",
-                        source="Wang 2015, below eq. (1)", signals=plant.output_names),
         _rank_condition(
-            "rank [E; C]", decide_rank(stacked, expected=work.nx),
+            "rank C",
+            outputs,
+            "some outputs repeat others: leave them out.",
+            source="Wang 2015, below eq. (1)",
+            signals=_leading(np.abs(np.linalg.svd(work.C)[0][:, -1]), plant.output_names),
+        ),
+        _rank_condition(
+            "rank [E; C]",
+            decide_rank(stacked, expected=work.nx),
             "not every state is either dynamic or measured. Measure more, or eliminate the algebraic states first "
             "(transform: {eliminate_algebraic_states: true} in a spec).",
-            source="Wang 2015, eq. (2)", signals=_unseen_states(stacked, work.state_names)),
-    ]  # fmt: skip
+            source="Wang 2015, eq. (2)",
+            signals=_unseen_states(stacked, work.state_names),
+        ),
+    ]
     return ranks
 
 
@@ -204,7 +253,7 @@ def _zero_conditions(plant: DescriptorSystem) -> list[Condition]:
     claim = "every invariant zero from the faults to the outputs strictly inside the unit circle"
     source = "never stated in Wang 2015: detectability of (A1, C1)"
     if not zeros.normal_rank_full:
-        detail = f"Faults {', '.join(map(repr, zeros.hidden_faults))} can act together without showing in any output."
+        detail = f"faults {', '.join(map(repr, zeros.hidden_faults))} can act together without showing in any output."
         return [Condition("fault zeros", claim, False, np.inf, 1.0, source, detail, signals=zeros.hidden_faults)]
     if zeros.outside:
         return [_zero_failure(plant, max(zeros.outside, key=lambda zero: abs(zero.value)), claim, source)]
@@ -216,13 +265,19 @@ def _zero_failure(plant: DescriptorSystem, zero: Zero, claim: str, source: str) 
     value = f"{zero.value.real:.6g}" if zero.value.imag == 0.0 else f"{zero.value:.6g}"
     if zero.is_unobservable_mode:
         signals = _leading(np.abs(zero.state_direction), plant.state_names)
-        detail = (f"The mode z = {value} (states {', '.join(map(repr, signals))}) never shows in the outputs and does "
-                  "not decay: measure something it moves.")  # fmt: skip
+        detail = (
+            f"the mode z = {value} (states {', '.join(map(repr, signals))}) never shows in the outputs and does "
+            "not decay: measure something it moves."
+        )
     else:
         signals = _leading(np.abs(zero.input_direction), plant.fault_names)
-        detail = (f"At the zero z = {value} the fault {', '.join(map(repr, signals))} can follow z^k without showing "
-                  "in any output, so no filter can estimate it. Measure another signal.")  # fmt: skip
-    return Condition("fault zeros", claim, False, abs(zero.value), 1.0, source, detail, mode=zero.value, signals=signals)
+        detail = (
+            f"at the zero z = {value} the fault {', '.join(map(repr, signals))} can follow z^k without showing "
+            "in any output, so no filter can estimate it. Measure another signal."
+        )
+    return Condition(
+        "fault zeros", claim, False, abs(zero.value), 1.0, source, detail, mode=zero.value, signals=signals
+    )
 
 
 def _leading(shares: FloatArray, names: tuple[str, ...], most: int = 4) -> tuple[str, ...]:

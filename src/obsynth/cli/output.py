@@ -36,8 +36,6 @@ def print_json(data: Any) -> None:
 def print_error(error: ObsynthError) -> None:
     """Print an error for people on stderr."""
     print(f"{_TITLES.get(type(error).__name__, 'Error')}: {error}", file=sys.stderr)
-    if isinstance(error, PreconditionError) and error.signals:
-        print(f"Signals involved: {', '.join(error.signals)}", file=sys.stderr)
     if isinstance(error, VerificationError):
         from rich.console import Console
 

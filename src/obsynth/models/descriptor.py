@@ -4,13 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.errors import SpecError
-from obsynth.models.names import checked_names, is_name_list, rows_picking
+from obsynth.models.names import checked_names
+from obsynth.models.validation import (
+    Problems,
+    checked_dt,
+    checked_point,
+    checked_units,
+    expected_shapes,
+    matrix_or_picks,
+    picked_names,
+    signal_counts,
+    square,
+)
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 
 MatrixOrNames = ArrayLike | Sequence[str] | None
@@ -113,63 +124,35 @@ class DescriptorSystem:
         operating_point: Mapping[str, float] | None = None,
         units: Mapping[str, str] | None = None,
     ) -> None:
-        problems = _Problems()
-        a = problems.collect(lambda: as_matrix(A, "A"))
-        if a is None or a.shape[0] == 0:
-            problems.add("A is empty: a plant needs at least one state.")
-            problems.raise_if_any()
-        assert_square = problems.collect(lambda: _square(a, "A"))
-        nx = a.shape[1] if assert_square is None else assert_square.shape[0]
-        states = problems.collect(lambda: checked_names(state_names, nx, prefix="x", what="state_names"))
-        known_states = states or tuple(f"x{i + 1}" for i in range(nx))
-        if is_name_list(C) and output_names is None:
-            output_names = tuple(C)  # type: ignore[arg-type]
-        if is_name_list(Bf) and fault_names is None:
-            fault_names = tuple(Bf)  # type: ignore[arg-type]
-        if is_name_list(Bd) and disturbance_names is None:
-            disturbance_names = tuple(Bd)  # type: ignore[arg-type]
-
-        def matrix(value: Any, name: str) -> FloatArray | None:
-            if value is None:
-                return None
-            if is_name_list(value):
-                rows = problems.collect(lambda: rows_picking(value, known_states, what=name))
-                return None if rows is None else (rows if name == "C" else rows.T)
-            return problems.collect(lambda: as_matrix(value, name))
-
-        given = {
-            name: matrix(value, name)
-            for name, value in {
-                "E": np.eye(nx) if E is None else E, "B": B, "C": C, "D": D, "Bf": Bf, "Df": Df,
-                "Bd": Bd, "Dd": Dd, "Bw": Bw, "Dw": Dw,
-            }.items()
-        }  # fmt: skip
-        ny = 0 if given["C"] is None else given["C"].shape[0]
-        sizes = {
-            "u": _columns(given["B"], given["D"]), "f": _columns(given["Bf"], given["Df"]),
-            "d": _columns(given["Bd"], given["Dd"]), "w": _columns(given["Bw"], given["Dw"]),
-        }  # fmt: skip
-        shapes = {"E": (nx, nx), "C": (ny, nx)}
-        for name, rows, signal in _MATRIX_LAYOUT:
-            shapes[name] = (nx if rows == "x" else ny, sizes[signal])
-        values: dict[str, Any] = {"A": a}
-        for name, shape in shapes.items():
-            values[name] = problems.shaped(given[name], name, shape)
-        values["dt"] = problems.collect(lambda: _checked_dt(dt))
-        counts = {
-            "input_names": (input_names, sizes["u"], "u"), "output_names": (output_names, ny, "y"),
-            "fault_names": (fault_names, sizes["f"], "f"), "disturbance_names": (disturbance_names, sizes["d"], "d"),
-            "noise_names": (noise_names, sizes["w"], "w"),
-        }  # fmt: skip
-        values["state_names"] = states
-        for field, (names, count, prefix) in counts.items():
-            values[field] = problems.collect(
-                lambda n=names, c=count, p=prefix, f=field: checked_names(n, c, prefix=p, what=f)  # type: ignore[misc]
-            )
+        problems = Problems()
+        a = problems.collect(lambda: square(as_matrix(A, "A"), "A"))
         problems.raise_if_any()
-        known = {name for field in ("state_names", *counts) for name in values[field]}
-        values["operating_point"] = problems.collect(lambda: _checked_point(operating_point, known))
-        values["units"] = problems.collect(lambda: _checked_units(units, known))
+        nx = a.shape[0]
+        states = problems.collect(lambda: checked_names(state_names, nx, prefix="x", what="state_names"))
+        problems.raise_if_any()
+        given: dict[str, FloatArray | None] = {"A": a, "E": np.eye(nx) if E is None else None}
+        asked = {"E": E, "B": B, "C": C, "D": D, "Bf": Bf, "Df": Df, "Bd": Bd, "Dd": Dd, "Bw": Bw, "Dw": Dw}
+        for name, value in asked.items():
+            if value is not None:
+                given[name] = problems.collect(partial(matrix_or_picks, value, name, states))
+        sizes = signal_counts(given)
+        values: dict[str, Any] = {
+            name: problems.shaped(given.get(name), name, shape) for name, shape in expected_shapes(nx, sizes).items()
+        }
+        values |= {"dt": problems.collect(lambda: checked_dt(dt)), "state_names": states}
+        named = {
+            "input_names": (input_names, "u"),
+            "output_names": (output_names or picked_names(C), "y"),
+            "fault_names": (fault_names or picked_names(Bf), "f"),
+            "disturbance_names": (disturbance_names or picked_names(Bd), "d"),
+            "noise_names": (noise_names, "w"),
+        }
+        for field, (names, signal) in named.items():
+            values[field] = problems.collect(partial(checked_names, names, sizes[signal], prefix=signal, what=field))
+        problems.raise_if_any()
+        known = {name for field in ("state_names", *named) for name in values[field]}
+        values["operating_point"] = problems.collect(lambda: checked_point(operating_point, known))
+        values["units"] = problems.collect(lambda: checked_units(units, known))
         problems.raise_if_any()
         for field, value in values.items():
             object.__setattr__(self, field, read_only(value) if isinstance(value, np.ndarray) else value)
@@ -229,83 +212,3 @@ class DescriptorSystem:
             f"DescriptorSystem(nx={self.nx}, nu={self.nu}, ny={self.ny}, nf={self.nf}, nd={self.nd}, "
             f"nw={self.nw}, {time})"
         )
-
-
-_MATRIX_LAYOUT = (
-    ("B", "x", "u"), ("D", "y", "u"), ("Bf", "x", "f"), ("Df", "y", "f"),
-    ("Bd", "x", "d"), ("Dd", "y", "d"), ("Bw", "x", "w"), ("Dw", "y", "w"),
-)  # fmt: skip
-
-
-class _Problems:
-    """Collects every problem of one document, to raise them together."""
-
-    def __init__(self) -> None:
-        self.messages: list[str] = []
-        self.first_path: str | None = None
-
-    def add(self, message: str, path: str | None = None) -> None:
-        self.messages.append(message)
-        self.first_path = self.first_path or path
-
-    def collect(self, make: Any) -> Any:
-        try:
-            return make()
-        except SpecError as error:
-            self.add(str(error), error.path)
-            return None
-
-    def shaped(self, value: FloatArray | None, name: str, shape: tuple[int, int]) -> FloatArray:
-        if value is None:
-            return np.zeros(shape)
-        if value.size == 0 and 0 in shape:
-            return np.zeros(shape)
-        if value.shape != shape:
-            self.add(f"{name} is {_by(value.shape)}, but {_by(shape)} is needed.", name)
-        return value
-
-    def raise_if_any(self) -> None:
-        if len(self.messages) == 1:
-            raise SpecError(self.messages[0], path=self.first_path)
-        if self.messages:
-            raise SpecError("The plant is not well formed:", path=self.first_path, problems=self.messages)
-
-
-def _by(shape: tuple[int, ...]) -> str:
-    return " by ".join(map(str, shape))
-
-
-def _square(matrix: FloatArray, name: str) -> FloatArray:
-    if matrix.shape[0] != matrix.shape[1]:
-        raise SpecError(f"{name} is {_by(matrix.shape)}, but it must be square (nx by nx).", path=name)
-    return matrix
-
-
-def _columns(*matrices: FloatArray | None) -> int:
-    return next((m.shape[1] for m in matrices if m is not None and m.size), 0)
-
-
-def _checked_dt(dt: Any) -> float:
-    if isinstance(dt, bool) or not isinstance(dt, (int, float, np.integer, np.floating)):
-        raise SpecError(f"dt is {dt!r}: give the sampling time in seconds, or 0 for continuous time.", path="dt")
-    if not np.isfinite(dt) or dt < 0:
-        raise SpecError(f"dt is {dt}: give a sampling time >= 0 in seconds (0 for continuous time).", path="dt")
-    return float(dt)
-
-
-def _checked_point(point: Mapping[str, float] | None, known: set[str]) -> dict[str, float]:
-    checked: dict[str, float] = {}
-    for name, value in (point or {}).items():
-        if name not in known:
-            raise SpecError(f"operating_point names {name!r}, which is no signal of the plant.", path="operating_point")
-        checked[name] = float(as_matrix(value, f"operating_point[{name!r}]")[0, 0])
-    return checked
-
-
-def _checked_units(units: Mapping[str, str] | None, known: set[str]) -> dict[str, str]:
-    for name, value in (units or {}).items():
-        if name not in known:
-            raise SpecError(f"units names {name!r}, which is no signal of the plant.", path="units")
-        if not isinstance(value, str):
-            raise SpecError(f"The unit of {name!r} must be a text.", path="units")
-    return dict(units or {})

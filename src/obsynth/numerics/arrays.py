@@ -34,7 +34,9 @@ def as_matrix(value: Any, name: str) -> FloatArray:
         if raw.size == 0:
             raw = raw.astype(np.float64)
         else:
-            kind = {"b": "booleans", "c": "complex numbers", "U": "text"}.get(raw.dtype.kind, "entries that are no numbers")
+            kind = {"b": "booleans", "c": "complex numbers", "U": "text"}.get(
+                raw.dtype.kind, "entries that are no numbers"
+            )
             raise SpecError(f"{name} holds {kind}: every entry must be a real number.", path=name)
     if raw.ndim == 0:
         raw = raw.reshape(1, 1)

@@ -8,7 +8,8 @@ floating-point matrix :math:`\tilde A`, the factor satisfies :math:`R^T R = \til
 Rump's k is n + 1; we use 2 (n + 4), which also covers kernels that multiply by rounded reciprocals.
 So, with :math:`\tilde A = \mathrm{fl}(A - c I)`, completion proves
 
-.. math:: \lambda_{\min}(A) \ge c - \frac{\gamma_k}{1-\gamma_k} \mathrm{tr}\,\tilde A - u \max_i |\tilde a_{ii}| - \eta .
+.. math::
+    \lambda_{\min}(A) \ge c - \frac{\gamma_k}{1-\gamma_k} \mathrm{tr}\,\tilde A - u \max_i |\tilde a_{ii}| - \eta .
 
 The error of forming A enters as the largest row sum of its radii, a bound on the spectral norm of any
 symmetric perturbation within them.
@@ -63,11 +64,17 @@ def prove_positive_definite(matrix: Ball | FloatArray) -> DefinitenessProof:
     if size == 0:
         return DefinitenessProof(True, float("inf"), 0.0)
     diagonal = np.diag(ball.midpoint)
-    if not np.all(np.isfinite(ball.midpoint)) or not np.all(np.isfinite(ball.radius)) or np.any(diagonal <= 0.0):
+    if not _is_finite(ball) or np.any(diagonal <= 0.0):
         return DefinitenessProof(False, -float("inf"), 0.0)
-    scaled = _symmetric(ball.congruent(np.exp2(-np.round(np.log2(diagonal) / 2.0))))
+    scaled = _symmetric(ball.congruent(-np.round(np.log2(diagonal) / 2.0).astype(np.int64)))
+    if not _is_finite(scaled):
+        return DefinitenessProof(False, -float("inf"), 0.0)
     first = _by_cholesky(scaled)
     return first if first.proved else _by_preconditioning(scaled) or first
+
+
+def _is_finite(ball: Ball) -> bool:
+    return bool(np.all(np.isfinite(ball.midpoint)) and np.all(np.isfinite(ball.radius)))
 
 
 def _symmetric(ball: Ball) -> Ball:
@@ -76,9 +83,10 @@ def _symmetric(ball: Ball) -> Ball:
     Such members lie in the ball and in its transpose, so averaging the midpoints loses none; the difference of the
     midpoints more than covers the rounding of the average.
     """
-    middle = 0.5 * (ball.midpoint + ball.midpoint.T)
-    radius = np.maximum(ball.radius, ball.radius.T) + np.abs(ball.midpoint - ball.midpoint.T)
-    return Ball(middle, rounded_up(radius, 4))
+    with np.errstate(over="ignore", invalid="ignore"):
+        middle = 0.5 * (ball.midpoint + ball.midpoint.T)
+        radius = np.maximum(ball.radius, ball.radius.T) + np.abs(ball.midpoint - ball.midpoint.T)
+        return Ball(middle, rounded_up(radius, 4))
 
 
 def _by_cholesky(ball: Ball) -> DefinitenessProof:
@@ -102,11 +110,18 @@ def _by_preconditioning(ball: Ball) -> DefinitenessProof | None:
     factor = _cholesky_factor(ball.midpoint)
     if factor is None:
         return None
-    change = np.triu(np.linalg.inv(factor).T)
+    try:
+        change = np.triu(np.linalg.inv(factor).T)
+    except np.linalg.LinAlgError:
+        # Pivoting can make pivots underflow although the diagonal of the factor does not.
+        return None
     if not np.all(np.isfinite(change)) or np.any(np.diag(change) == 0.0):
         return None
     exact = Ball.exact(change)
-    proof = _by_cholesky(_symmetric(exact.T @ ball @ exact))
+    near_identity = _symmetric(exact.T @ ball @ exact)
+    if not _is_finite(near_identity):
+        return None
+    proof = _by_cholesky(near_identity)
     return proof if proof.proved else None
 
 

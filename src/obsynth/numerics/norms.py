@@ -73,9 +73,10 @@ def hinf_norm(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> Hin
     """
     if b.shape[1] == 0 or c.shape[0] == 0:
         return HinfNorm(0.0, 0.0, 0.0, np.inf)
-    if spectral_radius(a) >= 1.0:
-        return HinfNorm(np.inf, np.inf, np.nan, 0.0)
     poles = np.linalg.eigvals(a) if a.size else np.zeros(0, dtype=complex)
+    if np.any(np.abs(poles) >= 1.0):
+        return HinfNorm(np.inf, np.inf, np.nan, 0.0)
+    a, b, c = _balanced(a, b, c)
     angles = np.concatenate([np.linspace(0.0, np.pi, GRID_POINTS), np.abs(np.angle(poles))])
     best, angle = _peak(a, b, c, d, angles)
     if best == 0.0 or a.shape[0] == 0:
@@ -94,6 +95,17 @@ def hinf_norm(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> Hin
             return HinfNorm(max(best, higher), level, angle, distance)
         best, angle = higher, where
     return HinfNorm(best, np.inf, angle, distance)
+
+
+def _balanced(a: FloatArray, b: FloatArray, c: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the realisation with its states scaled by powers of two, which is exact: units must not cost digits."""
+    from scipy.linalg import matrix_balance
+
+    n, inputs, outputs = a.shape[0], b.shape[1], c.shape[0]
+    system = np.zeros((n + inputs + outputs, n + inputs + outputs))
+    system[:n, :n], system[:n, n : n + inputs], system[n + inputs :, :n] = a, b, c
+    scale = matrix_balance(system, permute=False, separate=True)[1][0][:n]
+    return a * scale / scale[:, None], b / scale[:, None], c * scale
 
 
 def _peak(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, angles: FloatArray) -> tuple[float, float]:

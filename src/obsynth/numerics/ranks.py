@@ -129,4 +129,4 @@ def decide_rank(
     else:
         gap = (kept if rank else tolerance) / dropped
     wanted = min(work.shape) if expected is None else expected
-    return RankDecision(rank, wanted, read_only(values), kept, dropped, gap)
+    return RankDecision(rank, wanted, read_only(np.asarray(values, dtype=np.float64)), kept, dropped, gap)

@@ -100,7 +100,10 @@ class LinearObserver:
     def from_dict(cls, data: Mapping[str, Any]) -> LinearObserver:
         """Return the observer that `as_dict` described (lists or arrays)."""
         # JSON has lists where we have tuples of names and delays.
-        return cls(**{key: tuple(value) if isinstance(value, list) else value for key, value in data.items()})
+        values: dict[str, Any] = {
+            key: tuple(value) if isinstance(value, list) else value for key, value in data.items()
+        }
+        return cls(**values)
 
     def start(self, initial_state: ArrayLike | None = None) -> RunningObserver:
         """Return an observer at rest that takes one sample at a time.
@@ -135,7 +138,9 @@ class LinearObserver:
             Shapes do not fit, or a sample is not finite.
         """
         outputs = _record(y, len(self.output_names), "y")
-        inputs = _record(np.zeros((len(outputs), 0)) if u is None and not self.input_names else u, len(self.input_names), "u")
+        inputs = _record(
+            np.zeros((len(outputs), 0)) if u is None and not self.input_names else u, len(self.input_names), "u"
+        )
         if len(inputs) != len(outputs):
             raise SpecError(f"u has {len(inputs)} samples and y has {len(outputs)}: give the same number.", path="u")
         running = self.start(initial_state)
@@ -175,7 +180,9 @@ class RunningObserver:
 
     def __init__(self, observer: LinearObserver, initial_state: ArrayLike | None = None) -> None:
         if observer.dt <= 0.0:
-            raise SpecError("This observer is continuous in time: it must be discretised before it can step.", path="dt")
+            raise SpecError(
+                "This observer is continuous in time: it must be discretised before it can step.", path="dt"
+            )
         start = np.zeros(observer.order) if initial_state is None else np.asarray(initial_state, dtype=np.float64)
         if start.shape != (observer.order,) or not np.all(np.isfinite(start)):
             raise SpecError(f"initial_state needs {observer.order} finite numbers.", path="initial_state")
@@ -240,7 +247,12 @@ class Estimates:
     def split(cls, observer: LinearObserver, rows: FloatArray) -> Estimates:
         """Return the estimates in ``rows (steps, nx + nf + nr)`` of ``observer``."""
         return cls(
-            read_only(rows[:, observer.state_rows]), read_only(rows[:, observer.fault_rows]),
-            read_only(rows[:, observer.residual_rows]), observer.state_names, observer.fault_names,
-            observer.residual_names, observer.state_delays, observer.fault_delays,
-        )  # fmt: skip
+            read_only(rows[:, observer.state_rows]),
+            read_only(rows[:, observer.fault_rows]),
+            read_only(rows[:, observer.residual_rows]),
+            observer.state_names,
+            observer.fault_names,
+            observer.residual_names,
+            observer.state_delays,
+            observer.fault_delays,
+        )

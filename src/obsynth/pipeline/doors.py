@@ -98,11 +98,13 @@ def fault_estimation_filter(
         Discrete time (``dt > 0``), ``E (nx, nx)``, ``C (ny, nx)``, ``Bf (nx, nf)``, ``Bd (nx, nd)``; feedthrough
         ``D, Df, Dd`` and noise ``Bw, Dw`` allowed.
     gamma : float, optional, dimensionless
-        Required bound on the l2 gain d -> fault error.  ``None`` ships ``1 + gamma_margin`` times the least one.
+        Required bound on the l2 gain d -> fault error.  ``None`` ships ``1 + gamma_margin`` times the least one; where
+        the plant states noise, not less than the gain of the Kalman filter that takes d as unit white noise.
     gamma_search : {"direct", "bisection"}, optional
         How the least gain is found: one minimisation, or the paper's Algorithm 1 made to end.
     gamma_margin : float, optional
-        Relative distance to the least gain that buys small gains; the bare optimum is badly conditioned.
+        Relative distance to the least gain that buys small gains, or little noise where the plant states noise; the
+        bare optimum is badly conditioned.
     free_residual_weight : bool, optional
         Whether W is free within ``W Upsilon = I``.  By default yes when the plant states noise, else no.
     residual_weight_limit : float, optional
@@ -149,10 +151,18 @@ def fault_estimation_filter(
        descriptor systems, IET Control Theory Appl. 9 (10), 2015, Theorem 2, eqs. (45)-(48).
     """
     return design(
-        plant, "fault-estimation-filter", name=name, gamma=gamma, gamma_search=gamma_search, gamma_margin=gamma_margin,
-        free_residual_weight=free_residual_weight, residual_weight_limit=residual_weight_limit, S=S, solver=solver,
+        plant,
+        "fault-estimation-filter",
+        name=name,
+        gamma=gamma,
+        gamma_search=gamma_search,
+        gamma_margin=gamma_margin,
+        free_residual_weight=free_residual_weight,
+        residual_weight_limit=residual_weight_limit,
+        S=S,
+        solver=solver,
         tolerance=tolerance,
-    )  # fmt: skip
+    )
 
 
 def fault_estimation_filter_from_gains(
@@ -198,7 +208,9 @@ def fault_estimation_filter_from_gains(
     from obsynth.synthesis.methods.fault_estimation_filter import synthesis_from_gains
 
     if plant.nd and gamma is None:
-        raise SpecError("gamma is needed: the plant has disturbances, and a gain set claims a bound on them.", path="gamma")
+        raise SpecError(
+            "gamma is needed: the plant has disturbances, and a gain set claims a bound on them.", path="gamma"
+        )
     found = synthesis_from_gains(plant, T=T, N=N, L=L, W=W, gamma=gamma)
     draft = _draft(plant, "fault-estimation-filter", found, name=name, recovery=None)
     return draft.replace(report=verify(draft))
@@ -223,8 +235,10 @@ def _checked_options(method: str, options: dict[str, Any]) -> dict[str, Any]:
     method_module(method)
     unknown = sorted(set(options) - allowed)
     if unknown:
-        raise SpecError(f"{method} has no option {', '.join(map(repr, unknown))}; there are: "
-                        f"{', '.join(sorted(allowed))}.", path="method.options")  # fmt: skip
+        raise SpecError(
+            f"{method} has no option {', '.join(map(repr, unknown))}; there are: {', '.join(sorted(allowed))}.",
+            path="method.options",
+        )
     return options
 
 
@@ -232,9 +246,17 @@ def _draft(
     plant: DescriptorSystem, method: str, found: Synthesis, *, name: str, recovery: StateRecovery | None
 ) -> ObserverDesign:
     return ObserverDesign(
-        name=name, method=method, plant=plant, options=found.options, gains=found.gains, observer=found.observer,
-        certificate=found.certificate, solver=found.solver, notes=found.notes, recovery=recovery,
-    )  # fmt: skip
+        name=name,
+        method=method,
+        plant=plant,
+        options=found.options,
+        gains=found.gains,
+        observer=found.observer,
+        certificate=found.certificate,
+        solver=found.solver,
+        notes=found.notes,
+        recovery=recovery,
+    )
 
 
 def _verified(
@@ -244,6 +266,9 @@ def _verified(
     report = verify(draft)
     if not report.passed:
         failed = "; ".join(f"{row.name} ({row.value:.3g} against {row.bound:.3g})" for row in report.failures)
-        raise VerificationError(f"Gains were found, but the shipped realisation fails: {failed}. Nothing was shipped; "
-                                "rescale the plant, or ask for a larger gamma.", report=report)  # fmt: skip
+        raise VerificationError(
+            f"Gains were found, but the shipped realisation fails: {failed}. Nothing was shipped; "
+            "rescale the plant, or ask for a larger gamma.",
+            report=report,
+        )
     return draft.replace(report=report)

@@ -17,7 +17,7 @@ from obsynth.results.design import ObserverDesign
 
 _MEANINGS = {
     "gamma": "l2 gain from the disturbance to the fault error: shipped, proved",
-    "gamma_min": "least such gain found, for this T, N and W",
+    "gamma_min": "least such gain found",
     "gamma_bracket_low": "lower end of the bisection's bracket",
     "gamma_bracket_high": "upper end of the bisection's bracket",
     "state_lag": "samples by which the state estimate lags",
@@ -91,8 +91,11 @@ def _promises(design: ObserverDesign) -> Iterator[tuple[str, str, str]]:
 
 
 def _fault_estimates(design: ObserverDesign) -> Table:
-    observer = design.observer
-    table = headed_table("fault", "delay in samples", "delay in s")
+    observer, units = design.observer, design.plant.units
+    deviations = {check.name: check.value for check in design.report.checks}
+    table = headed_table("fault", "delay in samples", "delay in s", "std under the stated noise")
     for name, delay in zip(observer.fault_names, observer.fault_delays, strict=True):
-        table.add_row(Text(name), str(delay), number(delay * observer.dt))
+        deviation = deviations.get(f"noise in fhat[{name}]")
+        shown = "no noise stated" if deviation is None else f"{number(deviation)} {units.get(name, '')}".strip()
+        table.add_row(Text(name), str(delay), number(delay * observer.dt), Text(shown))
     return table

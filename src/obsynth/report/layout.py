@@ -50,12 +50,12 @@ def complex_numbers(values: Iterable[complex], *, limit: int = 8) -> str:
 
 
 def name_list(names: Sequence[str], *, limit: int = 6) -> str:
-    """Return names separated by commas; of a long list the first ones and how many there are."""
+    """Return names separated by commas; of a long list the first ones and how many more there are."""
     if not names:
         return "none"
     if len(names) <= limit + 1:
         return ", ".join(names)
-    return f"{', '.join(names[:limit])}, ... ({len(names)} in all)"
+    return f"{', '.join(names[:limit])} and {len(names) - limit} more"
 
 
 def verdict(check: Check) -> Text:

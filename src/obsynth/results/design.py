@@ -131,7 +131,13 @@ class ObserverDesign:
             *(f"r[{name}]" for name in observer.residual_names),
         ]
         return control.ss(
-            observer.Az, np.hstack([observer.Bu, observer.By]), observer.Cz, np.hstack([observer.Du, observer.Dy]),
-            observer.dt, inputs=[*observer.input_names, *observer.output_names], outputs=outputs,
-            states=[f"z[{i + 1}]" for i in range(observer.order)], name=self.name,
-        )  # fmt: skip
+            observer.Az,
+            np.hstack([observer.Bu, observer.By]),
+            observer.Cz,
+            np.hstack([observer.Du, observer.Dy]),
+            observer.dt,
+            inputs=[*observer.input_names, *observer.output_names],
+            outputs=outputs,
+            states=[f"z[{i + 1}]" for i in range(observer.order)],
+            name=self.name,
+        )

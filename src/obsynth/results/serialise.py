@@ -64,14 +64,21 @@ def digest_of(body: Mapping[str, Any]) -> str:
 
 def design_as_dict(design: ObserverDesign) -> dict[str, Any]:
     """Return the whole gain set as JSON data, digest included."""
-    body = plain({
-        "name": design.name, "method": design.method, "plant": design.plant.as_dict(), "options": design.options,
-        "gains": design.gains, "observer": design.observer.as_dict(),
-        "certificate": {"matrices": design.certificate.matrices, "claims": design.certificate.claims},
-        "solver": design.solver, "notes": design.notes,
-        "recovery": None if design.recovery is None else _fields_of(design.recovery),
-        "report": design.report.as_dict(),
-    })  # fmt: skip
+    body = plain(
+        {
+            "name": design.name,
+            "method": design.method,
+            "plant": design.plant.as_dict(),
+            "options": design.options,
+            "gains": design.gains,
+            "observer": design.observer.as_dict(),
+            "certificate": {"matrices": design.certificate.matrices, "claims": design.certificate.claims},
+            "solver": design.solver,
+            "notes": design.notes,
+            "recovery": None if design.recovery is None else _fields_of(design.recovery),
+            "report": design.report.as_dict(),
+        }
+    )
     return {"kind": _KIND, "schema_version": SCHEMA_VERSION, "sha256": digest_of(body), "design": body}
 
 
@@ -128,23 +135,29 @@ def load(path: str | Path) -> ObserverDesign:
     """
     source = Path(path)
     try:
-        document = json.loads(source.read_text(encoding="utf-8"))
+        document = json.loads(source.read_text(encoding="utf-8"), parse_constant=_refuse_constant)
     except OSError as error:
         raise SpecError(f"{source} cannot be read: {error.strerror}.", path=str(source)) from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise SpecError(f"{source} is no JSON document ({error}).", path=str(source)) from error
     if not isinstance(document, dict) or document.get("kind") != _KIND:
         raise SpecError(f"{source} is no gain set of obsynth.", path=str(source))
     if document.get("schema_version") != SCHEMA_VERSION:
         version = document.get("schema_version")
-        raise SpecError(f"{source} has schema version {version!r}; this obsynth reads {SCHEMA_VERSION}.", path=str(source))
+        raise SpecError(
+            f"{source} has schema version {version!r}; this obsynth reads {SCHEMA_VERSION}.", path=str(source)
+        )
     body = document.get("design")
     if not isinstance(body, dict) or document.get("sha256") != digest_of(body):
         raise SpecError(f"{source} was changed after it was written: its digest does not match.", path=str(source))
     try:
         return _design_from(restored(body))
-    except (KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise SpecError(f"{source} is incomplete: {error}.", path=str(source)) from error
+
+
+def _refuse_constant(name: str) -> float:
+    raise ValueError(f"{name} is not allowed in JSON")
 
 
 def _fields_of(record: StateRecovery) -> dict[str, Any]:
@@ -153,10 +166,17 @@ def _fields_of(record: StateRecovery) -> dict[str, Any]:
 
 def _design_from(data: dict[str, Any]) -> ObserverDesign:
     return ObserverDesign(
-        name=data["name"], method=data["method"], plant=DescriptorSystem(**data["plant"]), options=data["options"],
-        gains=data["gains"], observer=LinearObserver.from_dict(data["observer"]),
-        certificate=Certificate(**data["certificate"]), solver=data["solver"], notes=tuple(data["notes"]),
-        recovery=None if data["recovery"] is None else StateRecovery(
-            **{**data["recovery"], "names": tuple(data["recovery"]["names"])}),
+        name=data["name"],
+        method=data["method"],
+        plant=DescriptorSystem(**data["plant"]),
+        options=data["options"],
+        gains=data["gains"],
+        observer=LinearObserver.from_dict(data["observer"]),
+        certificate=Certificate(**data["certificate"]),
+        solver=data["solver"],
+        notes=tuple(data["notes"]),
+        recovery=None
+        if data["recovery"] is None
+        else StateRecovery(**{**data["recovery"], "names": tuple(data["recovery"]["names"])}),
         report=VerificationReport.from_dict(data["report"]),
-    )  # fmt: skip
+    )

@@ -11,6 +11,8 @@ from obsynth.synthesis.riccati import bounded_real_matrix, normalising_change
 from obsynth.verification.bounded_real import prove_bounded_real
 from obsynth.verification.error_system import ErrorSystem
 
+#: Levels, relative to the claimed one, at which coordinates are improved on the way to it.
+APPROACH = (1.5, 1.05, 1.001)
 #: Slack of the Riccati equation relative to the output weight, largest first: the first that proves is taken.
 SLACKS = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)
 
@@ -35,16 +37,18 @@ def bounded_real_certificate(
     a, b = observer.Az[:core, :core], errors.disturbance[:core] / gain
     c, d = -errors.fault_output[0][:, :core], errors.fault_output[2] / gain
     change = np.eye(core)
-    for level in (1.5, 1.05, 1.0 + 1e-3):
-        change = change @ _well_scaled(np.linalg.solve(change, a @ change), np.linalg.solve(change, b), c @ change, d, level)
-    inverse = np.linalg.inv(change)
+    for level in APPROACH:
+        inverse = np.asarray(np.linalg.inv(change))
+        better = _well_scaled(inverse @ a @ change, inverse @ b, c @ change, d, level)
+        change = change @ better
+    inverse = np.asarray(np.linalg.inv(change))
     a, b, c = inverse @ a @ change, inverse @ b, c @ change
     best = _triangular(inverse)
     for slack in SLACKS:
         p = bounded_real_matrix(a, b, c, d, 1.0, slack=slack * max(1.0, float(np.linalg.norm(c, 2)) ** 2))
         if p is None:
             continue
-        best = _triangular(np.linalg.cholesky(p).T @ inverse)
+        best = _triangular(np.asarray(np.linalg.cholesky(p)).T @ inverse)
         if prove_bounded_real(plant, observer, tracking, best, gain, lag=lag).proved:
             break
     return best

@@ -73,10 +73,21 @@ def realise_filter(
     bu = -by @ plant.D
     bu[:na] += t @ work.B
     observer = LinearObserver(
-        Az=az, Bu=bu, By=by, Cz=cz, Du=-dy @ plant.D, Dy=dy, dt=plant.dt, input_names=plant.input_names,
-        output_names=plant.output_names, state_names=plant.state_names, fault_names=plant.fault_names,
-        residual_names=plant.fault_names, state_delays=(lag,) * nx, fault_delays=tuple(indexes),
-    )  # fmt: skip
+        Az=az,
+        Bu=bu,
+        By=by,
+        Cz=cz,
+        Du=-dy @ plant.D,
+        Dy=dy,
+        dt=plant.dt,
+        input_names=plant.input_names,
+        output_names=plant.output_names,
+        state_names=plant.state_names,
+        fault_names=plant.fault_names,
+        residual_names=plant.fault_names,
+        state_delays=(lag,) * nx,
+        fault_delays=tuple(indexes),
+    )
     tracking = np.zeros((nz, nx * (lag + 1)))
     tracking[:na, :nx] = t[:, :nx]
     tracking[na:, nx:] = np.eye(lag * nx)

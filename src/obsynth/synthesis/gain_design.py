@@ -80,7 +80,7 @@ class _Inequality:
             return injection_for(problem, solution, level)
         if problem.measured == 0:
             return Injection(np.zeros((problem.order, 0)), lmi.value_of(self.v))
-        return Injection(np.linalg.solve(solution, lmi.value_of(self.y)), lmi.value_of(self.v))
+        return Injection(np.asarray(np.linalg.solve(solution, lmi.value_of(self.y))), lmi.value_of(self.v))
 
 
 def _inequality(problem: GainProblem, squared: Any) -> _Inequality:
@@ -110,12 +110,14 @@ def _full_inequality(problem: GainProblem, p: Any, squared: Any) -> _Inequality:
     n, m, q, nd = problem.order, problem.measured, problem.Z.shape[0], problem.disturbances
     y = lmi.matrix_variable(n, m)
     v = lmi.matrix_variable(q, m) if problem.weight_is_free else np.zeros((q, m))
-    whole = lmi.symmetric_blocks([
-        [p],
-        [np.zeros((nd, n)), squared * np.eye(nd)],
-        [p @ problem.A - y @ problem.C, p @ problem.B - y @ problem.D, p],
-        [problem.Z + v @ problem.C, problem.Zd + v @ problem.D, np.zeros((q, n)), np.eye(q)],
-    ])  # fmt: skip
+    whole = lmi.symmetric_blocks(
+        [
+            [p],
+            [np.zeros((nd, n)), squared * np.eye(nd)],
+            [p @ problem.A - y @ problem.C, p @ problem.B - y @ problem.D, p],
+            [problem.Z + v @ problem.C, problem.Zd + v @ problem.D, np.zeros((q, n)), np.eye(q)],
+        ]
+    )
     constraints = [lmi.at_least(p, P_FLOOR), lmi.at_most(p, P_CEILING), lmi.at_least(whole, MARGIN)]
     limit = problem.weight_limit
     if limit is not None:
@@ -247,9 +249,13 @@ def small_gains(problem: GainProblem, gain: float, *, solver: str) -> GainSoluti
     p, x = lmi.symmetric_variable(n), lmi.symmetric_variable(nw)
     inequality = _full_inequality(problem, p, gain**2)
     noise = p @ problem.Bn - inequality.y @ problem.Dn
-    variance = lmi.symmetric_blocks([
-        [x], [noise, p], [problem.Zn + inequality.v @ problem.Dn, np.zeros((q, n)), np.eye(q)],
-    ])  # fmt: skip
+    variance = lmi.symmetric_blocks(
+        [
+            [x],
+            [noise, p],
+            [problem.Zn + inequality.v @ problem.Dn, np.zeros((q, n)), np.eye(q)],
+        ]
+    )
     constraints = [*inequality.constraints, lmi.at_least(variance)]
     record = lmi.minimise(lmi.trace(x), constraints, what="small gains", solver=solver)
     return GainSolution(gain, lmi.value_of(p), inequality.gains(problem, gain), record)

@@ -207,10 +207,17 @@ def normalise(problem: GainProblem, *, start: Injection | None = None) -> Normal
     # With P near I in units of gain^2: B is scaled by 1/gain, and x by the root of P.
     limit = problem.weight_limit
     changed = replace(
-        problem, weight_limit=None if limit is None else replace(limit, free=measurements @ limit.free), A=inverse @ problem.A @ states, C=measurements @ c, Z=problem.Z @ states,
-        B=inverse @ problem.B / size, D=measurements @ problem.D / size, Zd=problem.Zd / size,
-        Bn=inverse @ problem.Bn, Dn=measurements @ problem.Dn,
-    )  # fmt: skip
+        problem,
+        weight_limit=None if limit is None else replace(limit, free=measurements @ limit.free),
+        A=inverse @ problem.A @ states,
+        C=measurements @ c,
+        Z=problem.Z @ states,
+        B=inverse @ problem.B / size,
+        D=measurements @ problem.D / size,
+        Zd=problem.Zd / size,
+        Bn=inverse @ problem.Bn,
+        Dn=measurements @ problem.Dn,
+    )
     return NormalisedProblem(changed, states, measurements, size, start)
 
 
@@ -218,6 +225,8 @@ def _starting_filter(problem: GainProblem) -> Injection:
     noise, through = np.hstack([problem.B, problem.Bn]), np.hstack([problem.D, problem.Dn])
     gain = stabilising_gain(problem.A, problem.C, noise, through)
     if gain is None:
-        raise SolverError("No stable starting filter was found, although the existence conditions hold: "
-                          "the data are too badly scaled or too close to the boundary. Nothing is known.")  # fmt: skip
+        raise SolverError(
+            "No stable starting filter was found, although the existence conditions hold: "
+            "the data are too badly scaled or too close to the boundary. Nothing is known."
+        )
     return Injection(gain, np.zeros((problem.Z.shape[0], problem.measured)))

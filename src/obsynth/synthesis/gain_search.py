@@ -1,7 +1,7 @@
-"""Strategy around the convex core: find the least gain, then gains of least size, and prove what is impossible.
+"""Strategy around the convex core: find the least gain, then gains of least size at a given gain.
 
 No number of a solver is believed: a gain counts as reached only when the true H-infinity norm of the closed loop
-says so, and as impossible only with a dual point that passes our own check.
+says so.
 """
 
 from __future__ import annotations
@@ -11,11 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.errors import InfeasibleError, SolverError
-from obsynth.numerics.arrays import FloatArray
+from obsynth.errors import SolverError
 from obsynth.numerics.norms import spectral_radius
-from obsynth.numerics.ranks import RANK_TOLERANCE
-from obsynth.synthesis import gain_design, lmi
+from obsynth.synthesis import gain_design
 from obsynth.synthesis.gain_problem import GainProblem, Injection, NormalisedProblem, normalise
 
 #: The search stops when another pass in better coordinates improves the gain by less than this.
@@ -25,9 +23,11 @@ MOST_PASSES = 4
 NEGLIGIBLE_GAIN = 1e-6
 #: A shipped gain is never asked to be smaller than this fraction of the starting filter's.
 SMALLEST_USEFUL_GAIN = 1e-3
-#: A dual point must be positive definite, and beat the level, by these relative margins.
-DUAL_MARGIN = 1e-8
-BOUND_MARGIN = 1e-6
+#: Descent in steps: ratios of successive levels, tried in turn, and how many steps at most.
+STEP_RATIOS = (0.6, 0.9)
+MOST_STEPS = 24
+#: A step counts when its level is met to this relative accuracy.
+LEVEL_ACCURACY = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +100,12 @@ def search_by_bisection(problem: GainProblem, *, tolerance: float, solver: str) 
     injection = normalised.restore(found)
     better = normalise(problem, start=injection)
     return LeastGain(
-        problem.achieved_gain(injection), better, injection, gain, (low * normalised.gain, high * normalised.gain), records
+        problem.achieved_gain(injection),
+        better,
+        injection,
+        gain,
+        (low * normalised.gain, high * normalised.gain),
+        records,
     )
 
 
@@ -136,15 +141,12 @@ def small_gain_design(
         # Without a noise model the objective is the size of the gains themselves, and zero is least.
         return nothing, records
     for normalised in (least.normalised, normalise(problem)):
-        try:
-            found = gain_design.small_gains(_with_scaled_noise(normalised), gain / normalised.gain, solver=solver)
-        except SolverError as error:
-            records.append(dict(error.record) | {"outcome": str(error)})
-            continue
-        records.append(found.record)
-        injection = normalised.restore(found.injection)
-        if _reaches(problem, injection, gain):
+        injection = _small_gains_in(problem, normalised, gain, records, solver=solver)
+        if injection is not None and _reaches(problem, injection, gain):
             return injection, records
+    injection = _small_gains_step_by_step(problem, gain, records, solver=solver)
+    if injection is not None:
+        return injection, records
     if problem.disturbances:
         centre = gain_design.feasible_point(least.normalised.problem, gain / least.normalised.gain, solver=solver)
         if centre is not None and _reaches(problem, least.normalised.restore(centre.injection), gain):
@@ -152,6 +154,43 @@ def small_gain_design(
     if _reaches(problem, least.injection, gain):
         return least.injection, records
     raise SolverError(f"No filter with gain {gain:.6g} was found: nothing is known.", record=records[-1])
+
+
+def _small_gains_in(
+    problem: GainProblem, normalised: NormalisedProblem, gain: float, records: list[dict[str, Any]], *, solver: str
+) -> Injection | None:
+    try:
+        found = gain_design.small_gains(_with_scaled_noise(normalised), gain / normalised.gain, solver=solver)
+    except (SolverError, np.linalg.LinAlgError) as error:
+        records.append(dict(getattr(error, "record", {})) | {"outcome": str(error)})
+        return None
+    records.append(found.record)
+    return normalised.restore(found.injection)
+
+
+def _small_gains_step_by_step(
+    problem: GainProblem, gain: float, records: list[dict[str, Any]], *, solver: str
+) -> Injection | None:
+    """Walk from the starting filter down to ``gain``, each filter giving the coordinates for the next level.
+
+    Far below the starting filter's gain its coordinates are too bad for one jump, and those of the least gain can
+    be extreme (a decoupled disturbance).
+    """
+    normalised = normalise(problem)
+    reached = problem.achieved_gain(normalised.start)
+    for _ in range(MOST_STEPS):
+        for ratio in STEP_RATIOS:
+            level = max(gain, ratio * reached)
+            injection = _small_gains_in(problem, normalised, level, records, solver=solver)
+            if injection is not None and _reaches(problem, injection, level * (1.0 + LEVEL_ACCURACY)):
+                break
+        else:
+            return None
+        if _reaches(problem, injection, gain):
+            return injection
+        reached = problem.achieved_gain(injection)
+        normalised = normalise(problem, start=injection)
+    return None
 
 
 def _reaches(problem: GainProblem, injection: Injection, gain: float) -> bool:
@@ -170,125 +209,3 @@ def _with_scaled_noise(normalised: NormalisedProblem) -> GainProblem:
     size = float(np.linalg.norm(np.vstack([work.Bn - r @ work.Dn, work.Zn])))
     size = size if size > 0.0 else max(float(np.linalg.norm(work.Dn)), 1.0)
     return replace(work, Bn=work.Bn / size, Dn=work.Dn / size, Zn=work.Zn / size)
-
-
-def proved_lower_bound(problem: GainProblem, *, solver: str) -> float:
-    """Return a lower bound on the gain of every filter, from a dual point that passes our own check; 0 without one.
-
-    For ``Z1 >= 0`` in the null basis N of [C D] with ``Q = G N Z1 N'G' - Nx Z1 Nx' >= 0`` and, for a fixed weight,
-    ``Z2 = [Q, *; *, *] >= 0``: multiplying the two eliminated inequalities by Z1 and Z2 cancels P, and leaves
-    ``g^2 (tr Nd Z1 Nd' + tr Z2_22) > tr H N Z1 N'H' + tr H Z2 H'`` (for a free weight without Z2).  The check is in
-    floating point with margins, on the normalised data.
-    """
-    normalised = normalise(problem)
-    work = disturbed_part(normalised.problem)
-    n, nd = work.order, work.disturbances
-    if nd == 0:
-        return 0.0
-    basis = _null_space(np.hstack([work.C, work.D]))
-    top, bottom, image = basis[:n], basis[n:], np.hstack([work.A, work.B]) @ basis
-    outputs = np.hstack([work.Z, work.Zd])
-    z1 = lmi.symmetric_variable(basis.shape[1])
-    corner, last = lmi.matrix_variable(nd, n), lmi.symmetric_variable(nd)
-    q = image @ z1 @ image.T - top @ z1 @ top.T
-    shown = lmi.trace(outputs @ basis @ z1 @ basis.T @ outputs.T)
-    size = lmi.trace(bottom @ z1 @ bottom.T)
-    if work.weight_is_free:
-        second = q
-    else:
-        second = lmi.symmetric_blocks([[q], [corner, last]])
-        shown, size = shown + lmi.trace(outputs @ second @ outputs.T), size + lmi.trace(last)
-    constraints = [lmi.at_least(z1, DUAL_MARGIN * 2), lmi.at_least(second, DUAL_MARGIN * 2), lmi.at_most(lmi.symmetric_blocks([[_square(size)]]), 1.0)]
-    try:
-        lmi.minimise(-shown, constraints, what="lower bound on the gain", solver=solver)
-        point = lmi.value_of(z1)
-        corner_value = np.zeros((nd, n)) if work.weight_is_free else lmi.value_of(corner)
-        last_value = np.zeros((nd, nd)) if work.weight_is_free else lmi.value_of(last)
-    except SolverError:
-        return 0.0
-    return normalised.gain * _checked_bound(work, basis, point, corner_value, last_value)
-
-
-def disturbed_part(problem: GainProblem) -> GainProblem:
-    """Return the problem on the states that the disturbance reaches whatever the gains.
-
-    That is the least subspace W with ``A x + B d`` in W for every x in W and d with ``C x + D d = 0``.  Outside it
-    the dual inequalities have no strict solution; restricted to it they lose nothing.
-    """
-    n = problem.order
-    subspace = np.zeros((n, 0))
-    while True:
-        hidden = _null_space(np.hstack([problem.C @ subspace, problem.D]))
-        image = np.hstack([problem.A @ subspace, problem.B]) @ hidden
-        left, values, _ = np.linalg.svd(np.hstack([subspace, image]))
-        rank = int(np.sum(values > RANK_TOLERANCE * max(1.0, float(values[0])))) if values.size else 0
-        if rank == subspace.shape[1]:
-            break
-        subspace = left[:, :rank]
-    t = subspace.T
-    return replace(
-        problem, A=t @ problem.A @ subspace, C=problem.C @ subspace, Z=problem.Z @ subspace, B=t @ problem.B,
-        Bn=t @ problem.Bn,
-    )  # fmt: skip
-
-
-def _null_space(matrix: FloatArray) -> FloatArray:
-    """Return an orthonormal null basis of a matrix of any rank."""
-    _, values, right = np.linalg.svd(matrix)
-    rank = int(np.sum(values > RANK_TOLERANCE * max(1.0, float(values[0])))) if values.size else 0
-    return np.asarray(right[rank:].T)
-
-
-def _square(expression: Any) -> Any:
-    import cvxpy
-
-    return cvxpy.reshape(expression, (1, 1), order="C")
-
-
-def _checked_bound(
-    work: GainProblem, basis: FloatArray, z1: FloatArray, corner: FloatArray, last: FloatArray
-) -> float:
-    """Recompute the bound of a dual point from the data; 0 unless it is strictly feasible."""
-    n = work.order
-    top, bottom, image = basis[:n], basis[n:], np.hstack([work.A, work.B]) @ basis
-    outputs = np.hstack([work.Z, work.Zd])
-    z1 = 0.5 * (z1 + z1.T)
-    q = image @ z1 @ image.T - top @ z1 @ top.T
-    second = q if work.weight_is_free else np.block([[q, corner.T], [corner, 0.5 * (last + last.T)]])
-    for matrix in (z1, second):
-        values = np.linalg.eigvalsh(0.5 * (matrix + matrix.T))
-        if values[0] < DUAL_MARGIN * min(1.0, float(values[-1])):
-            return 0.0
-    shown = float(np.trace(outputs @ basis @ z1 @ basis.T @ outputs.T))
-    size = float(np.trace(bottom @ z1 @ bottom.T))
-    if not work.weight_is_free:
-        shown += float(np.trace(outputs @ second @ outputs.T))
-        size += float(np.trace(last))
-    return float(np.sqrt(max(shown, 0.0) / size)) * (1.0 - BOUND_MARGIN) if size > 0.0 else 0.0
-
-
-def require_reachable(problem: GainProblem, least: LeastGain, gain: float, *, solver: str) -> None:
-    """Raise unless a filter with the asked gain exists.
-
-    Raises
-    ------
-    InfeasibleError
-        A checked lower bound lies above ``gain``.
-    SolverError
-        Neither a filter nor a proof was found.
-    """
-    if problem.disturbances == 0 or least.gain <= gain:
-        return
-    bound = least.gain * (1.0 - BOUND_MARGIN) if problem.measured == 0 else proved_lower_bound(problem, solver=solver)
-    choice = "for this T and N" if problem.free_weight else "for this T, N and W"
-    if bound > gain:
-        raise InfeasibleError(
-            f"No filter reaches gamma = {gain:.6g} {choice}: a checked dual certificate proves gamma >= {bound:.6g}, "
-            f"and the best filter found has {least.gain:.6g}. Ask for more, leave gamma out for the least, or set "
-            "free_residual_weight: true.", necessary=False, lower_bound=bound,
-        )  # fmt: skip
-    raise SolverError(
-        f"gamma = {gain:.6g} was not reached (best found {least.gain:.6g}), and the proved lower bound {bound:.6g} does "
-        f"not rule it out: nothing is known {choice}. Ask for a slightly larger gamma.",
-        record=least.records[-1] if least.records else None,
-    )

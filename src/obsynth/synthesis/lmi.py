@@ -86,6 +86,13 @@ def trace(expression: Any) -> Any:
     return cvxpy.trace(expression)
 
 
+def scalar_block(expression: Any) -> Any:
+    """Return a scalar expression as a matrix ``(1, 1)``."""
+    import cvxpy
+
+    return cvxpy.reshape(expression, (1, 1), order="C")
+
+
 def value_of(variable: Any) -> FloatArray:
     """Return the value of a variable or constant block as an array; raise `SolverError` when there is none."""
     value = variable if isinstance(variable, np.ndarray) else variable.value
@@ -131,7 +138,7 @@ def minimise(objective: Any, constraints: Sequence[Any], *, what: str, solver: s
             problem.solve(solver=solver, **settings)
     except (KeyboardInterrupt, SystemExit, MemoryError):
         raise
-    except BaseException as error:  # noqa: BLE001  Clarabel can panic with a BaseException
+    except BaseException as error:
         record |= {"status": "crashed", "reason": str(error)}
         raise SolverError(f"{solver} failed while solving for {what}: nothing is known.", record=record) from error
     stats = problem.solver_stats
@@ -141,7 +148,9 @@ def minimise(objective: Any, constraints: Sequence[Any], *, what: str, solver: s
         "seconds": time.perf_counter() - began,
     }
     if problem.status not in USABLE_STATUSES:
-        raise SolverError(f"{solver} ended with status {problem.status!r} while solving for {what}: nothing is known.", record=record)
+        raise SolverError(
+            f"{solver} ended with status {problem.status!r} while solving for {what}: nothing is known.", record=record
+        )
     return record
 
 

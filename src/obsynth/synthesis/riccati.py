@@ -15,9 +15,7 @@ REGULARISATIONS = (1e-6, 1e-4, 1e-2, 1.0)
 CONDITION_LIMIT = 1e-12
 
 
-def stabilising_gain(
-    a: FloatArray, c: FloatArray, noise_a: FloatArray, noise_c: FloatArray
-) -> FloatArray | None:
+def stabilising_gain(a: FloatArray, c: FloatArray, noise_a: FloatArray, noise_c: FloatArray) -> FloatArray | None:
     """Return R ``(n, m)`` such that ``A - R C`` is Schur stable, by a Kalman filter Riccati equation.
 
     Parameters
@@ -41,7 +39,9 @@ def stabilising_gain(
     process_size = max(float(np.linalg.norm(process, 2)), 1e-8 * float(np.linalg.norm(a, 2)) ** 2, 1e-8)
     for epsilon in REGULARISATIONS:
         q = process + epsilon * process_size * np.eye(n)
-        r = measured + epsilon * (float(np.linalg.norm(c @ q @ c.T, 2)) + float(np.linalg.norm(measured, 2))) * np.eye(m)
+        r = measured + epsilon * (float(np.linalg.norm(c @ q @ c.T, 2)) + float(np.linalg.norm(measured, 2))) * np.eye(
+            m
+        )
         try:
             x = solve_discrete_are(a.T, c.T, q, r, s=cross)
         except (np.linalg.LinAlgError, ValueError):

@@ -25,7 +25,13 @@ from obsynth.verification.error_system import LaggedPlant
 
 
 def prove_bounded_real(
-    plant: DescriptorSystem, observer: LinearObserver, tracking: FloatArray, factor: FloatArray, gain: float, *, lag: int
+    plant: DescriptorSystem,
+    observer: LinearObserver,
+    tracking: FloatArray,
+    factor: FloatArray,
+    gain: float,
+    *,
+    lag: int,
 ) -> DefinitenessProof:
     """Try to prove the bounded real inequality for the shipped observer.
 
@@ -63,9 +69,14 @@ def prove_bounded_real(
 
 
 def _formed(
-    plant: DescriptorSystem, observer: LinearObserver, tracking: FloatArray, factor: FloatArray, inverse: FloatArray,
-    gain: float, lag: int,
-) -> Ball:  # fmt: skip
+    plant: DescriptorSystem,
+    observer: LinearObserver,
+    tracking: FloatArray,
+    factor: FloatArray,
+    inverse: FloatArray,
+    gain: float,
+    lag: int,
+) -> Ball:
     """Return the matrix of the inequality with the bounds on the errors of forming it."""
     core, nd = factor.shape[0], plant.nd
     bd = LaggedPlant.of(plant, lag).input(plant.Bd)
@@ -80,9 +91,11 @@ def _formed(
     def zero(rows: int, columns: int) -> Ball:
         return Ball.exact(np.zeros((rows, columns)))
 
-    return block([
-        [qs.T @ qs, zero(core, nd), qms.T, cs.T],
-        [zero(nd, core), level, qb.T, -d.T],
-        [qms, qb, Ball.exact(np.eye(core)), zero(core, nf)],
-        [cs, -d, zero(nf, core), Ball.exact(np.eye(nf))],
-    ])  # fmt: skip
+    return block(
+        [
+            [qs.T @ qs, zero(core, nd), qms.T, cs.T],
+            [zero(nd, core), level, qb.T, -d.T],
+            [qms, qb, Ball.exact(np.eye(core)), zero(core, nf)],
+            [cs, -d, zero(nf, core), Ball.exact(np.eye(nf))],
+        ]
+    )

@@ -125,9 +125,13 @@ class ErrorSystem:
             return observer.Cz[rows], direct @ plant.Df, direct @ plant.Dd, direct @ plant.Dw
 
         return cls(
-            observer.Az, driven(plant.Bf, plant.Df), driven(plant.Bd, plant.Dd), driven(plant.Bw, plant.Dw),
-            output(observer.fault_rows), output(observer.state_rows),
-        )  # fmt: skip
+            observer.Az,
+            driven(plant.Bf, plant.Df),
+            driven(plant.Bd, plant.Dd),
+            driven(plant.Bw, plant.Dw),
+            output(observer.fault_rows),
+            output(observer.state_rows),
+        )
 
 
 def tracking_residuals(
@@ -139,13 +143,26 @@ def tracking_residuals(
     states, faults = observer.state_rows, observer.fault_rows
     cz, dy, du = observer.Cz, observer.Dy, observer.Du
     return {
-        "dynamics": residual(observer.Az @ ve, observer.By @ lagged.C, -tracking @ lagged.A,
-                             factors=((observer.Az, tracking, lagged.E), (observer.By, lagged.C), (tracking, lagged.A))),
-        "inputs": residual(observer.Bu, observer.By @ plant.D, -tracking @ lagged.B,
-                           factors=((observer.By, plant.D), (tracking, lagged.B))),
-        "state estimate": residual(cz[states] @ ve, dy[states] @ lagged.C, -lagged.oldest,
-                                   factors=((cz[states], tracking, lagged.E), (dy[states], lagged.C))),
-        "fault estimate": residual(cz[faults] @ ve, dy[faults] @ lagged.C,
-                                   factors=((cz[faults], tracking, lagged.E), (dy[faults], lagged.C))),
+        "dynamics": residual(
+            observer.Az @ ve,
+            observer.By @ lagged.C,
+            -tracking @ lagged.A,
+            factors=((observer.Az, tracking, lagged.E), (observer.By, lagged.C), (tracking, lagged.A)),
+        ),
+        "inputs": residual(
+            observer.Bu,
+            observer.By @ plant.D,
+            -tracking @ lagged.B,
+            factors=((observer.By, plant.D), (tracking, lagged.B)),
+        ),
+        "state estimate": residual(
+            cz[states] @ ve,
+            dy[states] @ lagged.C,
+            -lagged.oldest,
+            factors=((cz[states], tracking, lagged.E), (dy[states], lagged.C)),
+        ),
+        "fault estimate": residual(
+            cz[faults] @ ve, dy[faults] @ lagged.C, factors=((cz[faults], tracking, lagged.E), (dy[faults], lagged.C))
+        ),
         "input feedthrough": residual(du, dy @ plant.D, factors=((dy, plant.D),)),
-    }  # fmt: skip
+    }

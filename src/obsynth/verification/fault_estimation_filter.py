@@ -25,10 +25,18 @@ EQUALITY_TOLERANCE = 1e-9
 _IDENTITIES = {
     "dynamics": ("unbiased: dynamics", "Az V E + By C = V A", "Wang 2015, eqs. (7), (26)"),
     "inputs": ("unbiased: inputs", "Bu + By D = V B", "Wang 2015, eq. (23)"),
-    "state estimate": ("unbiased: state", "the state estimate equals the state when the error is zero", "Wang 2015, eq. (7)"),
+    "state estimate": (
+        "unbiased: state",
+        "the state estimate equals the state when the error is zero",
+        "Wang 2015, eq. (7)",
+    ),
     "fault estimate": ("unbiased: fault", "the fault estimate does not see the state", "Wang 2015, eq. (25)"),
-    "input feedthrough": ("unbiased: feedthrough", "no estimate sees the input directly (Du + Dy D = 0)", "our extension"),
-}  # fmt: skip
+    "input feedthrough": (
+        "unbiased: feedthrough",
+        "no estimate sees the input directly (Du + Dy D = 0)",
+        "our extension",
+    ),
+}
 
 
 def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
@@ -39,8 +47,13 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     tracking, factor = design.certificate.matrices.get("tracking"), design.certificate.matrices.get("P_factor")
     lag = int(design.certificate.claims.get("state_lag", -1))
     fitting = _fits(plant, observer, tracking, factor, lag)
-    yield upper_bound_check("fits the plant", "observer, certificate and plant have matching signals and shapes",
-                            0.0 if fitting else 1.0, 0.0, source="shipped realisation")  # fmt: skip
+    yield upper_bound_check(
+        "fits the plant",
+        "observer, certificate and plant have matching signals and shapes",
+        0.0 if fitting else 1.0,
+        0.0,
+        source="shipped realisation",
+    )
     if not fitting or tracking is None or factor is None:
         return
     tolerance = EQUALITY_TOLERANCE
@@ -53,8 +66,14 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     errors = ErrorSystem.of(plant, observer, tracking, lag)
     yield from _fault_rows(plant, errors, observer, tolerance)
     radius = spectral_radius(observer.Az)
-    yield upper_bound_check("spectral radius", "the observer is stable", radius, np.nextafter(1.0, 0.0), source="Wang 2015, Theorem 2",
-                            detail=f"eigenvalues computed; proved by the row 'LMI'; {_time_constant(radius, plant.dt)}")  # fmt: skip
+    yield upper_bound_check(
+        "spectral radius",
+        "the observer is stable",
+        radius,
+        np.nextafter(1.0, 0.0),
+        source="Wang 2015, Theorem 2",
+        detail=f"eigenvalues computed; proved by the row 'LMI'; {_time_constant(radius, plant.dt)}",
+    )
     yield from _gain_rows(design, errors, tracking, factor, lag)
     yield from _noise_rows(plant, errors)
 
@@ -79,8 +98,15 @@ def _fits(
 
 
 def _equality(name: str, claim: str, found: Residual, tolerance: float, source: str) -> Check:
-    return upper_bound_check(name, claim, found.relative, tolerance, source=source, kind="equality",
-                             detail=f"largest miss {found.error:.1e} among terms of size {found.scale:.1e}")  # fmt: skip
+    return upper_bound_check(
+        name,
+        claim,
+        found.relative,
+        tolerance,
+        source=source,
+        kind="equality",
+        detail=f"largest miss {found.error:.1e} among terms of size {found.scale:.1e}",
+    )
 
 
 def _fault_rows(
@@ -106,12 +132,27 @@ def _fault_rows(
         vector, product = errors.Az @ vector, np.abs(errors.Az) @ np.abs(vector)
         history = np.maximum(history, np.maximum(product, np.abs(vector)))
     source = "Wang 2015, eqs. (32), (44)"
-    yield _equality("fault decoupled after its delay", "(TA - LC) Psi = 0: no trace of a fault remains in the error after "
-                    "its delay", residual(vector, factors=((history,),)), tolerance, source)
-    yield _equality("fault estimate", f"fhat_i(k) = f_i(k - rho_i), rho = {', '.join(map(str, observer.fault_delays))} "
-                    "(W Upsilon = I)", _worst(to_fault), tolerance, source)
-    yield _equality("no fault in the state estimate", "the transfer from the faults to the state error is zero",
-                    _worst(to_state), tolerance, "ours: the paper's xhat is biased by Psi")
+    yield _equality(
+        "fault decoupled after its delay",
+        "(TA - LC) Psi = 0: no trace of a fault remains in the error after its delay",
+        residual(vector, factors=((history,),)),
+        tolerance,
+        source,
+    )
+    yield _equality(
+        "fault estimate",
+        f"fhat_i(k) = f_i(k - rho_i), rho = {', '.join(map(str, observer.fault_delays))} (W Upsilon = I)",
+        _worst(to_fault),
+        tolerance,
+        source,
+    )
+    yield _equality(
+        "no fault in the state estimate",
+        "the transfer from the faults to the state error is zero",
+        _worst(to_state),
+        tolerance,
+        "ours: the paper's xhat is biased by Psi",
+    )
 
 
 def _worst(found: list[Residual]) -> Residual:
@@ -126,18 +167,33 @@ def _gain_rows(
     gamma = float(claims.get("gamma", np.nan))
     proof = prove_bounded_real(plant, design.observer, tracking, factor, gamma if plant.nd else 1.0, lag=lag)
     what = f"stable, and l2 gain d -> fault error < {gamma:.6g}" if plant.nd else "stable (Lyapunov)"
-    yield Check("LMI", f"the matrix inequality is positive definite: {what}", proof.lower_bound, 0.0, proof.lower_bound,
-                proof.proved, "Wang 2015, eq. (45)", "proved",
-                f"Cholesky with rounding bound {proof.error_bound:.1e}, on a unit diagonal")  # fmt: skip
+    yield Check(
+        "LMI",
+        f"the matrix inequality is positive definite: {what}",
+        proof.lower_bound,
+        0.0,
+        proof.lower_bound,
+        proof.proved,
+        "Wang 2015, eq. (45)",
+        "proved",
+        f"Cholesky with rounding bound {proof.error_bound:.1e}, on a unit diagonal",
+    )
     if not plant.nd:
         return
     norm = hinf_norm(errors.Az, errors.disturbance, errors.fault_output[0], -errors.fault_output[2])
     reported = max(gamma, norm.upper)
-    yield upper_bound_check("H-infinity norm", "the exact norm d -> fault error is at most the claimed gamma",
-                            norm.upper, gamma, source="Wang 2015, eq. (49)",
-                            detail=f"peak at {norm.angle / (2.0 * np.pi * plant.dt):.4g} Hz; report {reported:.6g}")  # fmt: skip
+    yield upper_bound_check(
+        "H-infinity norm",
+        "the exact norm d -> fault error is at most the claimed gamma",
+        norm.upper,
+        gamma,
+        source="Wang 2015, eq. (49)",
+        detail=f"peak at {norm.angle / (2.0 * np.pi * plant.dt):.4g} Hz; the gain to quote is {reported:.6g}",
+    )
     state = hinf_norm(errors.Az, errors.disturbance, errors.state_output[0], -errors.state_output[2])
-    yield information("disturbance in the state estimate", "H-infinity norm d -> state error", state.upper, source="recomputed")
+    yield information(
+        "disturbance in the state estimate", "H-infinity norm d -> state error", state.upper, source="recomputed"
+    )
 
 
 def _noise_rows(plant: DescriptorSystem, errors: ErrorSystem) -> Iterator[Check]:
@@ -145,9 +201,13 @@ def _noise_rows(plant: DescriptorSystem, errors: ErrorSystem) -> Iterator[Check]
         return
     covariance = output_covariance(errors.Az, errors.noise, -errors.fault_output[0], errors.fault_output[3])
     for name, variance in zip(plant.fault_names, np.diag(covariance), strict=True):
-        yield information(f"noise in fhat[{name}]", "standard deviation of the fault estimate under the stated noise",
-                          float(np.sqrt(variance)), source="recomputed, Lyapunov equation",
-                          detail=plant.units.get(name, ""))  # fmt: skip
+        yield information(
+            f"noise in fhat[{name}]",
+            "standard deviation of the fault estimate under the stated noise",
+            float(np.sqrt(variance)),
+            source="recomputed, Lyapunov equation",
+            detail=plant.units.get(name, ""),
+        )
 
 
 def _time_constant(radius: float, dt: float) -> str:

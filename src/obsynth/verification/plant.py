@@ -17,16 +17,32 @@ def plant_information(plant: DescriptorSystem) -> Iterator[Check]:
     yield information("plant: regular", "det(A - zE) is not identically zero", float(structure.regular), source=source)
     if not structure.regular:
         return
-    yield information("plant: index", "index of the pencil (0: E nonsingular)", float(structure.index or 0), source=source)
+    yield information(
+        "plant: index", "index of the pencil (0: E nonsingular)", float(structure.index or 0), source=source
+    )
     count = len(structure.finite_eigenvalues)
-    yield information("plant: finite eigenvalues", "number of dynamic modes", float(count), source=source,
-                      detail=_eigenvalue_text(structure.finite_eigenvalues))  # fmt: skip
-    yield information("plant: infinite eigenvalues", "number of infinite eigenvalues",
-                      float(sum(structure.infinite_block_sizes)), source=source,
-                      detail=f"block sizes {list(structure.infinite_block_sizes)}" if structure.infinite_block_sizes else "")  # fmt: skip
+    yield information(
+        "plant: finite eigenvalues",
+        "number of dynamic modes",
+        float(count),
+        source=source,
+        detail=_eigenvalue_text(structure.finite_eigenvalues),
+    )
+    yield information(
+        "plant: infinite eigenvalues",
+        "number of infinite eigenvalues",
+        float(sum(structure.infinite_block_sizes)),
+        source=source,
+        detail=f"block sizes {list(structure.infinite_block_sizes)}" if structure.infinite_block_sizes else "",
+    )
     verdict = "admissible" if structure.admissible else "not admissible: an observer may exist all the same"
-    yield information("plant: admissible", "regular, impulse-free and stable", float(structure.admissible),
-                      source=source, detail=verdict)  # fmt: skip
+    yield information(
+        "plant: admissible",
+        "regular, impulse-free and stable",
+        float(structure.admissible),
+        source=source,
+        detail=verdict,
+    )
 
 
 def _eigenvalue_text(values: Iterable[complex], most: int = 6) -> str:
@@ -39,6 +55,13 @@ def condition_rows(conditions: Iterable[Condition]) -> Iterator[Check]:
     """Yield one row per existence condition."""
     for condition in conditions:
         yield Check(
-            f"exists: {condition.name}", condition.claim, condition.value, condition.bound,
-            abs(condition.bound - condition.value), condition.holds, condition.source, "condition", condition.detail,
-        )  # fmt: skip
+            f"exists: {condition.name}",
+            condition.claim,
+            condition.value,
+            condition.bound,
+            abs(condition.bound - condition.value),
+            condition.holds,
+            condition.source,
+            "condition",
+            condition.detail,
+        )

@@ -29,5 +29,3 @@ def method_module(method: str) -> Any:
     if method not in REGISTRY:
         raise SpecError(f"There is no method {method!r}; there are: {', '.join(REGISTRY)}.", path="method")
     return import_module(REGISTRY[method])
-
-

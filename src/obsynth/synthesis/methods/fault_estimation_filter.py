@@ -39,6 +39,7 @@ from obsynth.results.design import Certificate
 from obsynth.synthesis import gain_search
 from obsynth.synthesis.certify import bounded_real_certificate
 from obsynth.synthesis.filter_realisation import realise_filter
+from obsynth.synthesis.gain_bound import require_reachable
 from obsynth.synthesis.gain_design import null_basis
 from obsynth.synthesis.gain_problem import GainProblem, Injection, WeightLimit
 from obsynth.synthesis.lmi import SOLVER_SETTINGS
@@ -113,7 +114,7 @@ def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **op
         least = gain_search.search_least_gain(problem, solver=asked.solver)
     else:
         least = gain_search.search_by_bisection(problem, tolerance=asked.tolerance, solver=asked.solver)
-    gamma = _gain_to_ship(asked, problem, least)
+    gamma = _gain_to_ship(asked, problem, least, noisy=plant.nw > 0)
     progress("choosing small gains")
     inner = gamma - min(CERTIFICATE_SHARE * (gamma - least.gain), CERTIFICATE_MARGIN * gamma)
     chosen, records = gain_search.small_gain_design(problem, least, inner, solver=asked.solver)
@@ -122,23 +123,32 @@ def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **op
     observer, tracking, lag = realise_filter(plant, prepared.plant, gains, prepared.detectability)
     level = gamma if problem.disturbances else NOMINAL_GAIN
     factor = bounded_real_certificate(plant, observer, tracking, level, core=prepared.plant.nx, lag=lag)
-    claims = {"gamma": level, "gamma_min": least.gain, "state_lag": float(lag)} if plant.nd else {"state_lag": float(lag)}
+    claims = (
+        {"gamma": level, "gamma_min": least.gain, "state_lag": float(lag)} if plant.nd else {"state_lag": float(lag)}
+    )
     if plant.nd and asked.gamma_search == "bisection":
         claims |= {"gamma_bracket_low": least.bracket[0], "gamma_bracket_high": least.bracket[1]}
     resolved = {
-        "gamma": asked.gamma, "gamma_search": asked.gamma_search, "gamma_margin": asked.gamma_margin,
-        "free_residual_weight": free, "residual_weight_limit": limit, "S": None if s is None else s.tolist(),
-        "solver": asked.solver, "tolerance": asked.tolerance,
-    }  # fmt: skip
+        "gamma": asked.gamma,
+        "gamma_search": asked.gamma_search,
+        "gamma_margin": asked.gamma_margin,
+        "free_residual_weight": free,
+        "residual_weight_limit": limit,
+        "S": None if s is None else s.tolist(),
+        "solver": asked.solver,
+        "tolerance": asked.tolerance,
+    }
     return Synthesis(
-        resolved, gains, observer, Certificate({"P_factor": factor, "tracking": tracking}, claims),
-        {"runs": [*least.records, *records]}, notes(plant, prepared.detectability, observer.Az),
-    )  # fmt: skip
+        resolved,
+        gains,
+        observer,
+        Certificate({"P_factor": factor, "tracking": tracking}, claims),
+        {"runs": [*least.records, *records]},
+        notes(plant, prepared.detectability, observer.Az),
+    )
 
 
-def synthesis_from_gains(
-    plant: DescriptorSystem, *, T: Any, N: Any, L: Any, W: Any, gamma: float | None
-) -> Synthesis:
+def synthesis_from_gains(plant: DescriptorSystem, *, T: Any, N: Any, L: Any, W: Any, gamma: float | None) -> Synthesis:
     """Return the realisation and certificate of given gains; see `obsynth.fault_estimation_filter_from_gains`."""
     require_all(conditions(plant))
     work = with_sensor_faults_as_states(plant)
@@ -155,9 +165,14 @@ def synthesis_from_gains(
     level = 1.0 if gamma is None else gamma
     factor = bounded_real_certificate(plant, observer, tracking, level, core=work.nx, lag=lag)
     claims = {"state_lag": float(lag)} | ({"gamma": level} if plant.nd else {})
-    return Synthesis({"from_gains": True, "gamma": gamma}, gains, observer,
-                     Certificate({"P_factor": factor, "tracking": tracking}, claims), {"runs": []},
-                     notes(plant, detectability, observer.Az))  # fmt: skip
+    return Synthesis(
+        {"from_gains": True, "gamma": gamma},
+        gains,
+        observer,
+        Certificate({"P_factor": factor, "tracking": tracking}, claims),
+        {"runs": []},
+        notes(plant, detectability, observer.Az),
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,11 +188,13 @@ def gain_problem(prepared: PreparedPlant, *, free_weight: bool) -> tuple[GainPro
     """Return the convex problem behind Theorem 2, with (32) solved exactly, and the fixed parts of the gains."""
     detectability = prepared.detectability
     upsilon = detectability.Upsilon
-    w0, v = np.linalg.pinv(upsilon), null_basis(upsilon.T)
+    w0, v = np.asarray(np.linalg.pinv(upsilon)), null_basis(upsilon.T)
     l0 = prepared.TA @ detectability.Psi @ w0
     measure, na = v.T, prepared.TA.shape[0]
     if prepared.Bw.shape[1]:
-        size = BACKGROUND_NOISE * max(float(np.linalg.norm(measure @ prepared.Dw)), float(np.linalg.norm(w0 @ prepared.Dw)))
+        size = BACKGROUND_NOISE * max(
+            float(np.linalg.norm(measure @ prepared.Dw)), float(np.linalg.norm(w0 @ prepared.Dw))
+        )
         background = size if size > 0.0 else BACKGROUND_NOISE
         bn = np.hstack([prepared.Bw - l0 @ prepared.Dw, np.zeros((na, v.shape[1]))])
         dn = np.hstack([measure @ prepared.Dw, -background * np.eye(v.shape[1])])
@@ -186,27 +203,42 @@ def gain_problem(prepared: PreparedPlant, *, free_weight: bool) -> tuple[GainPro
         # Unit noise on the free measurements: the variance is then the size of R (and V) itself.
         bn, dn, zn = np.zeros((na, v.shape[1])), -np.eye(v.shape[1]), np.zeros((w0.shape[0], v.shape[1]))
     problem = GainProblem(
-        A=prepared.TA - l0 @ prepared.C, C=measure @ prepared.C, Z=w0 @ prepared.C,
-        B=prepared.Bd - l0 @ prepared.Dd, D=measure @ prepared.Dd, Zd=w0 @ prepared.Dd,
-        Bn=bn, Dn=dn, Zn=zn, free_weight=free_weight,
-    )  # fmt: skip
+        A=prepared.TA - l0 @ prepared.C,
+        C=measure @ prepared.C,
+        Z=w0 @ prepared.C,
+        B=prepared.Bd - l0 @ prepared.Dd,
+        D=measure @ prepared.Dd,
+        Zd=w0 @ prepared.Dd,
+        Bn=bn,
+        Dn=dn,
+        Zn=zn,
+        free_weight=free_weight,
+    )
     return problem, _Parts(l0, w0, v)
 
 
-def _gain_to_ship(asked: FilterOptions, problem: GainProblem, least: gain_search.LeastGain) -> float:
+def _gain_to_ship(asked: FilterOptions, problem: GainProblem, least: gain_search.LeastGain, *, noisy: bool) -> float:
     floor = gain_search.SMALLEST_USEFUL_GAIN * least.starting_gain
     if problem.disturbances == 0:
         return NOMINAL_GAIN
+    if asked.gamma is None and noisy:
+        # Where noise is stated, the least gain may cost any amount of it (a decoupled disturbance).  The Kalman filter
+        # that takes the disturbance as unit white noise is a fair compromise, and its gain is known to be reachable.
+        return max((1.0 + asked.gamma_margin) * least.gain, least.starting_gain)
     if asked.gamma is None:
         return max((1.0 + asked.gamma_margin) * least.gain, floor)
-    gain_search.require_reachable(problem, least, asked.gamma, solver=asked.solver)
+    require_reachable(problem, least.gain, asked.gamma, solver=asked.solver)
     ceiling = LARGEST_USEFUL_GAIN * least.starting_gain
     return min(asked.gamma, ceiling) if ceiling > 0.0 else asked.gamma
 
 
 def _gains(prepared: PreparedPlant, parts: _Parts, chosen: Injection) -> dict[str, FloatArray]:
     """Return the gains in the user's coordinates; the factors are powers of two, so this is exact."""
-    states, equations, outputs = (prepared.scaling.states[:, None], prepared.scaling.equations, prepared.scaling.outputs)
+    states, equations, outputs = (
+        prepared.scaling.states[:, None],
+        prepared.scaling.equations,
+        prepared.scaling.outputs,
+    )
     free = chosen.R @ parts.V.T
     return {
         "T": states * prepared.T * equations,
@@ -219,9 +251,7 @@ def _gains(prepared: PreparedPlant, parts: _Parts, chosen: Injection) -> dict[st
     }
 
 
-def _with_weight_limit(
-    problem: GainProblem, prepared: PreparedPlant, parts: _Parts, bound: float
-) -> GainProblem:
+def _with_weight_limit(problem: GainProblem, prepared: PreparedPlant, parts: _Parts, bound: float) -> GainProblem:
     """Return the problem with the norm of W bounded, in the user's output units.
 
     Raises
@@ -234,8 +264,10 @@ def _with_weight_limit(
     if smallest >= bound:
         raise InfeasibleError(
             f"No residual weight W with W Upsilon = I has a norm of {bound:.6g} or less: the least is {smallest:.6g}. "
-            "Raise residual_weight_limit.", necessary=True, lower_bound=smallest,
-        )  # fmt: skip
+            "Raise residual_weight_limit.",
+            necessary=True,
+            lower_bound=smallest,
+        )
     return replace(problem, weight_limit=WeightLimit(parts.W0 * outputs, parts.V.T * outputs, bound))
 
 
@@ -243,17 +275,23 @@ def notes(plant: DescriptorSystem, detectability: FaultDetectability, az: FloatA
     """Return what a user should know: slow zeros, ill-conditioned or large weights, slow filters."""
     found = list(sampling_zero_warnings(plant))
     if detectability.condition_number > WARN_CONDITION:
-        found.append(f"Upsilon has condition number {detectability.condition_number:.3g}: some combination of faults is "
-                     "estimated with much more noise than others.")  # fmt: skip
+        found.append(
+            f"Upsilon has condition number {detectability.condition_number:.3g}: some combination of faults is "
+            "estimated with much more noise than others."
+        )
     for name, column in zip(plant.fault_names, detectability.Upsilon.T, strict=True):
         size = float(np.linalg.norm(column))
         if size < 1.0 / WARN_AMPLIFICATION:
-            found.append(f"Fault {name!r} moves the outputs by {size:.3g} per unit: its estimate multiplies measurement "
-                         f"errors by up to about {1.0 / size:.3g}.")  # fmt: skip
+            found.append(
+                f"Fault {name!r} moves the outputs by {size:.3g} per unit: its estimate multiplies measurement "
+                f"errors by up to about {1.0 / size:.3g}."
+            )
     radius = spectral_radius(az)
     if radius > SLOW_FILTER:
-        found.append(f"The filter forgets its start slowly: spectral radius {radius:.6g}, time constant "
-                     f"{-plant.dt / np.log(radius):.3g} s.")  # fmt: skip
+        found.append(
+            f"The filter forgets its start slowly: spectral radius {radius:.6g}, time constant "
+            f"{-plant.dt / np.log(radius):.3g} s."
+        )
     return tuple(found)
 
 

@@ -1,0 +1,120 @@
+"""What a transformation did, and the map back to the states of the plant it started from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any, TypeVar
+
+import numpy as np
+
+from obsynth.models.descriptor import DescriptorSystem
+from obsynth.numerics.arrays import FloatArray, read_only
+
+_Value = TypeVar("_Value")
+
+
+@dataclass(frozen=True, eq=False)
+class StateRecovery:
+    """The states of a source plant from the signals of a transformed one.
+
+    ``x_source = from_state x + from_input u + from_fault f + from_disturbance d + from_noise w``
+
+    Parameters
+    ----------
+    names : tuple of str
+        Names of the source states.
+    from_state, from_input, from_fault, from_disturbance, from_noise : FloatArray
+        ``(nx_source, nx)``, ``(nx_source, nu)`` and so on, read-only.
+    noise_kept : FloatArray
+        ``(nw_source, nw)``: the noise of the source as far as the transformed plant still has it.
+    """
+
+    names: tuple[str, ...]
+    from_state: FloatArray
+    from_input: FloatArray
+    from_fault: FloatArray
+    from_disturbance: FloatArray
+    from_noise: FloatArray
+    noise_kept: FloatArray
+
+    def __post_init__(self) -> None:
+        """Make the arrays private and read-only."""
+        for field in fields(self)[1:]:
+            object.__setattr__(self, field.name, read_only(getattr(self, field.name)))
+
+    def flags(self) -> tuple[str, ...]:
+        """Return per source state what an estimate from state and input alone is.
+
+        ``exact``, ``needs the fault estimate`` or ``biased by the disturbance`` (which wins).
+        """
+        return tuple(
+            "biased by the disturbance" if biased.any() else "needs the fault estimate" if faulty.any() else "exact"
+            for biased, faulty in zip(self.from_disturbance, self.from_fault, strict=True)
+        )
+
+    def then(self, later: StateRecovery) -> StateRecovery:
+        """Return the recovery through two transformations, this one first."""
+        step = self.from_state
+        return StateRecovery(
+            names=self.names,
+            from_state=step @ later.from_state,
+            from_input=step @ later.from_input + self.from_input,
+            from_fault=step @ later.from_fault + self.from_fault,
+            from_disturbance=step @ later.from_disturbance + self.from_disturbance,
+            from_noise=step @ later.from_noise + self.from_noise @ later.noise_kept,
+            noise_kept=self.noise_kept @ later.noise_kept,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Transformation:
+    """A plant made from another one.
+
+    Parameters
+    ----------
+    source, plant : DescriptorSystem
+        The plant before and after.
+    description : str
+        What was done, in words.
+    recovery : StateRecovery
+        The states of ``source`` from the signals of ``plant``.
+    """
+
+    source: DescriptorSystem
+    plant: DescriptorSystem
+    description: str
+    recovery: StateRecovery
+
+    def then(self, later: Transformation) -> Transformation:
+        """Return both steps as one, for a ``later`` that starts from this one's plant."""
+        description = "; ".join(text for text in (self.description, later.description) if text)
+        return Transformation(self.source, later.plant, description, self.recovery.then(later.recovery))
+
+
+def unchanged_states(
+    source: DescriptorSystem, new: DescriptorSystem, *, from_state: FloatArray, noise_kept: FloatArray | None = None
+) -> StateRecovery:
+    """Return the recovery of a transformation that adds no direct effect of any signal on the states."""
+    return StateRecovery(
+        source.state_names,
+        from_state,
+        from_input=np.zeros((source.nx, new.nu)),
+        from_fault=np.zeros((source.nx, new.nf)),
+        from_disturbance=np.zeros((source.nx, new.nd)),
+        from_noise=np.zeros((source.nx, new.nw)),
+        noise_kept=np.eye(source.nw) if noise_kept is None else noise_kept,
+    )
+
+
+def with_states(plant: DescriptorSystem, names: Sequence[str], **changes: Any) -> DescriptorSystem:
+    """Replace matrices and states, dropping operating points and units of states that are gone."""
+    others = (plant.input_names, plant.output_names, plant.fault_names, plant.disturbance_names, plant.noise_names)
+    # An output or a fault may carry the name of the state it was picked by, and outlives it.
+    gone = set(plant.state_names) - set(names) - {name for signals in others for name in signals}
+
+    def surviving(table: Mapping[str, _Value]) -> dict[str, _Value]:
+        return {name: value for name, value in table.items() if name not in gone}
+
+    point, units = surviving(plant.operating_point), surviving(plant.units)
+    return plant.replace(state_names=names, operating_point=point, units=units, **changes)

@@ -1,0 +1,152 @@
+"""Zero-order-hold sampling of continuous plants."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from obsynth.analysis.transformations.elimination import columns_of, eliminate_algebraic_states
+from obsynth.analysis.transformations.recovery import Transformation, unchanged_states
+from obsynth.analysis.zeros import fault_zeros
+from obsynth.errors import PreconditionError, SpecError
+from obsynth.models.descriptor import DescriptorSystem
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, SLOW_ZERO_RADIUS
+from obsynth.numerics.scaling import power_of_two_below
+
+
+def discretise(plant: DescriptorSystem, sample_time: float) -> Transformation:
+    """Sample a continuous plant with a zero-order hold.
+
+    Exact for inputs, faults and disturbances that are constant between samples.  Algebraic states are
+    eliminated first.
+
+    Parameters
+    ----------
+    plant : DescriptorSystem
+        Continuous, regular, index 0 or 1.
+    sample_time : float, seconds
+        Time between samples.
+
+    Returns
+    -------
+    Transformation
+        Process noise (``Bw``, per square root of a second) is integrated over a sample and becomes
+        ``process noise 1, 2, ...``, a factor of its covariance; ``Dw`` is per sample and stays.
+
+    Raises
+    ------
+    SpecError
+        ``plant.dt > 0``, or ``sample_time`` is not a positive number.
+    PreconditionError
+        As for `eliminate_algebraic_states`; or continuous white noise reaches an output directly.
+
+    References
+    ----------
+    .. [VanLoan1978] C. Van Loan, "Computing integrals involving the matrix exponential", IEEE TAC 23, 1978.
+    """
+    if plant.dt > 0.0:
+        raise SpecError(f"The plant is already sampled (dt = {plant.dt:g} s): give a continuous plant.", path="dt")
+    if not (math.isfinite(sample_time) and sample_time > 0.0):
+        raise SpecError(f"sample_time is {sample_time}: give a positive number of seconds.", path="sample_time")
+    first = eliminate_algebraic_states(plant)
+    smooth = first.plant
+    direct = np.flatnonzero(np.any(smooth.Dw, axis=0))
+    process = np.flatnonzero(np.any(plant.Bw, axis=0) | np.any(smooth.Bw, axis=0))
+    signals = tuple(smooth.noise_names[i] for i in np.intersect1d(direct, process))
+    if signals:
+        raise PreconditionError(
+            f"Process noise {', '.join(signals)} reaches an output directly, where continuous white noise has "
+            "infinite variance: give measurement noise in Dw only, or filter the process noise by a state.",
+            condition="noise without a direct path",
+            signals=signals,
+        )
+    transition, held = _zero_order_hold(smooth.A, np.hstack([smooth.B, smooth.Bf, smooth.Bd]), sample_time)
+    B, Bf, Bd = columns_of(held, (smooth.nu, smooth.nf, smooth.nd))
+    factor = _noise_factor(smooth.A, smooth.Bw, sample_time)
+    kept = [smooth.noise_names[i] for i in direct]
+    noise_names = [*(f"process noise {i + 1}" for i in range(factor.shape[1])), *kept]
+    sampled = smooth.replace(
+        A=transition,
+        B=B,
+        Bf=Bf,
+        Bd=Bd,
+        dt=float(sample_time),
+        noise_names=noise_names,
+        Bw=np.hstack([factor, np.zeros((smooth.nx, len(kept)))]),
+        Dw=np.hstack([np.zeros((smooth.ny, factor.shape[1])), smooth.Dw[:, direct]]),
+    )
+    noise_kept = np.hstack([np.zeros((smooth.nw, factor.shape[1])), np.eye(smooth.nw)[:, direct]])
+    recovery = unchanged_states(smooth, sampled, from_state=np.eye(smooth.nx), noise_kept=noise_kept)
+    description = f"sampled every {sample_time:g} s (zero-order hold)"
+    return first.then(Transformation(smooth, sampled, description, recovery))
+
+
+def sampling_zero_warnings(plant: DescriptorSystem) -> tuple[str, ...]:
+    """Return a text for every fault zero strictly inside, but near, the unit circle of a sampled plant.
+
+    The fault estimate rings for ``dt / -ln abs(z)`` seconds there.
+
+    Parameters
+    ----------
+    plant : DescriptorSystem
+        ``dt > 0``; a continuous plant gets no warnings.
+    """
+    if not plant.is_discrete:
+        return ()
+    found = fault_zeros(plant)
+    inside = [zero.value for zero in found.zeros if not any(zero is other for other in found.outside)]
+    texts = [
+        f"Fault zero at {_number(value)} (modulus {abs(value):.6g}): errors of a fault estimate die out there with a "
+        f"time constant of {-plant.dt / math.log(abs(value)):.3g} s. Sample more slowly, or measure a signal nearer to "
+        "the fault."
+        for value in inside
+        if value.imag >= 0.0 and SLOW_ZERO_RADIUS < abs(value) < 1.0
+    ]
+    return tuple(dict.fromkeys(texts))
+
+
+def _zero_order_hold(A: FloatArray, inputs: FloatArray, step: float) -> tuple[FloatArray, FloatArray]:
+    """Return ``exp(A h)`` and its integral times ``inputs``, from one balanced block exponential."""
+    from scipy.linalg import expm, matrix_balance
+
+    nx, width = inputs.shape
+    balanced, (scale, _) = matrix_balance(A, permute=False, separate=True)
+    scaled = inputs / scale[:, None]
+    # Large inputs would make the exponential square more often than its dynamics need.
+    sizes = power_of_two_below(np.max(np.abs(scaled), axis=0, initial=0.0))
+    block = np.zeros((nx + width, nx + width))
+    block[:nx, :nx], block[:nx, nx:] = balanced, scaled / sizes
+    result = expm(block * step)
+    return scale[:, None] * result[:nx, :nx] / scale, scale[:, None] * result[:nx, nx:] * sizes
+
+
+def _noise_factor(A: FloatArray, noise: FloatArray, step: float) -> FloatArray:
+    """Return a factor of the covariance that unit white noise through ``noise`` gathers in ``step``."""
+    from scipy.linalg import expm, matrix_balance
+
+    nx = A.shape[0]
+    if not noise.any():
+        return np.zeros((nx, 0))
+    balanced, (scale, _) = matrix_balance(A, permute=False, separate=True)
+    scaled = noise / scale[:, None]
+    # Van Loan's block grows like exp(-A h): integrate a short step, then double it.
+    doublings = math.ceil(math.log2(max(float(np.linalg.norm(balanced, 1)) * step, 1.0)))
+    block = np.block([[-balanced, scaled @ scaled.T], [np.zeros((nx, nx)), balanced.T]])
+    result = expm(block * (step / 2.0**doublings))
+    transition = result[nx:, nx:].T
+    covariance = transition @ result[:nx, nx:]
+    for _ in range(doublings):
+        covariance = covariance + transition @ covariance @ transition.T
+        transition = transition @ transition
+    # An integrated state gathers far less noise than its derivative: compare like with like.
+    spread = power_of_two_below(np.sqrt(np.abs(np.diag(covariance))))
+    correlation = covariance / spread / spread[:, None]
+    sizes, directions = np.linalg.eigh((correlation + correlation.T) / 2.0)
+    kept = sizes > CANCELLATION_TOLERANCE * sizes[-1]
+    return np.asarray((scale * spread)[:, None] * directions[:, kept] * np.sqrt(sizes[kept]))
+
+
+def _number(value: complex) -> str:
+    return f"{value.real:.6g}" if value.imag == 0.0 else f"{value.real:.6g} +- {abs(value.imag):.6g}j"
