@@ -16,6 +16,11 @@ if TYPE_CHECKING:
 class ObsynthError(Exception):
     """Base class of every error that obsynth raises on purpose.
 
+    Parameters
+    ----------
+    *args
+        The message.
+
     Attributes
     ----------
     exit_code : int
@@ -23,6 +28,9 @@ class ObsynthError(Exception):
     """
 
     exit_code = 1
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*args)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the error as plain data, for ``--json``."""

@@ -258,7 +258,9 @@ def _hidden(
     return result, names
 
 
-def leading_names(shares: FloatArray, names: Sequence[str]) -> tuple[str, ...]:
-    """Return the names whose share ``(n,)``, never negative, is not small beside the largest one."""
-    least = NAMED_SHARE * float(np.max(shares, initial=0.0))
-    return tuple(name for name, share in zip(names, shares, strict=True) if 0.0 < share >= least)
+def leading_names(shares: FloatArray, names: Sequence[str], *, most: int | None = None) -> tuple[str, ...]:
+    """Return the names whose share ``(n,)`` is not small beside the largest one: the ``most`` largest, in given order."""
+    sizes = np.abs(shares)
+    largest = float(np.max(sizes, initial=0.0))
+    order = np.argsort(-sizes, kind="stable")[:most]
+    return tuple(names[i] for i in sorted(order) if sizes[i] > 0.0 and sizes[i] >= NAMED_SHARE * largest)

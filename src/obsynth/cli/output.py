@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from obsynth.errors import ObsynthError, PreconditionError, VerificationError
+from obsynth.errors import ObsynthError, VerificationError
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -94,7 +94,9 @@ def _by_cholesky(ball: Ball) -> DefinitenessProof:
     forming = float(rounded_up(np.max(np.sum(ball.radius, axis=1)), size + 2))
     error = forming + _factorisation_bound(ball.midpoint)
     estimate = float(np.linalg.eigvalsh(ball.midpoint)[0])
-    for shift in (0.5 * estimate + error, 2.0 * error):
+    # Half way to the computed eigenvalue leaves a good bound; close to the error bound is the last that can succeed.
+    for share in (0.5, 2.0**-6):
+        shift = error + share * (estimate - error)
         if shift > error and _cholesky_factor(ball.midpoint - shift * np.eye(size)) is not None:
             return DefinitenessProof(True, shift - error, error)
     return DefinitenessProof(False, min(estimate - error, 0.0), error)

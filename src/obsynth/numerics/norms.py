@@ -10,8 +10,9 @@ from obsynth.numerics.arrays import ComplexArray, FloatArray
 
 #: Relative gap between the attained value and the certified level of an H-infinity norm.
 NORM_TOLERANCE = 1e-9
-#: Eigenvalues of the symplectic pencil this close to the unit circle are looked at as crossings.
-CIRCLE_TOLERANCE = 1e-5
+#: Eigenvalues of the symplectic pencil this close to the unit circle are looked at as crossings: a false one costs
+#: one more look, a missed one would cost the bound.
+CIRCLE_TOLERANCE = 1e-3
 #: Points of the starting frequency grid.
 GRID_POINTS = 129
 #: Each round at least squares the relative error near the peak; more than this means trouble.
@@ -27,7 +28,8 @@ class HinfNorm:
     value : float
         Largest singular value found on the unit circle: a lower bound that is attained.
     upper : float
-        Level at which the symplectic pencil has no eigenvalue on the unit circle: the norm is below it.
+        Level at which the symplectic pencil has no eigenvalue on the unit circle: the norm is below it, as far as
+        double precision can tell (computed, not proved).
     angle : float
         Where the peak is, radians per sample.
     distance : float

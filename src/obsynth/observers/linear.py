@@ -98,7 +98,13 @@ class LinearObserver:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> LinearObserver:
-        """Return the observer that `as_dict` described (lists or arrays)."""
+        """Return the observer that `as_dict` described.
+
+        Parameters
+        ----------
+        data : mapping
+            Every field by name; lists stand for tuples.
+        """
         # JSON has lists where we have tuples of names and delays.
         values: dict[str, Any] = {
             key: tuple(value) if isinstance(value, list) else value for key, value in data.items()
@@ -190,7 +196,13 @@ class RunningObserver:
         self.state = start.copy()
 
     def raw_step(self, y: FloatArray, u: FloatArray) -> FloatArray:
-        """Return the row ``[xhat, fhat, r]`` for checked samples ``y (ny,)``, ``u (nu,)`` and advance."""
+        """Return the row ``[xhat, fhat, r]`` and advance, without checking the samples.
+
+        Parameters
+        ----------
+        y, u : FloatArray
+            ``(ny,)`` and ``(nu,)``, finite.
+        """
         system = self.observer
         row = system.Cz @ self.state + system.Du @ u + system.Dy @ y
         self.state = system.Az @ self.state + system.Bu @ u + system.By @ y
@@ -245,7 +257,15 @@ class Estimates:
 
     @classmethod
     def split(cls, observer: LinearObserver, rows: FloatArray) -> Estimates:
-        """Return the estimates in ``rows (steps, nx + nf + nr)`` of ``observer``."""
+        """Return the estimates in the output rows of an observer.
+
+        Parameters
+        ----------
+        observer : LinearObserver
+            Whose rows they are.
+        rows : FloatArray
+            ``(steps, nx + nf + nr)``.
+        """
         return cls(
             read_only(rows[:, observer.state_rows]),
             read_only(rows[:, observer.fault_rows]),

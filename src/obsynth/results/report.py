@@ -84,7 +84,13 @@ class VerificationReport:
 
     @classmethod
     def of(cls, checks: Iterable[Check]) -> VerificationReport:
-        """Return a report of ``checks``."""
+        """Return a report.
+
+        Parameters
+        ----------
+        checks : iterable of Check
+            Its rows.
+        """
         return cls(tuple(checks))
 
     @property
@@ -110,5 +116,11 @@ class VerificationReport:
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> VerificationReport:
-        """Return the report that `as_dict` wrote."""
+        """Return the report that `as_dict` wrote.
+
+        Parameters
+        ----------
+        data : dict
+            With the key ``checks``.
+        """
         return cls.of(Check(**row) for row in data["checks"])

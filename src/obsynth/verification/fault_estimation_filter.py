@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from obsynth.analysis.fault_filter import fault_filter_conditions
+from obsynth.analysis.fault_filter_conditions import fault_filter_conditions
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.norms import hinf_norm, output_covariance, spectral_radius
@@ -123,14 +123,15 @@ def _fault_rows(
     sizes = np.abs(observer.Dy) @ np.abs(plant.Df)
     to_fault = [residual(direct_fault, factors=((sizes[observer.fault_rows],),))]
     to_state = [residual(direct_state, factors=((sizes[observer.state_rows],),))]
-    vector, product, history = errors.fault, np.abs(errors.fault), np.abs(errors.fault)
+    # What is left after cancellation is judged against the largest trace on the way, not against itself.
+    vector, history = errors.fault, np.abs(errors.fault)
     for step in range(1, longest + 1):
         expected = np.diag([1.0 if delay == step else 0.0 for delay in observer.fault_delays])
-        to_fault.append(residual(-cf @ vector, -expected, factors=((cf, product),)))
+        to_fault.append(residual(-cf @ vector, -expected, factors=((cf, history),)))
         # Leading observer states are in the units of the plant's states, so their traces tell what is small.
-        to_state.append(residual(cx @ vector, factors=((cx, product), (history[: plant.nx],))))
-        vector, product = errors.Az @ vector, np.abs(errors.Az) @ np.abs(vector)
-        history = np.maximum(history, np.maximum(product, np.abs(vector)))
+        to_state.append(residual(cx @ vector, factors=((cx, history), (history[: plant.nx],))))
+        history = np.maximum(history, np.abs(errors.Az) @ np.abs(vector))
+        vector = errors.Az @ vector
     source = "Wang 2015, eqs. (32), (44)"
     yield _equality(
         "fault decoupled after its delay",

@@ -24,12 +24,8 @@ import numpy as np
 
 from obsynth.analysis.conditions import Condition, require_all
 from obsynth.analysis.fault_detectability import WARN_CONDITION, FaultDetectability, fault_detectability
-from obsynth.analysis.fault_filter import (
-    PreparedPlant,
-    fault_filter_conditions,
-    prepare,
-    with_sensor_faults_as_states,
-)
+from obsynth.analysis.fault_filter import PreparedPlant, prepare, with_sensor_faults_as_states
+from obsynth.analysis.fault_filter_conditions import fault_filter_conditions
 from obsynth.analysis.transformations import sampling_zero_warnings
 from obsynth.errors import InfeasibleError, SpecError
 from obsynth.models.descriptor import DescriptorSystem

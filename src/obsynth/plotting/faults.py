@@ -1,0 +1,228 @@
+"""Fault estimates against faults, residuals against thresholds, and the poles of an observer.
+
+Every line differs from its neighbours by more than its colour, so that the pictures can be printed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from obsynth.analysis.zeros import fault_zeros
+from obsynth.errors import SpecError
+from obsynth.numerics.arrays import FloatArray, as_matrix
+from obsynth.observers.linear import Estimates
+from obsynth.results.design import ObserverDesign
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+#: Inches: the width of every figure, and the height of one panel.
+WIDTH = 7.5
+PANEL_HEIGHT = 2.2
+#: The true signal lies under the estimate: wide, grey, solid.  The estimate on it: thin, dark, dashed.
+TRUE_STYLE: dict[str, Any] = {"color": "0.72", "linewidth": 4.0, "linestyle": "-", "solid_capstyle": "butt"}
+ESTIMATE_STYLE: dict[str, Any] = {"color": "black", "linewidth": 1.1, "linestyle": "--"}
+RESIDUAL_STYLE: dict[str, Any] = {"color": "black", "linewidth": 1.0, "linestyle": "-"}
+#: One line style for each threshold, in order.
+THRESHOLD_STYLES: tuple[dict[str, Any], ...] = (
+    {"color": "tab:red", "linewidth": 1.6, "linestyle": "--"},
+    {"color": "tab:blue", "linewidth": 1.6, "linestyle": "-."},
+    {"color": "tab:green", "linewidth": 1.6, "linestyle": ":"},
+)
+CROSSING_MARKERS = ("o", "s", "^")
+
+
+def plot_faults(
+    estimates: Estimates,
+    *,
+    faults: ArrayLike | None = None,
+    dt: float = 1.0,
+    units: Mapping[str, str] | None = None,
+    axes: Iterable[Axes] | None = None,
+) -> list[Axes]:
+    """Plot each fault estimate, on the true fault delayed by its detectability index.
+
+    Parameters
+    ----------
+    estimates : Estimates
+        From a run of an observer; ``faults (steps, nf)``.
+    faults : array_like, optional
+        True faults ``(steps, nf)``, not delayed; a single one may be ``(steps,)``.
+    dt : float, optional, seconds
+        Time between samples.
+    units : mapping, optional
+        Unit of each fault by name, such as ``plant.units``.
+    axes : iterable of Axes, optional
+        One for each fault; new ones, one above the other, by default.
+
+    Returns
+    -------
+    list of Axes
+        One for each fault.
+
+    Raises
+    ------
+    SpecError
+        ``faults`` has the wrong shape, or there are too few or too many axes.
+    """
+    steps, count = estimates.faults.shape
+    truth = None if faults is None else _matching(faults, "faults", (steps, count))
+    panels = _panels(axes, count)
+    time = dt * np.arange(steps)
+    for i, (panel, name, delay) in enumerate(zip(panels, estimates.fault_names, estimates.fault_delays, strict=True)):
+        if truth is not None:
+            label = f"fault, delayed by {_samples(delay)}" if delay else "fault"
+            panel.plot(time[delay:], truth[: steps - delay, i], label=label, **TRUE_STYLE)
+        panel.plot(time, estimates.faults[:, i], label="estimate", **ESTIMATE_STYLE)
+        unit = (units or {}).get(name)
+        panel.set_ylabel(f"{name} ({unit})" if unit else name)
+        panel.legend(loc="best")
+        _tidy(panel)
+    if panels:
+        panels[-1].set_xlabel("time (s)")
+    return panels
+
+
+def plot_residuals(
+    estimates: Estimates,
+    *,
+    threshold: ArrayLike | Mapping[str, ArrayLike] | None = None,
+    dt: float = 1.0,
+    axes: Axes | None = None,
+) -> Axes:
+    """Plot the norm of the residual, with thresholds and the first sample at which each is crossed.
+
+    Parameters
+    ----------
+    estimates : Estimates
+        From a run of an observer; ``residuals (steps, nr)``.
+    threshold : array_like or mapping of str to array_like, optional
+        A number or a curve ``(steps,)``, or up to three of them by name.
+    dt : float, optional, seconds
+        Time between samples.
+    axes : Axes, optional
+        New ones by default.
+
+    Returns
+    -------
+    Axes
+        With a vertical logarithmic scale; a residual of exactly zero has no place on it.
+
+    Raises
+    ------
+    SpecError
+        A threshold has the wrong length, or there are more than three.
+    """
+    steps = len(estimates.residuals)
+    if threshold is None:
+        curves = {}
+    else:
+        named = threshold if isinstance(threshold, Mapping) else {"threshold": threshold}
+        curves = {name: _curve(value, name, steps) for name, value in named.items()}
+    if len(curves) > len(THRESHOLD_STYLES):
+        raise SpecError(f"{len(curves)} thresholds are too many for one picture: give at most 3.", path="threshold")
+    (panel,) = _panels(None if axes is None else [axes], 1)
+    time, size = dt * np.arange(steps), np.linalg.norm(estimates.residuals, axis=1)
+    panel.plot(time, np.where(size > 0.0, size, np.nan), label="norm of the residual", **RESIDUAL_STYLE)
+    for (name, curve), style, marker in zip(curves.items(), THRESHOLD_STYLES, CROSSING_MARKERS, strict=False):
+        panel.plot(time, curve, label=name, **style)
+        crossed = np.flatnonzero(size > curve)
+        if crossed.size:
+            first = int(crossed[0])
+            panel.plot(
+                time[first], size[first], marker=marker, markersize=9, markerfacecolor="none", markeredgewidth=1.6,
+                color=style["color"], linestyle="none", label=f"first above it at k = {first} ({time[first]:g} s)",
+            )  # fmt: skip
+    panel.set_yscale("log")
+    panel.set_ylabel("norm of the residual")
+    panel.set_xlabel("time (s)")
+    panel.legend(loc="best")
+    _tidy(panel)
+    return panel
+
+
+def plot_poles(design: ObserverDesign, *, axes: Axes | None = None) -> Axes:
+    """Plot the observer's eigenvalues and the plant's fault zeros, with the unit circle.
+
+    Parameters
+    ----------
+    design : ObserverDesign
+        A discrete-time design.
+    axes : Axes, optional
+        New ones by default.
+
+    Returns
+    -------
+    Axes
+        The complex plane.
+    """
+    if axes is None:
+        (axes,) = _panels(None, 1, size=(5.0, 5.4))
+    poles = np.linalg.eigvals(design.observer.Az)
+    zeros = np.array([zero.value for zero in fault_zeros(design.plant).zeros], dtype=complex)
+    circle = np.exp(2j * np.pi * np.linspace(0.0, 1.0, 361))
+    axes.plot(circle.real, circle.imag, color="0.5", linewidth=1.0, linestyle="--", label="unit circle")
+    axes.axhline(0.0, color="0.85", linewidth=0.8, zorder=0)
+    axes.axvline(0.0, color="0.85", linewidth=0.8, zorder=0)
+    axes.plot(poles.real, poles.imag, marker="x", markersize=9, markeredgewidth=1.6, linestyle="none", color="black",
+              label=f"observer eigenvalues ({len(poles)})")  # fmt: skip
+    axes.plot(zeros.real, zeros.imag, marker="o", markersize=9, markerfacecolor="none", markeredgewidth=1.6,
+              linestyle="none", color="tab:red", label=f"fault zeros ({len(zeros)})")  # fmt: skip
+    axes.set_aspect("equal")
+    reach = 1.1 * max(1.05, float(np.max(np.abs(np.concatenate([poles, zeros])), initial=0.0)))
+    axes.set_xlim(-reach, reach)
+    axes.set_ylim(-reach, reach)
+    axes.set_xlabel("real part")
+    axes.set_ylabel("imaginary part")
+    axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False)
+    return axes
+
+
+def _panels(axes: Iterable[Axes] | None, count: int, *, size: tuple[float, float] | None = None) -> list[Axes]:
+    """Return ``count`` axes: the given ones, or new ones one above the other."""
+    if axes is not None:
+        given = list(np.ravel(np.asarray(axes, dtype=object)))
+        if len(given) != count:
+            raise SpecError(f"{len(given)} axes were given, but {count} are needed.", path="axes")
+        return given
+    if count == 0:
+        return []
+    import matplotlib.pyplot as plt
+
+    _, grid = plt.subplots(
+        count, 1, sharex=True, squeeze=False, layout="constrained",
+        figsize=size or (WIDTH, PANEL_HEIGHT * count + 0.8),
+    )  # fmt: skip
+    return list(grid[:, 0])
+
+
+def _matching(value: ArrayLike, name: str, shape: tuple[int, int]) -> FloatArray:
+    array = np.asarray(value)
+    matrix = as_matrix(array.reshape(-1, 1) if array.ndim == 1 and shape[1] == 1 else array, name)
+    if matrix.shape != shape:
+        raise SpecError(f"{name} is {matrix.shape[0]} by {matrix.shape[1]}, but {shape[0]} by {shape[1]} is needed "
+                        "(samples by faults).", path=name)  # fmt: skip
+    return matrix
+
+
+def _curve(value: ArrayLike, name: str, steps: int) -> FloatArray:
+    curve = np.asarray(value, dtype=np.float64)
+    if curve.ndim and curve.shape != (steps,):
+        raise SpecError(f"{name} needs one number, or {steps} of them: one for each sample.", path="threshold")
+    return np.broadcast_to(curve, (steps,)).copy()
+
+
+def _samples(count: int) -> str:
+    return f"{count} sample" if count == 1 else f"{count} samples"
+
+
+def _tidy(panel: Axes) -> None:
+    panel.grid(True, color="0.9", linewidth=0.6)
+    panel.set_axisbelow(True)
+    for side in ("top", "right"):
+        panel.spines[side].set_visible(False)
+    panel.margins(x=0.01)

@@ -1,0 +1,81 @@
+"""What the README claims."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from obsynth.cli.main import main
+from obsynth.synthesis.methods import REGISTRY
+
+ROOT = Path(__file__).parents[2]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", README, re.DOTALL)
+
+
+def test_there_are_exactly_two_commands_to_start_with():
+    lines = re.search(r"<!-- commands -->\n```sh\n(.*?)```\n<!-- end -->", README, re.DOTALL).group(1).splitlines()
+    assert len(lines) == 2
+    assert lines[0].startswith("pip install . && design --system designs/wang2015/spec.yaml")
+    assert "python -m pytest" in lines[1]
+
+
+def test_every_linked_file_exists():
+    links = [link for link in re.findall(r"\]\(([^)]+)\)", README) if "://" not in link]
+    assert links
+    assert [link for link in links if not (ROOT / link).exists()] == []
+
+
+@pytest.mark.parametrize("code", blocks("python"))
+def test_python_examples_run(code, tmp_path):
+    result = subprocess.run(
+        [sys.executable, "-W", "error", "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.split()[1] == "True"
+    assert (tmp_path / "actuator.gains.json").exists()
+
+
+@pytest.mark.parametrize("spec", re.findall(r"design --system (designs/\S+)", README))
+def test_every_design_command_writes_a_gain_set_that_verifies(spec, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["design", "--system", str(ROOT / spec), "--quiet"]) == 0
+    (gains,) = tmp_path.glob("*.gains.json")
+    assert main(["verify", str(gains)]) == 0
+    assert main(["check", "--system", str(ROOT / spec)]) == 0
+    assert "holds" in capsys.readouterr().out
+
+
+def test_first_command_writes_the_file_it_names(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    main(["design", "--system", str(ROOT / "designs/wang2015/spec.yaml"), "--quiet"])
+    assert [path.name for path in tmp_path.iterdir()] == ["wang2015.gains.json"]
+    assert "`wang2015.gains.json`" in README
+
+
+def test_every_method_is_in_the_table():
+    assert set(re.findall(r"^\| `([a-z-]+)` \| (?:discrete|continuous|both)", README, re.MULTILINE)) == set(REGISTRY)
+
+
+def test_the_example_spec_has_only_keys_that_exist(tmp_path):
+    from obsynth.spec import load_spec
+
+    (text,) = blocks("yaml")
+    (tmp_path / "spec.yaml").write_text(text, encoding="utf-8")
+    (tmp_path / "E.mtx").write_text(
+        "%%MatrixMarket matrix array real general\n3 3\n1\n0\n0\n0\n0\n0\n0\n0\n0\n", encoding="utf-8"
+    )
+    (tmp_path / "A.mtx").write_text(
+        "%%MatrixMarket matrix array real general\n3 3\n-1\n0\n1\n0\n-1\n0\n1\n1\n-1\n", encoding="utf-8"
+    )
+    (tmp_path / "names.json").write_text('["omega 1", "tm 1", "v 3"]', encoding="utf-8")
+    spec = load_spec(tmp_path / "spec.yaml")
+    assert spec.plant.dt == 0.02
+    assert spec.plant.output_names == ("omega 1", "v 3")

@@ -1,0 +1,179 @@
+"""Pictures: what is drawn where, with which names; whether they are beautiful is for eyes."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+
+mpl.use("Agg")
+
+import matplotlib.pyplot as plt
+
+import obsynth
+from obsynth.errors import SpecError
+from obsynth.observers.linear import Estimates
+from obsynth.plotting import plot_faults, plot_poles, plot_residuals
+from obsynth.spec import load_spec
+
+DESIGNS = Path(__file__).parents[2] / "designs"
+STEPS = 30
+FAULTS = np.column_stack([np.arange(STEPS) >= 10, np.sin(0.3 * np.arange(STEPS))]).astype(float)
+
+
+@pytest.fixture(autouse=True)
+def _closed_figures():
+    yield
+    plt.close("all")
+
+
+def made_estimates(*, residuals: np.ndarray | None = None, delays: tuple[int, ...] = (1, 3)) -> Estimates:
+    """Return perfect estimates of `FAULTS` with the given delays."""
+    estimated = np.zeros_like(FAULTS)
+    for i, delay in enumerate(delays):
+        estimated[delay:, i] = FAULTS[: STEPS - delay, i]
+    return Estimates(
+        np.zeros((STEPS, 1)), estimated, estimated if residuals is None else residuals, ("x",), ("valve", "pump"),
+        ("valve", "pump"), (2,), delays,
+    )  # fmt: skip
+
+
+def lines_of(axes) -> dict[str, object]:
+    return {line.get_label(): line for line in axes.get_lines()}
+
+
+def legend_of(axes) -> list[str]:
+    return [text.get_text() for text in axes.get_legend().get_texts()]
+
+
+def test_each_fault_is_delayed_by_its_own_index() -> None:
+    panels = plot_faults(made_estimates(), faults=FAULTS, dt=0.5)
+    assert len(panels) == 2
+    for i, (axes, label) in enumerate(zip(panels, ("1 sample", "3 samples"), strict=True)):
+        lines = lines_of(axes)
+        assert legend_of(axes) == [f"fault, delayed by {label}", "estimate"]
+        true, estimate = lines[f"fault, delayed by {label}"], lines["estimate"]
+        delay = (1, 3)[i]
+        # A true value at sample k stands at the time of sample k + delay, where the estimate has it too.
+        np.testing.assert_allclose(true.get_xdata(), 0.5 * np.arange(delay, STEPS))
+        np.testing.assert_array_equal(true.get_ydata(), FAULTS[: STEPS - delay, i])
+        np.testing.assert_allclose(estimate.get_xdata(), 0.5 * np.arange(STEPS))
+        np.testing.assert_array_equal(estimate.get_ydata()[delay:], true.get_ydata())
+
+
+def test_axes_say_names_units_and_seconds() -> None:
+    panels = plot_faults(made_estimates(), faults=FAULTS, units={"valve": "%"})
+    assert [axes.get_ylabel() for axes in panels] == ["valve (%)", "pump"]
+    assert [axes.get_xlabel() for axes in panels] == ["", "time (s)"]
+
+
+def test_lines_differ_by_more_than_colour() -> None:
+    true, estimate = plot_faults(made_estimates(), faults=FAULTS)[0].get_lines()
+    assert true.get_linestyle() != estimate.get_linestyle()
+    curves = {"low": 0.1, "middle": 0.2, "high": np.full(STEPS, 5.0)}
+    lines = lines_of(plot_residuals(made_estimates(), threshold=curves))
+    styles = {lines[name].get_linestyle() for name in ("norm of the residual", *curves)}
+    assert len(styles) == 4
+    markers = {line.get_marker() for line in lines.values()} - {"None"}
+    assert len(markers) == 2
+
+
+def test_faults_may_be_unknown_and_axes_given() -> None:
+    figure, grid = plt.subplots(1, 2)
+    panels = plot_faults(made_estimates(), axes=grid)
+    assert panels == list(grid)
+    assert [axes.figure for axes in panels] == [figure, figure]
+    assert [legend_of(axes) for axes in panels] == [["estimate"], ["estimate"]]
+    assert len(plt.get_fignums()) == 1
+
+
+def test_the_norm_of_the_residual_and_the_first_crossing() -> None:
+    residuals = np.tile([0.3, 0.4], (STEPS, 1))
+    residuals[12:] *= 4.0
+    residuals[20] = 0.0
+    axes = plot_residuals(made_estimates(residuals=residuals), threshold=1.0, dt=0.02)
+    lines = lines_of(axes)
+    expected = np.where(np.arange(STEPS) < 12, 0.5, 2.0)
+    expected[20] = np.nan
+    np.testing.assert_allclose(lines["norm of the residual"].get_ydata(), expected)
+    np.testing.assert_allclose(lines["threshold"].get_ydata(), np.ones(STEPS))
+    mark = lines["first above it at k = 12 (0.24 s)"]
+    np.testing.assert_allclose([*mark.get_xdata(), *mark.get_ydata()], [0.24, 2.0])
+    assert (axes.get_xlabel(), axes.get_ylabel(), axes.get_yscale()) == ("time (s)", "norm of the residual", "log")
+
+
+def test_a_threshold_that_only_touches_is_not_crossed() -> None:
+    residuals = np.tile([3.0, 4.0], (STEPS, 1))
+    touching = plot_residuals(made_estimates(residuals=residuals), threshold=5.0)
+    assert legend_of(touching) == ["norm of the residual", "threshold"]
+    curve = np.full(STEPS, 5.0)
+    curve[7] = np.nextafter(5.0, 0.0)
+    crossed = plot_residuals(made_estimates(residuals=residuals), threshold=curve)
+    assert legend_of(crossed)[-1] == "first above it at k = 7 (7 s)"
+
+
+def test_several_thresholds_keep_their_names_and_crossings() -> None:
+    residuals = np.outer(np.arange(STEPS), [0.6, 0.8])
+    axes = plot_residuals(made_estimates(residuals=residuals), threshold={"a": 2.5, "b": np.full(STEPS, 4.0)})
+    assert legend_of(axes) == [
+        "norm of the residual", "a", "first above it at k = 3 (3 s)", "b", "first above it at k = 5 (5 s)",
+    ]  # fmt: skip
+
+
+def test_poles_zeros_and_the_unit_circle() -> None:
+    design = obsynth.fault_estimation_filter(load_spec(DESIGNS / "wang2015_printed_psi" / "spec.yaml").plant)
+    axes = plot_poles(design)
+    lines = lines_of(axes)
+    poles = lines["observer eigenvalues (4)"]
+    drawn = np.array(poles.get_xdata()) + 1j * np.array(poles.get_ydata())
+    np.testing.assert_allclose(np.sort(np.abs(drawn)), np.sort(np.abs(np.linalg.eigvals(design.observer.Az))))
+    # The audit: for F = [a1, b2] there is one finite invariant zero, at the origin.
+    zeros = lines["fault zeros (1)"]
+    np.testing.assert_allclose([*zeros.get_xdata(), *zeros.get_ydata()], [0.0, 0.0], atol=1e-9)
+    circle = lines["unit circle"]
+    np.testing.assert_allclose(np.hypot(circle.get_xdata(), circle.get_ydata()), 1.0)
+    assert axes.get_aspect() == 1.0
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("real part", "imaginary part")
+
+
+def test_axes_given_for_residuals_and_poles_are_used() -> None:
+    _, (left, right) = plt.subplots(1, 2)
+    design = obsynth.fault_estimation_filter(load_spec(DESIGNS / "wang2015" / "spec.yaml").plant)
+    assert plot_residuals(made_estimates(), axes=left) is left
+    assert plot_poles(design, axes=right) is right
+    assert "fault zeros (0)" in lines_of(right)
+
+
+@pytest.mark.parametrize(
+    ("draw", "path"),
+    [
+        (lambda: plot_faults(made_estimates(), faults=FAULTS[:-1]), "faults"),
+        (lambda: plot_faults(made_estimates(), faults=FAULTS[:, 0]), "faults"),
+        (lambda: plot_faults(made_estimates(), axes=[plt.figure().add_subplot()]), "axes"),
+        (lambda: plot_residuals(made_estimates(), threshold=np.ones(STEPS + 1)), "threshold"),
+        (lambda: plot_residuals(made_estimates(), threshold=dict.fromkeys("abcd", 1.0)), "threshold"),
+    ],
+)
+def test_malformed_arguments_are_named(draw, path: str) -> None:
+    with pytest.raises(SpecError) as caught:
+        draw()
+    assert caught.value.path == path
+
+
+def test_importing_the_room_does_not_load_matplotlib() -> None:
+    code = "import sys, obsynth.plotting; print('matplotlib' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
+
+
+def test_nothing_is_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+    shown = []
+    monkeypatch.setattr(plt, "show", lambda *args, **kwargs: shown.append(args))
+    plot_faults(made_estimates(), faults=FAULTS)
+    plot_residuals(made_estimates(), threshold=1.0)
+    assert shown == []
+    assert len(plt.get_fignums()) == 2
