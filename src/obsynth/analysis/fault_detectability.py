@@ -92,8 +92,13 @@ def _first_visible(ta: FloatArray, c: FloatArray, direction: FloatArray) -> tupl
     return None, np.zeros_like(direction)
 
 
-def detectability_conditions(detectability: FaultDetectability, fault_names: tuple[str, ...]) -> tuple[Condition, ...]:
-    """Return the conditions on indexes and matrix: finite indexes, ``rank Upsilon = nf``, its condition number."""
+def detectability_conditions(
+    detectability: FaultDetectability, fault_names: tuple[str, ...], output_scales: FloatArray
+) -> tuple[Condition, ...]:
+    """Return the conditions on indexes and matrix: finite indexes, ``rank Upsilon = nf`` with its condition number.
+
+    ``output_scales (ny,)`` are the factors by which the outputs were balanced, to give norms in the user's units.
+    """
     hidden = tuple(name for name, index in zip(fault_names, detectability.indexes, strict=True) if index is None)
     largest = max((index for index in detectability.indexes if index is not None), default=0)
     finite = Condition(
@@ -110,7 +115,7 @@ def detectability_conditions(detectability: FaultDetectability, fault_names: tup
     )
     if hidden:
         return (finite,)
-    rank = detectability.rank
+    rank, user_units = detectability.rank, detectability.Upsilon / output_scales[:, None]
     usable = rank.full and detectability.condition_number <= REFUSE_CONDITION
     mixed = () if usable else _dependent_faults(detectability.Upsilon, fault_names)
     independent = Condition(
@@ -120,16 +125,16 @@ def detectability_conditions(detectability: FaultDetectability, fault_names: tup
         detectability.condition_number,
         REFUSE_CONDITION,
         "Wang 2015, Theorem 2 (i)",
-        f"{rank.describe()}, condition number {detectability.condition_number:.3g}"
-        + (
-            f"; the faults {', '.join(map(repr, mixed))} cannot be told apart at first sight. Leave one out, or "
-            "measure another signal."
-            if mixed
-            else "."
-        ),
+        f"{rank.describe()}, condition number {detectability.condition_number:.3g}, "
+        f"||Upsilon|| = {float(np.linalg.norm(user_units, 2)):.3g}"
+        + (f"; {_names(mixed)} cannot be told apart at first sight. Leave one out, or measure more." if mixed else "."),
         signals=mixed,
     )
     return finite, independent
+
+
+def _names(faults: tuple[str, ...]) -> str:
+    return f"the faults {', '.join(map(repr, faults))}"
 
 
 def _dependent_faults(upsilon: FloatArray, names: tuple[str, ...]) -> tuple[str, ...]:

@@ -156,7 +156,8 @@ def _rank_conditions(plant: DescriptorSystem) -> list[Condition]:
 
 
 def _visibility_conditions(plant: DescriptorSystem) -> list[Condition]:
-    return list(detectability_conditions(prepare(plant).detectability, plant.fault_names))
+    prepared = prepare(plant)
+    return list(detectability_conditions(prepared.detectability, plant.fault_names, prepared.scaling.outputs))
 
 
 def _zero_conditions(plant: DescriptorSystem) -> list[Condition]:

@@ -259,7 +259,7 @@ def _hidden(
 
 
 def leading_names(shares: FloatArray, names: Sequence[str], *, most: int | None = None) -> tuple[str, ...]:
-    """Return the names whose share ``(n,)`` is not small beside the largest one: the ``most`` largest, in given order."""
+    """Return the names whose share ``(n,)`` is not small beside the largest: the ``most`` largest, in given order."""
     sizes = np.abs(shares)
     largest = float(np.max(sizes, initial=0.0))
     order = np.argsort(-sizes, kind="stable")[:most]

@@ -31,6 +31,7 @@ from obsynth.errors import InfeasibleError, SpecError
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.norms import spectral_radius
+from obsynth.observers.linear import LinearObserver
 from obsynth.results.design import Certificate
 from obsynth.synthesis import gain_search
 from obsynth.synthesis.certify import bounded_real_certificate
@@ -140,7 +141,7 @@ def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **op
         observer,
         Certificate({"P_factor": factor, "tracking": tracking}, claims),
         {"runs": [*least.records, *records]},
-        notes(plant, prepared.detectability, observer.Az),
+        notes(plant, prepared.detectability, observer),
     )
 
 
@@ -167,7 +168,7 @@ def synthesis_from_gains(plant: DescriptorSystem, *, T: Any, N: Any, L: Any, W: 
         observer,
         Certificate({"P_factor": factor, "tracking": tracking}, claims),
         {"runs": []},
-        notes(plant, detectability, observer.Az),
+        notes(plant, detectability, observer),
     )
 
 
@@ -267,22 +268,22 @@ def _with_weight_limit(problem: GainProblem, prepared: PreparedPlant, parts: _Pa
     return replace(problem, weight_limit=WeightLimit(parts.W0 * outputs, parts.V.T * outputs, bound))
 
 
-def notes(plant: DescriptorSystem, detectability: FaultDetectability, az: FloatArray) -> tuple[str, ...]:
-    """Return what a user should know: slow zeros, ill-conditioned or large weights, slow filters."""
+def notes(plant: DescriptorSystem, detectability: FaultDetectability, observer: LinearObserver) -> tuple[str, ...]:
+    """Return what a user should know: slow zeros, ill-conditioned faults, amplified noise, slow filters."""
     found = list(sampling_zero_warnings(plant))
     if detectability.condition_number > WARN_CONDITION:
         found.append(
             f"Upsilon has condition number {detectability.condition_number:.3g}: some combination of faults is "
             "estimated with much more noise than others."
         )
-    for name, column in zip(plant.fault_names, detectability.Upsilon.T, strict=True):
-        size = float(np.linalg.norm(column))
-        if size < 1.0 / WARN_AMPLIFICATION:
+    for name, row in zip(plant.fault_names, observer.Dy[observer.fault_rows], strict=True):
+        amplification = float(np.linalg.norm(row))
+        if amplification > WARN_AMPLIFICATION:
             found.append(
-                f"Fault {name!r} moves the outputs by {size:.3g} per unit: its estimate multiplies measurement "
-                f"errors by up to about {1.0 / size:.3g}."
+                f"The estimate of {name!r} multiplies errors of the newest measurement by up to {amplification:.3g}: "
+                "the fault moves the outputs little within its delay."
             )
-    radius = spectral_radius(az)
+    radius = spectral_radius(observer.Az)
     if radius > SLOW_FILTER:
         found.append(
             f"The filter forgets its start slowly: spectral radius {radius:.6g}, time constant "
@@ -291,7 +292,7 @@ def notes(plant: DescriptorSystem, detectability: FaultDetectability, az: FloatA
     return tuple(found)
 
 
-#: Weights above this are worth a note.
+#: Amplifications of measurement errors above this are worth a note.
 WARN_AMPLIFICATION = 50.0
 #: Spectral radii above this are worth a note.
 SLOW_FILTER = 0.98
