@@ -177,7 +177,6 @@ def build(rng: np.random.Generator, recipe: Recipe) -> KnownPlant:
                         np.hstack([np.zeros((recipe.sensor_faults, nf)), np.eye(recipe.sensor_faults)])])  # fmt: skip
     # State, equation and output coordinates.
     change, mixing = well_conditioned(rng, nx), well_conditioned(rng, recipe.ny)
-    inverse = np.linalg.inv(change)
     rows = np.linalg.inv(change) if recipe.explicit else well_conditioned(rng, nx)
     e = rows @ (np.eye(nx) - n @ c) @ change
     data = {
@@ -185,14 +184,13 @@ def build(rng: np.random.Generator, recipe: Recipe) -> KnownPlant:
         "C": mixing @ outputs @ change, "Bf": rows @ faults, "Df": mixing @ direct, "Bd": rows @ disturbances,
         "Bw": rows @ rng.normal(size=(nx, recipe.noise)) * 0.01, "Dw": rng.normal(size=(recipe.ny, recipe.noise)) * 0.01,
     }  # fmt: skip
-    assert inverse.shape == (nx, nx)
     if recipe.feedthrough:
         data["D"] = rng.normal(size=(recipe.ny, recipe.nu))
     if recipe.nd and (recipe.feedthrough or recipe.disturbance == "sensor") and recipe.disturbance != "invisible":
         data["Dd"] = rng.normal(size=(recipe.ny, recipe.nd))
     data = _scaled(rng, data, recipe.scales, explicit=recipe.explicit)
     plant = obsynth.DescriptorSystem(**data, dt=float(rng.choice([0.02, 0.1, 1.0])))
-    zeros = with_conjugates([z for z in recipe.zeros if complex(z).imag >= 0.0]) + tuple(map(complex, recipe.hidden_modes))
+    zeros = with_conjugates([z for z in map(complex, recipe.zeros) if z.imag >= 0.0]) + tuple(map(complex, recipe.hidden_modes))
     return KnownPlant(plant, recipe.indexes + (1,) * recipe.sensor_faults, zeros, recipe)
 
 

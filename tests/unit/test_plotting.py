@@ -125,6 +125,13 @@ def test_several_thresholds_keep_their_names_and_crossings() -> None:
     ]  # fmt: skip
 
 
+def test_residuals_that_are_all_zero_are_drawn_too() -> None:
+    axes = plot_residuals(made_estimates(residuals=np.zeros((STEPS, 2))), threshold=0.0)
+    np.testing.assert_array_equal(lines_of(axes)["norm of the residual"].get_ydata(), np.zeros(STEPS))
+    assert legend_of(axes) == ["norm of the residual", "threshold"]
+    axes.figure.canvas.draw()
+
+
 def test_poles_zeros_and_the_unit_circle() -> None:
     design = obsynth.fault_estimation_filter(load_spec(DESIGNS / "wang2015_printed_psi" / "spec.yaml").plant)
     axes = plot_poles(design)

@@ -71,17 +71,19 @@ def hinf_norm(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> Hin
     Returns
     -------
     HinfNorm
-        Infinite when ``a`` is not Schur stable.
+        Infinite when ``a`` is not Schur stable, or when the data or the response are not finite.
     """
     if b.shape[1] == 0 or c.shape[0] == 0:
         return HinfNorm(0.0, 0.0, 0.0, np.inf)
+    if not all(np.all(np.isfinite(part)) for part in (a, b, c, d)):
+        return HinfNorm(np.inf, np.inf, np.nan, 0.0)
     poles = np.linalg.eigvals(a) if a.size else np.zeros(0, dtype=complex)
     if np.any(np.abs(poles) >= 1.0):
         return HinfNorm(np.inf, np.inf, np.nan, 0.0)
     a, b, c = _balanced(a, b, c)
     angles = np.concatenate([np.linspace(0.0, np.pi, GRID_POINTS), np.abs(np.angle(poles))])
     best, angle = _peak(a, b, c, d, angles)
-    if best == 0.0 or a.shape[0] == 0:
+    if best == 0.0 or not np.isfinite(best) or a.shape[0] == 0:
         return HinfNorm(best, best, angle, np.inf)
     distance = 0.0
     for _ in range(MAXIMUM_ROUNDS):
@@ -101,17 +103,20 @@ def hinf_norm(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> Hin
 
 def _balanced(a: FloatArray, b: FloatArray, c: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the realisation with its states scaled by powers of two, which is exact: units must not cost digits."""
-    from scipy.linalg import matrix_balance
+    from scipy.linalg.lapack import dgebal
 
     n, inputs, outputs = a.shape[0], b.shape[1], c.shape[0]
     system = np.zeros((n + inputs + outputs, n + inputs + outputs))
     system[:n, :n], system[:n, n : n + inputs], system[n + inputs :, :n] = a, b, c
-    scale = matrix_balance(system, permute=False, separate=True)[1][0][:n]
+    scale = dgebal(system, scale=1, permute=0)[3][:n]
     return a * scale / scale[:, None], b / scale[:, None], c * scale
 
 
 def _peak(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, angles: FloatArray) -> tuple[float, float]:
-    response = frequency_response(a, b, c, d, angles)
+    with np.errstate(over="ignore", invalid="ignore"):
+        response = frequency_response(a, b, c, d, angles)
+    if not np.all(np.isfinite(response)):
+        return np.inf, np.nan
     gains = np.linalg.svd(response, compute_uv=False)[:, 0]
     top = int(np.argmax(gains))
     return float(gains[top]), float(angles[top])
@@ -146,11 +151,17 @@ def _crossings(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, level
 def output_covariance(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> FloatArray:
     """Return the stationary covariance ``(p, p)`` of the output under white input of unit covariance.
 
-    Infinite when ``a`` is not Schur stable.
+    Infinite when ``a`` is not Schur stable, or when the numbers overflow.
     """
+    infinite = np.full((c.shape[0], c.shape[0]), np.inf)
     if spectral_radius(a) >= 1.0:
-        return np.full((c.shape[0], c.shape[0]), np.inf)
+        return infinite
     from scipy.linalg import solve_discrete_lyapunov
 
-    states = solve_discrete_lyapunov(a, b @ b.T) if a.size else np.zeros((0, 0))
-    return np.asarray(c @ states @ c.T + d @ d.T)
+    with np.errstate(over="ignore", invalid="ignore"):
+        inputs = b @ b.T
+        if not np.all(np.isfinite(inputs)):
+            return infinite
+        states = solve_discrete_lyapunov(a, inputs) if a.size else np.zeros((0, 0))
+        found = np.asarray(c @ states @ c.T + d @ d.T)
+    return found if np.all(np.isfinite(found)) else infinite

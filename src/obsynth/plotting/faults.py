@@ -110,7 +110,7 @@ def plot_residuals(
     Returns
     -------
     Axes
-        With a vertical logarithmic scale; a residual of exactly zero has no place on it.
+        With a vertical logarithmic scale, where a residual of exactly zero has no place; linear if all are zero.
 
     Raises
     ------
@@ -127,7 +127,11 @@ def plot_residuals(
         raise SpecError(f"{len(curves)} thresholds are too many for one picture: give at most 3.", path="threshold")
     (panel,) = _panels(None if axes is None else [axes], 1)
     time, size = dt * np.arange(steps), np.linalg.norm(estimates.residuals, axis=1)
-    panel.plot(time, np.where(size > 0.0, size, np.nan), label="norm of the residual", **RESIDUAL_STYLE)
+    if np.any(size > 0.0):
+        panel.set_yscale("log")
+        panel.plot(time, np.where(size > 0.0, size, np.nan), label="norm of the residual", **RESIDUAL_STYLE)
+    else:
+        panel.plot(time, size, label="norm of the residual", **RESIDUAL_STYLE)
     for (name, curve), style, marker in zip(curves.items(), THRESHOLD_STYLES, CROSSING_MARKERS, strict=False):
         panel.plot(time, curve, label=name, **style)
         crossed = np.flatnonzero(size > curve)
@@ -137,7 +141,6 @@ def plot_residuals(
                 time[first], size[first], marker=marker, markersize=9, markerfacecolor="none", markeredgewidth=1.6,
                 color=style["color"], linestyle="none", label=f"first above it at k = {first} ({time[first]:g} s)",
             )  # fmt: skip
-    panel.set_yscale("log")
     panel.set_ylabel("norm of the residual")
     panel.set_xlabel("time (s)")
     panel.legend(loc="best")
