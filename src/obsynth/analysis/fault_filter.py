@@ -82,16 +82,17 @@ def prepare(plant: DescriptorSystem, s: FloatArray | None = None) -> PreparedPla
     plant : DescriptorSystem
         Discrete time, with faults.
     s : FloatArray, optional
-        The paper's free matrix S ``(na, na + ny)``; the plant is then not balanced.
+        The paper's free matrix S ``(na, na + ny)``, for the plant as given.
     """
     work = with_sensor_faults_as_states(plant)
+    scaling = balance_system(work.E, work.A, inputs=[work.Bf], outputs=[work.C])
+    a, c = scaling.scale_dynamics(work.A), scaling.scale_output(work.C)
     if s is None:
-        scaling = balance_system(work.E, work.A, inputs=[work.Bf], outputs=[work.C])
+        t, n = restricted_equivalent(scaling.scale_dynamics(work.E), c)
     else:
-        scaling = Scaling(np.ones(work.nx), np.ones(work.nx), np.ones(work.ny))
-    e, a = scaling.scale_dynamics(work.E), scaling.scale_dynamics(work.A)
-    c = scaling.scale_output(work.C)
-    t, n = restricted_equivalent(e, c) if s is None else restricted_equivalent_from(e, c, s)
+        # S is meant for the plant as given; what it makes is then moved to the balanced coordinates, exactly.
+        t, n = restricted_equivalent_from(work.E, work.C, s)
+        t, n = t / scaling.states[:, None] / scaling.equations, n / scaling.states[:, None] / scaling.outputs
     ta, tf = t @ a, t @ scaling.scale_input(work.Bf)
     shown = np.eye(work.ny) - c @ n
 

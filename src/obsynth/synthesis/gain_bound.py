@@ -25,7 +25,7 @@ def proved_lower_bound(problem: GainProblem, *, solver: str) -> float:
     ``g^2 (tr Nd Z1 Nd' + tr Z2_22) > tr H N Z1 N'H' + tr H Z2 H'`` (for a free weight without Z2).  The check is in
     floating point with margins, on the normalised data.
     """
-    normalised = normalise(problem)
+    normalised = normalise(problem, rotate=solver not in lmi.FIRST_ORDER_SOLVERS)
     work = disturbed_part(normalised.problem)
     n, nd = work.order, work.disturbances
     if nd == 0:

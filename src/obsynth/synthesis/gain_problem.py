@@ -17,7 +17,7 @@ import numpy as np
 
 from obsynth.errors import SolverError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.norms import hinf_norm
+from obsynth.numerics.norms import hinf_norm, output_covariance
 from obsynth.synthesis.riccati import bounded_real_matrix, normalising_change, stabilising_gain
 
 #: The normalising Riccati solution is taken at this multiple of the starting filter's norm.
@@ -113,6 +113,10 @@ class GainProblem:
         r, v = solution.R, solution.V
         return self.A - r @ self.C, self.Bn - r @ self.Dn, self.Z + v @ self.C, self.Zn + v @ self.Dn
 
+    def noise_variance(self, solution: Injection) -> float:
+        """Return the true total variance of xi under the noise of the problem, with the given gains."""
+        return float(np.trace(output_covariance(*self.noise_loop(solution))))
+
     def achieved_gain(self, solution: Injection) -> float:
         """Return the true H-infinity norm d -> xi with the given gains."""
         return hinf_norm(*self.closed_loop(solution)).upper
@@ -177,7 +181,7 @@ class NormalisedProblem:
         return np.asarray(inverse.T @ p @ inverse)
 
 
-def normalise(problem: GainProblem, *, start: Injection | None = None) -> NormalisedProblem:
+def normalise(problem: GainProblem, *, start: Injection | None = None, rotate: bool = True) -> NormalisedProblem:
     """Return the problem in well-scaled coordinates.
 
     Parameters
@@ -186,6 +190,9 @@ def normalise(problem: GainProblem, *, start: Injection | None = None) -> Normal
         In any coordinates.
     start : Injection, optional
         Gains of a stable filter, the closer to the optimum the better; a Kalman filter by default.
+    rotate : bool, optional
+        Change the states as a whole, not only their scale.  First-order solvers do better without: in normalised
+        coordinates the solution reaches from one up to the ceiling on P.
 
     Raises
     ------
@@ -200,7 +207,12 @@ def normalise(problem: GainProblem, *, start: Injection | None = None) -> Normal
     p = bounded_real_matrix(a, b, z, zd, NORMALISING_LEVEL * size, slack=tail)
     if p is None:
         p = bounded_real_matrix(a, b[:, :0], z, zd[:, :0], 1.0, slack=tail)
-    states = np.eye(problem.order) if p is None else normalising_change(p)
+    if p is None:
+        states = np.eye(problem.order)
+    elif rotate:
+        states = normalising_change(p)
+    else:
+        states = np.eye(problem.order) / np.sqrt(np.trace(p) / problem.order)
     inverse = np.linalg.inv(states)
     c = problem.C @ states
     measurements = np.linalg.inv(np.linalg.cholesky(c @ c.T)) if problem.measured else np.zeros((0, 0))

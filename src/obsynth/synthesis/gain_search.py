@@ -13,7 +13,7 @@ import numpy as np
 
 from obsynth.errors import SolverError
 from obsynth.numerics.norms import spectral_radius
-from obsynth.synthesis import gain_design
+from obsynth.synthesis import gain_design, lmi
 from obsynth.synthesis.gain_problem import GainProblem, Injection, NormalisedProblem, normalise
 
 #: The search stops when another pass in better coordinates improves the gain by less than this.
@@ -58,6 +58,11 @@ class LeastGain:
     records: list[dict[str, Any]] = field(default_factory=list)
 
 
+def coordinates(problem: GainProblem, *, solver: str, start: Injection | None = None) -> NormalisedProblem:
+    """Return the problem in the coordinates that suit the solver."""
+    return normalise(problem, start=start, rotate=solver not in lmi.FIRST_ORDER_SOLVERS)
+
+
 def search_least_gain(problem: GainProblem, *, solver: str) -> LeastGain:
     """Minimise the gain directly, improving the coordinates between passes.
 
@@ -66,7 +71,7 @@ def search_least_gain(problem: GainProblem, *, solver: str) -> LeastGain:
     SolverError
         No pass gave a stable filter.
     """
-    normalised = normalise(problem)
+    normalised = coordinates(problem, solver=solver)
     best, gain = normalised.start, problem.achieved_gain(normalised.start)
     starting, records = gain, []
     if problem.measured == 0 or gain == 0.0:
@@ -83,7 +88,7 @@ def search_least_gain(problem: GainProblem, *, solver: str) -> LeastGain:
         improved = reached < gain * (1.0 - PASS_IMPROVEMENT)
         if reached < gain:
             best, gain = injection, reached
-            normalised = normalise(problem, start=best)
+            normalised = coordinates(problem, solver=solver, start=best)
         if not improved or gain <= NEGLIGIBLE_GAIN * starting:
             break
     return LeastGain(gain, normalised, best, starting, (gain, gain), records)
@@ -91,14 +96,14 @@ def search_least_gain(problem: GainProblem, *, solver: str) -> LeastGain:
 
 def search_by_bisection(problem: GainProblem, *, tolerance: float, solver: str) -> LeastGain:
     """Minimise the gain by bisection (the paper's Algorithm 1, made to end)."""
-    normalised = normalise(problem)
+    normalised = coordinates(problem, solver=solver)
     gain = problem.achieved_gain(normalised.start)
     if problem.measured == 0 or gain == 0.0:
         return LeastGain(gain, normalised, normalised.start, gain, (gain, gain))
     start = normalised.contracted(normalised.start)
     high, low, found, records = gain_design.bisected_gain(normalised.problem, start, tolerance=tolerance, solver=solver)
     injection = normalised.restore(found)
-    better = normalise(problem, start=injection)
+    better = coordinates(problem, solver=solver, start=injection)
     return LeastGain(
         problem.achieved_gain(injection),
         better,
@@ -140,13 +145,19 @@ def small_gain_design(
     if not np.any(problem.Bn) and not np.any(problem.Zn) and _reaches(problem, nothing, gain):
         # Without a noise model the objective is the size of the gains themselves, and zero is least.
         return nothing, records
-    for normalised in (least.normalised, normalise(problem)):
+    candidates: list[Injection] = []
+    for normalised in (least.normalised, coordinates(problem, solver=solver)):
         injection = _small_gains_in(problem, normalised, gain, records, solver=solver)
         if injection is not None and _reaches(problem, injection, gain):
-            return injection, records
-    injection = _small_gains_step_by_step(problem, gain, records, solver=solver)
-    if injection is not None:
-        return injection, records
+            candidates.append(injection)
+            if records[-1]["status"] == "optimal":
+                return injection, records
+    stepped = _small_gains_step_by_step(problem, gain, records, solver=solver)
+    if stepped is not None:
+        candidates.append(stepped)
+    if candidates:
+        # An inaccurate solution may be far from the least noise: the true variance decides, not the solver.
+        return min(candidates, key=problem.noise_variance), records
     if problem.disturbances:
         centre = gain_design.feasible_point(least.normalised.problem, gain / least.normalised.gain, solver=solver)
         if centre is not None and _reaches(problem, least.normalised.restore(centre.injection), gain):
@@ -176,7 +187,7 @@ def _small_gains_step_by_step(
     Far below the starting filter's gain its coordinates are too bad for one jump, and those of the least gain can
     be extreme (a decoupled disturbance).
     """
-    normalised = normalise(problem)
+    normalised = coordinates(problem, solver=solver)
     reached = problem.achieved_gain(normalised.start)
     for _ in range(MOST_STEPS):
         for ratio in STEP_RATIOS:
@@ -189,7 +200,7 @@ def _small_gains_step_by_step(
         if _reaches(problem, injection, gain):
             return injection
         reached = problem.achieved_gain(injection)
-        normalised = normalise(problem, start=injection)
+        normalised = coordinates(problem, solver=solver, start=injection)
     return None
 
 

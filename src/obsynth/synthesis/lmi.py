@@ -24,9 +24,10 @@ if TYPE_CHECKING:
 #: Statuses that come with numbers; whether they count is decided by verification, not here.
 USABLE_STATUSES = ("optimal", "optimal_inaccurate")
 #: Solvers that take semidefinite constraints, and the settings we use.
+FIRST_ORDER_SOLVERS = ("SCS",)
 SOLVER_SETTINGS: dict[str, dict[str, Any]] = {
     "CLARABEL": {},
-    "SCS": {"eps_abs": 1e-9, "eps_rel": 1e-9, "max_iters": 100_000},
+    "SCS": {"eps_abs": 1e-9, "eps_rel": 1e-9, "max_iters": 20_000},
 }
 
 

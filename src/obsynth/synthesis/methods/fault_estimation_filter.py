@@ -49,6 +49,8 @@ LARGEST_USEFUL_GAIN = 1e3
 #: The gains are designed for a slightly smaller gamma than claimed, so that the claim has a well-conditioned proof.
 CERTIFICATE_MARGIN = 5e-3
 CERTIFICATE_SHARE = 0.2
+#: The least relative distance to the optimum at which a proof can be expected.
+LEAST_MARGIN = 1e-4
 #: Level of the certificate when no disturbance reaches the fault estimate at all.
 NOMINAL_GAIN = 1e-6
 
@@ -77,8 +79,11 @@ class FilterOptions:
             problems.append(f"gamma is {self.gamma}: give a positive number, or none for the least.")
         if self.gamma_search not in ("direct", "bisection"):
             problems.append(f"gamma_search is {self.gamma_search!r}: use 'direct' or 'bisection'.")
-        if not (np.isfinite(self.gamma_margin) and self.gamma_margin > 0.0):
-            problems.append(f"gamma_margin is {self.gamma_margin}: give a positive number, such as 0.05.")
+        if not (np.isfinite(self.gamma_margin) and self.gamma_margin >= LEAST_MARGIN):
+            problems.append(
+                f"gamma_margin is {self.gamma_margin}: give {LEAST_MARGIN} or more, such as 0.05; less leaves no room "
+                "for a proof."
+            )
         if self.solver not in SOLVER_SETTINGS:
             problems.append(f"solver is {self.solver!r}: use one of {', '.join(SOLVER_SETTINGS)}.")
         if not 0.0 < self.tolerance < 1.0:

@@ -1,0 +1,118 @@
+"""The least gain: the same by every route, never beaten, and what lies below it is refused with a sound bound."""
+
+import numpy as np
+import pytest
+from plants import build, random_recipe
+from reference_gain import ErrorProblem
+
+import obsynth
+
+#: Gains below this count as a decoupled disturbance: their digits mean nothing.
+NEGLIGIBLE = 1e-4
+
+
+def disturbed_plants(count, stream, **fixed):
+    """Return plants on which the gains are free: more outputs than faults, and a disturbance."""
+    found = []
+    i = 0
+    while len(found) < count:
+        rng = np.random.default_rng([45, stream, i])
+        i += 1
+        recipe = random_recipe(rng, **{"largest": 6, "nd": int(rng.integers(1, 4)), **fixed})
+        if recipe.ny > len(recipe.indexes):
+            found.append(build(rng, recipe).plant)
+    return found
+
+
+def least(plant, **options):
+    return obsynth.fault_estimation_filter(plant, **options).certificate.claims["gamma_min"]
+
+
+def test_bisection_agrees_with_the_direct_solution():
+    tolerance = 1e-4
+    for plant in [*disturbed_plants(12, 0), *disturbed_plants(6, 1, feedthrough=True)]:
+        direct = least(plant)
+        claims = obsynth.fault_estimation_filter(plant, gamma_search="bisection", tolerance=tolerance).certificate.claims
+        low, high = claims["gamma_bracket_low"], claims["gamma_bracket_high"]
+        assert high - low <= tolerance * high
+        assert claims["gamma_min"] <= high * (1.0 + 1e-6)
+        # 1e-5: what the direct search itself leaves open.
+        assert claims["gamma_min"] == pytest.approx(direct, rel=tolerance + 1e-5)
+
+
+def test_two_solvers_agree():
+    for plant in disturbed_plants(6, 2, largest=4):
+        assert least(plant, solver="SCS") == pytest.approx(least(plant, solver="CLARABEL"), rel=1e-3)
+
+
+@pytest.mark.parametrize("fixed", [{}, {"feedthrough": True}, {"explicit": True, "singularity": 0}], ids=str)
+def test_no_filter_beats_the_least_gain(fixed):
+    beaten = []
+    for plant in disturbed_plants(15, 3, largest=8, **fixed):
+        design = obsynth.fault_estimation_filter(plant)
+        found = design.certificate.claims["gamma_min"]
+        better = ErrorProblem.of(design).best(found)
+        if better < found * (1.0 - 1e-3):
+            beaten.append((repr(plant), found, better))
+    assert beaten == []
+
+
+def test_no_filter_with_free_weight_beats_the_least_gain():
+    beaten = []
+    for plant in disturbed_plants(15, 4, largest=8):
+        design = obsynth.fault_estimation_filter(plant, free_residual_weight=True)
+        found = design.certificate.claims["gamma_min"]
+        better = max(ErrorProblem.of(design, free_weight=True).best(found), NEGLIGIBLE)
+        if better < found * (1.0 - 1e-3):
+            beaten.append((repr(plant), found, better))
+    assert beaten == []
+
+
+def test_free_weight_never_costs_gain():
+    worse = []
+    for plant in [*disturbed_plants(25, 5, largest=8), *disturbed_plants(10, 6, feedthrough=True)]:
+        fixed, free = least(plant), least(plant, free_residual_weight=True)
+        if free > fixed * (1.0 + 1e-5):
+            worse.append((repr(plant), fixed, free))
+    assert worse == []
+
+
+@pytest.mark.parametrize("share", [0.5, 0.9, 0.99])
+def test_gamma_below_the_least_is_refused_with_a_sound_bound(share):
+    plants = [*disturbed_plants(25, 7, largest=8), *disturbed_plants(10, 8, feedthrough=True)]
+    proved = 0
+    for plant in plants:
+        found = least(plant)
+        with pytest.raises((obsynth.InfeasibleError, obsynth.SolverError)) as refusal:
+            obsynth.fault_estimation_filter(plant, gamma=share * found)
+        if isinstance(refusal.value, obsynth.InfeasibleError):
+            proved += 1
+            assert share * found < refusal.value.lower_bound <= found * (1.0 + 1e-9)
+            assert not refusal.value.necessary
+    # A SolverError is honest ("nothing is known") but should be the exception.
+    assert proved >= 0.9 * len(plants)
+
+
+def test_gamma_below_the_least_is_always_proved_without_freedom():
+    rng = np.random.default_rng(9)
+    for _ in range(20):
+        plant = build(rng, random_recipe(rng, square=True, nd=2)).plant
+        found = least(plant)
+        with pytest.raises(obsynth.InfeasibleError) as refusal:
+            obsynth.fault_estimation_filter(plant, gamma=0.99 * found)
+        assert 0.99 * found < refusal.value.lower_bound <= found
+
+
+@pytest.mark.parametrize("factor", [1.001, 1.05, 10.0, 1e6])
+def test_gamma_above_the_least_is_reached(factor):
+    failures = []
+    for plant in disturbed_plants(20, 10, largest=8):
+        found = least(plant)
+        try:
+            design = obsynth.fault_estimation_filter(plant, gamma=factor * found)
+        except obsynth.ObsynthError as error:
+            failures.append((repr(plant), found, str(error)))
+            continue
+        assert design.report.passed
+        assert design.certificate.claims["gamma"] <= factor * found * (1.0 + 1e-12)
+    assert failures == []
