@@ -55,7 +55,8 @@ class Recipe:
         Whether D and Dd are random instead of zero.
     disturbance : str
         ``"random"``, ``"invisible"`` (acts on a hidden mode only; needs one), ``"zero"``, ``"sensor"`` (Dd only),
-        ``"fault"`` (enters like a further fault, so that a free W decouples it) or ``"large"`` (more inputs and larger).
+        ``"fault"`` (enters like a further fault, so that a free W decouples it) or ``"large"``
+        (large entries).
     noise : int
         Number of noise inputs, through Bw and Dw.
     scales : float
@@ -180,17 +181,23 @@ def build(rng: np.random.Generator, recipe: Recipe) -> KnownPlant:
     rows = np.linalg.inv(change) if recipe.explicit else well_conditioned(rng, nx)
     e = rows @ (np.eye(nx) - n @ c) @ change
     data = {
-        "E": np.eye(nx) if recipe.explicit else e, "A": rows @ a1 @ change, "B": rows @ rng.normal(size=(nx, recipe.nu)),
-        "C": mixing @ outputs @ change, "Bf": rows @ faults, "Df": mixing @ direct, "Bd": rows @ disturbances,
-        "Bw": rows @ rng.normal(size=(nx, recipe.noise)) * 0.01, "Dw": rng.normal(size=(recipe.ny, recipe.noise)) * 0.01,
-    }  # fmt: skip
+        "E": np.eye(nx) if recipe.explicit else e,
+        "A": rows @ a1 @ change,
+        "B": rows @ rng.normal(size=(nx, recipe.nu)),
+        "C": mixing @ outputs @ change,
+        "Bf": rows @ faults,
+        "Df": mixing @ direct,
+        "Bd": rows @ disturbances,
+        "Bw": rows @ rng.normal(size=(nx, recipe.noise)) * 0.01,
+        "Dw": rng.normal(size=(recipe.ny, recipe.noise)) * 0.01,
+    }
     if recipe.feedthrough:
         data["D"] = rng.normal(size=(recipe.ny, recipe.nu))
     if recipe.nd and (recipe.feedthrough or recipe.disturbance == "sensor") and recipe.disturbance != "invisible":
         data["Dd"] = rng.normal(size=(recipe.ny, recipe.nd))
     data = _scaled(rng, data, recipe.scales, explicit=recipe.explicit)
     plant = obsynth.DescriptorSystem(**data, dt=float(rng.choice([0.02, 0.1, 1.0])))
-    zeros = with_conjugates([z for z in map(complex, recipe.zeros) if z.imag >= 0.0]) + tuple(map(complex, recipe.hidden_modes))
+    zeros = with_conjugates([*(z for z in map(complex, recipe.zeros) if z.imag >= 0.0), *recipe.hidden_modes])
     return KnownPlant(plant, recipe.indexes + (1,) * recipe.sensor_faults, zeros, recipe)
 
 
@@ -225,8 +232,9 @@ def _chain_system(
     rest[nz + observed :, : nz + observed] = rng.normal(size=(hidden, nz + observed)) * 0.5
     a1[length:, length:] = rest
     a1[:length, visible] = rng.normal(size=(length, nz + observed)) * 0.5
-    seen = np.hstack([np.zeros((ny - nf, nz)), well_conditioned(rng, ny - nf, observed)]) if ny > nf else np.zeros((0, nz))
-    c[:, visible] = upsilon @ rng.normal(size=(nf, nz + observed)) * 0.5 + rest_of_outputs @ seen
+    c[:, visible] = upsilon @ rng.normal(size=(nf, nz + observed)) * 0.5
+    if ny > nf:
+        c[:, length + nz : nx - hidden] += rest_of_outputs @ well_conditioned(rng, ny - nf, observed)
     return a1, f, c, first
 
 
@@ -237,7 +245,7 @@ def _output_injection(rng: np.random.Generator, recipe: Recipe, a1: Array, c: Ar
     if recipe.explicit:
         return a1 + 0.5 * recipe.radius * rng.normal(size=(nx, ny)) @ c, np.zeros((nx, ny))
     kernel_in_outputs = orthogonal(rng, ny)[:, :count]
-    kernel = np.linalg.pinv(c) @ kernel_in_outputs + (null_space(c) @ rng.normal(size=(nx - ny, count)) if nx > ny else 0.0)
+    kernel = np.linalg.pinv(c) @ kernel_in_outputs + null_space(c) @ rng.normal(size=(nx - ny, count))
     pick = np.linalg.pinv(c @ kernel) if count else np.zeros((0, ny))
     n = kernel @ pick + 0.3 * rng.normal(size=(nx, ny)) @ (np.eye(ny) - c @ kernel @ pick)
     e = np.eye(nx) - n @ c

@@ -7,8 +7,10 @@ from reference_gain import ErrorProblem
 
 import obsynth
 
-#: Gains below this count as a decoupled disturbance: their digits mean nothing.
-NEGLIGIBLE = 1e-4
+#: Gains below this share of the one with a fixed weight count as a decoupled disturbance: their digits mean nothing.
+NEGLIGIBLE = 1e-3
+#: A SolverError is honest ("nothing is known") but should be the exception.
+SHARE_TO_BE_PROVED = 0.9
 
 
 def disturbed_plants(count, stream, **fixed):
@@ -28,11 +30,19 @@ def least(plant, **options):
     return obsynth.fault_estimation_filter(plant, **options).certificate.claims["gamma_min"]
 
 
+@pytest.fixture(scope="module")
+def solved():
+    """Plants with their least gain, fixed weight."""
+    plants = [*disturbed_plants(20, 7, largest=8), *disturbed_plants(10, 8, feedthrough=True)]
+    return [(plant, least(plant)) for plant in plants]
+
+
 def test_bisection_agrees_with_the_direct_solution():
     tolerance = 1e-4
     for plant in [*disturbed_plants(12, 0), *disturbed_plants(6, 1, feedthrough=True)]:
         direct = least(plant)
-        claims = obsynth.fault_estimation_filter(plant, gamma_search="bisection", tolerance=tolerance).certificate.claims
+        design = obsynth.fault_estimation_filter(plant, gamma_search="bisection", tolerance=tolerance)
+        claims = design.certificate.claims
         low, high = claims["gamma_bracket_low"], claims["gamma_bracket_high"]
         assert high - low <= tolerance * high
         assert claims["gamma_min"] <= high * (1.0 + 1e-6)
@@ -48,7 +58,7 @@ def test_two_solvers_agree():
 @pytest.mark.parametrize("fixed", [{}, {"feedthrough": True}, {"explicit": True, "singularity": 0}], ids=str)
 def test_no_filter_beats_the_least_gain(fixed):
     beaten = []
-    for plant in disturbed_plants(15, 3, largest=8, **fixed):
+    for plant in disturbed_plants(12, 3, largest=8, **fixed):
         design = obsynth.fault_estimation_filter(plant)
         found = design.certificate.claims["gamma_min"]
         better = ErrorProblem.of(design).best(found)
@@ -57,45 +67,36 @@ def test_no_filter_beats_the_least_gain(fixed):
     assert beaten == []
 
 
-def test_no_filter_with_free_weight_beats_the_least_gain():
-    beaten = []
-    for plant in disturbed_plants(15, 4, largest=8):
+def test_free_weight_never_costs_gain_and_is_not_beaten(solved):
+    worse, beaten = [], []
+    for plant, fixed in solved:
         design = obsynth.fault_estimation_filter(plant, free_residual_weight=True)
         found = design.certificate.claims["gamma_min"]
-        better = max(ErrorProblem.of(design, free_weight=True).best(found), NEGLIGIBLE)
+        if found > fixed * (1.0 + 1e-5):
+            worse.append((repr(plant), fixed, found))
+        better = max(ErrorProblem.of(design, free_weight=True).best(found), NEGLIGIBLE * fixed)
         if better < found * (1.0 - 1e-3):
             beaten.append((repr(plant), found, better))
+    assert worse == []
     assert beaten == []
 
 
-def test_free_weight_never_costs_gain():
-    worse = []
-    for plant in [*disturbed_plants(25, 5, largest=8), *disturbed_plants(10, 6, feedthrough=True)]:
-        fixed, free = least(plant), least(plant, free_residual_weight=True)
-        if free > fixed * (1.0 + 1e-5):
-            worse.append((repr(plant), fixed, free))
-    assert worse == []
-
-
 @pytest.mark.parametrize("share", [0.5, 0.9, 0.99])
-def test_gamma_below_the_least_is_refused_with_a_sound_bound(share):
-    plants = [*disturbed_plants(25, 7, largest=8), *disturbed_plants(10, 8, feedthrough=True)]
+def test_gamma_below_the_least_is_refused_with_a_sound_bound(solved, share):
     proved = 0
-    for plant in plants:
-        found = least(plant)
+    for plant, found in solved:
         with pytest.raises((obsynth.InfeasibleError, obsynth.SolverError)) as refusal:
             obsynth.fault_estimation_filter(plant, gamma=share * found)
         if isinstance(refusal.value, obsynth.InfeasibleError):
             proved += 1
             assert share * found < refusal.value.lower_bound <= found * (1.0 + 1e-9)
             assert not refusal.value.necessary
-    # A SolverError is honest ("nothing is known") but should be the exception.
-    assert proved >= 0.9 * len(plants)
+    assert proved >= SHARE_TO_BE_PROVED * len(solved)
 
 
 def test_gamma_below_the_least_is_always_proved_without_freedom():
     rng = np.random.default_rng(9)
-    for _ in range(20):
+    for _ in range(15):
         plant = build(rng, random_recipe(rng, square=True, nd=2)).plant
         found = least(plant)
         with pytest.raises(obsynth.InfeasibleError) as refusal:
@@ -103,11 +104,10 @@ def test_gamma_below_the_least_is_always_proved_without_freedom():
         assert 0.99 * found < refusal.value.lower_bound <= found
 
 
-@pytest.mark.parametrize("factor", [1.001, 1.05, 10.0, 1e6])
-def test_gamma_above_the_least_is_reached(factor):
+@pytest.mark.parametrize("factor", [1.001, 10.0, 1e6])
+def test_gamma_above_the_least_is_reached(solved, factor):
     failures = []
-    for plant in disturbed_plants(20, 10, largest=8):
-        found = least(plant)
+    for plant, found in solved:
         try:
             design = obsynth.fault_estimation_filter(plant, gamma=factor * found)
         except obsynth.ObsynthError as error:
@@ -116,3 +116,14 @@ def test_gamma_above_the_least_is_reached(factor):
         assert design.report.passed
         assert design.certificate.claims["gamma"] <= factor * found * (1.0 + 1e-12)
     assert failures == []
+
+
+@pytest.mark.parametrize("options", [{}, {"gamma": 1.0}, {"free_residual_weight": True}], ids=str)
+@pytest.mark.parametrize("square", [False, True])
+def test_disturbance_without_any_effect_is_served(options, square):
+    for i in range(4):
+        rng = np.random.default_rng([46, i])
+        recipe = random_recipe(rng, disturbance="invisible", nd=1, hidden_modes=(0.5,), square=square)
+        design = obsynth.fault_estimation_filter(build(rng, recipe).plant, **options)
+        assert design.report.passed
+        assert design.certificate.claims["gamma_min"] <= 1e-9

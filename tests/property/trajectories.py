@@ -87,8 +87,8 @@ def matched_start(design: obsynth.ObserverDesign, record: Record, k: int) -> Arr
 def transfer(design: obsynth.ObserverDesign, z: complex) -> dict[str, Array]:
     """Return the transfer functions at ``z`` of plant and observer in series, by input, and what passes through them.
 
-    Keys ``"u"``, ``"f"``, ``"d"``: ``(nx + nf, *)`` from that input to ``[xhat; fhat]``, and ``"xu"``, ``"xf"``, ``"xd"``:
-    ``(nx, *)`` to the true states.  ``"size"`` is the size of the terms that were summed up.
+    Keys ``"u"``, ``"f"``, ``"d"``: ``(nx + nf, *)`` from that input to ``[xhat; fhat]``; ``"xu"``, ``"xf"``, ``"xd"``:
+    ``(nx, *)`` from it to the true states; ``"size"``: the size of the terms that were summed up.
     """
     plant, observer = design.plant, design.observer
     inputs = np.hstack([plant.B, plant.Bf, plant.Bd])

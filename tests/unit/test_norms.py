@@ -256,6 +256,15 @@ class TestOutputCovariance:
         silent = output_covariance(np.eye(1) * 0.5, np.zeros((1, 0)), np.eye(1), np.zeros((1, 0)))
         assert np.array_equal(silent, [[0.0]])
 
+    def test_units_of_the_states_do_not_matter(self):
+        """Without balancing, scipy's solver warned of an ill-conditioned matrix."""
+        rng = np.random.default_rng(10)
+        for _ in range(50):
+            a, b, c, d = random_system(rng, damping=0.1)
+            powers = np.exp2(rng.integers(-40, 41, a.shape[0]))
+            scaled = output_covariance(a * powers / powers[:, None], b / powers[:, None], c * powers, d)
+            assert np.allclose(scaled, output_covariance(a, b, c, d), rtol=1e-10, atol=0.0)
+
     def test_overflow_is_infinite(self):
         for b, c, d in ((1e200, 1.0, 0.0), (1.0, 1e200, 0.0), (1.0, 1.0, 1e200)):
             assert output_covariance(*system(0.5, b, c, d))[0, 0] == np.inf

@@ -17,6 +17,10 @@ CIRCLE_TOLERANCE = 1e-3
 GRID_POINTS = 129
 #: Each round at least squares the relative error near the peak; more than this means trouble.
 MAXIMUM_ROUNDS = 40
+#: Variance of a state in the rest of an infinite sum, relative to what is summed, below which the sum is complete.
+SUM_TOLERANCE = 1e-17
+#: Each doubles the number of terms of that sum.
+MAXIMUM_DOUBLINGS = 64
 
 
 @dataclass(frozen=True)
@@ -154,14 +158,19 @@ def output_covariance(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray
     Infinite when ``a`` is not Schur stable, or when the numbers overflow.
     """
     infinite = np.full((c.shape[0], c.shape[0]), np.inf)
-    if spectral_radius(a) >= 1.0:
+    if not np.all(np.isfinite(a)) or spectral_radius(a) >= 1.0:
         return infinite
-    from scipy.linalg import solve_discrete_lyapunov
-
     with np.errstate(over="ignore", invalid="ignore"):
-        inputs = b @ b.T
-        if not np.all(np.isfinite(inputs)):
+        states, power = b @ b.T, a
+        for _ in range(MAXIMUM_DOUBLINGS):
+            # The sum of A^k B B' A'^k over the first k, doubled: every term is positive semidefinite.
+            later = power @ states @ power.T
+            states, power = states + later, power @ power
+            if not np.all(np.isfinite(states)):
+                return infinite
+            if np.all(np.diag(later) <= SUM_TOLERANCE * np.diag(states)):
+                break
+        else:
             return infinite
-        states = solve_discrete_lyapunov(a, inputs) if a.size else np.zeros((0, 0))
         found = np.asarray(c @ states @ c.T + d @ d.T)
     return found if np.all(np.isfinite(found)) else infinite

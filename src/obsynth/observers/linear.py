@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
@@ -59,18 +60,20 @@ class LinearObserver:
     fault_delays: tuple[int, ...]
 
     def __post_init__(self) -> None:
-        nz = np.asarray(self.Az).shape[0]
-        nu, ny = len(self.input_names), len(self.output_names)
+        given = {name: as_matrix(getattr(self, name), name) for name in ("Az", "Bu", "By", "Cz", "Du", "Dy")}
+        nz, nu, ny = given["Az"].shape[0], len(self.input_names), len(self.output_names)
         rows = len(self.state_names) + len(self.fault_names) + len(self.residual_names)
         shapes = {"Az": (nz, nz), "Bu": (nz, nu), "By": (nz, ny), "Cz": (rows, nz), "Du": (rows, nu), "Dy": (rows, ny)}
         for name, shape in shapes.items():
-            matrix = np.zeros(shape) if 0 in shape else as_matrix(getattr(self, name), name)
+            matrix = np.zeros(shape) if 0 in shape and given[name].size == 0 else given[name]
             if matrix.shape != shape:
                 raise SpecError(f"{name} of the observer is {matrix.shape}, but {shape} is needed.", path=name)
             object.__setattr__(self, name, read_only(matrix))
+        if not (math.isfinite(self.dt) and self.dt >= 0.0):
+            raise SpecError(f"dt of the observer is {self.dt}: give seconds, or 0 for continuous time.", path="dt")
         for names, delays in ((self.state_names, self.state_delays), (self.fault_names, self.fault_delays)):
-            if len(names) != len(delays):
-                raise SpecError("The observer needs one delay for each estimated signal.", path="delays")
+            if len(names) != len(delays) or not all(isinstance(delay, int) and delay >= 0 for delay in delays):
+                raise SpecError("The observer needs one delay >= 0, in samples, for each signal.", path="delays")
 
     @property
     def order(self) -> int:
@@ -144,9 +147,8 @@ class LinearObserver:
             Shapes do not fit, or a sample is not finite.
         """
         outputs = _record(y, len(self.output_names), "y")
-        inputs = _record(
-            np.zeros((len(outputs), 0)) if u is None and not self.input_names else u, len(self.input_names), "u"
-        )
+        known = np.zeros((len(outputs), 0)) if u is None and not self.input_names else u
+        inputs = _record(known, len(self.input_names), "u")
         if len(inputs) != len(outputs):
             raise SpecError(f"u has {len(inputs)} samples and y has {len(outputs)}: give the same number.", path="u")
         running = self.start(initial_state)
@@ -156,16 +158,35 @@ class LinearObserver:
         return Estimates.split(self, rows)
 
 
+def _numbers(value: Any, name: str) -> FloatArray:
+    """Return an array of finite real numbers of one or two dimensions; raise `SpecError` naming it."""
+    try:
+        raw = np.asarray(value)
+    except ValueError:
+        raise SpecError(f"{name} is ragged: give the same number of signals at each sample.", path=name) from None
+    if raw.ndim <= 1:
+        return np.asarray(as_matrix(raw.reshape(1, -1), name)[0])
+    return as_matrix(raw, name)
+
+
 def _record(value: Any, columns: int, name: str) -> FloatArray:
+    """Return a record ``(steps, columns)``; one signal may be given as a plain list."""
     if value is None:
         raise SpecError(f"{name} is missing: the observer needs {columns} signal(s).", path=name)
-    if columns == 0:
-        return np.zeros((len(np.asarray(value)), 0))
-    array = np.asarray(value, dtype=np.float64)
-    matrix = as_matrix(array.reshape(-1, 1) if array.ndim == 1 and columns == 1 else array, name)
-    if matrix.shape[1] != columns:
-        raise SpecError(f"{name} has {matrix.shape[1]} columns, but the observer needs {columns}.", path=name)
-    return matrix
+    array = _numbers(value, name)
+    if array.ndim == 1 and columns == 1:
+        array = array.reshape(-1, 1)
+    if array.ndim != 2 or array.shape[1] != columns:
+        raise SpecError(f"{name} has shape {array.shape}, but the observer needs (steps, {columns}).", path=name)
+    return array
+
+
+def _sample(value: Any, count: int, name: str) -> FloatArray:
+    """Return one sample ``(count,)``."""
+    array = _numbers(value, name)
+    if array.shape != (count,):
+        raise SpecError(f"{name} has shape {array.shape}, but the observer needs {count} number(s).", path=name)
+    return array
 
 
 class RunningObserver:
@@ -189,11 +210,9 @@ class RunningObserver:
             raise SpecError(
                 "This observer is continuous in time: it must be discretised before it can step.", path="dt"
             )
-        start = np.zeros(observer.order) if initial_state is None else np.asarray(initial_state, dtype=np.float64)
-        if start.shape != (observer.order,) or not np.all(np.isfinite(start)):
-            raise SpecError(f"initial_state needs {observer.order} finite numbers.", path="initial_state")
+        start = np.zeros(observer.order) if initial_state is None else initial_state
+        self.state = _sample(start, observer.order, "initial_state").copy()
         self.observer = observer
-        self.state = start.copy()
 
     def raw_step(self, y: FloatArray, u: FloatArray) -> FloatArray:
         """Return the row ``[xhat, fhat, r]`` and advance, without checking the samples.
@@ -223,9 +242,9 @@ class RunningObserver:
         SpecError
             A sample has the wrong length or is not finite; the state is left as it was.
         """
-        outputs = _record(np.atleast_1d(np.asarray(y, dtype=np.float64))[None, :], len(self.observer.output_names), "y")
-        inputs = _record(np.atleast_1d(np.asarray(u, dtype=np.float64))[None, :], len(self.observer.input_names), "u")
-        return Estimates.split(self.observer, self.raw_step(outputs[0], inputs[0])[None, :])
+        outputs = _sample(y, len(self.observer.output_names), "y")
+        inputs = _sample(u, len(self.observer.input_names), "u")
+        return Estimates.split(self.observer, self.raw_step(outputs, inputs)[None, :])
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,10 +23,13 @@ from obsynth.results.report import VerificationReport
 
 SCHEMA_VERSION = 1
 _KIND = "obsynth gain set"
+# What JSON does not have is marked by these sets of keys; a mapping that happens to have one of them is wrapped.
+_ARRAY, _FLOAT, _MAPPING = {"shape", "data"}, {"float"}, {"mapping"}
+_MARKS = (_ARRAY, _FLOAT, _MAPPING)
 
 
 def plain(value: Any) -> Any:
-    """Return ``value`` as JSON data: arrays as nested lists, NaN as ``"nan"``, infinities as ``"inf"``."""
+    """Return ``value`` as JSON data; arrays, NaN and infinities are marked so that `restored` finds them."""
     if isinstance(value, np.ndarray):
         return {"shape": list(value.shape), "data": [plain(x) for x in value.ravel().tolist()]}
     if isinstance(value, (np.floating, np.integer, np.bool_)):
@@ -34,7 +37,8 @@ def plain(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return {"float": str(value)}
     if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
+        entries = {str(key): plain(item) for key, item in value.items()}
+        return {"mapping": entries} if entries.keys() in _MARKS else entries
     if isinstance(value, (list, tuple)):
         return [plain(item) for item in value]
     if value is None or isinstance(value, (bool, int, float, str)):
@@ -45,11 +49,13 @@ def plain(value: Any) -> Any:
 def restored(value: Any) -> Any:
     """Return what `plain` wrote, with arrays and special floats restored."""
     if isinstance(value, dict):
-        if set(value) == {"shape", "data"}:
+        if value.keys() == _ARRAY:
             data = [restored(item) for item in value["data"]]
             return np.array(data, dtype=np.float64).reshape(value["shape"])
-        if set(value) == {"float"}:
+        if value.keys() == _FLOAT:
             return float(value["float"])
+        if value.keys() == _MAPPING:
+            value = value["mapping"]
         return {key: restored(item) for key, item in value.items()}
     if isinstance(value, list):
         return [restored(item) for item in value]
@@ -104,9 +110,10 @@ def write_atomically(path: str | Path, text: str) -> Path:
         os.chmod(temporary, 0o666 & ~mask)
         os.replace(temporary, target)
     except OSError as error:
+        raise SpecError(f"{target} cannot be written: {error.strerror}.", path=str(target)) from error
+    finally:
         if temporary is not None and os.path.exists(temporary):
             os.unlink(temporary)
-        raise SpecError(f"{target} cannot be written: {error.strerror}.", path=str(target)) from error
     return target
 
 
@@ -148,7 +155,11 @@ def load(path: str | Path) -> ObserverDesign:
             f"{source} has schema version {version!r}; this obsynth reads {SCHEMA_VERSION}.", path=str(source)
         )
     body = document.get("design")
-    if not isinstance(body, dict) or document.get("sha256") != digest_of(body):
+    try:
+        intact = isinstance(body, dict) and document.get("sha256") == digest_of(body)
+    except ValueError:  # a number too large for a float
+        intact = False
+    if not intact:
         raise SpecError(f"{source} was changed after it was written: its digest does not match.", path=str(source))
     try:
         return _design_from(restored(body))

@@ -18,6 +18,7 @@ import numpy as np
 
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.scaling import balance_system
 from obsynth.observers.linear import LinearObserver
 
 
@@ -66,11 +67,13 @@ class Residual:
         return self.error / self.scale if self.scale > 0.0 else self.error
 
 
-def residual(*terms: FloatArray, factors: tuple[tuple[FloatArray, ...], ...] = ()) -> Residual:
-    """Return the residual of ``terms[0] + terms[1] + ... = 0``.
+def residual(
+    *terms: FloatArray, factors: tuple[tuple[FloatArray, ...], ...] = (), units: FloatArray | None = None
+) -> Residual:
+    """Return the residual of ``terms[0] + terms[1] + ... = 0``: the entry that is worst beside what it is made of.
 
-    The scale counts, row by row, what the terms and the products inside them (``factors``) could contribute to
-    rounding; the error is the largest ratio times the largest scale.
+    The scale counts what the terms and the products inside them (``factors``) could contribute to rounding, largest
+    entry of each row.  ``units`` are the sizes of the columns' signals: multiplied by them, entries of one row compare.
     """
     total = sum(terms[1:], start=terms[0].copy())
     if total.size == 0:
@@ -81,12 +84,13 @@ def residual(*terms: FloatArray, factors: tuple[tuple[FloatArray, ...], ...] = (
         for factor in product[1:]:
             bound = bound @ np.abs(factor)
         size = size + bound
-    rows = np.max(size, axis=1, keepdims=True)
-    rows[rows == 0.0] = 1.0
-    worst = np.unravel_index(int(np.argmax(np.abs(total) / rows)), total.shape)
-    if not np.all(np.isfinite(total)):
+    if not np.all(np.isfinite(total)) or not np.all(np.isfinite(size)):
         return Residual(float("nan"), 1.0)
-    return Residual(float(np.abs(total[worst])), float(rows[worst[0], 0]))
+    columns = np.ones(total.shape[1]) if units is None else units
+    rows = np.max(size * columns, axis=1, keepdims=True)
+    scale = np.where(rows > 0.0, rows, 1.0) / columns
+    worst = np.unravel_index(int(np.argmax(np.abs(total) / scale)), total.shape)
+    return Residual(float(np.abs(total[worst])), float(scale[worst]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,8 +103,8 @@ class ErrorSystem:
         ``(nz, nz)``.
     fault, disturbance, noise : FloatArray
         Inputs of the error ``V b - By d``: ``(nz, nf)``, ``(nz, nd)``, ``(nz, nw)``.
-    fault_output : tuple of FloatArray
-        ``(Cf, Df, Dd, Dw)``: fault estimate = ``-Cf e + Df f + Dd d + Dw w``.
+    fault_output, residual_output : tuple of FloatArray
+        ``(Cf, Df, Dd, Dw)``: fault estimate (residual) = ``-Cf e + Df f + Dd d + Dw w``.
     state_output : tuple of FloatArray
         ``(Cx, Df, Dd, Dw)``: state error = ``Cx e - Df f - Dd d - Dw w``.
     """
@@ -110,6 +114,7 @@ class ErrorSystem:
     disturbance: FloatArray
     noise: FloatArray
     fault_output: tuple[FloatArray, FloatArray, FloatArray, FloatArray]
+    residual_output: tuple[FloatArray, FloatArray, FloatArray, FloatArray]
     state_output: tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 
     @classmethod
@@ -130,6 +135,7 @@ class ErrorSystem:
             driven(plant.Bd, plant.Dd),
             driven(plant.Bw, plant.Dw),
             output(observer.fault_rows),
+            output(observer.residual_rows),
             output(observer.state_rows),
         )
 
@@ -140,14 +146,21 @@ def tracking_residuals(
     """Return the residuals of the identities that make the observer unbiased without faults and disturbances."""
     lagged = LaggedPlant.of(plant, lag)
     ve = tracking @ lagged.E
-    states, faults = observer.state_rows, observer.fault_rows
-    cz, dy, du = observer.Cz, observer.Dy, observer.Du
+    states, cz, dy, du = observer.state_rows, observer.Cz, observer.Dy, observer.Du
+    # A state in small units must not hide behind one in large units.
+    units = np.tile(balance_system(plant.E, plant.A, outputs=[plant.C]).states, lag + 1)
+
+    def unseen(rows: slice) -> Residual:
+        factors = ((cz[rows], tracking, lagged.E), (dy[rows], lagged.C))
+        return residual(cz[rows] @ ve, dy[rows] @ lagged.C, factors=factors, units=units)
+
     return {
         "dynamics": residual(
             observer.Az @ ve,
             observer.By @ lagged.C,
             -tracking @ lagged.A,
             factors=((observer.Az, tracking, lagged.E), (observer.By, lagged.C), (tracking, lagged.A)),
+            units=units,
         ),
         "inputs": residual(
             observer.Bu,
@@ -160,9 +173,9 @@ def tracking_residuals(
             dy[states] @ lagged.C,
             -lagged.oldest,
             factors=((cz[states], tracking, lagged.E), (dy[states], lagged.C)),
+            units=units,
         ),
-        "fault estimate": residual(
-            cz[faults] @ ve, dy[faults] @ lagged.C, factors=((cz[faults], tracking, lagged.E), (dy[faults], lagged.C))
-        ),
+        "fault estimate": unseen(observer.fault_rows),
+        "residual": unseen(observer.residual_rows),
         "input feedthrough": residual(du, dy @ plant.D, factors=((dy, plant.D),)),
     }

@@ -17,7 +17,7 @@ from obsynth.observers.linear import LinearObserver
 from obsynth.results.design import ObserverDesign
 from obsynth.results.report import Check, information, upper_bound_check
 from obsynth.verification.bounded_real import prove_bounded_real
-from obsynth.verification.error_system import ErrorSystem, Residual, residual, tracking_residuals
+from obsynth.verification.error_system import ErrorSystem, LaggedPlant, Residual, residual, tracking_residuals
 from obsynth.verification.plant import condition_rows, plant_information
 
 #: Equalities may miss by this much, relative to the terms they are made of.
@@ -31,6 +31,7 @@ _IDENTITIES = {
         "Wang 2015, eq. (7)",
     ),
     "fault estimate": ("unbiased: fault", "the fault estimate does not see the state", "Wang 2015, eq. (25)"),
+    "residual": ("unbiased: residual", "the residual does not see the state", "Wang 2015, eq. (25)"),
     "input feedthrough": (
         "unbiased: feedthrough",
         "no estimate sees the input directly (Du + Dy D = 0)",
@@ -45,7 +46,7 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     yield from plant_information(plant)
     yield from condition_rows(fault_filter_conditions(plant))
     tracking, factor = design.certificate.matrices.get("tracking"), design.certificate.matrices.get("P_factor")
-    lag = int(design.certificate.claims.get("state_lag", -1))
+    lag = _whole(design.certificate.claims.get("state_lag", -1.0))
     fitting = _fits(plant, observer, tracking, factor, lag)
     yield upper_bound_check(
         "fits the plant",
@@ -64,7 +65,7 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
         name, claim, source = _IDENTITIES[key]
         yield _equality(name, claim, found, tolerance, source)
     errors = ErrorSystem.of(plant, observer, tracking, lag)
-    yield from _fault_rows(plant, errors, observer, tolerance)
+    yield from _fault_rows(plant, errors, observer, tracking, tolerance)
     radius = spectral_radius(observer.Az)
     yield upper_bound_check(
         "spectral radius",
@@ -78,19 +79,26 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     yield from _noise_rows(plant, errors)
 
 
+def _whole(lag: float) -> int:
+    """Return a lag as a number of samples, -1 when it is none."""
+    return int(lag) if np.isfinite(lag) and lag == int(lag) else -1
+
+
 def _fits(
     plant: DescriptorSystem, observer: LinearObserver, tracking: FloatArray | None, factor: FloatArray | None, lag: int
 ) -> bool:
+    if tracking is None or factor is None or tracking.ndim != 2 or factor.ndim != 2:
+        return False
     return bool(
-        tracking is not None
-        and factor is not None
-        and lag >= 0
+        lag >= 0
         and tracking.shape == (observer.order, plant.nx * (lag + 1))
         and factor.shape[0] == factor.shape[1] <= observer.order
+        and np.all(np.isfinite(tracking))
+        and np.all(np.isfinite(factor))
         and observer.input_names == plant.input_names
         and observer.output_names == plant.output_names
         and observer.state_names == plant.state_names
-        and observer.fault_names == plant.fault_names
+        and observer.fault_names == observer.residual_names == plant.fault_names
         and observer.dt == plant.dt
         and all(delay == lag for delay in observer.state_delays)
         and all(delay >= 1 for delay in observer.fault_delays)
@@ -110,7 +118,7 @@ def _equality(name: str, claim: str, found: Residual, tolerance: float, source: 
 
 
 def _fault_rows(
-    plant: DescriptorSystem, errors: ErrorSystem, observer: LinearObserver, tolerance: float
+    plant: DescriptorSystem, errors: ErrorSystem, observer: LinearObserver, tracking: FloatArray, tolerance: float
 ) -> Iterator[Check]:
     """Check the whole transfer from the faults: a pure delay to the fault estimate, nothing to the state error.
 
@@ -118,25 +126,27 @@ def _fault_rows(
     from there on makes the response, and so the transfer function, complete.
     """
     cf, direct_fault = errors.fault_output[:2]
+    cr, direct_residual = errors.residual_output[:2]
     cx, direct_state = errors.state_output[:2]
-    longest = max(observer.fault_delays)
-    sizes = np.abs(observer.Dy) @ np.abs(plant.Df)
-    to_fault = [residual(direct_fault, factors=((sizes[observer.fault_rows],),))]
-    to_state = [residual(direct_state, factors=((sizes[observer.state_rows],),))]
-    # What is left after cancellation is judged against the largest trace on the way, not against itself.
-    vector, history = errors.fault, np.abs(errors.fault)
-    for step in range(1, longest + 1):
+    longest = max(observer.fault_delays, default=1)
+    traces = [errors.fault]
+    for _ in range(longest):
+        traces.append(errors.Az @ traces[-1])
+    sizes = _trace_sizes(plant, observer, tracking, traces)
+    seen, shown, moved = (cf, sizes), (cr, sizes), (_in_state_units(sizes, plant.nx),)
+    to_fault = [residual(direct_fault, factors=(seen,))]
+    to_residual = [residual(direct_residual, factors=(shown,))]
+    to_state = [residual(direct_state, factors=((cx, sizes), moved))]
+    for step, trace in enumerate(traces[:-1], start=1):
         expected = np.diag([1.0 if delay == step else 0.0 for delay in observer.fault_delays])
-        to_fault.append(residual(-cf @ vector, -expected, factors=((cf, history),)))
-        # Leading observer states are in the units of the plant's states, so their traces tell what is small.
-        to_state.append(residual(cx @ vector, factors=((cx, history), (history[: plant.nx],))))
-        history = np.maximum(history, np.abs(errors.Az) @ np.abs(vector))
-        vector = errors.Az @ vector
+        to_fault.append(residual(-cf @ trace, -expected, factors=(seen,)))
+        to_residual.append(residual(-cr @ trace, -expected, factors=(shown,)))
+        to_state.append(residual(cx @ trace, factors=((cx, sizes), moved)))
     source = "Wang 2015, eqs. (32), (44)"
     yield _equality(
         "fault decoupled after its delay",
         "(TA - LC) Psi = 0: no trace of a fault remains in the error after its delay",
-        residual(vector, factors=((history,),)),
+        residual(traces[-1], factors=((sizes,),)),
         tolerance,
         source,
     )
@@ -147,6 +157,7 @@ def _fault_rows(
         tolerance,
         source,
     )
+    yield _equality("fault in the residual", "r(k) equals fhat(k)", _worst(to_residual), tolerance, source)
     yield _equality(
         "no fault in the state estimate",
         "the transfer from the faults to the state error is zero",
@@ -154,6 +165,30 @@ def _fault_rows(
         tolerance,
         "ours: the paper's xhat is biased by Psi",
     )
+
+
+def _trace_sizes(
+    plant: DescriptorSystem, observer: LinearObserver, tracking: FloatArray, traces: list[FloatArray]
+) -> FloatArray:
+    """Return, per error state and fault, the size of the terms from which its traces were formed ``(nz, nf)``.
+
+    What is left after a cancellation is judged against these terms: Az itself is the difference of V A and By C.
+    """
+    lagged = LaggedPlant.of(plant, tracking.shape[1] // plant.nx - 1)
+    formed = np.abs(tracking) @ np.abs(lagged.A) + np.abs(observer.By) @ np.abs(lagged.C)
+    sizes = np.abs(tracking) @ np.abs(lagged.input(plant.Bf)) + np.abs(observer.By) @ np.abs(plant.Df)
+    largest = _in_state_units(np.maximum(sizes, np.max(np.abs(traces), axis=0)), plant.nx)
+    for trace in traces[:-1]:
+        sizes = np.maximum(sizes, np.abs(observer.Az) @ np.abs(trace))
+    sizes = np.maximum(sizes, formed @ np.tile(largest, (lagged.lag + 1, 1)))
+    return np.asarray(sizes)
+
+
+def _in_state_units(sizes: FloatArray, nx: int) -> FloatArray:
+    """Return the leading rows ``(nx, nf)``: these observer states are in the units of the plant's states."""
+    leading = np.zeros((nx, sizes.shape[1]))
+    leading[: len(sizes)] = sizes[:nx]
+    return leading
 
 
 def _worst(found: list[Residual]) -> Residual:
@@ -189,7 +224,7 @@ def _gain_rows(
         norm.upper,
         gamma,
         source="Wang 2015, eq. (49)",
-        detail=f"peak at {norm.angle / (2.0 * np.pi * plant.dt):.4g} Hz; the gain to quote is {reported:.6g}",
+        detail=f"peak at {norm.angle:.4g} rad/sample; the gain to quote is {reported:.6g}",
     )
     state = hinf_norm(errors.Az, errors.disturbance, errors.state_output[0], -errors.state_output[2])
     yield information(

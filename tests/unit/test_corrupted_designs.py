@@ -1,0 +1,608 @@
+"""The corruption table: every row of the verification report fails when, and only when, what it claims is untrue."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from obsynth import (
+    Certificate,
+    DescriptorSystem,
+    ObserverDesign,
+    SpecError,
+    VerificationReport,
+    fault_estimation_filter,
+    fault_estimation_filter_from_gains,
+    verify,
+)
+from obsynth.spec.loader import load_spec
+
+PAPER = Path(__file__).parents[2] / "designs" / "wang2015" / "spec.yaml"
+
+DYNAMICS, INPUTS, STATE = "unbiased: dynamics", "unbiased: inputs", "unbiased: state"
+FAULT, RESIDUAL, FEEDTHROUGH = "unbiased: fault", "unbiased: residual", "unbiased: feedthrough"
+DECOUPLED, ESTIMATE = "fault decoupled after its delay", "fault estimate"
+IN_RESIDUAL, IN_STATE = "fault in the residual", "no fault in the state estimate"
+RADIUS, LMI, NORM, FITS = "spectral radius", "LMI", "H-infinity norm", "fits the plant"
+ESTIMATES = (ESTIMATE, IN_RESIDUAL)
+
+
+# The good designs.
+
+
+def paper() -> DescriptorSystem:
+    """The paper's example: index 1 for both faults, an algebraic state."""
+    return load_spec(PAPER).plant
+
+
+def chain() -> DescriptorSystem:
+    """Detectability indexes 3 and 1: the state estimate lags by two samples, past states form a chain."""
+    return DescriptorSystem(
+        np.diag([1.0, 1, 1, 1, 0]),
+        [[0.5, 1, 0, 0, 0], [0.1, 0.4, 1, 0, 0], [0, 0.2, 0.3, 0, 0.1], [0.1, 0, 0, 0.6, 0.2], [0, 0.3, 0, 0.1, -1]],
+        [[0], [1], [0], [0.5], [0.2]],
+        [[1, 0, 0, 0, 0], [0, 0, 0, 1, 0], [0, 0, 0, 0, 1]],
+        Bf=[[0, 0], [0, 0], [1, 0], [0, 1], [0, 0]],
+        Bd=[[0.1], [0.2], [0.3], [0.1], [0.1]],
+        dt=0.1,
+    )
+
+
+def direct() -> DescriptorSystem:
+    """Feedthrough of input, fault and disturbance, and sensor noise; one fault is that of a sensor."""
+    return DescriptorSystem(
+        np.diag([1.0, 1, 0]),
+        [[0.7, 0.2, 0], [-0.1, 0.8, 0.3], [0.2, 0.1, -1]],
+        [[1], [0.5], [0.2]],
+        [[1, 0, 0], [0, 0, 1], [1, 1, 0], [0, 1, 1]],
+        D=[[0.3], [0.4], [-0.2], [1]],
+        Bf=[[0, 1], [0, 0.3], [0, 0]],
+        Df=[[1, 0], [0, 0], [0, 0], [0, 0]],
+        Bd=[[0.3], [0.1], [0.2]],
+        Dd=[[0.1], [0], [0.2], [0]],
+        Bw=np.zeros((3, 4)),
+        Dw=0.01 * np.eye(4),
+        dt=0.5,
+    )
+
+
+def quiet() -> DescriptorSystem:
+    """No disturbance; an unstable plant."""
+    return DescriptorSystem(
+        np.diag([1.0, 1, 0]),
+        [[1.1, 0.2, 0], [-0.1, 0.8, 0.3], [0.2, 0.1, -1]],
+        [[1], [0.5], [0.2]],
+        [[1, 0, 0], [0, 0, 1]],
+        Bf=[[1.0], [0], [0.1]],
+        dt=0.5,
+    )
+
+
+PLANTS = {"paper": paper, "chain": chain, "direct": direct, "quiet": quiet}
+
+
+@cache
+def good(name: str) -> ObserverDesign:
+    return fault_estimation_filter(PLANTS[name](), name=name)
+
+
+def failed(design: ObserverDesign, **options: int) -> set[str]:
+    return {check.name for check in verify(design, **options).failures}
+
+
+# Ways to corrupt a design.
+
+
+def nudged(matrix: np.ndarray, row: int, column: int, by: float = 1e-6) -> np.ndarray:
+    changed = np.array(matrix)
+    changed[row, column] += by
+    return changed
+
+
+def with_observer(design: ObserverDesign, **changes: object) -> ObserverDesign:
+    return design.replace(observer=dataclasses.replace(design.observer, **changes))
+
+
+def with_plant(design: ObserverDesign, **changes: object) -> ObserverDesign:
+    return design.replace(plant=design.plant.replace(**changes))
+
+
+def with_certificate(design: ObserverDesign, claims: dict[str, float] | None = None, **matrices: np.ndarray):
+    old = design.certificate
+    return design.replace(certificate=Certificate({**old.matrices, **matrices}, {**old.claims, **(claims or {})}))
+
+
+def entry(name: str, row: int, column: int, by: float = 1e-6) -> Callable[[ObserverDesign], ObserverDesign]:
+    """One entry of the observer."""
+    return lambda design: with_observer(design, **{name: nudged(getattr(design.observer, name), row, column, by)})
+
+
+def plant_entry(name: str, row: int, column: int, by: float) -> Callable[[ObserverDesign], ObserverDesign]:
+    return lambda design: with_plant(design, **{name: nudged(getattr(design.plant, name), row, column, by)})
+
+
+def certificate_entry(name: str, row: int, column: int, value: float) -> Callable[[ObserverDesign], ObserverDesign]:
+    def corrupt(design: ObserverDesign) -> ObserverDesign:
+        changed = np.array(design.certificate.matrices[name])
+        changed[row, column] = value
+        return with_certificate(design, **{name: changed})
+
+    return corrupt
+
+
+def certificate_times(name: str, factor: float) -> Callable[[ObserverDesign], ObserverDesign]:
+    return lambda design: with_certificate(design, **{name: factor * design.certificate.matrices[name]})
+
+
+def certificate_cut(name: str, *key: object) -> Callable[[ObserverDesign], ObserverDesign]:
+    return lambda design: with_certificate(design, **{name: design.certificate.matrices[name][key]})
+
+
+def claim(name: str, value: float) -> Callable[[ObserverDesign], ObserverDesign]:
+    return lambda design: with_certificate(design, {name: value})
+
+
+def observer_field(**changes: object) -> Callable[[ObserverDesign], ObserverDesign]:
+    return lambda design: with_observer(design, **changes)
+
+
+def plant_field(**changes: object) -> Callable[[ObserverDesign], ObserverDesign]:
+    return lambda design: with_plant(design, **changes)
+
+
+def gamma_just_below_the_norm(design: ObserverDesign) -> ObserverDesign:
+    return with_certificate(design, {"gamma": design.report[NORM].value * (1.0 - 1e-4)})
+
+
+def gamma_hardly_below_the_norm(design: ObserverDesign) -> ObserverDesign:
+    """Below by less than the norm's own tolerance: the row fails because its upper bound is compared."""
+    return with_certificate(design, {"gamma": design.report[NORM].value * (1.0 - 0.5e-9)})
+
+
+def in_continuous_time(design: ObserverDesign) -> ObserverDesign:
+    return with_plant(with_observer(design, dt=0.0), dt=0.0)
+
+
+def swapped_faults(design: ObserverDesign) -> ObserverDesign:
+    """The estimates of two faults under each other's names."""
+    observer, nx = design.observer, design.plant.nx
+    rows = [*range(nx), nx + 1, nx, *range(nx + 2, len(observer.Cz))]
+    return with_observer(design, Cz=observer.Cz[rows], Dy=observer.Dy[rows], Du=observer.Du[rows])
+
+
+def with_paper_state_estimate(design: ObserverDesign) -> ObserverDesign:
+    """The paper's state estimate z + N y, biased by Psi under a fault: no correction by the residual."""
+    observer, nx = design.observer, design.plant.nx
+    psi, residual = design.gains["Psi"], observer.residual_rows
+    cz, dy, du = (np.array(getattr(observer, name)) for name in ("Cz", "Dy", "Du"))
+    cz[:nx] -= psi @ cz[residual]
+    dy[:nx] -= psi @ dy[residual]
+    du[:nx] -= psi @ du[residual]
+    return with_observer(design, Cz=cz, Dy=dy, Du=du)
+
+
+def with_unstable_gain(design: ObserverDesign) -> ObserverDesign:
+    """L moved along the directions that keep (TA - LC) Psi = 0: unbiased, decoupled, and unstable."""
+    gains = design.gains
+    free = np.eye(design.plant.ny) - gains["Upsilon"] @ np.linalg.pinv(gains["Upsilon"])
+    moved = gains["L"] - 10.0 * np.ones((len(gains["L"]), 1)) @ np.ones((1, design.plant.ny)) @ free
+    gamma = design.certificate.claims.get("gamma")
+    return fault_estimation_filter_from_gains(
+        design.plant, T=gains["T"], N=gains["N"], L=moved, W=gains["W"], gamma=gamma
+    )
+
+
+def without_faults(design: ObserverDesign) -> ObserverDesign:
+    """Plant and observer agree that there is no fault: nothing is estimated."""
+    plant, rows = design.plant, design.observer.state_rows
+    bare = with_plant(design, Bf=np.zeros((plant.nx, 0)), Df=np.zeros((plant.ny, 0)), fault_names=())
+    parts = {name: getattr(design.observer, name)[rows] for name in ("Cz", "Dy", "Du")}
+    return with_observer(bare, **parts, fault_names=(), residual_names=(), fault_delays=())
+
+
+def with_more_faults_than_outputs(design: ObserverDesign) -> ObserverDesign:
+    rng = np.random.default_rng(1)
+    count = design.plant.ny + 1
+    return with_plant(design, Bf=rng.standard_normal((design.plant.nx, count)), Df=None, fault_names=None)
+
+
+def grown(matrix: np.ndarray, rows: int, columns: int, corner: float = 0.0) -> np.ndarray:
+    """Return the matrix with zero rows and columns appended, and ``corner`` in the last place."""
+    larger = np.zeros((matrix.shape[0] + rows, matrix.shape[1] + columns))
+    larger[: matrix.shape[0], : matrix.shape[1]] = matrix
+    if rows and columns:
+        larger[-1, -1] = corner
+    return larger
+
+
+def with_repeated_output(design: ObserverDesign) -> ObserverDesign:
+    """The last output once more; the observer does not use it, so all else stays true."""
+    plant, observer = design.plant, design.observer
+    again = {
+        name: np.vstack([getattr(plant, name), getattr(plant, name)[-1:]]) for name in ("C", "D", "Df", "Dd", "Dw")
+    }
+    larger = with_plant(design, **again, output_names=(*plant.output_names, "again"))
+    used = {name: grown(getattr(observer, name), 0, 1) for name in ("By", "Dy")}
+    return with_observer(larger, **used, output_names=(*observer.output_names, "again"))
+
+
+def with_state(
+    design: ObserverDesign, *, e: float, a: float, measured: bool, estimated_by: str | None
+) -> ObserverDesign:
+    """Append a state of its own, ``e x+ = a x``, to a design without lag, and a row that estimates it.
+
+    ``estimated_by`` is ``"output"`` (its own measurement), ``"copy"`` (a copy of its dynamics) or nothing.
+    """
+    plant, observer, nx = design.plant, design.observer, design.plant.nx
+    more = int(measured)
+    changes = {name: grown(getattr(plant, name), 1, 0) for name in ("B", "Bf", "Bd", "Bw")}
+    changes |= {name: grown(getattr(plant, name), more, 0) for name in ("D", "Df", "Dd", "Dw")}
+    changes |= {"E": grown(plant.E, 1, 1, e), "A": grown(plant.A, 1, 1, a), "C": grown(plant.C, more, 1, 1.0)}
+    names = {
+        "state_names": (*plant.state_names, "extra"),
+        "output_names": (*plant.output_names, "its own")[: plant.ny + more],
+    }
+    copied = int(estimated_by == "copy")
+    cz = np.insert(grown(observer.Cz, 0, copied), nx, 0.0, axis=0)
+    dy = np.insert(grown(observer.Dy, 0, more), nx, 0.0, axis=0)
+    if estimated_by == "copy":
+        cz[nx, -1] = 1.0
+    if estimated_by == "output":
+        dy[nx, -1] = 1.0
+    matrices = design.certificate.matrices
+    larger = with_plant(design, **changes, **names)
+    larger = with_certificate(
+        larger,
+        tracking=grown(matrices["tracking"], copied, 1, float(copied)),
+        P_factor=grown(matrices["P_factor"], copied, copied, 1.0),
+    )
+    return with_observer(
+        larger, **names, state_delays=(0,) * (nx + 1), Cz=cz, Dy=dy,
+        Az=grown(observer.Az, copied, copied, a), By=grown(observer.By, copied, more),
+        Bu=grown(observer.Bu, copied, 0), Du=np.insert(observer.Du, nx, 0.0, axis=0),
+    )  # fmt: skip
+
+
+def with_hidden_fault(design: ObserverDesign) -> ObserverDesign:
+    """A state that nothing measures (stable, so this alone is harmless), on which the fault then acts alone."""
+    hidden = with_state(design, e=1.0, a=0.5, measured=False, estimated_by="copy")
+    assert failed(hidden) == set()
+    direction = np.zeros((hidden.plant.nx, 1))
+    direction[-1] = 1.0
+    return with_plant(hidden, Bf=direction)
+
+
+# What fails when a fault acts otherwise than the observer expects.
+WRONG_FAULT = (DECOUPLED, *ESTIMATES, IN_STATE)
+UNBIASED = (DYNAMICS, STATE, FAULT, RESIDUAL)
+
+#: What is corrupted -> (good design, corruption, exactly the rows that fail).
+TABLE: dict[str, tuple[str, Callable[[ObserverDesign], ObserverDesign], tuple[str, ...]]] = {
+    # One entry of the observer, by 1e-6.
+    "Az": ("paper", entry("Az", 1, 1), (DYNAMICS, DECOUPLED)),
+    "Az in a direction that only faults excite": ("paper", entry("Az", 1, 3), (DECOUPLED,)),
+    "Az, core of a chain": ("chain", entry("Az", 0, 1), (DYNAMICS, DECOUPLED, *ESTIMATES, IN_STATE)),
+    "Az, a delayed state drives the core": ("chain", entry("Az", 0, 9), (DYNAMICS, LMI)),
+    "Az, a delayed state drives itself": ("chain", entry("Az", 6, 6), (DYNAMICS, DECOUPLED, LMI)),
+    "By": ("paper", entry("By", 2, 1), (DYNAMICS,)),
+    "By with feedthrough of the input": ("direct", entry("By", 1, 1), (DYNAMICS, INPUTS)),
+    "By of an output with a sensor fault": ("direct", entry("By", 1, 0), (DYNAMICS, INPUTS, *WRONG_FAULT)),
+    "Bu": ("paper", entry("Bu", 0, 1), (INPUTS,)),
+    "Bu of a delayed state": ("chain", entry("Bu", 12, 0), (INPUTS,)),
+    "Cz, state": ("paper", entry("Cz", 0, 1), (STATE, IN_STATE)),
+    "Cz, state, seen by faults alone": ("paper", entry("Cz", 2, 3), (IN_STATE,)),
+    "Cz, fault": ("paper", entry("Cz", 4, 1), (FAULT, ESTIMATE)),
+    "Cz, fault, seen by faults alone": ("paper", entry("Cz", 5, 3), (ESTIMATE,)),
+    "Cz, fault from a delayed state": ("chain", entry("Cz", 6, 9), (FAULT, LMI)),
+    "Cz, residual": ("paper", entry("Cz", 6, 1), (RESIDUAL, IN_RESIDUAL)),
+    "Cz, residual, seen by faults alone": ("paper", entry("Cz", 7, 3), (IN_RESIDUAL,)),
+    "Dy, state": ("paper", entry("Dy", 3, 2), (STATE,)),
+    "Dy, fault": ("paper", entry("Dy", 4, 0), (FAULT,)),
+    "Dy, residual": ("paper", entry("Dy", 6, 0), (RESIDUAL,)),
+    "Dy, fault, with feedthrough of input and fault": ("direct", entry("Dy", 3, 0), (FAULT, FEEDTHROUGH, ESTIMATE)),
+    "Dy, state, with feedthrough of input and fault": ("direct", entry("Dy", 0, 0), (STATE, FEEDTHROUGH, IN_STATE)),
+    "Du, state": ("paper", entry("Du", 0, 0), (FEEDTHROUGH,)),
+    "Du, fault": ("paper", entry("Du", 4, 1), (FEEDTHROUGH,)),
+    "Du, residual": ("direct", entry("Du", 5, 0), (FEEDTHROUGH,)),
+    # What the observer says about itself.
+    "fault delay one too long": ("paper", observer_field(fault_delays=(2, 1)), ESTIMATES),
+    "fault delay far too long": ("quiet", observer_field(fault_delays=(40,)), ESTIMATES),
+    "fault delay one too short": ("chain", observer_field(fault_delays=(2, 1)), (DECOUPLED, *ESTIMATES)),
+    "fault delays exchanged": ("chain", observer_field(fault_delays=(1, 3)), ESTIMATES),
+    "no fault delay": ("paper", observer_field(fault_delays=(0, 1)), (FITS,)),
+    "state delays": ("paper", observer_field(state_delays=(1, 1, 1, 1)), (FITS,)),
+    "one state delay": ("chain", observer_field(state_delays=(2, 2, 2, 2, 1)), (FITS,)),
+    "sampling time of the observer": ("paper", observer_field(dt=0.5), (FITS,)),
+    "input names": ("paper", observer_field(input_names=("u2", "u1")), (FITS,)),
+    "output names": ("paper", observer_field(output_names=("x3", "x2", "x4")), (FITS,)),
+    "state names": ("paper", observer_field(state_names=("x2", "x1", "x3", "x4")), (FITS,)),
+    "fault names": ("paper", observer_field(fault_names=("actuator 2", "actuator 1")), (FITS,)),
+    "residual names": ("paper", observer_field(residual_names=("a", "b")), (FITS,)),
+    "fault estimates exchanged": ("paper", swapped_faults, (ESTIMATE,)),
+    "the paper's biased state estimate": ("paper", with_paper_state_estimate, (IN_STATE,)),
+    "unstable gain": ("quiet", with_unstable_gain, (RADIUS, LMI)),
+    "unstable gain, with disturbance": ("paper", with_unstable_gain, (RADIUS, LMI, NORM)),
+    # The certificate.
+    "tracking": ("paper", certificate_entry("tracking", 0, 0, 0.9), (DYNAMICS, INPUTS, STATE, DECOUPLED, IN_STATE)),
+    "tracking, a delayed state": ("chain", certificate_entry("tracking", 6, 6, 1.0 + 1e-6), (DYNAMICS,)),
+    "tracking zero": ("paper", certificate_times("tracking", 0.0), (*UNBIASED, INPUTS, *ESTIMATES)),
+    "tracking NaN": ("paper", certificate_entry("tracking", 1, 2, np.nan), (FITS,)),
+    "tracking infinite": ("quiet", certificate_entry("tracking", 1, 2, np.inf), (FITS,)),
+    "tracking without a row": ("paper", certificate_cut("tracking", slice(1, None)), (FITS,)),
+    "tracking a vector": ("paper", certificate_cut("tracking", 0), (FITS,)),
+    "P_factor wrong": ("paper", certificate_entry("P_factor", 0, 0, 1.0), (LMI,)),
+    "P_factor zero": ("paper", certificate_times("P_factor", 0.0), (LMI,)),
+    "P_factor zero, no disturbance": ("quiet", certificate_times("P_factor", 0.0), (LMI,)),
+    "P_factor with a zero on the diagonal": ("chain", certificate_entry("P_factor", 2, 2, 0.0), (LMI,)),
+    "P_factor not triangular": ("paper", certificate_entry("P_factor", 3, 0, 1e-300), (LMI,)),
+    "P_factor twice as large": ("paper", certificate_times("P_factor", 2.0), (LMI,)),
+    "P_factor tiny": ("quiet", certificate_times("P_factor", 1e-200), (LMI,)),
+    "P_factor huge": ("direct", certificate_entry("P_factor", 0, 0, 1e300), (LMI,)),
+    "P_factor too small for the core": ("paper", certificate_cut("P_factor", slice(1, None), slice(1, None)), (LMI,)),
+    "P_factor empty": ("quiet", certificate_cut("P_factor", slice(0), slice(0)), (LMI,)),
+    "P_factor NaN": ("paper", certificate_entry("P_factor", 0, 1, np.nan), (FITS,)),
+    "P_factor infinite": ("direct", certificate_entry("P_factor", 0, 1, np.inf), (FITS,)),
+    "P_factor a vector": ("paper", certificate_cut("P_factor", 0), (FITS,)),
+    "P_factor not square": ("chain", certificate_cut("P_factor", slice(1, None)), (FITS,)),
+    "no matrices": ("paper", lambda d: d.replace(certificate=Certificate({}, d.certificate.claims)), (FITS,)),
+    "no claims": ("paper", lambda d: d.replace(certificate=Certificate(d.certificate.matrices, {})), (FITS,)),
+    "gamma 1e-4 below the norm": ("paper", gamma_just_below_the_norm, (LMI, NORM)),
+    "gamma 1e-4 below the norm, chain": ("chain", gamma_just_below_the_norm, (LMI, NORM)),
+    "gamma 1e-4 below the norm, feedthrough": ("direct", gamma_just_below_the_norm, (LMI, NORM)),
+    "gamma within 1e-9 of the norm": ("paper", gamma_hardly_below_the_norm, (LMI, NORM)),
+    "gamma NaN": ("paper", claim("gamma", np.nan), (LMI, NORM)),
+    "gamma zero": ("direct", claim("gamma", 0.0), (LMI, NORM)),
+    "gamma negative": ("paper", claim("gamma", -1.6), (LMI, NORM)),
+    "gamma infinite": ("paper", claim("gamma", np.inf), (LMI,)),
+    "lag NaN": ("paper", claim("state_lag", np.nan), (FITS,)),
+    "lag infinite": ("chain", claim("state_lag", np.inf), (FITS,)),
+    "lag negative": ("paper", claim("state_lag", -1.0), (FITS,)),
+    "lag not whole": ("paper", claim("state_lag", 0.5), (FITS,)),
+    "lag too long": ("chain", claim("state_lag", 3.0), (FITS,)),
+    # Numbers that overflow.
+    "Az huge": ("paper", entry("Az", 0, 0, 1e300), (DYNAMICS, DECOUPLED, RADIUS, LMI, NORM)),
+    "Cz huge": ("direct", entry("Cz", 3, 0, 1e300), (FAULT, ESTIMATE, LMI, NORM)),
+    "By huge": ("direct", entry("By", 0, 0, 1e300), (DYNAMICS, INPUTS, *WRONG_FAULT, LMI, NORM)),
+    # The plant is another one.
+    "E": ("paper", plant_entry("E", 0, 0, 1e-6), (DYNAMICS, STATE)),
+    "A": ("paper", plant_entry("A", 3, 2, 1e-6), (DYNAMICS,)),
+    "B": ("paper", plant_entry("B", 1, 1, 1e-6), (INPUTS,)),
+    "C": ("paper", plant_entry("C", 0, 1, 1e-6), UNBIASED),
+    "D": ("direct", plant_entry("D", 1, 0, 1e-6), (INPUTS, FEEDTHROUGH)),
+    "fault direction": ("quiet", plant_entry("Bf", 0, 0, 1e-6), WRONG_FAULT),
+    "fault direction, index 3": ("chain", plant_entry("Bf", 2, 0, 1e-6), ESTIMATES),
+    "direction of a sensor fault": ("direct", plant_entry("Df", 1, 0, 1e-6), WRONG_FAULT),
+    "disturbance twice as large": ("paper", lambda d: with_plant(d, Bd=2.0 * d.plant.Bd), (LMI, NORM)),
+    "disturbance in the outputs": ("direct", plant_entry("Dd", 1, 0, 5.0), (LMI, NORM)),
+    "sampling time of the plant": ("paper", plant_field(dt=0.5), (FITS,)),
+    "continuous plant": ("paper", plant_field(dt=0.0), ("exists: discrete time", FITS)),
+    "names of the plant": ("paper", plant_field(state_names=["a", "b", "c", "d"]), (FITS,)),
+    # Existence conditions.
+    "continuous plant and observer": ("quiet", in_continuous_time, ("exists: discrete time",)),
+    "continuous plant and observer, disturbance": ("paper", in_continuous_time, ("exists: discrete time",)),
+    "no fault": ("quiet", without_faults, ("exists: faults",)),
+    "no fault, disturbance and noise": ("direct", without_faults, ("exists: faults",)),
+    "a state that no equation determines": (
+        "quiet", lambda d: with_state(d, e=0.0, a=0.0, measured=True, estimated_by="output"), ("exists: regularity",)),
+    "more faults than outputs": ("quiet", with_more_faults_than_outputs, ("exists: nf <= ny", FITS)),
+    "a fault that acts nowhere": ("quiet", plant_field(Bf=np.zeros((3, 1))), ("exists: rank F", *ESTIMATES)),
+    "two faults in one direction": (
+        "paper", lambda d: with_plant(d, Bf=d.plant.Bf[:, [0, 0]]), ("exists: rank F", *ESTIMATES)),
+    "a repeated output": ("quiet", with_repeated_output, ("exists: rank C",)),
+    "a repeated output, disturbance and noise": ("direct", with_repeated_output, ("exists: rank C",)),
+    "an algebraic state that nothing measures": (
+        "quiet", lambda d: with_state(d, e=0.0, a=1.0, measured=False, estimated_by=None),
+        ("exists: rank [E; C]", STATE)),
+    "a sensor fault like an algebraic state": (
+        "quiet", plant_entry("Df", 1, 0, 1.0), ("exists: rank [E 0; 0 0; C Df]", *WRONG_FAULT)),
+    "a fault that never shows": ("quiet", with_hidden_fault, ("exists: finite detectability indexes", *WRONG_FAULT)),
+    "two faults alike at first sight": (
+        "chain", plant_field(Bf=[[0, 0], [0, 1], [1, 0], [0, 0], [0, 0]]),
+        ("exists: rank Upsilon", *ESTIMATES, IN_STATE)),
+    "two faults alike through the dynamics": ("chain", plant_entry("A", 3, 2, 0.5), ("exists: rank Upsilon", DYNAMICS)),
+    "a zero outside the unit circle": (
+        "quiet", plant_field(A=[[1.1, 0.2, 0], [-0.1, 1.3, 0.3], [0.2, 0, -1]], Bf=[[1.0], [0], [0]]),
+        ("exists: fault zeros", DYNAMICS, *WRONG_FAULT)),
+    "an unstable mode that nothing measures": (
+        "quiet", lambda d: with_state(d, e=1.0, a=1.1, measured=False, estimated_by="copy"),
+        ("exists: fault zeros", RADIUS, LMI)),
+    "a mode on the unit circle that nothing measures": (
+        "quiet", lambda d: with_state(d, e=1.0, a=1.0, measured=False, estimated_by="copy"),
+        ("exists: fault zeros", RADIUS, LMI)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_a_good_design_passes(name: str) -> None:
+    design = good(name)
+    assert design.report.passed
+    assert failed(design) == set()
+
+
+@pytest.mark.parametrize("case", TABLE)
+def test_exactly_the_rows_that_are_untrue_fail(case: str) -> None:
+    name, corrupt, expected = TABLE[case]
+    report = verify(corrupt(good(name)))
+    assert {check.name for check in report.failures} == set(expected)
+    assert not report.passed
+
+
+def rows_that_decide(report: VerificationReport) -> set[str]:
+    return {check.name for check in report.checks if check.kind != "information"}
+
+
+def test_the_table_breaks_every_row_that_verification_produces() -> None:
+    produced = set().union(*(rows_that_decide(good(name).report) for name in PLANTS))
+    for name, corrupt, _ in TABLE.values():
+        produced |= rows_that_decide(verify(corrupt(good(name))))
+    broken = set().union(*(expected for _, _, expected in TABLE.values()))
+    assert broken == produced
+
+
+def test_rows_that_inform_do_not_fail() -> None:
+    for name, corrupt, _ in TABLE.values():
+        report = verify(corrupt(good(name)))
+        assert all(check.passed for check in report.checks if check.kind == "information")
+        assert len({check.name for check in report.checks}) == len(report.checks)
+
+
+#: Observer matrix -> for each part of its rows, the rows of the report of which at least one must fail.
+CAUGHT_BY = {
+    "Az": {"all": {DYNAMICS, DECOUPLED}},
+    "Bu": {"all": {INPUTS}},
+    "By": {"all": {DYNAMICS}},
+    "Cz": {"state": {STATE, IN_STATE}, "fault": {FAULT, ESTIMATE}, "residual": {RESIDUAL, IN_RESIDUAL}},
+    "Du": {"state": {FEEDTHROUGH}, "fault": {FEEDTHROUGH}, "residual": {FEEDTHROUGH}},
+    "Dy": {"state": {STATE}, "fault": {FAULT}, "residual": {RESIDUAL}},
+}
+
+
+@pytest.mark.parametrize("matrix", CAUGHT_BY)
+@pytest.mark.parametrize("name", PLANTS)
+def test_every_single_entry_of_the_observer_counts(name: str, matrix: str) -> None:
+    design = good(name)
+    observer = design.observer
+    parts = {"state": observer.state_rows, "fault": observer.fault_rows, "residual": observer.residual_rows}
+    shape = getattr(observer, matrix).shape
+    for part, causes in CAUGHT_BY[matrix].items():
+        for row in range(shape[0])[parts.get(part, slice(None))]:
+            for column in range(shape[1]):
+                found = failed(entry(matrix, row, column)(design))
+                assert found & causes, (row, column, found)
+
+
+@pytest.mark.parametrize("matrix", ["E", "A", "B", "C", "D", "Bf", "Df"])
+@pytest.mark.parametrize("name", PLANTS)
+def test_every_single_entry_of_the_plant_counts(name: str, matrix: str) -> None:
+    design = good(name)
+    rows, columns = getattr(design.plant, matrix).shape
+    for row in range(rows):
+        for column in range(columns):
+            assert failed(plant_entry(matrix, row, column, 1e-6)(design)), (row, column)
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_not_a_number_anywhere_is_refused_or_fails(name: str) -> None:
+    design = good(name)
+    for owner in (design.observer, design.plant):
+        for field, value in owner.as_dict().items():
+            if isinstance(value, np.ndarray) and value.size:
+                for bad in (np.nan, np.inf):
+                    changed = np.array(value)
+                    changed[-1, -1] = bad
+                    change = with_observer if owner is design.observer else with_plant
+                    with pytest.raises(SpecError):
+                        change(design, **{field: changed})
+    for key, matrix in design.certificate.matrices.items():
+        for row in range(matrix.shape[0]):
+            for column in range(matrix.shape[1]):
+                assert failed(certificate_entry(key, row, column, np.nan)(design)) == {FITS}
+    needed = {"state_lag": {FITS}} | ({"gamma": {LMI, NORM}} if design.plant.nd else {})
+    for key, expected in needed.items():
+        assert failed(claim(key, np.nan)(design)) == expected
+
+
+def in_units(design: ObserverDesign, powers: np.ndarray) -> ObserverDesign:
+    """The same design with the states of plant and observer in other units, powers of two: exact in every digit."""
+    plant, observer, nx = design.plant, design.observer, design.plant.nx
+    lag = int(design.certificate.claims["state_lag"])
+    core = observer.order - lag * nx
+    own = np.concatenate([np.resize(np.append(powers, 1.0), core), *[powers] * lag])
+    rows = np.append(powers, np.ones(len(observer.Cz) - nx))[:, None]
+    changed = with_plant(design, E=plant.E * powers, A=plant.A * powers, C=plant.C * powers)
+    changed = with_observer(
+        changed,
+        Az=observer.Az * own / own[:, None],
+        Bu=observer.Bu / own[:, None],
+        By=observer.By / own[:, None],
+        Cz=observer.Cz * own / rows,
+        Du=observer.Du / rows,
+        Dy=observer.Dy / rows,
+    )
+    matrices = design.certificate.matrices
+    return with_certificate(
+        changed,
+        tracking=matrices["tracking"] * np.concatenate([np.ones(nx), *[powers] * lag]) / own[:, None],
+        P_factor=matrices["P_factor"] * own[:core],
+    )
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_units_of_the_states_do_not_hide_a_corruption(name: str) -> None:
+    """What fails is the same when the states are measured in units from 2^-3 to 2^3."""
+    design = good(name)
+    powers = np.exp2(np.round(np.linspace(-3.0, 3.0, design.plant.nx)))
+    assert failed(in_units(design, powers)) == set()
+    for matrix in CAUGHT_BY:
+        rows, columns = getattr(design.observer, matrix).shape
+        for row in range(rows):
+            for column in range(columns):
+                corrupted = entry(matrix, row, column)(design)
+                assert failed(in_units(corrupted, powers)) == failed(corrupted), (matrix, row, column)
+
+
+def test_an_empty_report_does_not_pass() -> None:
+    emptied = good("paper").replace(report=VerificationReport())
+    assert not emptied.report.passed
+    assert verify(emptied).passed
+
+
+def test_a_report_is_about_the_design_it_is_made_of_not_about_the_one_saved() -> None:
+    """The report that a corrupted design carries still says that all is well; only a new one knows."""
+    corrupted = entry("By", 0, 0)(good("paper"))
+    assert corrupted.report.passed
+    assert not verify(corrupted).passed
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_verification_changes_nothing(name: str) -> None:
+    design = good(name)
+    before = [np.array(value) for value in (*design.certificate.matrices.values(), design.observer.Az, design.plant.A)]
+    verify(design)
+    after = [*design.certificate.matrices.values(), design.observer.Az, design.plant.A]
+    assert all(np.array_equal(first, second) for first, second in zip(before, after, strict=True))
+
+
+class TestPrintedDigits:
+    """Gains from paper: rounded to four decimals."""
+
+    GAMMA = 1.6
+
+    def rounded(self, **changes: np.ndarray) -> ObserverDesign:
+        gains = {letter: np.round(good("paper").gains[letter], 4) for letter in "TNLW"} | changes
+        return fault_estimation_filter_from_gains(good("paper").plant, **gains, gamma=self.GAMMA)
+
+    def test_rounded_gains_fail_by_default_and_pass_with_their_digits(self) -> None:
+        design = self.rounded()
+        assert failed(design) == {DECOUPLED, ESTIMATE, IN_RESIDUAL, IN_STATE}
+        assert failed(design, printed_digits=4) == set()
+        assert failed(design, printed_digits=7) == {DECOUPLED, ESTIMATE, IN_RESIDUAL, IN_STATE}
+
+    def test_full_digits_pass_either_way(self) -> None:
+        for name in PLANTS:
+            assert failed(good(name), printed_digits=4) == set()
+
+    @pytest.mark.parametrize("letter", ["T", "N", "L", "W"])
+    def test_any_wrong_digit_still_fails(self, letter: str) -> None:
+        gain = np.round(good("paper").gains[letter], 4)
+        for row in range(gain.shape[0]):
+            for column in range(gain.shape[1]):
+                for by in (0.05, -0.05):
+                    wrong = self.rounded(**{letter: nudged(gain, row, column, by)})
+                    assert failed(wrong, printed_digits=4), (row, column, by)
+
+    def test_digits_do_not_soften_the_inequalities(self) -> None:
+        lowered = gamma_just_below_the_norm(good("paper"))
+        assert failed(lowered, printed_digits=1) == {LMI, NORM}
+        assert failed(with_unstable_gain(good("paper")), printed_digits=1) == {RADIUS, LMI, NORM}
+
+    @pytest.mark.parametrize("digits", [0, -1, 16])
+    def test_digits_out_of_range(self, digits: int) -> None:
+        with pytest.raises(SpecError) as caught:
+            verify(good("paper"), printed_digits=digits)
+        assert caught.value.path == "printed_digits"
