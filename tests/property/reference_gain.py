@@ -34,11 +34,11 @@ class ErrorProblem:
 
     @classmethod
     def of(cls, design: obsynth.ObserverDesign, *, free_weight: bool = False) -> ErrorProblem:
-        """Return the problem that was solved for ``design`` (no sensor faults), from the plant, T, N and Psi alone."""
+        """Return the problem behind ``design`` (no sensor faults), for its T, N and W; R and perhaps V start afresh."""
         plant, gains = design.plant, design.gains
-        t, n, psi, upsilon = (gains[name] for name in ("T", "N", "Psi", "Upsilon"))
+        t, n, w, psi, upsilon = (gains[name] for name in ("T", "N", "W", "Psi", "Upsilon"))
         ta, outputs = t @ plant.A, np.eye(plant.ny) - plant.C @ n
-        w, v = np.linalg.pinv(upsilon), null_space(upsilon.T).T
+        v = null_space(upsilon.T).T
         first = ta @ psi @ w
         bd, dd = t @ plant.Bd - ta @ n @ plant.Dd, outputs @ plant.Dd
         return cls(ta - first @ plant.C, bd - first @ dd, v @ plant.C, v @ dd, w @ plant.C, w @ dd, free_weight)

@@ -84,7 +84,7 @@ def test_every_plant_is_solved(family):
     [
         {"free_residual_weight": True},
         {"gamma_margin": 0.5},
-        {"gamma_margin": 1e-3},
+        {"gamma_margin": 1e-2},
         {"gamma": 1e6},
         {"gamma_search": "bisection", "tolerance": 1e-2},
     ],

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 
 from obsynth.models.descriptor import DescriptorSystem
@@ -12,7 +14,9 @@ from obsynth.verification.bounded_real import prove_bounded_real
 from obsynth.verification.error_system import ErrorSystem
 
 #: Levels, relative to the claimed one, at which coordinates are improved on the way to it.
-APPROACH = (1.5, 1.05, 1.001)
+APPROACHES = ((1.05,), (1.5, 1.05, 1.001))
+#: Weights of what the output does not show, relative to the output's, tried in turn.
+TAILS = (1e-2, 1e-4, 1e-6, 1e-9, 1e-12)
 #: Slack of the Riccati equation relative to the output weight, largest first: the first that proves is taken.
 SLACKS = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)
 
@@ -36,33 +40,44 @@ def bounded_real_certificate(
     errors = ErrorSystem.of(plant, observer, tracking, lag)
     a, b = observer.Az[:core, :core], errors.disturbance[:core] / gain
     c, d = -errors.fault_output[0][:, :core], errors.fault_output[2] / gain
-    change = np.eye(core)
-    for level in APPROACH:
-        inverse = np.asarray(np.linalg.inv(change))
-        better = _well_scaled(inverse @ a @ change, inverse @ b, c @ change, d, level)
-        change = change @ better
-    inverse = np.asarray(np.linalg.inv(change))
-    a, b, c = inverse @ a @ change, inverse @ b, c @ change
-    best = _triangular(inverse)
-    for slack in SLACKS:
-        p = bounded_real_matrix(a, b, c, d, 1.0, slack=slack * max(1.0, float(np.linalg.norm(c, 2)) ** 2))
-        if p is None:
+    best = np.eye(core)
+    for path, tail in product(APPROACHES, TAILS):
+        change = _coordinates(a, b, c, d, path=path, tail=tail)
+        if change is None:
             continue
-        best = _triangular(np.asarray(np.linalg.cholesky(p)).T @ inverse)
-        if prove_bounded_real(plant, observer, tracking, best, gain, lag=lag).proved:
-            break
+        inverse = np.asarray(np.linalg.inv(change))
+        moved_a, moved_b, moved_c = inverse @ a @ change, inverse @ b, c @ change
+        weight = max(1.0, float(np.linalg.norm(moved_c, 2)) ** 2)
+        for slack in SLACKS:
+            p = bounded_real_matrix(moved_a, moved_b, moved_c, d, 1.0, slack=slack * weight)
+            if p is None:
+                continue
+            best = _triangular(np.asarray(np.linalg.cholesky(p)).T @ inverse)
+            if prove_bounded_real(plant, observer, tracking, best, gain, lag=lag).proved:
+                return best
     return best
+
+
+def _coordinates(
+    a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, *, path: tuple[float, ...], tail: float
+) -> FloatArray | None:
+    """Return a state change in which a rough Riccati solution is the identity, approached over the levels of ``path``.
+
+    ``tail`` weighs states that the output does not show: little enough that the disturbance on them does not count,
+    and otherwise as much as possible, for the sake of the condition number.  ``None`` when there is no solution.
+    """
+    change = np.eye(a.shape[0])
+    for level in path:
+        inverse = np.asarray(np.linalg.inv(change))
+        shown = c @ change
+        size = max(float(np.linalg.norm(shown, 2)) ** 2, np.finfo(np.float64).tiny)
+        p = bounded_real_matrix(inverse @ a @ change, inverse @ b, shown, d, level, slack=tail * size)
+        if p is None:
+            return None
+        change = change @ normalising_change(p)
+    return change
 
 
 def _triangular(factor: FloatArray) -> FloatArray:
     """Return the upper triangular factor of the same Gram matrix."""
     return np.asarray(np.triu(np.linalg.qr(factor, mode="r")))
-
-
-def _well_scaled(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, level: float) -> FloatArray:
-    """Return a state change in which the Riccati solution at ``level`` is the identity."""
-    tail = 1e-6 * max(float(np.linalg.norm(c, 2)) ** 2, np.finfo(np.float64).tiny)
-    p = bounded_real_matrix(a, b, c, d, level, slack=tail)
-    if p is None:
-        p = bounded_real_matrix(a, b[:, :0], c, d[:, :0], 1.0, slack=tail)
-    return np.eye(a.shape[0]) if p is None else normalising_change(p)

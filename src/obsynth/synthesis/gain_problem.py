@@ -22,8 +22,6 @@ from obsynth.synthesis.riccati import bounded_real_matrix, normalising_change, s
 
 #: The normalising Riccati solution is taken at this multiple of the starting filter's norm.
 NORMALISING_LEVEL = 1.3
-#: Disturbance matrices smaller than this, relative to the plant, are rounding errors of a decoupled disturbance.
-ROUNDING = 1e-14
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,10 +92,10 @@ class GainProblem:
         return self.free_weight and self.measured > 0
 
     @property
-    def is_undisturbed(self) -> bool:
-        """Whether the disturbance does nothing beyond rounding."""
-        inputs = max((float(np.linalg.norm(part)) for part in (self.B, self.D, self.Zd)), default=0.0)
-        return inputs <= ROUNDING * max(float(np.linalg.norm(self.A)), float(np.linalg.norm(self.Z)), 1.0)
+    def disturbance_size(self) -> float:
+        """What the disturbance could do to xi at most in one step, whatever cancels: the scale of a gain."""
+        state, direct = np.vstack([self.B, self.D]), float(np.linalg.norm(self.Zd))
+        return float(np.linalg.norm(self.Z) * np.linalg.norm(state)) + direct
 
     def without_disturbance(self) -> GainProblem:
         """Return the problem without its disturbance."""

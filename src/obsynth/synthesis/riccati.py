@@ -12,7 +12,7 @@ from obsynth.numerics.norms import spectral_radius
 #: Relative sizes of the fictitious process and measurement noise, tried in turn, that make the equation regular.
 REGULARISATIONS = (1e-6, 1e-4, 1e-2, 1.0)
 #: Eigenvalues of a normalising matrix are kept above this fraction of the largest.
-CONDITION_LIMIT = 1e-12
+CONDITION_LIMIT = 1e-20
 
 
 def stabilising_gain(a: FloatArray, c: FloatArray, noise_a: FloatArray, noise_c: FloatArray) -> FloatArray | None:

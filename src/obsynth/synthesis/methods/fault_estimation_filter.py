@@ -50,9 +50,11 @@ LARGEST_USEFUL_GAIN = 1e3
 CERTIFICATE_MARGIN = 5e-3
 CERTIFICATE_SHARE = 0.2
 #: The least relative distance to the optimum at which a proof can be expected.
-LEAST_MARGIN = 1e-4
-#: Level of the certificate when no disturbance reaches the fault estimate at all.
-NOMINAL_GAIN = 1e-6
+LEAST_MARGIN = 1e-2
+#: Gains below this, relative to the disturbance and the output it could reach, are rounding errors.
+ROUNDING_GAIN = 1e-11
+#: Level of the certificate, relative to the same, when no disturbance reaches the fault estimate at all.
+NOMINAL_GAIN = 1e-3
 
 
 def conditions(plant: DescriptorSystem) -> tuple[Condition, ...]:
@@ -109,13 +111,13 @@ def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **op
     problem, parts = gain_problem(prepared, free_weight=free)
     if limit is not None:
         problem = _with_weight_limit(problem, prepared, parts, limit)
-    if problem.is_undisturbed:
-        problem = problem.without_disturbance()
+    size = max(problem.disturbance_size, NOMINAL_GAIN)
     progress("searching the least gain")
-    if asked.gamma_search == "direct":
-        least = gain_search.search_least_gain(problem, solver=asked.solver)
-    else:
-        least = gain_search.search_by_bisection(problem, tolerance=asked.tolerance, solver=asked.solver)
+    least = _least_gain(problem, asked)
+    if problem.disturbances and least.starting_gain <= ROUNDING_GAIN * problem.disturbance_size:
+        # What is left of the disturbance in the estimates is rounding: nothing to minimise.
+        problem = problem.without_disturbance()
+        least = replace(_least_gain(problem, asked), gain=least.starting_gain)
     gamma = _gain_to_ship(asked, problem, least, noisy=plant.nw > 0)
     progress("choosing small gains")
     inner = gamma - min(CERTIFICATE_SHARE * (gamma - least.gain), CERTIFICATE_MARGIN * gamma)
@@ -123,7 +125,7 @@ def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **op
     gains = _gains(prepared, parts, chosen)
     progress("building the realisation and its certificate")
     observer, tracking, lag = realise_filter(plant, prepared.plant, gains, prepared.detectability)
-    level = gamma if problem.disturbances else NOMINAL_GAIN
+    level = gamma if problem.disturbances else NOMINAL_GAIN * size
     factor = bounded_real_certificate(plant, observer, tracking, level, core=prepared.plant.nx, lag=lag)
     claims = (
         {"gamma": level, "gamma_min": least.gain, "state_lag": float(lag)} if plant.nd else {"state_lag": float(lag)}
@@ -217,6 +219,12 @@ def gain_problem(prepared: PreparedPlant, *, free_weight: bool) -> tuple[GainPro
         free_weight=free_weight,
     )
     return problem, _Parts(l0, w0, v)
+
+
+def _least_gain(problem: GainProblem, asked: FilterOptions) -> gain_search.LeastGain:
+    if asked.gamma_search == "direct":
+        return gain_search.search_least_gain(problem, solver=asked.solver)
+    return gain_search.search_by_bisection(problem, tolerance=asked.tolerance, solver=asked.solver)
 
 
 def _gain_to_ship(asked: FilterOptions, problem: GainProblem, least: gain_search.LeastGain, *, noisy: bool) -> float:
