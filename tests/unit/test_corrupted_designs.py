@@ -534,9 +534,9 @@ def in_units(design: ObserverDesign, powers: np.ndarray) -> ObserverDesign:
 
 @pytest.mark.parametrize("name", PLANTS)
 def test_units_of_the_states_do_not_hide_a_corruption(name: str) -> None:
-    """What fails is the same when the states are measured in units from 2^-3 to 2^3."""
+    """What fails is the same when the states are measured in units from 2^-14 to 2^14."""
     design = good(name)
-    powers = np.exp2(np.round(np.linspace(-3.0, 3.0, design.plant.nx)))
+    powers = np.exp2(np.round(np.linspace(-14.0, 14.0, design.plant.nx)))
     assert failed(in_units(design, powers)) == set()
     for matrix in CAUGHT_BY:
         rows, columns = getattr(design.observer, matrix).shape

@@ -13,6 +13,10 @@ from obsynth.numerics.arrays import FloatArray, read_only
 MOST_SWEEPS = 10
 
 
+#: Makes the factors unique where one group of signals does not touch another; too small to move them.
+SMALL_RIDGE = 1e-9
+
+
 @dataclass(frozen=True, eq=False)
 class Scaling:
     """Power-of-two factors for the equations, states and outputs of a plant.
@@ -151,6 +155,49 @@ def balance_system(
             break
         best, peaks = trial, new_peaks
     return best
+
+
+def balance_by_least_squares(
+    E: FloatArray, A: FloatArray, inputs: Sequence[FloatArray] = (), outputs: Sequence[FloatArray] = ()
+) -> Scaling:
+    """Find power-of-two factors that bring all entries of a plant, on the whole, near one.
+
+    The sum of the squared logarithms of all nonzero entries of the scaled ``E``, ``A``, input-like (their columns
+    are free as well) and output-like matrices is least.  The result does not depend on the units of the plant, up
+    to one rounding of each exponent: changing them only shifts the unknowns.
+
+    Parameters
+    ----------
+    E, A, inputs, outputs
+        As for `balance_system`.
+
+    Returns
+    -------
+    Scaling
+        The factors.
+
+    References
+    ----------
+    R. C. Ward, *Balancing the generalized eigenvalue problem*, SIAM J. Sci. Stat. Comput. 2, 1981.
+    """
+    nx = E.shape[0]
+    b, c = np.hstack([np.zeros((nx, 0)), *inputs]), np.vstack([np.zeros((0, nx)), *outputs])
+    parts = np.split(np.arange(2 * nx + len(c) + b.shape[1]), [nx, 2 * nx, 2 * nx + len(c)])
+    equations, states, shown, entering = parts
+    normal = SMALL_RIDGE * np.eye(sum(map(len, parts)))
+    right = np.zeros(len(normal))
+    blocks = ((E, equations, states), (A, equations, states), (c, shown, states), (b, equations, entering))
+    for matrix, rows, columns in blocks:
+        there = matrix != 0.0
+        sizes = np.log2(np.abs(np.where(there, matrix, 1.0)))
+        normal[np.ix_(rows, columns)] += there
+        normal[np.ix_(columns, rows)] += there.T
+        normal[rows, rows] += np.sum(there, axis=1)
+        normal[columns, columns] += np.sum(there, axis=0)
+        right[rows] -= np.sum(sizes, axis=1)
+        right[columns] -= np.sum(sizes, axis=0)
+    exponents = np.round(np.linalg.solve(normal, right)).astype(np.int64)
+    return Scaling(*(read_only(np.ldexp(1.0, exponents[part])) for part in (equations, states, shown)))
 
 
 def _scale_rows(e: FloatArray, a: FloatArray, b: FloatArray, c: FloatArray, states: FloatArray) -> Scaling:

@@ -18,7 +18,7 @@ import numpy as np
 
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.scaling import balance_system
+from obsynth.numerics.scaling import balance_by_least_squares
 from obsynth.observers.linear import LinearObserver
 
 
@@ -148,7 +148,7 @@ def tracking_residuals(
     ve = tracking @ lagged.E
     states, cz, dy, du = observer.state_rows, observer.Cz, observer.Dy, observer.Du
     # A state in small units must not hide behind one in large units.
-    units = np.tile(balance_system(plant.E, plant.A, outputs=[plant.C]).states, lag + 1)
+    units = np.tile(balance_by_least_squares(plant.E, plant.A, outputs=[plant.C]).states, lag + 1)
 
     def unseen(rows: slice) -> Residual:
         factors = ((cz[rows], tracking, lagged.E), (dy[rows], lagged.C))

@@ -9,10 +9,13 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from obsynth.analysis.fault_filter import with_sensor_faults_as_states
 from obsynth.analysis.fault_filter_conditions import fault_filter_conditions
+from obsynth.errors import PreconditionError
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.norms import hinf_norm, output_covariance, spectral_radius
+from obsynth.numerics.scaling import balance_by_least_squares
 from obsynth.observers.linear import LinearObserver
 from obsynth.results.design import ObserverDesign
 from obsynth.results.report import Check, information, upper_bound_check
@@ -22,6 +25,8 @@ from obsynth.verification.plant import condition_rows, plant_information
 
 #: Equalities may miss by this much, relative to the terms they are made of.
 EQUALITY_TOLERANCE = 1e-9
+#: A trace of a fault in an observer state below this share of its largest one is held to be no trace.
+UNREACHED = 1e-4
 _IDENTITIES = {
     "dynamics": ("unbiased: dynamics", "Az V E + By C = V A", "Wang 2015, eqs. (7), (26)"),
     "inputs": ("unbiased: inputs", "Bu + By D = V B", "Wang 2015, eq. (23)"),
@@ -181,7 +186,15 @@ def _trace_sizes(
     for trace in traces[:-1]:
         sizes = np.maximum(sizes, np.abs(observer.Az) @ np.abs(trace))
     sizes = np.maximum(sizes, formed @ np.tile(largest, (lagged.lag + 1, 1)))
-    return np.asarray(sizes)
+    # A state that no fault reaches holds only rounding errors of the gains: it is not judged against itself but
+    # against a small share of the fault's largest trace, in the units in which the plant is balanced.
+    try:
+        work = with_sensor_faults_as_states(plant)
+    except PreconditionError:
+        return np.asarray(sizes)  # a failed existence condition says so already
+    units = balance_by_least_squares(work.E, work.A, inputs=[work.Bf], outputs=[work.C]).states
+    units = np.resize(np.append(units, np.tile(units[: plant.nx], lagged.lag)), len(sizes))[:, None]
+    return np.asarray(np.maximum(sizes, UNREACHED * units * np.max(sizes / units, axis=0)))
 
 
 def _in_state_units(sizes: FloatArray, nx: int) -> FloatArray:
