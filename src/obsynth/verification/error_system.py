@@ -150,8 +150,11 @@ def tracking_residuals(
     # A state in small units must not hide behind one in large units.
     units = np.tile(balance_by_least_squares(plant.E, plant.A, outputs=[plant.C]).states, lag + 1)
 
+    # An observer state that tracks nothing but a sensor fault cancels what it is formed of down to rounding.
+    formed = np.abs(tracking) @ np.abs(lagged.A) + np.abs(observer.By) @ np.abs(lagged.C)
+
     def unseen(rows: slice) -> Residual:
-        factors = ((cz[rows], tracking, lagged.E), (dy[rows], lagged.C))
+        factors = ((cz[rows], tracking, lagged.E), (dy[rows], lagged.C), (cz[rows], formed))
         return residual(cz[rows] @ ve, dy[rows] @ lagged.C, factors=factors, units=units)
 
     return {
