@@ -51,7 +51,7 @@ def test_bisection_agrees_with_the_direct_solution():
 
 
 def test_two_solvers_agree():
-    for plant in disturbed_plants(6, 2, largest=4):
+    for plant in disturbed_plants(4, 2, largest=4):
         assert least(plant, solver="SCS") == pytest.approx(least(plant, solver="CLARABEL"), rel=1e-3)
 
 
@@ -104,7 +104,7 @@ def test_gamma_below_the_least_is_always_proved_without_freedom():
         assert 0.99 * found < refusal.value.lower_bound <= found
 
 
-@pytest.mark.parametrize("factor", [1.001, 10.0, 1e6])
+@pytest.mark.parametrize("factor", [1.001, 1e6])
 def test_gamma_above_the_least_is_reached(solved, factor):
     failures = []
     for plant, found in solved:

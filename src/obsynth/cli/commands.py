@@ -50,7 +50,7 @@ def run_design(options: argparse.Namespace) -> int:
         print_json({
             "command": "design", "spec": str(spec.path), "file": str(file), "passed": design.report.passed,
             "gain_set": design_as_dict(design),
-        })  # fmt: skip
+        }, is_plain=True)  # fmt: skip
         return 0
     from obsynth.report import design_report
 

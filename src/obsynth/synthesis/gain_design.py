@@ -152,13 +152,15 @@ def injection_for(problem: GainProblem, p: FloatArray, gain: float) -> Injection
     return Injection(gains[:n], v)
 
 
-def least_gain(problem: GainProblem, *, solver: str) -> GainSolution:
+def least_gain(problem: GainProblem, *, solver: str, ceiling: float = P_CEILING) -> GainSolution:
     """Minimise the gain by the eliminated inequality.
 
     Parameters
     ----------
     problem : GainProblem
         Normalised.
+    ceiling : float, optional
+        Bound on P, besides the general one.
     solver : str
         Name of the solver.
 
@@ -169,6 +171,7 @@ def least_gain(problem: GainProblem, *, solver: str) -> GainSolution:
     """
     squared = lmi.scalar_variable()
     inequality = _inequality(problem, squared)
+    inequality.constraints.append(lmi.at_most(inequality.p, ceiling))
     record = lmi.minimise(squared, inequality.constraints, what="least gain", solver=solver)
     gain = float(np.sqrt(max(float(lmi.value_of(squared)), 0.0)))
     return GainSolution(gain, lmi.value_of(inequality.p), inequality.gains(problem, gain), record)

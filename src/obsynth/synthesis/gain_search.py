@@ -18,7 +18,9 @@ from obsynth.synthesis.gain_problem import GainProblem, Injection, NormalisedPro
 
 #: The search stops when another pass in better coordinates improves the gain by less than this.
 PASS_IMPROVEMENT = 1e-6
-MOST_PASSES = 4
+MOST_PASSES = 8
+#: Bounds on P in normalised coordinates, tried in turn: a tight one is easier, and the next pass moves on from it.
+CEILINGS = (1e4, 1e2, 1e1)
 #: Gains below this fraction of the starting filter's are treated as zero: the disturbance is decoupled.
 NEGLIGIBLE_GAIN = 1e-6
 #: A shipped gain is never asked to be smaller than this fraction of the starting filter's.
@@ -73,16 +75,14 @@ def search_least_gain(problem: GainProblem, *, solver: str) -> LeastGain:
     """
     normalised = coordinates(problem, solver=solver)
     best, gain = normalised.start, problem.achieved_gain(normalised.start)
-    starting, records = gain, []
+    starting = gain
+    records: list[dict[str, Any]] = []
     if problem.measured == 0 or gain == 0.0:
         return LeastGain(gain, normalised, best, starting, (gain, gain))
     for _ in range(MOST_PASSES):
-        try:
-            found = gain_design.least_gain(normalised.problem, solver=solver)
-        except (SolverError, np.linalg.LinAlgError) as error:
-            records.append(dict(getattr(error, "record", {})) | {"outcome": str(error)})
+        found = _pass(normalised, records, solver=solver)
+        if found is None:
             break
-        records.append(found.record)
         injection = normalised.restore(found.injection)
         reached = problem.achieved_gain(injection)
         improved = reached < gain * (1.0 - PASS_IMPROVEMENT)
@@ -92,6 +92,22 @@ def search_least_gain(problem: GainProblem, *, solver: str) -> LeastGain:
         if not improved or gain <= NEGLIGIBLE_GAIN * starting:
             break
     return LeastGain(gain, normalised, best, starting, (gain, gain), records)
+
+
+def _pass(
+    normalised: NormalisedProblem, records: list[dict[str, Any]], *, solver: str
+) -> gain_design.GainSolution | None:
+    """Minimise once, with the bound on P that lets the solver through; ``None`` when none does."""
+    for ceiling in CEILINGS:
+        try:
+            found = gain_design.least_gain(normalised.problem, solver=solver, ceiling=ceiling)
+        except (SolverError, np.linalg.LinAlgError) as error:
+            records.append(dict(getattr(error, "record", {})) | {"outcome": str(error)})
+            continue
+        records.append(found.record)
+        if np.isfinite(normalised.problem.achieved_gain(found.injection)):
+            return found
+    return None
 
 
 def search_by_bisection(problem: GainProblem, *, tolerance: float, solver: str) -> LeastGain:
