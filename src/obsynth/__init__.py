@@ -18,7 +18,9 @@ if TYPE_CHECKING:
     )
     from obsynth.models.descriptor import DescriptorSystem
     from obsynth.observers.linear import Estimates, LinearObserver, RunningObserver
-    from obsynth.pipeline import design, fault_estimation_filter, fault_estimation_filter_from_gains
+    from obsynth.observers.sampling import sample_observer
+    from obsynth.pipeline.designing import design
+    from obsynth.pipeline.fault_estimation_filter import fault_estimation_filter, fault_estimation_filter_from_gains
     from obsynth.results.design import Certificate, ObserverDesign
     from obsynth.results.report import Check, VerificationReport
     from obsynth.results.serialise import load
@@ -43,12 +45,13 @@ _HOMES = {
     "VerificationError": "obsynth.errors",
     "VerificationReport": "obsynth.results.report",
     "analyse_structure": "obsynth.analysis.structure",
-    "design": "obsynth.pipeline",
+    "design": "obsynth.pipeline.designing",
     "discretise": "obsynth.analysis.transformations",
     "eliminate_algebraic_states": "obsynth.analysis.transformations",
-    "fault_estimation_filter": "obsynth.pipeline",
-    "fault_estimation_filter_from_gains": "obsynth.pipeline",
+    "fault_estimation_filter": "obsynth.pipeline.fault_estimation_filter",
+    "fault_estimation_filter_from_gains": "obsynth.pipeline.fault_estimation_filter",
     "load": "obsynth.results.serialise",
+    "sample_observer": "obsynth.observers.sampling",
     "verify": "obsynth.verification",
 }
 
@@ -74,6 +77,7 @@ __all__ = [
     "fault_estimation_filter",
     "fault_estimation_filter_from_gains",
     "load",
+    "sample_observer",
     "verify",
 ]
 

@@ -13,10 +13,10 @@ import scipy.io
 import scipy.sparse
 
 from obsynth.errors import SpecError
-from obsynth.pipeline import fault_estimation_filter
+from obsynth.pipeline.designing import door_of
 from obsynth.spec import load_spec
 from obsynth.spec.matrices import read_matrix
-from obsynth.spec.schema import METHOD_OPTIONS
+from obsynth.spec.options import METHOD_OPTIONS
 from obsynth.synthesis.methods import REGISTRY
 
 DESIGNS = Path(__file__).parents[2] / "designs"
@@ -354,8 +354,9 @@ class TestMethods:
     def test_the_schema_knows_every_method(self) -> None:
         assert set(METHOD_OPTIONS) == set(REGISTRY)
 
-    def test_the_schema_has_the_options_and_defaults_of_the_function(self) -> None:
-        parameters = inspect.signature(fault_estimation_filter).parameters
+    @pytest.mark.parametrize("method", METHOD_OPTIONS)
+    def test_the_schema_has_the_options_and_defaults_of_the_function(self, method: str) -> None:
+        parameters = inspect.signature(door_of(method)).parameters
         of_function = {name: p.default for name, p in parameters.items() if name not in ("plant", "name")}
-        fields = METHOD_OPTIONS["fault-estimation-filter"].model_fields
+        fields = METHOD_OPTIONS[method].model_fields
         assert {name: field.default for name, field in fields.items()} == of_function

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from obsynth.errors import PreconditionError
+from obsynth.numerics.ranks import RankDecision
 
 
 @dataclass(frozen=True)
@@ -64,3 +65,33 @@ def require_all(conditions: Iterable[Condition]) -> None:
     """Raise `PreconditionError` for the first condition that fails."""
     for condition in conditions:
         condition.require()
+
+
+def rank_condition(
+    name: str, decision: RankDecision, remedy: str, *, source: str, signals: tuple[str, ...] = ()
+) -> Condition:
+    """Return the condition that a rank is full.
+
+    Parameters
+    ----------
+    name : str
+        The rank in words or symbols.
+    decision : RankDecision
+        With what was expected, and the singular-value gap behind it.
+    remedy : str
+        What to do when it fails.
+    source : str
+        Paper and equation.
+    signals : tuple of str, optional
+        Names of the signals involved when it fails.
+    """
+    return Condition(
+        name,
+        f"{name} = {decision.expected}",
+        decision.full,
+        float(decision.rank),
+        float(decision.expected),
+        source,
+        decision.describe() + ("" if decision.full else f": {remedy}"),
+        signals=() if decision.full else signals,
+    )

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from obsynth.analysis.conditions import Condition
+from obsynth.analysis.conditions import Condition, rank_condition
 from obsynth.analysis.fault_detectability import detectability_conditions
 from obsynth.analysis.fault_filter import prepare, with_sensor_faults_as_states
 from obsynth.analysis.zeros import Zero, fault_zeros, leading_names
 from obsynth.errors import PreconditionError
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.pencils import pencil_structure
-from obsynth.numerics.ranks import RankDecision, decide_rank
+from obsynth.numerics.ranks import decide_rank
 
 #: At most this many signals are named in a failed condition.
 MOST_NAMES = 4
@@ -76,21 +76,6 @@ def _form_conditions(plant: DescriptorSystem) -> list[Condition]:
     ]
 
 
-def _rank_condition(
-    name: str, decision: RankDecision, remedy: str, *, source: str, signals: tuple[str, ...] = ()
-) -> Condition:
-    return Condition(
-        name,
-        f"{name} = {decision.expected}",
-        decision.full,
-        float(decision.rank),
-        float(decision.expected),
-        source,
-        decision.describe() + ("" if decision.full else f": {remedy}"),
-        signals=() if decision.full else signals,
-    )
-
-
 def _rank_conditions(plant: DescriptorSystem) -> list[Condition]:
     enough = Condition(
         "nf <= ny",
@@ -107,7 +92,7 @@ def _rank_conditions(plant: DescriptorSystem) -> list[Condition]:
     faults = decide_rank(np.vstack([plant.Bf, plant.Df]), expected=plant.nf)
     ranks = [
         enough,
-        _rank_condition(
+        rank_condition(
             "rank F",
             faults,
             "some faults act nowhere, or in the same direction as others, and cannot be told apart.",
@@ -136,14 +121,14 @@ def _rank_conditions(plant: DescriptorSystem) -> list[Condition]:
     outputs = decide_rank(work.C, expected=work.ny)
     stacked = np.vstack([work.E, work.C])
     ranks += [
-        _rank_condition(
+        rank_condition(
             "rank C",
             outputs,
             "some outputs repeat others: leave them out.",
             source="Wang 2015, below eq. (1)",
             signals=leading_names(np.linalg.svd(work.C)[0][:, -1], plant.output_names, most=MOST_NAMES),
         ),
-        _rank_condition(
+        rank_condition(
             "rank [E; C]",
             decide_rank(stacked, expected=work.nx),
             "not every state is either dynamic or measured. Measure more, or eliminate the algebraic states first "

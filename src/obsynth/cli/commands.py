@@ -59,7 +59,7 @@ def run_design(options: argparse.Namespace) -> int:
 
 
 def _designed(spec: Spec, report_stage: Any) -> ObserverDesign:
-    from obsynth.pipeline import design
+    from obsynth.pipeline.designing import design
 
     recovery = None if spec.transformation is None else spec.transformation.recovery
     return design(
@@ -101,7 +101,7 @@ def run_check(options: argparse.Namespace) -> int:
 
     spec = load_spec(options.system)
     from obsynth.analysis.structure import analyse_structure
-    from obsynth.pipeline import check
+    from obsynth.pipeline.designing import check
 
     structures = {"as the method sees it": analyse_structure(spec.plant)}
     if spec.transformation is not None:

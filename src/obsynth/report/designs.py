@@ -11,17 +11,10 @@ from rich.text import Text
 
 from obsynth.analysis.transformations import StateRecovery
 from obsynth.models.descriptor import DescriptorSystem
+from obsynth.report.claims import meaning_of
 from obsynth.report.layout import facts_table, headed_table, name_list, number, print_section
 from obsynth.report.verification import verification_report
 from obsynth.results.design import ObserverDesign
-
-_MEANINGS = {
-    "gamma": "l2 gain from the disturbance to the fault error: shipped, proved",
-    "gamma_min": "least such gain found",
-    "gamma_bracket_low": "lower end of the bisection's bracket",
-    "gamma_bracket_high": "upper end of the bisection's bracket",
-    "state_lag": "samples by which the state estimate lags",
-}
 
 
 def plant_facts(plant: DescriptorSystem) -> Iterator[tuple[str, str]]:
@@ -83,7 +76,7 @@ def _recovered_states(recovery: StateRecovery) -> Iterator[tuple[str, str]]:
 
 def _promises(design: ObserverDesign) -> Iterator[tuple[str, str, str]]:
     for name, value in design.certificate.claims.items():
-        yield name, number(value, digits=7), _MEANINGS.get(name, "")
+        yield name, number(value, digits=7), meaning_of(design.method, name)
     for check in design.report.checks:
         if check.name == "H-infinity norm":
             yield "norm", number(check.value, digits=7), "the same gain recomputed by a second route"

@@ -85,7 +85,8 @@ def checked_spec(document: Mapping[str, Any], source: Path) -> tuple[SpecDocumen
     SpecError
         The document does not fit the schema; all problems at once.
     """
-    from obsynth.spec.schema import METHOD_OPTIONS, SpecDocument
+    from obsynth.spec.options import METHOD_OPTIONS
+    from obsynth.spec.schema import SpecDocument
 
     problems = DocumentProblems(source, what="spec")
     _check_version(document, problems)

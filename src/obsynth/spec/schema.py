@@ -5,7 +5,7 @@ This module imports pydantic, so it is imported only when a spec is read.
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from pydantic import (
     BaseModel,
@@ -64,7 +64,9 @@ def _kind_of_plant(value: Any) -> str:
     return _FILE if isinstance(value, dict) and "file" in value else _INLINE
 
 
-class _Section(BaseModel):
+class Section(BaseModel):
+    """A part of a document: strict types, no unknown keys, finite numbers."""
+
     model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, frozen=True)
 
 
@@ -75,26 +77,26 @@ Rows = Annotated[
 ]
 
 
-class MatrixFile(_Section):
+class MatrixFile(Section):
     """A matrix in a file: ``{file: A.mtx}``, or ``{file: plant.mat, variable: A}``."""
 
     file: Text
     variable: Text | None = None
 
 
-class NamesFile(_Section):
+class NamesFile(Section):
     """Names in a JSON file: ``{file: names.json}``."""
 
     file: Text
 
 
-class OutputPick(_Section):
+class OutputPick(Section):
     """Outputs by state name: ``{outputs: [omega 1, v 3]}``."""
 
     outputs: Annotated[list[Text], Field(min_length=1)]
 
 
-class StatePick(_Section):
+class StatePick(Section):
     """Equations by state name: ``{states: [tm 1]}``."""
 
     states: Annotated[list[Text], Field(min_length=1)]
@@ -110,14 +112,14 @@ OutputMatrix = Annotated[
 Names = Annotated[Annotated[list[Text], Tag(_LIST)] | Annotated[NamesFile, Tag(_FILE)], Discriminator(_kind_of_names)]
 
 
-class TransformSection(_Section):
+class TransformSection(Section):
     """What is done to the plant before a method sees it, in this order."""
 
     eliminate_algebraic_states: bool = False
     sample_time: Positive | None = None
 
 
-class PlantSection(_Section):
+class PlantSection(Section):
     """A plant, matrix by matrix."""
 
     dt: Annotated[float, Field(ge=0.0)]
@@ -150,20 +152,20 @@ class PlantDocument(PlantSection):
     schema_version: int
 
 
-class PlantReference(_Section):
+class PlantReference(Section):
     """A plant in another file: ``{file: plant.yaml}``."""
 
     file: Text
 
 
-class MethodSection(_Section):
+class MethodSection(Section):
     """The method and its options; the options have a schema per method."""
 
     id: Text
     options: dict[str, Any] = Field(default_factory=dict)
 
 
-class SpecDocument(_Section):
+class SpecDocument(Section):
     """A whole spec."""
 
     schema_version: int
@@ -173,20 +175,3 @@ class SpecDocument(_Section):
         Annotated[PlantReference, Tag(_FILE)] | Annotated[PlantSection, Tag(_INLINE)], Discriminator(_kind_of_plant)
     ]
     method: MethodSection
-
-
-class FaultEstimationFilterOptions(_Section):
-    """Options of the method ``fault-estimation-filter``."""
-
-    gamma: Positive | None = None
-    gamma_search: Literal["direct", "bisection"] = "direct"
-    gamma_margin: Positive = 0.05
-    free_residual_weight: bool | None = None
-    residual_weight_limit: Positive | None = None
-    S: Matrix | None = None
-    solver: Literal["CLARABEL", "SCS"] = "CLARABEL"
-    tolerance: Annotated[float, Field(gt=0.0, lt=1.0)] = 1e-6
-
-
-#: Options of every method, by its identifier.
-METHOD_OPTIONS: dict[str, type[_Section]] = {"fault-estimation-filter": FaultEstimationFilterOptions}

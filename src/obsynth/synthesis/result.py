@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from obsynth.analysis.transformations import Transformation
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear import LinearObserver
 from obsynth.results.design import Certificate
@@ -29,6 +30,9 @@ class Synthesis:
         Records of the solver runs.
     notes : tuple of str
         What a user should know.
+    transformation : Transformation, optional
+        What the method did to the plant before it designed for it (such as the elimination of algebraic states):
+        the design is then for the transformed plant, with the way back.
     """
 
     options: Mapping[str, Any]
@@ -37,3 +41,4 @@ class Synthesis:
     certificate: Certificate
     solver: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    transformation: Transformation | None = None

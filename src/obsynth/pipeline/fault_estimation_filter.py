@@ -1,77 +1,14 @@
-"""From a plant to a verified design: the only place that goes analyse -> synthesise -> verify."""
+"""Public functions of the method ``fault-estimation-filter``."""
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Callable
-from typing import Any
-
 from numpy.typing import ArrayLike
 
-from obsynth.analysis.transformations import StateRecovery
-from obsynth.errors import SpecError, VerificationError
+from obsynth.errors import SpecError
 from obsynth.models.descriptor import DescriptorSystem
+from obsynth.pipeline.designing import design, draft_of
 from obsynth.results.design import ObserverDesign
-from obsynth.results.report import VerificationReport
-from obsynth.synthesis.methods import REGISTRY, method_module
-from obsynth.synthesis.result import Synthesis
 from obsynth.verification import verify
-from obsynth.verification.plant import condition_rows
-
-
-def _silent(_: str) -> None:
-    """Progress that nobody watches."""
-
-
-def design(
-    plant: DescriptorSystem,
-    method: str = "fault-estimation-filter",
-    *,
-    name: str = "design",
-    recovery: StateRecovery | None = None,
-    progress: Callable[[str], None] | None = None,
-    **options: Any,
-) -> ObserverDesign:
-    """Design an observer and verify what is shipped.
-
-    Parameters
-    ----------
-    plant : DescriptorSystem
-        The plant.
-    method : str, optional
-        Method id; see `fault_estimation_filter` for the options of ``"fault-estimation-filter"``.
-    name : str, optional
-        Name of the design.
-    recovery : StateRecovery, optional
-        Map back to the states of the plant before its transformation, kept with the design.
-    progress : callable, optional
-        Called with a text at the start of each stage.
-    **options
-        Options of the method.
-
-    Returns
-    -------
-    ObserverDesign
-        Verified: every check of its report holds.
-
-    Raises
-    ------
-    SpecError
-        Unknown method or option, or an option out of range.
-    PreconditionError
-        No such observer exists for this plant; the failing condition, mode and signals are named.
-    InfeasibleError
-        A checked certificate proves that what was asked cannot be reached.
-    SolverError
-        The solver gave no usable answer: nothing is known.
-    VerificationError
-        Gains were found, but the shipped realisation fails a check.
-    """
-    report_stage = progress or _silent
-    options = _checked_options(method, options)
-    found = method_module(method).synthesise(plant, progress=report_stage, **options)
-    report_stage("verifying the shipped realisation")
-    return _verified(plant, method, found, name=name, recovery=recovery)
 
 
 def fault_estimation_filter(
@@ -212,63 +149,5 @@ def fault_estimation_filter_from_gains(
             "gamma is needed: the plant has disturbances, and a gain set claims a bound on them.", path="gamma"
         )
     found = synthesis_from_gains(plant, T=T, N=N, L=L, W=W, gamma=gamma)
-    draft = _draft(plant, "fault-estimation-filter", found, name=name, recovery=None)
+    draft = draft_of(plant, "fault-estimation-filter", found, name=name)
     return draft.replace(report=verify(draft))
-
-
-def check(plant: DescriptorSystem) -> dict[str, VerificationReport]:
-    """Return, for every method, the report of its existence conditions; nothing is designed or raised.
-
-    Parameters
-    ----------
-    plant : DescriptorSystem
-        The plant.
-    """
-    return {
-        method: VerificationReport.of(condition_rows(method_module(method).conditions(plant))) for method in REGISTRY
-    }
-
-
-def _checked_options(method: str, options: dict[str, Any]) -> dict[str, Any]:
-    known = {"fault-estimation-filter": fault_estimation_filter}
-    allowed = set(inspect.signature(known[method]).parameters) - {"plant", "name"} if method in known else set()
-    method_module(method)
-    unknown = sorted(set(options) - allowed)
-    if unknown:
-        raise SpecError(
-            f"{method} has no option {', '.join(map(repr, unknown))}; there are: {', '.join(sorted(allowed))}.",
-            path="method.options",
-        )
-    return options
-
-
-def _draft(
-    plant: DescriptorSystem, method: str, found: Synthesis, *, name: str, recovery: StateRecovery | None
-) -> ObserverDesign:
-    return ObserverDesign(
-        name=name,
-        method=method,
-        plant=plant,
-        options=found.options,
-        gains=found.gains,
-        observer=found.observer,
-        certificate=found.certificate,
-        solver=found.solver,
-        notes=found.notes,
-        recovery=recovery,
-    )
-
-
-def _verified(
-    plant: DescriptorSystem, method: str, found: Synthesis, *, name: str, recovery: StateRecovery | None
-) -> ObserverDesign:
-    draft = _draft(plant, method, found, name=name, recovery=recovery)
-    report = verify(draft)
-    if not report.passed:
-        failed = "; ".join(f"{row.name} ({row.value:.3g} against {row.bound:.3g})" for row in report.failures)
-        raise VerificationError(
-            f"Gains were found, but the shipped realisation fails: {failed}. Nothing was shipped; "
-            "rescale the plant, or ask for a larger gamma.",
-            report=report,
-        )
-    return draft.replace(report=report)

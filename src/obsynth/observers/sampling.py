@@ -1,0 +1,58 @@
+"""A discrete-time observer from a continuous-time one, for data that come in samples."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.observers.linear import LinearObserver
+
+
+def sample_observer(observer: LinearObserver, dt: float) -> LinearObserver:
+    r"""Sample a continuous-time observer by a first-order hold.
+
+    Exact for known inputs and outputs that are linear between samples: with v = [u; y],
+
+    .. math::
+        z_{k+1} = \Phi z_k + \Gamma_0 v_k + \Gamma_1 (v_{k+1} - v_k), \qquad \xi_k = z_k - \Gamma_1 v_k
+
+    and the state that is kept is :math:`\xi`, so that no sample is needed in advance.
+
+    Parameters
+    ----------
+    observer : LinearObserver
+        Continuous time (``dt == 0``).
+    dt : float
+        Seconds between samples, positive.
+
+    Returns
+    -------
+    LinearObserver
+        Of the same order and with the same signals; a start at rest means ``z(0) = Gamma_1 v(0)``.
+
+    Raises
+    ------
+    SpecError
+        The observer is discrete in time already, or ``dt`` is not positive and finite.
+    """
+    from scipy.linalg import expm
+
+    if observer.dt > 0.0:
+        raise SpecError(f"The observer is discrete in time already (dt = {observer.dt:g} s).", path="dt")
+    if not (math.isfinite(dt) and dt > 0.0):
+        raise SpecError(f"dt is {dt}: give the seconds between two samples, a positive number.", path="dt")
+    n, inputs = observer.order, len(observer.input_names)
+    b, d = np.hstack([observer.Bu, observer.By]), np.hstack([observer.Du, observer.Dy])
+    m = b.shape[1]
+    chain = np.zeros((n + 2 * m, n + 2 * m))
+    chain[:n, :n], chain[:n, n : n + m], chain[n : n + m, n + m :] = observer.Az * dt, b * dt, np.eye(m)
+    row = expm(chain)[:n]
+    transition, constant, ramp = row[:, :n], row[:, n : n + m], row[:, n + m :]
+    into, through = transition @ ramp + constant - ramp, d + observer.Cz @ ramp
+    return replace(
+        observer, Az=transition, Bu=into[:, :inputs], By=into[:, inputs:], Du=through[:, :inputs],
+        Dy=through[:, inputs:], dt=dt,
+    )  # fmt: skip

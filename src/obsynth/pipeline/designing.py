@@ -1,0 +1,173 @@
+"""From a plant to a verified design: the only place that goes analyse -> synthesise -> verify."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from importlib import import_module
+from typing import Any
+
+from obsynth.analysis.transformations import StateRecovery
+from obsynth.errors import SpecError, VerificationError
+from obsynth.models.descriptor import DescriptorSystem
+from obsynth.results.design import ObserverDesign
+from obsynth.results.report import VerificationReport
+from obsynth.synthesis.methods import REGISTRY, method_module
+from obsynth.synthesis.result import Synthesis
+from obsynth.verification import verify
+from obsynth.verification.plant import condition_rows
+
+
+def _silent(_: str) -> None:
+    """Progress that nobody watches."""
+
+
+def design(
+    plant: DescriptorSystem,
+    method: str = "fault-estimation-filter",
+    *,
+    name: str = "design",
+    recovery: StateRecovery | None = None,
+    progress: Callable[[str], None] | None = None,
+    **options: Any,
+) -> ObserverDesign:
+    """Design an observer and verify what is shipped.
+
+    Parameters
+    ----------
+    plant : DescriptorSystem
+        The plant.
+    method : str, optional
+        Method id; see `fault_estimation_filter` for the options of ``"fault-estimation-filter"``.
+    name : str, optional
+        Name of the design.
+    recovery : StateRecovery, optional
+        Map back to the states of the plant before its transformation, kept with the design.
+    progress : callable, optional
+        Called with a text at the start of each stage.
+    **options
+        Options of the method.
+
+    Returns
+    -------
+    ObserverDesign
+        Verified: every check of its report holds.
+
+    Raises
+    ------
+    SpecError
+        Unknown method or option, or an option out of range.
+    PreconditionError
+        No such observer exists for this plant; the failing condition, mode and signals are named.
+    InfeasibleError
+        A checked certificate proves that what was asked cannot be reached.
+    SolverError
+        The solver gave no usable answer: nothing is known.
+    VerificationError
+        Gains were found, but the shipped realisation fails a check.
+    """
+    report_stage = progress or _silent
+    options = _checked_options(method, options)
+    found = method_module(method).synthesise(plant, progress=report_stage, **options)
+    report_stage("verifying the shipped realisation")
+    return verified(plant, method, found, name=name, recovery=recovery)
+
+
+def check(plant: DescriptorSystem) -> dict[str, VerificationReport]:
+    """Return, for every method, the report of its existence conditions; nothing is designed or raised.
+
+    Parameters
+    ----------
+    plant : DescriptorSystem
+        The plant.
+    """
+    return {
+        method: VerificationReport.of(condition_rows(method_module(method).conditions(plant))) for method in REGISTRY
+    }
+
+
+def door_of(method: str) -> Callable[..., ObserverDesign]:
+    """Return the public function of a method: of the same name, in a module of the same name.
+
+    Parameters
+    ----------
+    method : str
+        A method id.
+    """
+    name = method.replace("-", "_")
+    door: Callable[..., ObserverDesign] = getattr(import_module(f"obsynth.pipeline.{name}"), name)
+    return door
+
+
+def _checked_options(method: str, options: dict[str, Any]) -> dict[str, Any]:
+    method_module(method)
+    allowed = set(inspect.signature(door_of(method)).parameters) - {"plant", "name"}
+    unknown = sorted(set(options) - allowed)
+    if unknown:
+        raise SpecError(
+            f"{method} has no option {', '.join(map(repr, unknown))}; there are: {', '.join(sorted(allowed))}.",
+            path="method.options",
+        )
+    return options
+
+
+def draft_of(
+    plant: DescriptorSystem, method: str, found: Synthesis, *, name: str, recovery: StateRecovery | None = None
+) -> ObserverDesign:
+    """Return the design that a synthesis stands for, without a report.
+
+    Parameters
+    ----------
+    plant : DescriptorSystem
+        The plant that the method was given.
+    method : str
+        Method id.
+    found : Synthesis
+        Unverified.
+    name : str
+        Name of the design.
+    recovery : StateRecovery, optional
+        Map from the states of ``plant`` back to those before its transformation.
+    """
+    if found.transformation is not None:
+        own = found.transformation.recovery
+        plant, recovery = found.transformation.plant, own if recovery is None else recovery.then(own)
+    return ObserverDesign(
+        name=name,
+        method=method,
+        plant=plant,
+        options=found.options,
+        gains=found.gains,
+        observer=found.observer,
+        certificate=found.certificate,
+        solver=found.solver,
+        notes=found.notes,
+        recovery=recovery,
+    )
+
+
+def verified(
+    plant: DescriptorSystem, method: str, found: Synthesis, *, name: str, recovery: StateRecovery | None = None
+) -> ObserverDesign:
+    """Return the design with its report.
+
+    Parameters
+    ----------
+    plant, method, found, name, recovery
+        As for `draft_of`.
+
+    Raises
+    ------
+    VerificationError
+        A check fails.
+    """
+    draft = draft_of(plant, method, found, name=name, recovery=recovery)
+    report = verify(draft)
+    if not report.passed:
+        failed = "; ".join(f"{row.name} ({row.value:.3g} against {row.bound:.3g})" for row in report.failures)
+        raise VerificationError(
+            f"Gains were found, but the shipped realisation fails: {failed}. Nothing was shipped; "
+            "rescale the plant, or ask for less (a larger gamma, a slower decay).",
+            report=report,
+        )
+    return draft.replace(report=report)

@@ -1,0 +1,29 @@
+"""The options of every method as a spec gives them.
+
+This module imports pydantic, so it is imported only when a spec is read.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from obsynth.spec.schema import Matrix, Positive, Section
+
+
+class FaultEstimationFilterOptions(Section):
+    """Options of the method ``fault-estimation-filter``."""
+
+    gamma: Positive | None = None
+    gamma_search: Literal["direct", "bisection"] = "direct"
+    gamma_margin: Positive = 0.05
+    free_residual_weight: bool | None = None
+    residual_weight_limit: Positive | None = None
+    S: Matrix | None = None
+    solver: Literal["CLARABEL", "SCS"] = "CLARABEL"
+    tolerance: Annotated[float, Field(gt=0.0, lt=1.0)] = 1e-6
+
+
+#: Options of every method, by its identifier.
+METHOD_OPTIONS: dict[str, type[Section]] = {"fault-estimation-filter": FaultEstimationFilterOptions}
