@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 from plants import build, random_recipe
+from reference_gain import ErrorProblem
 
 import obsynth
 
 #: Gains below this share of the one with a fixed weight count as a decoupled disturbance: their digits mean nothing.
 NEGLIGIBLE = 1e-3
 #: A SolverError is honest ("nothing is known") but should be the exception.
-SHARE_TO_BE_PROVED = 0.9
+SHARE_TO_BE_PROVED = 0.95
 
 
 def disturbed_plants(count, stream, **fixed):
@@ -34,6 +35,63 @@ def solved():
     """Plants with their least gain, fixed weight."""
     plants = [*disturbed_plants(14, 7, largest=8), *disturbed_plants(6, 8, feedthrough=True)]
     return [(plant, least(plant)) for plant in plants]
+
+
+def test_bisection_agrees_with_the_direct_solution():
+    tolerance = 1e-4
+    for plant in [*disturbed_plants(10, 0), *disturbed_plants(5, 1, feedthrough=True)]:
+        direct = least(plant)
+        design = obsynth.fault_estimation_filter(plant, gamma_search="bisection", tolerance=tolerance)
+        claims = design.certificate.claims
+        low, high = claims["gamma_bracket_low"], claims["gamma_bracket_high"]
+        assert high - low <= tolerance * high
+        assert claims["gamma_min"] <= high * (1.0 + 1e-6)
+        # 1e-5: what the direct search itself leaves open.
+        assert claims["gamma_min"] == pytest.approx(direct, rel=tolerance + 1e-5)
+
+
+def test_two_solvers_agree():
+    for plant in disturbed_plants(4, 2, largest=4):
+        assert least(plant, solver="SCS") == pytest.approx(least(plant, solver="CLARABEL"), rel=1e-3)
+
+
+@pytest.mark.parametrize("fixed", [{}, {"feedthrough": True}, {"explicit": True, "singularity": 0}], ids=str)
+def test_no_filter_beats_the_least_gain(fixed):
+    beaten = []
+    for plant in disturbed_plants(10, 3, largest=8, **fixed):
+        design = obsynth.fault_estimation_filter(plant)
+        found = design.certificate.claims["gamma_min"]
+        better = ErrorProblem.of(design).best(found)
+        if better < found * (1.0 - 1e-3):
+            beaten.append((repr(plant), found, better))
+    assert beaten == []
+
+
+def test_free_weight_never_costs_gain_and_is_not_beaten(solved):
+    worse, beaten = [], []
+    for plant, fixed in solved:
+        design = obsynth.fault_estimation_filter(plant, free_residual_weight=True)
+        found = design.certificate.claims["gamma_min"]
+        if found > fixed * (1.0 + 1e-5):
+            worse.append((repr(plant), fixed, found))
+        better = max(ErrorProblem.of(design, free_weight=True).best(found), NEGLIGIBLE * fixed)
+        if better < found * (1.0 - 1e-3):
+            beaten.append((repr(plant), found, better))
+    assert worse == []
+    assert beaten == []
+
+
+@pytest.mark.parametrize("share", [0.5, 0.9, 0.9999])
+def test_gamma_below_the_least_is_refused_with_a_sound_bound(solved, share):
+    proved = 0
+    for plant, found in solved:
+        with pytest.raises((obsynth.InfeasibleError, obsynth.SolverError)) as refusal:
+            obsynth.fault_estimation_filter(plant, gamma=share * found)
+        if isinstance(refusal.value, obsynth.InfeasibleError):
+            proved += 1
+            assert share * found < refusal.value.lower_bound <= found * (1.0 + 1e-9)
+            assert not refusal.value.necessary
+    assert proved >= SHARE_TO_BE_PROVED * len(solved)
 
 
 def test_gamma_below_the_least_is_always_proved_without_freedom():

@@ -20,6 +20,7 @@ from obsynth import (
     fault_estimation_filter_from_gains,
     verify,
 )
+from obsynth.analysis.transformations import StateRecovery
 from obsynth.spec.loader import load_spec
 
 PAPER = Path(__file__).parents[2] / "designs" / "wang2015" / "spec.yaml"
@@ -29,6 +30,10 @@ FAULT, RESIDUAL, FEEDTHROUGH = "unbiased: fault", "unbiased: residual", "unbiase
 DECOUPLED, ESTIMATE = "fault decoupled after its delay", "fault estimate"
 IN_RESIDUAL, IN_STATE = "fault in the residual", "no fault in the state estimate"
 RADIUS, LMI, NORM, FITS = "spectral radius", "LMI", "H-infinity norm", "fits the plant"
+GAINS, RESTRICTED, WEIGHT = "gains fit", "gains: T and N", "gains: W"
+MATRIX, FREE, REALISED = "gains: Psi and Upsilon", "gains: R", "gains: realisation"
+CLAIMS, ORDER = "claims", "claimed gains"
+RECOVERY, KEPT = "recovery fits", "recovery of kept states"
 ESTIMATES = (ESTIMATE, IN_RESIDUAL)
 
 
@@ -147,6 +152,50 @@ def claim(name: str, value: float) -> Callable[[ObserverDesign], ObserverDesign]
     return lambda design: with_certificate(design, {name: value})
 
 
+def without_claim(name: str) -> Callable[[ObserverDesign], ObserverDesign]:
+    def corrupt(design: ObserverDesign) -> ObserverDesign:
+        claims = {key: value for key, value in design.certificate.claims.items() if key != name}
+        return design.replace(certificate=Certificate(design.certificate.matrices, claims))
+
+    return corrupt
+
+
+def claimed_bracket(low: float, high: float) -> Callable[[ObserverDesign], ObserverDesign]:
+    """A bracket around the least gain, its ends given relative to it."""
+
+    def corrupt(design: ObserverDesign) -> ObserverDesign:
+        least = design.certificate.claims["gamma_min"]
+        return with_certificate(design, {"gamma_bracket_low": low * least, "gamma_bracket_high": high * least})
+
+    return corrupt
+
+
+def gain_set(change: Callable[[dict[str, np.ndarray]], dict[str, np.ndarray]]) -> Callable[..., ObserverDesign]:
+    """The letters that go with the realisation, which itself stays as it is."""
+    return lambda design: design.replace(gains=change(dict(design.gains)))
+
+
+def gain_entry(letter: str, row: int, column: int, by: float = 1e-6) -> Callable[..., ObserverDesign]:
+    return gain_set(lambda gains: {**gains, letter: nudged(gains[letter], row, column, by)})
+
+
+def with_recovery(**changes: object) -> Callable[[ObserverDesign], ObserverDesign]:
+    """A map back to a plant with one more state, the sum of all others and of all other signals, with changes."""
+
+    def corrupt(design: ObserverDesign) -> ObserverDesign:
+        plant = design.plant
+        widths = {"input": plant.nu, "fault": plant.nf, "disturbance": plant.nd, "noise": plant.nw}
+        fields = {
+            f"from_{signal}": np.vstack([np.zeros((plant.nx, n)), np.ones((1, n))]) for signal, n in widths.items()
+        }
+        fields["from_state"] = np.vstack([np.eye(plant.nx), np.ones((1, plant.nx))])
+        fields |= {"noise_kept": np.eye(plant.nw), "names": (*plant.state_names, "their sum")}
+        wanted = {name: value(fields[name]) if callable(value) else value for name, value in changes.items()}
+        return design.replace(recovery=StateRecovery(**{**fields, **wanted}))
+
+    return corrupt
+
+
 def observer_field(**changes: object) -> Callable[[ObserverDesign], ObserverDesign]:
     return lambda design: with_observer(design, **changes)
 
@@ -202,6 +251,9 @@ def without_faults(design: ObserverDesign) -> ObserverDesign:
     plant, rows = design.plant, design.observer.state_rows
     bare = with_plant(design, Bf=np.zeros((plant.nx, 0)), Df=np.zeros((plant.ny, 0)), fault_names=())
     parts = {name: getattr(design.observer, name)[rows] for name in ("Cz", "Dy", "Du")}
+    gains = design.gains
+    nothing = {"W": gains["W"][:0], "Psi": gains["Psi"][:, :0], "Upsilon": gains["Upsilon"][:, :0], "R": gains["L"]}
+    bare = bare.replace(gains={**gains, **nothing})
     return with_observer(bare, **parts, fault_names=(), residual_names=(), fault_delays=())
 
 
@@ -228,6 +280,9 @@ def with_repeated_output(design: ObserverDesign) -> ObserverDesign:
     }
     larger = with_plant(design, **again, output_names=(*plant.output_names, "again"))
     used = {name: grown(getattr(observer, name), 0, 1) for name in ("By", "Dy")}
+    gains = {letter: grown(design.gains[letter], 0, 1) for letter in "NLWR"}
+    gains["Upsilon"] = np.vstack([design.gains["Upsilon"], design.gains["Upsilon"][-1:]])
+    larger = larger.replace(gains={**design.gains, **gains})
     return with_observer(larger, **used, output_names=(*observer.output_names, "again"))
 
 
@@ -254,8 +309,17 @@ def with_state(
         cz[nx, -1] = 1.0
     if estimated_by == "output":
         dy[nx, -1] = 1.0
-    matrices = design.certificate.matrices
+    matrices, gains = design.certificate.matrices, design.gains
     larger = with_plant(design, **changes, **names)
+    larger = larger.replace(
+        gains={
+            "T": grown(gains["T"], 1, 1, 1.0),
+            **{letter: grown(gains[letter], 1, more) for letter in ("N", "L", "R")},
+            "W": grown(gains["W"], 0, more),
+            "Psi": grown(gains["Psi"], 1, 0),
+            "Upsilon": grown(gains["Upsilon"], more, 0),
+        }
+    )
     larger = with_certificate(
         larger,
         tracking=grown(matrices["tracking"], copied, 1, float(copied)),
@@ -279,41 +343,44 @@ def with_hidden_fault(design: ObserverDesign) -> ObserverDesign:
 
 # What fails when a fault acts otherwise than the observer expects.
 WRONG_FAULT = (DECOUPLED, *ESTIMATES, IN_STATE)
+OTHER_GAINS = (WEIGHT, MATRIX, REALISED)
 UNBIASED = (DYNAMICS, STATE, FAULT, RESIDUAL)
 
 #: What is corrupted -> (good design, corruption, exactly the rows that fail).
 TABLE: dict[str, tuple[str, Callable[[ObserverDesign], ObserverDesign], tuple[str, ...]]] = {
     # One entry of the observer, by 1e-6.
-    "Az": ("paper", entry("Az", 1, 1), (DYNAMICS, DECOUPLED)),
-    "Az in a direction that only faults excite": ("paper", entry("Az", 1, 3), (DECOUPLED,)),
-    "Az, core of a chain": ("chain", entry("Az", 0, 1), (DYNAMICS, DECOUPLED, *ESTIMATES, IN_STATE)),
-    "Az, a delayed state drives the core": ("chain", entry("Az", 0, 9), (DYNAMICS, LMI)),
-    "Az, a delayed state drives itself": ("chain", entry("Az", 6, 6), (DYNAMICS, DECOUPLED, LMI)),
-    "By": ("paper", entry("By", 2, 1), (DYNAMICS,)),
-    "By with feedthrough of the input": ("direct", entry("By", 1, 1), (DYNAMICS, INPUTS)),
-    "By of an output with a sensor fault": ("direct", entry("By", 1, 0), (DYNAMICS, INPUTS, *WRONG_FAULT)),
-    "Bu": ("paper", entry("Bu", 0, 1), (INPUTS,)),
-    "Bu of a delayed state": ("chain", entry("Bu", 12, 0), (INPUTS,)),
-    "Cz, state": ("paper", entry("Cz", 0, 1), (STATE, IN_STATE)),
-    "Cz, state, seen by faults alone": ("paper", entry("Cz", 2, 3), (IN_STATE,)),
-    "Cz, fault": ("paper", entry("Cz", 4, 1), (FAULT, ESTIMATE)),
-    "Cz, fault, seen by faults alone": ("paper", entry("Cz", 5, 3), (ESTIMATE,)),
-    "Cz, fault from a delayed state": ("chain", entry("Cz", 6, 9), (FAULT, LMI)),
-    "Cz, residual": ("paper", entry("Cz", 6, 1), (RESIDUAL, IN_RESIDUAL)),
-    "Cz, residual, seen by faults alone": ("paper", entry("Cz", 7, 3), (IN_RESIDUAL,)),
-    "Dy, state": ("paper", entry("Dy", 3, 2), (STATE,)),
-    "Dy, fault": ("paper", entry("Dy", 4, 0), (FAULT,)),
-    "Dy, residual": ("paper", entry("Dy", 6, 0), (RESIDUAL,)),
-    "Dy, fault, with feedthrough of input and fault": ("direct", entry("Dy", 3, 0), (FAULT, FEEDTHROUGH, ESTIMATE)),
-    "Dy, state, with feedthrough of input and fault": ("direct", entry("Dy", 0, 0), (STATE, FEEDTHROUGH, IN_STATE)),
-    "Du, state": ("paper", entry("Du", 0, 0), (FEEDTHROUGH,)),
-    "Du, fault": ("paper", entry("Du", 4, 1), (FEEDTHROUGH,)),
-    "Du, residual": ("direct", entry("Du", 5, 0), (FEEDTHROUGH,)),
+    "Az": ("paper", entry("Az", 1, 1), (DYNAMICS, DECOUPLED, REALISED)),
+    "Az in a direction that only faults excite": ("paper", entry("Az", 1, 3), (DECOUPLED, REALISED)),
+    "Az, core of a chain": ("chain", entry("Az", 0, 1), (DYNAMICS, DECOUPLED, *ESTIMATES, IN_STATE, REALISED)),
+    "Az, a delayed state drives the core": ("chain", entry("Az", 0, 9), (DYNAMICS, LMI, REALISED)),
+    "Az, a delayed state drives itself": ("chain", entry("Az", 6, 6), (DYNAMICS, DECOUPLED, LMI, REALISED)),
+    "By": ("paper", entry("By", 2, 1), (DYNAMICS, REALISED)),
+    "By with feedthrough of the input": ("direct", entry("By", 1, 1), (DYNAMICS, INPUTS, REALISED)),
+    "By of an output with a sensor fault": ("direct", entry("By", 1, 0), (DYNAMICS, INPUTS, *WRONG_FAULT, REALISED)),
+    "Bu": ("paper", entry("Bu", 0, 1), (INPUTS, REALISED)),
+    "Bu of a delayed state": ("chain", entry("Bu", 12, 0), (INPUTS, REALISED)),
+    "Cz, state": ("paper", entry("Cz", 0, 1), (STATE, IN_STATE, REALISED)),
+    "Cz, state, seen by faults alone": ("paper", entry("Cz", 2, 3), (IN_STATE, REALISED)),
+    "Cz, fault": ("paper", entry("Cz", 4, 1), (FAULT, ESTIMATE, REALISED)),
+    "Cz, fault, seen by faults alone": ("paper", entry("Cz", 5, 3), (ESTIMATE, REALISED)),
+    "Cz, fault from a delayed state": ("chain", entry("Cz", 6, 9), (FAULT, LMI, REALISED)),
+    "Cz, residual": ("paper", entry("Cz", 6, 1), (RESIDUAL, IN_RESIDUAL, REALISED)),
+    "Cz, residual, seen by faults alone": ("paper", entry("Cz", 7, 3), (IN_RESIDUAL, REALISED)),
+    "Dy, state": ("paper", entry("Dy", 3, 2), (STATE, REALISED)),
+    "Dy, fault": ("paper", entry("Dy", 4, 0), (FAULT, REALISED)),
+    "Dy, residual": ("paper", entry("Dy", 6, 0), (RESIDUAL, REALISED)),
+    "Dy, fault, with feedthrough of input and fault": (
+        "direct", entry("Dy", 3, 0), (FAULT, FEEDTHROUGH, ESTIMATE, REALISED)),
+    "Dy, state, with feedthrough of input and fault": (
+        "direct", entry("Dy", 0, 0), (STATE, FEEDTHROUGH, IN_STATE, REALISED)),
+    "Du, state": ("paper", entry("Du", 0, 0), (FEEDTHROUGH, REALISED)),
+    "Du, fault": ("paper", entry("Du", 4, 1), (FEEDTHROUGH, REALISED)),
+    "Du, residual": ("direct", entry("Du", 5, 0), (FEEDTHROUGH, REALISED)),
     # What the observer says about itself.
-    "fault delay one too long": ("paper", observer_field(fault_delays=(2, 1)), ESTIMATES),
-    "fault delay far too long": ("quiet", observer_field(fault_delays=(40,)), ESTIMATES),
-    "fault delay one too short": ("chain", observer_field(fault_delays=(2, 1)), (DECOUPLED, *ESTIMATES)),
-    "fault delays exchanged": ("chain", observer_field(fault_delays=(1, 3)), ESTIMATES),
+    "fault delay one too long": ("paper", observer_field(fault_delays=(2, 1)), (*ESTIMATES, GAINS)),
+    "fault delay far too long": ("quiet", observer_field(fault_delays=(40,)), (*ESTIMATES, GAINS)),
+    "fault delay one too short": ("chain", observer_field(fault_delays=(2, 1)), (DECOUPLED, *ESTIMATES, GAINS)),
+    "fault delays exchanged": ("chain", observer_field(fault_delays=(1, 3)), (*ESTIMATES, *OTHER_GAINS)),
     "no fault delay": ("paper", observer_field(fault_delays=(0, 1)), (FITS,)),
     "state delays": ("paper", observer_field(state_delays=(1, 1, 1, 1)), (FITS,)),
     "one state delay": ("chain", observer_field(state_delays=(2, 2, 2, 2, 1)), (FITS,)),
@@ -323,14 +390,15 @@ TABLE: dict[str, tuple[str, Callable[[ObserverDesign], ObserverDesign], tuple[st
     "state names": ("paper", observer_field(state_names=("x2", "x1", "x3", "x4")), (FITS,)),
     "fault names": ("paper", observer_field(fault_names=("actuator 2", "actuator 1")), (FITS,)),
     "residual names": ("paper", observer_field(residual_names=("a", "b")), (FITS,)),
-    "fault estimates exchanged": ("paper", swapped_faults, (ESTIMATE,)),
-    "the paper's biased state estimate": ("paper", with_paper_state_estimate, (IN_STATE,)),
+    "fault estimates exchanged": ("paper", swapped_faults, (ESTIMATE, REALISED)),
+    "the paper's biased state estimate": ("paper", with_paper_state_estimate, (IN_STATE, REALISED)),
     "unstable gain": ("quiet", with_unstable_gain, (RADIUS, LMI)),
     "unstable gain, with disturbance": ("paper", with_unstable_gain, (RADIUS, LMI, NORM)),
     # The certificate.
-    "tracking": ("paper", certificate_entry("tracking", 0, 0, 0.9), (DYNAMICS, INPUTS, STATE, DECOUPLED, IN_STATE)),
-    "tracking, a delayed state": ("chain", certificate_entry("tracking", 6, 6, 1.0 + 1e-6), (DYNAMICS,)),
-    "tracking zero": ("paper", certificate_times("tracking", 0.0), (*UNBIASED, INPUTS, *ESTIMATES)),
+    "tracking": (
+        "paper", certificate_entry("tracking", 0, 0, 0.9), (DYNAMICS, INPUTS, STATE, DECOUPLED, IN_STATE, REALISED)),
+    "tracking, a delayed state": ("chain", certificate_entry("tracking", 6, 6, 1.0 + 1e-6), (DYNAMICS, REALISED)),
+    "tracking zero": ("paper", certificate_times("tracking", 0.0), (*UNBIASED, INPUTS, *ESTIMATES, REALISED)),
     "tracking NaN": ("paper", certificate_entry("tracking", 1, 2, np.nan), (FITS,)),
     "tracking infinite": ("quiet", certificate_entry("tracking", 1, 2, np.inf), (FITS,)),
     "tracking without a row": ("paper", certificate_cut("tracking", slice(1, None)), (FITS,)),
@@ -350,33 +418,81 @@ TABLE: dict[str, tuple[str, Callable[[ObserverDesign], ObserverDesign], tuple[st
     "P_factor a vector": ("paper", certificate_cut("P_factor", 0), (FITS,)),
     "P_factor not square": ("chain", certificate_cut("P_factor", slice(1, None)), (FITS,)),
     "no matrices": ("paper", lambda d: d.replace(certificate=Certificate({}, d.certificate.claims)), (FITS,)),
-    "no claims": ("paper", lambda d: d.replace(certificate=Certificate(d.certificate.matrices, {})), (FITS,)),
+    "no claims": ("paper", lambda d: d.replace(certificate=Certificate(d.certificate.matrices, {})), (FITS, CLAIMS)),
     "gamma 1e-4 below the norm": ("paper", gamma_just_below_the_norm, (LMI, NORM)),
     "gamma 1e-4 below the norm, chain": ("chain", gamma_just_below_the_norm, (LMI, NORM)),
     "gamma 1e-4 below the norm, feedthrough": ("direct", gamma_just_below_the_norm, (LMI, NORM)),
     "gamma within 1e-9 of the norm": ("paper", gamma_hardly_below_the_norm, (LMI, NORM)),
-    "gamma NaN": ("paper", claim("gamma", np.nan), (LMI, NORM)),
-    "gamma zero": ("direct", claim("gamma", 0.0), (LMI, NORM)),
-    "gamma negative": ("paper", claim("gamma", -1.6), (LMI, NORM)),
-    "gamma infinite": ("paper", claim("gamma", np.inf), (LMI,)),
-    "lag NaN": ("paper", claim("state_lag", np.nan), (FITS,)),
-    "lag infinite": ("chain", claim("state_lag", np.inf), (FITS,)),
+    "gamma NaN": ("paper", claim("gamma", np.nan), (LMI, NORM, CLAIMS, ORDER)),
+    "gamma zero": ("direct", claim("gamma", 0.0), (LMI, NORM, CLAIMS, ORDER)),
+    "gamma negative": ("paper", claim("gamma", -1.6), (LMI, NORM, CLAIMS, ORDER)),
+    "gamma infinite": ("paper", claim("gamma", np.inf), (LMI, CLAIMS, ORDER)),
+    "lag NaN": ("paper", claim("state_lag", np.nan), (FITS, CLAIMS)),
+    "lag infinite": ("chain", claim("state_lag", np.inf), (FITS, CLAIMS)),
     "lag negative": ("paper", claim("state_lag", -1.0), (FITS,)),
     "lag not whole": ("paper", claim("state_lag", 0.5), (FITS,)),
     "lag too long": ("chain", claim("state_lag", 3.0), (FITS,)),
+    # What the certificate claims.
+    "no gamma": ("paper", without_claim("gamma"), (LMI, NORM, CLAIMS, ORDER)),
+    "gamma a text": ("paper", claim("gamma", "1.6"), (LMI, NORM, CLAIMS, ORDER)),
+    "gamma true": ("direct", claim("gamma", True), (LMI, NORM, CLAIMS, ORDER)),
+    "gamma NaN without a disturbance": ("quiet", claim("gamma", np.nan), (CLAIMS,)),
+    "gamma zero without a disturbance": ("quiet", claim("gamma", 0.0), (CLAIMS,)),
+    "lag a text": ("chain", claim("state_lag", "2"), (FITS, CLAIMS)),
+    "a claim that nobody knows": ("paper", claim("delay_margin", 1.0), (CLAIMS,)),
+    "a claim that nobody knows, no disturbance": ("quiet", claim("gamma_max", 1.0), (CLAIMS,)),
+    "gamma_min above gamma": ("paper", claim("gamma_min", 1.6), (ORDER,)),
+    "gamma_min negative": ("chain", claim("gamma_min", -0.1), (ORDER,)),
+    "gamma_min NaN": ("direct", claim("gamma_min", np.nan), (CLAIMS, ORDER)),
+    "gamma_min without gamma": ("quiet", claim("gamma_min", 0.1), (ORDER,)),
+    "bracket above gamma_min": ("paper", claimed_bracket(1.001, 1.002), (ORDER,)),
+    "bracket below gamma_min": ("paper", claimed_bracket(0.998, 0.999), (ORDER,)),
+    "bracket turned round": ("paper", claimed_bracket(1.001, 0.999), (ORDER,)),
+    "bracket from below zero": ("paper", claimed_bracket(-0.1, 1.0), (ORDER,)),
+    "bracket NaN": ("direct", claimed_bracket(np.nan, 1.0), (CLAIMS, ORDER)),
+    "half a bracket": ("paper", claim("gamma_bracket_low", 1.0), (CLAIMS, ORDER)),
+    # The gain set is not that of the realisation.
+    "T": ("paper", gain_entry("T", 0, 0), (RESTRICTED, MATRIX, FREE, REALISED)),
+    "N": ("paper", gain_entry("N", 1, 0), (RESTRICTED, REALISED)),
+    "L": ("paper", gain_entry("L", 3, 2), (FREE, REALISED)),
+    "W": ("chain", gain_entry("W", 1, 1), (WEIGHT, REALISED)),
+    "Psi": ("paper", gain_entry("Psi", 2, 0), (MATRIX, FREE)),
+    "Upsilon": ("direct", gain_entry("Upsilon", 3, 1), (MATRIX, FREE)),
+    "R": ("paper", gain_entry("R", 0, 0), (FREE,)),
+    "gains rounded": (
+        "paper", gain_set(lambda gains: {key: np.round(gain, 5) for key, gain in gains.items()}),
+        (WEIGHT, FREE, REALISED)),
+    "no W": ("quiet", gain_set(lambda gains: {key: gains[key] for key in gains if key != "W"}), (GAINS,)),
+    "a letter that nobody knows": ("paper", gain_set(lambda gains: {**gains, "K": gains["L"]}), (GAINS,)),
+    "L without a row": ("chain", gain_set(lambda gains: {**gains, "L": gains["L"][1:]}), (GAINS,)),
+    "Upsilon transposed": ("paper", gain_set(lambda gains: {**gains, "Upsilon": gains["Upsilon"].T}), (GAINS,)),
+    # The way back to the states before a transformation.
+    "recovery without a name": ("paper", with_recovery(names=lambda names: names[1:]), (RECOVERY,)),
+    "recovery with a name twice": ("paper", with_recovery(names=lambda names: (*names[:-1], names[0])), (RECOVERY,)),
+    "recovery with names in a list": ("quiet", with_recovery(names=list), (RECOVERY,)),
+    "recovery from other states": ("paper", with_recovery(from_state=lambda m: m[:, 1:]), (RECOVERY,)),
+    "recovery from other inputs": ("paper", with_recovery(from_input=lambda m: m[:, 1:]), (RECOVERY,)),
+    "recovery from other faults": ("direct", with_recovery(from_fault=lambda m: m[:, 1:]), (RECOVERY,)),
+    "recovery from other disturbances": ("direct", with_recovery(from_disturbance=lambda m: m[:, 1:]), (RECOVERY,)),
+    "recovery from other noise": ("direct", with_recovery(from_noise=lambda m: m[1:]), (RECOVERY,)),
+    "recovery of other noise": ("direct", with_recovery(noise_kept=lambda m: m[:, 1:]), (RECOVERY,)),
+    "recovery NaN": ("chain", with_recovery(from_state=lambda m: np.nan * m), (RECOVERY,)),
+    "recovery exchanges states": ("paper", with_recovery(from_state=lambda m: m[[1, 0, *range(2, len(m))]]), (KEPT,)),
+    "recovery adds a fault to a state": ("quiet", with_recovery(from_fault=lambda m: m + 1e-6), (KEPT,)),
     # Numbers that overflow.
-    "Az huge": ("paper", entry("Az", 0, 0, 1e300), (DYNAMICS, DECOUPLED, RADIUS, LMI, NORM)),
-    "Cz huge": ("direct", entry("Cz", 3, 0, 1e300), (FAULT, ESTIMATE, LMI, NORM)),
-    "By huge": ("direct", entry("By", 0, 0, 1e300), (DYNAMICS, INPUTS, *WRONG_FAULT, LMI, NORM)),
+    "Az huge": ("paper", entry("Az", 0, 0, 1e300), (DYNAMICS, DECOUPLED, RADIUS, LMI, NORM, REALISED)),
+    "Cz huge": ("direct", entry("Cz", 3, 0, 1e300), (FAULT, ESTIMATE, LMI, NORM, REALISED)),
+    "By huge": ("direct", entry("By", 0, 0, 1e300), (DYNAMICS, INPUTS, *WRONG_FAULT, LMI, NORM, REALISED)),
     # The plant is another one.
-    "E": ("paper", plant_entry("E", 0, 0, 1e-6), (DYNAMICS, STATE)),
-    "A": ("paper", plant_entry("A", 3, 2, 1e-6), (DYNAMICS,)),
-    "B": ("paper", plant_entry("B", 1, 1, 1e-6), (INPUTS,)),
-    "C": ("paper", plant_entry("C", 0, 1, 1e-6), UNBIASED),
-    "D": ("direct", plant_entry("D", 1, 0, 1e-6), (INPUTS, FEEDTHROUGH)),
-    "fault direction": ("quiet", plant_entry("Bf", 0, 0, 1e-6), WRONG_FAULT),
-    "fault direction, index 3": ("chain", plant_entry("Bf", 2, 0, 1e-6), ESTIMATES),
-    "direction of a sensor fault": ("direct", plant_entry("Df", 1, 0, 1e-6), WRONG_FAULT),
+    "E": ("paper", plant_entry("E", 0, 0, 1e-6), (DYNAMICS, STATE, RESTRICTED)),
+    "A": ("paper", plant_entry("A", 3, 2, 1e-6), (DYNAMICS, FREE, REALISED)),
+    "B": ("paper", plant_entry("B", 1, 1, 1e-6), (INPUTS, REALISED)),
+    "C": ("paper", plant_entry("C", 0, 1, 1e-6), (*UNBIASED, RESTRICTED, *OTHER_GAINS)),
+    "D": ("direct", plant_entry("D", 1, 0, 1e-6), (INPUTS, FEEDTHROUGH, REALISED)),
+    "fault direction": ("quiet", plant_entry("Bf", 0, 0, 1e-6), (*WRONG_FAULT, *OTHER_GAINS)),
+    "fault direction, index 3": ("chain", plant_entry("Bf", 2, 0, 1e-6), (*ESTIMATES, *OTHER_GAINS)),
+    "direction of a sensor fault": (
+        "direct", plant_entry("Df", 1, 0, 1e-6), (*WRONG_FAULT, RESTRICTED, *OTHER_GAINS)),
     "disturbance twice as large": ("paper", lambda d: with_plant(d, Bd=2.0 * d.plant.Bd), (LMI, NORM)),
     "disturbance in the outputs": ("direct", plant_entry("Dd", 1, 0, 5.0), (LMI, NORM)),
     "sampling time of the plant": ("paper", plant_field(dt=0.5), (FITS,)),
@@ -385,29 +501,33 @@ TABLE: dict[str, tuple[str, Callable[[ObserverDesign], ObserverDesign], tuple[st
     # Existence conditions.
     "continuous plant and observer": ("quiet", in_continuous_time, ("exists: discrete time",)),
     "continuous plant and observer, disturbance": ("paper", in_continuous_time, ("exists: discrete time",)),
-    "no fault": ("quiet", without_faults, ("exists: faults",)),
-    "no fault, disturbance and noise": ("direct", without_faults, ("exists: faults",)),
+    "no fault": ("quiet", without_faults, ("exists: faults", REALISED)),
+    "no fault, disturbance and noise": ("direct", without_faults, ("exists: faults", GAINS)),
     "a state that no equation determines": (
-        "quiet", lambda d: with_state(d, e=0.0, a=0.0, measured=True, estimated_by="output"), ("exists: regularity",)),
+        "quiet", lambda d: with_state(d, e=0.0, a=0.0, measured=True, estimated_by="output"),
+        ("exists: regularity", GAINS)),
     "more faults than outputs": ("quiet", with_more_faults_than_outputs, ("exists: nf <= ny", FITS)),
-    "a fault that acts nowhere": ("quiet", plant_field(Bf=np.zeros((3, 1))), ("exists: rank F", *ESTIMATES)),
+    "a fault that acts nowhere": (
+        "quiet", plant_field(Bf=np.zeros((3, 1))), ("exists: rank F", *ESTIMATES, *OTHER_GAINS)),
     "two faults in one direction": (
-        "paper", lambda d: with_plant(d, Bf=d.plant.Bf[:, [0, 0]]), ("exists: rank F", *ESTIMATES)),
+        "paper", lambda d: with_plant(d, Bf=d.plant.Bf[:, [0, 0]]), ("exists: rank F", *ESTIMATES, *OTHER_GAINS)),
     "a repeated output": ("quiet", with_repeated_output, ("exists: rank C",)),
     "a repeated output, disturbance and noise": ("direct", with_repeated_output, ("exists: rank C",)),
     "an algebraic state that nothing measures": (
         "quiet", lambda d: with_state(d, e=0.0, a=1.0, measured=False, estimated_by=None),
-        ("exists: rank [E; C]", STATE)),
+        ("exists: rank [E; C]", STATE, GAINS)),
     "a sensor fault like an algebraic state": (
         "quiet", plant_entry("Df", 1, 0, 1.0), ("exists: rank [E 0; 0 0; C Df]", *WRONG_FAULT)),
-    "a fault that never shows": ("quiet", with_hidden_fault, ("exists: finite detectability indexes", *WRONG_FAULT)),
+    "a fault that never shows": (
+        "quiet", with_hidden_fault, ("exists: finite detectability indexes", *WRONG_FAULT, *OTHER_GAINS)),
     "two faults alike at first sight": (
         "chain", plant_field(Bf=[[0, 0], [0, 1], [1, 0], [0, 0], [0, 0]]),
-        ("exists: rank Upsilon", *ESTIMATES, IN_STATE)),
-    "two faults alike through the dynamics": ("chain", plant_entry("A", 3, 2, 0.5), ("exists: rank Upsilon", DYNAMICS)),
+        ("exists: rank Upsilon", *ESTIMATES, IN_STATE, *OTHER_GAINS)),
+    "two faults alike through the dynamics": (
+        "chain", plant_entry("A", 3, 2, 0.5), ("exists: rank Upsilon", DYNAMICS, FREE, *OTHER_GAINS)),
     "a zero outside the unit circle": (
         "quiet", plant_field(A=[[1.1, 0.2, 0], [-0.1, 1.3, 0.3], [0.2, 0, -1]], Bf=[[1.0], [0], [0]]),
-        ("exists: fault zeros", DYNAMICS, *WRONG_FAULT)),
+        ("exists: fault zeros", DYNAMICS, *WRONG_FAULT, *OTHER_GAINS)),
     "an unstable mode that nothing measures": (
         "quiet", lambda d: with_state(d, e=1.0, a=1.1, measured=False, estimated_by="copy"),
         ("exists: fault zeros", RADIUS, LMI)),
@@ -422,6 +542,26 @@ def test_a_good_design_passes(name: str) -> None:
     design = good(name)
     assert design.report.passed
     assert failed(design) == set()
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_good_claims_and_a_good_recovery_pass(name: str) -> None:
+    design = with_recovery()(good(name))
+    if design.plant.nd:
+        design = claimed_bracket(1.0 - 1e-6, 1.0)(design)
+        assert verify(design)[ORDER].passed
+    assert failed(design) == set()
+    assert verify(design)[RECOVERY].passed
+    assert verify(design)[KEPT].passed
+
+
+@pytest.mark.parametrize("letter", ["T", "N", "L", "W", "Psi", "Upsilon", "R"])
+@pytest.mark.parametrize("name", PLANTS)
+def test_every_single_entry_of_the_gain_set_counts(name: str, letter: str) -> None:
+    rows, columns = good(name).gains[letter].shape
+    for row in range(rows):
+        for column in range(columns):
+            assert failed(gain_entry(letter, row, column)(good(name))), (row, column)
 
 
 @pytest.mark.parametrize("case", TABLE)
@@ -502,9 +642,13 @@ def test_not_a_number_anywhere_is_refused_or_fails(name: str) -> None:
         for row in range(matrix.shape[0]):
             for column in range(matrix.shape[1]):
                 assert failed(certificate_entry(key, row, column, np.nan)(design)) == {FITS}
-    needed = {"state_lag": {FITS}} | ({"gamma": {LMI, NORM}} if design.plant.nd else {})
+    needed = {"state_lag": {FITS, CLAIMS}}
+    needed["gamma"] = {LMI, NORM, CLAIMS, ORDER} if design.plant.nd else {CLAIMS}
     for key, expected in needed.items():
         assert failed(claim(key, np.nan)(design)) == expected
+    for letter in design.gains:
+        for bad in (np.nan, np.inf):
+            assert failed(gain_entry(letter, -1, -1, bad)(design)) == {GAINS}
 
 
 def in_units(design: ObserverDesign, powers: np.ndarray) -> ObserverDesign:
@@ -525,6 +669,8 @@ def in_units(design: ObserverDesign, powers: np.ndarray) -> ObserverDesign:
         Dy=observer.Dy / rows,
     )
     matrices = design.certificate.matrices
+    moved = {letter: design.gains[letter] / own[:core, None] for letter in ("T", "N", "L", "Psi", "R")}
+    changed = changed.replace(gains={**design.gains, **moved})
     return with_certificate(
         changed,
         tracking=matrices["tracking"] * np.concatenate([np.ones(nx), *[powers] * lag]) / own[:, None],
@@ -544,6 +690,15 @@ def test_units_of_the_states_do_not_hide_a_corruption(name: str) -> None:
             for column in range(columns):
                 corrupted = entry(matrix, row, column)(design)
                 assert failed(in_units(corrupted, powers)) == failed(corrupted), (matrix, row, column)
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_a_design_without_a_gain_set_says_nothing_about_gains(name: str) -> None:
+    bare = good(name).replace(gains={})
+    report = verify(bare)
+    assert report.passed
+    assert not any(check.name.startswith("gains") for check in report.checks)
+    assert failed(bare, printed_digits=4) == set()
 
 
 def test_an_empty_report_does_not_pass() -> None:
@@ -579,9 +734,9 @@ class TestPrintedDigits:
 
     def test_rounded_gains_fail_by_default_and_pass_with_their_digits(self) -> None:
         design = self.rounded()
-        assert failed(design) == {DECOUPLED, ESTIMATE, IN_RESIDUAL, IN_STATE}
+        assert failed(design) == {WEIGHT, DECOUPLED, ESTIMATE, IN_RESIDUAL, IN_STATE}
         assert failed(design, printed_digits=4) == set()
-        assert failed(design, printed_digits=7) == {DECOUPLED, ESTIMATE, IN_RESIDUAL, IN_STATE}
+        assert failed(design, printed_digits=7) == {WEIGHT, DECOUPLED, ESTIMATE, IN_RESIDUAL, IN_STATE}
 
     def test_full_digits_pass_either_way(self) -> None:
         for name in PLANTS:
@@ -595,6 +750,26 @@ class TestPrintedDigits:
                 for by in (0.05, -0.05):
                     wrong = self.rounded(**{letter: nudged(gain, row, column, by)})
                     assert failed(wrong, printed_digits=4), (row, column, by)
+
+    def unnoticed(self, letter: str, units: int) -> set[tuple[int, int]]:
+        """Entries that may be wrong by so many units of the last digit without any row failing."""
+        gain = np.round(good("paper").gains[letter], 4)
+        return {
+            (row, column)
+            for row, column in np.ndindex(gain.shape)
+            for by in (units * 1e-4, -units * 1e-4)
+            if not failed(self.rounded(**{letter: nudged(gain, row, column, by)}), printed_digits=4)
+        }
+
+    @pytest.mark.parametrize("letter", ["T", "N", "W"])
+    def test_ten_units_of_the_last_digit_fail(self, letter: str) -> None:
+        """What rounding can do to each identity is known entry by entry: a wrong digit before the last one shows."""
+        assert self.unnoticed(letter, 10) == set()
+
+    def test_in_L_ten_units_fail_in_most_entries_and_twenty_in_all(self) -> None:
+        """In the rows of large gains, roundings of T at their worst would do as much as ten units of one entry of L."""
+        assert self.unnoticed("L", 10) == {(0, 0), (0, 1), (3, 0), (3, 1)}
+        assert self.unnoticed("L", 20) == set()
 
     def test_digits_do_not_soften_the_inequalities(self) -> None:
         lowered = gamma_just_below_the_norm(good("paper"))

@@ -205,7 +205,26 @@ class TestConstruction:
             observer(dt=dt)
         assert caught.value.path == "dt"
 
-    @pytest.mark.parametrize("delays", [(), (1, 2), (-1,), (0.5,)])
+    @pytest.mark.parametrize("field", ["input_names", "output_names", "state_names", "fault_names", "residual_names"])
+    def test_names_are_tuples_of_unique_texts(self, field):
+        names = FIELDS[field]
+        twice = (names[0],) * len(names)
+        wrong = {
+            "give a tuple": [list(names), dict.fromkeys(names), "".join(names), None],
+            "non-empty texts": [(*names[1:], 1), (*names[1:], " "), (*names[1:], None)],
+            "repeats": [twice] if len(names) > 1 else [(*names, *names)],
+        }
+        for message, cases in wrong.items():
+            for case in cases:
+                with pytest.raises(SpecError, match=message) as caught:
+                    observer(**{field: case})
+                assert caught.value.path == field
+
+    def test_one_name_may_stand_for_signals_of_two_kinds(self):
+        shared = observer(input_names=("x1",), output_names=("x1", "x2"), fault_names=("x1",), residual_names=("x1",))
+        assert shared.output_names == shared.state_names
+
+    @pytest.mark.parametrize("delays", [(), (1, 2), (-1,), (0.5,), (True,), [2]])
     def test_wrong_delays(self, delays):
         with pytest.raises(SpecError) as caught:
             observer(fault_delays=delays)

@@ -1,11 +1,14 @@
 """Invariant zeros, their directions, and the boundary of stability."""
 
+from fractions import Fraction
+
 import numpy as np
 import pytest
 import slycot
 from scipy.linalg import block_diag, eigvals
 
 from obsynth.analysis import are_outside, fault_zeros, invariant_zeros, is_outside
+from obsynth.analysis.fault_filter_conditions import fault_filter_conditions
 from obsynth.models import DescriptorSystem
 from obsynth.numerics.pencils import finite_zeros
 
@@ -218,3 +221,71 @@ def test_fault_zeros_outside():
     found = fault_zeros(plant)
     assert [zero.value for zero in found.outside] == pytest.approx([1.2])
     assert not fault_zeros(plant.replace(Bf=[[1.0], [-0.9]])).outside
+
+
+def nearly_seen(entry, *, seen=True):
+    """Two faults; the first acts through x3, x2, x1 in a row, and an output of x2 sees x3 a little as well."""
+    A = [[0.5, 1, 0, 0], [0, 0.4, 1, 0], [0, 0.2, 0.3, 0], [0.1, 0, 0, 0.6]]
+    C = [[0, 0, 0, 1], [0, 0.3, entry, 0.1], *([[1, 0, 0, 0]] if seen else [])]
+    Bf = [[0, 0], [0, 0], [1, 0], [0, 1]]
+    return DescriptorSystem(None, A, C=C, Bf=Bf, dt=0.1)
+
+
+def rank_in_fractions(matrix):
+    """The rank by Gaussian elimination, without any rounding."""
+    rows, rank = [list(row) for row in matrix], 0
+    for column in range(len(rows[0])):
+        pivot = next((i for i in range(rank, len(rows)) if rows[i][column] != 0), None)
+        if pivot is None:
+            continue
+        rows[rank], rows[pivot] = rows[pivot], rows[rank]
+        for i in range(rank + 1, len(rows)):
+            factor = rows[i][column] / rows[rank][column]
+            rows[i] = [x - factor * y for x, y in zip(rows[i], rows[rank], strict=True)]
+        rank += 1
+    return rank
+
+
+def pencil_in_fractions(plant, z):
+    top = [
+        [Fraction(a) - z * Fraction(e) for a, e in zip(row_a, row_e, strict=True)] + [Fraction(f) for f in row_f]
+        for row_a, row_e, row_f in zip(plant.A.tolist(), plant.E.tolist(), plant.Bf.tolist(), strict=True)
+    ]
+    return top + [[Fraction(c) for c in row] + [Fraction(0)] * plant.nf for row in plant.C.tolist()]
+
+
+@pytest.mark.parametrize("entry", [1e-3, 1e-4, 1e-5, 1e-6])
+def test_a_small_entry_makes_no_zero_where_another_output_still_sees(entry):
+    """Without the output of x1 there is one, at about -0.3 / entry; with it there is none, in exact arithmetic."""
+    plant = nearly_seen(entry)
+    point = Fraction(0.4) - Fraction(0.3) / Fraction(entry)
+    assert rank_in_fractions(pencil_in_fractions(nearly_seen(entry, seen=False), point)) == 6 - 1
+    assert rank_in_fractions(pencil_in_fractions(plant, point)) == 6
+    assert fault_zeros(plant).zeros == ()
+
+
+@pytest.mark.parametrize("entry", [1e-2, 1e-4, 1e-6, -1e-6])
+def test_a_true_zero_far_out_is_found_and_its_fault_named(entry):
+    """Where the small entry does make a zero: it is real data, and the fault behind it is the first."""
+    plant = nearly_seen(entry, seen=False)
+    (zero,) = fault_zeros(plant).outside
+    assert zero.value == pytest.approx(0.4 - 0.3 / entry, rel=1e-9)
+    assert abs(zero.input_direction[0]) > 0.99
+    # The second fault only holds x4 at zero against 0.1 x1.
+    assert zero.input_direction[1] == pytest.approx(-0.1 * zero.state_direction[0], rel=1e-6, abs=1e-15)
+    assert not zero.is_unobservable_mode
+    condition = fault_filter_conditions(plant)[-1]
+    assert (condition.name, condition.holds, condition.signals) == ("fault zeros", False, ("f1",))
+
+
+@pytest.mark.parametrize("modulus", [1e2, 1e4, 1e6])
+@pytest.mark.parametrize("seed", range(5))
+def test_planted_zeros_far_out_of_a_tall_pencil_are_kept(modulus, seed):
+    rng = np.random.default_rng(seed)
+    A, B, C = (np.zeros(shape) for shape in ((4, 4), (4, 1), (2, 4)))
+    A[0] = [-modulus, 1.0, 0.0, 0.0]  # a mode that no output shows
+    A[1:, 1:], B[1:, 0], C[:, 1:] = rng.standard_normal((3, 3)), rng.standard_normal(3), rng.standard_normal((2, 3))
+    left, right = nonsingular(4, rng), nonsingular(4, rng)
+    zeros = invariant_zeros(left @ right, left @ A @ right, left @ B, C @ right)
+    assert [zero.value for zero in zeros] == [pytest.approx(-modulus, rel=1e-6)]
+    assert zeros[0].is_unobservable_mode

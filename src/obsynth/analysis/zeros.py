@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from obsynth.analysis.far_zeros import equilibrated_at, system_zeros
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import ComplexArray, FloatArray
-from obsynth.numerics.pencils import FiniteZeros, finite_zeros
+from obsynth.numerics.pencils import FiniteZeros
 from obsynth.numerics.ranks import (
     BOUNDARY_NEIGHBOURHOOD,
     BOUNDARY_RANK_TOLERANCE,
@@ -140,7 +141,7 @@ def invariant_zeros(
         Where several directions share one zero, those with the smallest input part come first.
     """
     wide_e, wide_a = _system_pencil(E, A, B, C, D)
-    return _with_directions(wide_e, wide_a, finite_zeros(wide_e, wide_a), nx=E.shape[0])
+    return _with_directions(wide_e, wide_a, system_zeros(wide_e, wide_a, nx=E.shape[0]), nx=E.shape[0])
 
 
 def fault_zeros(plant: DescriptorSystem) -> FaultZeros:
@@ -157,7 +158,7 @@ def fault_zeros(plant: DescriptorSystem) -> FaultZeros:
         The zeros, and whether every fault shows in the outputs at all.
     """
     e, a = _system_pencil(plant.E, plant.A, plant.Bf, plant.C, plant.Df)
-    found = finite_zeros(e, a)
+    found = system_zeros(e, a, nx=plant.nx)
     zeros = _with_directions(e, a, found, nx=plant.nx)
     outside = tuple(zero for zero, out in zip(zeros, are_outside(e, a, found, plant.dt), strict=True) if out)
     missing = plant.nx + plant.nf - found.normal_rank
@@ -186,13 +187,13 @@ def _reaches_boundary(pencil: EquilibratedPencil, value: complex, dt: float, nor
 
 
 def _with_directions(E: FloatArray, A: FloatArray, found: FiniteZeros, *, nx: int) -> tuple[Zero, ...]:
-    pencil = equilibrate_pencil(E, A)
     values = [complex(value) for value in found.values]
     zeros: list[Zero] = []
     for i, value in enumerate(values):
         if value.imag < 0.0:
             zeros.append(_conjugate(zeros[-1]))  # pairs follow each other and are exact
             continue
+        pencil = equilibrated_at(E, A, value, nx=nx)
         kernel = _kernel(pencil, value, least=pencil.A.shape[1] - found.normal_rank + 1)
         basis = _smallest_part_first(kernel, slice(nx, None))
         twins = sum(abs(value - other) <= CLUSTER_TOLERANCE * max(1.0, abs(value)) for other in values[:i])

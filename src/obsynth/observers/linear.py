@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
+from obsynth.observers.checking import NAME_FIELDS, checked_record, checked_sample, is_delay, require_names
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +42,7 @@ class LinearObserver:
     Raises
     ------
     SpecError
-        Shapes do not fit together.
+        Shapes do not fit together, names are no tuple of unique texts, or delays no tuple of whole numbers.
     """
 
     Az: FloatArray
@@ -60,6 +61,8 @@ class LinearObserver:
     fault_delays: tuple[int, ...]
 
     def __post_init__(self) -> None:
+        for field in NAME_FIELDS:
+            require_names(getattr(self, field), field)
         given = {name: as_matrix(getattr(self, name), name) for name in ("Az", "Bu", "By", "Cz", "Du", "Dy")}
         nz, nu, ny = given["Az"].shape[0], len(self.input_names), len(self.output_names)
         rows = len(self.state_names) + len(self.fault_names) + len(self.residual_names)
@@ -72,7 +75,7 @@ class LinearObserver:
         if not (math.isfinite(self.dt) and self.dt >= 0.0):
             raise SpecError(f"dt of the observer is {self.dt}: give seconds, or 0 for continuous time.", path="dt")
         for names, delays in ((self.state_names, self.state_delays), (self.fault_names, self.fault_delays)):
-            if len(names) != len(delays) or not all(isinstance(delay, int) and delay >= 0 for delay in delays):
+            if not isinstance(delays, tuple) or len(names) != len(delays) or not all(map(is_delay, delays)):
                 raise SpecError("The observer needs one delay >= 0, in samples, for each signal.", path="delays")
 
     @property
@@ -146,9 +149,9 @@ class LinearObserver:
         SpecError
             Shapes do not fit, or a sample is not finite.
         """
-        outputs = _record(y, len(self.output_names), "y")
+        outputs = checked_record(y, len(self.output_names), "y")
         known = np.zeros((len(outputs), 0)) if u is None and not self.input_names else u
-        inputs = _record(known, len(self.input_names), "u")
+        inputs = checked_record(known, len(self.input_names), "u")
         if len(inputs) != len(outputs):
             raise SpecError(f"u has {len(inputs)} samples and y has {len(outputs)}: give the same number.", path="u")
         running = self.start(initial_state)
@@ -156,37 +159,6 @@ class LinearObserver:
         for k in range(len(outputs)):
             rows[k] = running.raw_step(outputs[k], inputs[k])
         return Estimates.split(self, rows)
-
-
-def _numbers(value: Any, name: str) -> FloatArray:
-    """Return an array of finite real numbers of one or two dimensions; raise `SpecError` naming it."""
-    try:
-        raw = np.asarray(value)
-    except ValueError:
-        raise SpecError(f"{name} is ragged: give the same number of signals at each sample.", path=name) from None
-    if raw.ndim <= 1:
-        return np.asarray(as_matrix(raw.reshape(1, -1), name)[0])
-    return as_matrix(raw, name)
-
-
-def _record(value: Any, columns: int, name: str) -> FloatArray:
-    """Return a record ``(steps, columns)``; one signal may be given as a plain list."""
-    if value is None:
-        raise SpecError(f"{name} is missing: the observer needs {columns} signal(s).", path=name)
-    array = _numbers(value, name)
-    if array.ndim == 1 and columns == 1:
-        array = array.reshape(-1, 1)
-    if array.ndim != 2 or array.shape[1] != columns:
-        raise SpecError(f"{name} has shape {array.shape}, but the observer needs (steps, {columns}).", path=name)
-    return array
-
-
-def _sample(value: Any, count: int, name: str) -> FloatArray:
-    """Return one sample ``(count,)``."""
-    array = _numbers(value, name)
-    if array.shape != (count,):
-        raise SpecError(f"{name} has shape {array.shape}, but the observer needs {count} number(s).", path=name)
-    return array
 
 
 class RunningObserver:
@@ -211,7 +183,7 @@ class RunningObserver:
                 "This observer is continuous in time: it must be discretised before it can step.", path="dt"
             )
         start = np.zeros(observer.order) if initial_state is None else initial_state
-        self.state = _sample(start, observer.order, "initial_state").copy()
+        self.state = checked_sample(start, observer.order, "initial_state").copy()
         self.observer = observer
 
     def raw_step(self, y: FloatArray, u: FloatArray) -> FloatArray:
@@ -242,8 +214,8 @@ class RunningObserver:
         SpecError
             A sample has the wrong length or is not finite; the state is left as it was.
         """
-        outputs = _sample(y, len(self.observer.output_names), "y")
-        inputs = _sample(u, len(self.observer.input_names), "u")
+        outputs = checked_sample(y, len(self.observer.output_names), "y")
+        inputs = checked_sample(u, len(self.observer.input_names), "u")
         return Estimates.split(self.observer, self.raw_step(outputs, inputs)[None, :])
 
 

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from obsynth.errors import InfeasibleError, SolverError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.synthesis import lmi
 from obsynth.synthesis.gain_problem import GainProblem, normalise
+from obsynth.synthesis.invisible import invisible_pairs, invisible_part, null_space, strict_point
 
-#: A dual point must be positive definite, and beat the level, by these relative margins.
+#: A dual point must be positive definite by this margin, where the point of `strict_point` is the identity, and beat
+#: the level by this relative one.
 DUAL_MARGIN = 1e-8
 BOUND_MARGIN = 1e-6
 
@@ -23,93 +24,98 @@ def proved_lower_bound(problem: GainProblem, *, solver: str) -> float:
     For ``Z1 >= 0`` in the null basis N of [C D] with ``Q = G N Z1 N'G' - Nx Z1 Nx' >= 0`` and, for a fixed weight,
     ``Z2 = [Q, *; *, *] >= 0``: multiplying the two eliminated inequalities by Z1 and Z2 cancels P, and leaves
     ``g^2 (tr Nd Z1 Nd' + tr Z2_22) > tr H N Z1 N'H' + tr H Z2 H'`` (for a free weight without Z2).  The check is in
-    floating point with margins, on the normalised data.
+    floating point with margins, on data in which a strictly feasible dual point is the identity.
     """
     normalised = normalise(problem, rotate=solver not in lmi.FIRST_ORDER_SOLVERS)
-    work = disturbed_part(normalised.problem)
-    n, nd = work.order, work.disturbances
-    if nd == 0:
+    work = invisible_part(normalised.problem)
+    if work.disturbances == 0:
         return 0.0
-    basis = _null_space(np.hstack([work.C, work.D]))
-    top, bottom, image = basis[:n], basis[n:], np.hstack([work.A, work.B]) @ basis
-    outputs = np.hstack([work.Z, work.Zd])
-    z1 = lmi.symmetric_variable(basis.shape[1])
-    corner, last = lmi.matrix_variable(nd, n), lmi.symmetric_variable(nd)
-    q = image @ z1 @ image.T - top @ z1 @ top.T
-    shown = lmi.trace(outputs @ basis @ z1 @ basis.T @ outputs.T)
-    size = lmi.trace(bottom @ z1 @ bottom.T)
-    if work.weight_is_free:
-        second = q
-    else:
+    if work.order == 0:
+        return normalised.gain * _direct_bound(work) * (1.0 - BOUND_MARGIN)
+    try:
+        dual = _DualProblem.of(work)
+        point = _best_dual_point(dual, solver=solver)
+    except (SolverError, np.linalg.LinAlgError):
+        return 0.0
+    return normalised.gain * _checked_bound(dual, *point)
+
+
+def _direct_bound(work: GainProblem) -> float:
+    """Return the gain of what no measurement sees and no state keeps: the disturbance in xi at once."""
+    direct = work.Zd @ null_space(work.D) if work.weight_is_free else work.Zd
+    return float(np.linalg.norm(direct, 2)) if direct.size else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class _DualProblem:
+    """Data of the dual inequalities, in coordinates in which a strictly feasible point is about the identity.
+
+    ``Q = image Z1 image' - top Z1 top'``; ``shown`` and ``bottom`` are xi and d on the invisible directions,
+    ``outputs`` is xi on states and disturbance.
+    """
+
+    top: FloatArray
+    bottom: FloatArray
+    image: FloatArray
+    shown: FloatArray
+    outputs: FloatArray
+    free_weight: bool
+
+    @classmethod
+    def of(cls, work: GainProblem) -> _DualProblem:
+        top, bottom, image = invisible_pairs(work)
+        point = strict_point(top, image)
+        slack = image @ point @ image.T - top @ point @ top.T
+        invisible, states = np.linalg.cholesky(point), np.linalg.cholesky(0.5 * (slack + slack.T))
+        back, outputs = np.linalg.inv(states), np.hstack([work.Z @ states, work.Zd])
+        shown = (work.Z @ top + work.Zd @ bottom) @ invisible
+        moved = (back @ top @ invisible, bottom @ invisible, back @ image @ invisible)
+        return cls(*moved, shown, outputs, work.weight_is_free)
+
+
+def _best_dual_point(dual: _DualProblem, *, solver: str) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return ``Z1``, and corner and last block of ``Z2``, that maximise what is shown at disturbance energy one."""
+    (n, size), nd = dual.top.shape, dual.bottom.shape[0]
+    z1 = lmi.symmetric_variable(size)
+    q = dual.image @ z1 @ dual.image.T - dual.top @ z1 @ dual.top.T
+    shown = lmi.trace(dual.shown @ z1 @ dual.shown.T)
+    energy = lmi.trace(dual.bottom @ z1 @ dual.bottom.T)
+    second, corner, last = q, np.zeros((nd, n)), np.zeros((nd, nd))
+    if not dual.free_weight:
+        corner, last = lmi.matrix_variable(nd, n), lmi.symmetric_variable(nd)
         second = lmi.symmetric_blocks([[q], [corner, last]])
-        shown, size = shown + lmi.trace(outputs @ second @ outputs.T), size + lmi.trace(last)
+        shown, energy = shown + lmi.trace(dual.outputs @ second @ dual.outputs.T), energy + lmi.trace(last)
     constraints = [
         lmi.at_least(z1, DUAL_MARGIN * 2),
         lmi.at_least(second, DUAL_MARGIN * 2),
-        lmi.at_most(lmi.scalar_block(size), 1.0),
+        lmi.at_most(lmi.scalar_block(energy), 1.0),
     ]
-    try:
-        lmi.minimise(-shown, constraints, what="lower bound on the gain", solver=solver)
-        point = lmi.value_of(z1)
-        corner_value = np.zeros((nd, n)) if work.weight_is_free else lmi.value_of(corner)
-        last_value = np.zeros((nd, nd)) if work.weight_is_free else lmi.value_of(last)
-    except SolverError:
-        return 0.0
-    return normalised.gain * _checked_bound(work, basis, point, corner_value, last_value)
+    lmi.minimise(-shown, constraints, what="lower bound on the gain", solver=solver)
+    return lmi.value_of(z1), lmi.value_of(corner), lmi.value_of(last)
 
 
-def disturbed_part(problem: GainProblem) -> GainProblem:
-    """Return the problem on the states that the disturbance reaches whatever the gains.
+def _checked_bound(dual: _DualProblem, z1: FloatArray, corner: FloatArray, last: FloatArray) -> float:
+    """Recompute the bound of a dual point from the data; 0 unless it is strictly feasible.
 
-    That is the least subspace W with ``A x + B d`` in W for every x in W and d with ``C x + D d = 0``.  Outside it
-    the dual inequalities have no strict solution; restricted to it they lose nothing.
+    What the solver left short of feasibility is made up for by a little of the strict point, which is the identity.
     """
-    n = problem.order
-    subspace = np.zeros((n, 0))
-    while True:
-        hidden = _null_space(np.hstack([problem.C @ subspace, problem.D]))
-        image = np.hstack([problem.A @ subspace, problem.B]) @ hidden
-        left, values, _ = np.linalg.svd(np.hstack([subspace, image]))
-        rank = int(np.sum(values > RANK_TOLERANCE * max(1.0, float(values[0])))) if values.size else 0
-        if rank == subspace.shape[1]:
-            break
-        subspace = left[:, :rank]
-    t = subspace.T
-    return replace(
-        problem,
-        A=t @ problem.A @ subspace,
-        C=problem.C @ subspace,
-        Z=problem.Z @ subspace,
-        B=t @ problem.B,
-        Bn=t @ problem.Bn,
-    )
-
-
-def _null_space(matrix: FloatArray) -> FloatArray:
-    """Return an orthonormal null basis of a matrix of any rank."""
-    _, values, right = np.linalg.svd(matrix)
-    rank = int(np.sum(values > RANK_TOLERANCE * max(1.0, float(values[0])))) if values.size else 0
-    return np.asarray(right[rank:].T)
-
-
-def _checked_bound(work: GainProblem, basis: FloatArray, z1: FloatArray, corner: FloatArray, last: FloatArray) -> float:
-    """Recompute the bound of a dual point from the data; 0 unless it is strictly feasible."""
-    n = work.order
-    top, bottom, image = basis[:n], basis[n:], np.hstack([work.A, work.B]) @ basis
-    outputs = np.hstack([work.Z, work.Zd])
-    z1 = 0.5 * (z1 + z1.T)
-    q = image @ z1 @ image.T - top @ z1 @ top.T
-    second = q if work.weight_is_free else np.block([[q, corner.T], [corner, 0.5 * (last + last.T)]])
-    for matrix in (z1, second):
-        values = np.linalg.eigvalsh(0.5 * (matrix + matrix.T))
-        if values[0] < DUAL_MARGIN * min(1.0, float(values[-1])):
-            return 0.0
-    shown = float(np.trace(outputs @ basis @ z1 @ basis.T @ outputs.T))
-    size = float(np.trace(bottom @ z1 @ bottom.T))
-    if not work.weight_is_free:
-        shown += float(np.trace(outputs @ second @ outputs.T))
-        size += float(np.trace(last))
-    return float(np.sqrt(max(shown, 0.0) / size)) * (1.0 - BOUND_MARGIN) if size > 0.0 else 0.0
+    z1, last = 0.5 * (z1 + z1.T), 0.5 * (last + last.T)
+    short = 0.0
+    for _ in range(2):
+        z1, last = z1 + short * np.eye(len(z1)), last + short * np.eye(len(last))
+        q = dual.image @ z1 @ dual.image.T - dual.top @ z1 @ dual.top.T
+        second = q if dual.free_weight else np.block([[q, corner.T], [corner, last]])
+        second = 0.5 * (second + second.T)
+        least = min(float(np.linalg.eigvalsh(matrix)[0]) for matrix in (z1, second) if matrix.size)
+        short = max(0.0, 2.0 * DUAL_MARGIN - least)
+    if least < DUAL_MARGIN:
+        return 0.0
+    shown = float(np.trace(dual.shown @ z1 @ dual.shown.T))
+    energy = float(np.trace(dual.bottom @ z1 @ dual.bottom.T))
+    if not dual.free_weight:
+        shown += float(np.trace(dual.outputs @ second @ dual.outputs.T))
+        energy += float(np.trace(last))
+    return float(np.sqrt(max(shown, 0.0) / energy)) * (1.0 - BOUND_MARGIN) if energy > 0.0 else 0.0
 
 
 def require_reachable(problem: GainProblem, best: float, gain: float, *, solver: str) -> None:

@@ -195,38 +195,6 @@ def feasible_point(problem: GainProblem, gain: float, *, solver: str) -> GainSol
     return found if problem.achieved_gain(found.injection) < gain else None
 
 
-def bisected_gain(
-    problem: GainProblem, start: Injection, *, tolerance: float, solver: str
-) -> tuple[float, float, Injection, list[dict[str, Any]]]:
-    """Return ``(high, low, gains, records)``: the final bracket of a bisection on the gain, and the best filter.
-
-    Algorithm 1 of the paper, made to end: every upper end of the bracket is the true norm of a filter in hand, and
-    the lower end is a level at which none was found.
-
-    Parameters
-    ----------
-    problem : GainProblem
-        Normalised.
-    start : Injection
-        A stable filter: its own norm is the first upper end.
-    tolerance : float
-        Relative width of the bracket at which to stop.
-    solver : str
-        Name of the solver.
-    """
-    best, high, low = start, problem.achieved_gain(start), 0.0
-    records = []
-    while high - low > tolerance * high:
-        middle = 0.5 * (low + high)
-        found = feasible_point(problem, middle, solver=solver)
-        if found is None:
-            low = middle
-        else:
-            best, high = found.injection, min(middle, problem.achieved_gain(found.injection))
-            records.append(found.record)
-    return high, low, best, records
-
-
 def small_gains(problem: GainProblem, gain: float, *, solver: str) -> GainSolution:
     """Return gains of least size (or least noise) at level ``gain``, by the full inequality.
 

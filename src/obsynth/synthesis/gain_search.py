@@ -14,6 +14,7 @@ import numpy as np
 from obsynth.errors import SolverError
 from obsynth.numerics.norms import spectral_radius
 from obsynth.synthesis import gain_design, lmi
+from obsynth.synthesis.central_filter import search_central_filter, with_least_weight
 from obsynth.synthesis.gain_problem import GainProblem, Injection, NormalisedProblem, normalise
 
 #: The search stops when another pass in better coordinates improves the gain by less than this.
@@ -80,24 +81,36 @@ def search_least_gain(problem: GainProblem, *, solver: str) -> LeastGain:
     if problem.measured == 0 or gain == 0.0:
         return LeastGain(gain, normalised, best, starting, (gain, gain))
     for _ in range(MOST_PASSES):
-        found = _pass(normalised, records, solver=solver)
-        if found is None:
-            break
-        injection = normalised.restore(found.injection)
-        reached = problem.achieved_gain(injection)
-        improved = reached < gain * (1.0 - PASS_IMPROVEMENT)
-        if reached < gain:
-            best, gain = injection, reached
-            normalised = coordinates(problem, solver=solver, start=best)
-        if not improved or gain <= NEGLIGIBLE_GAIN * starting:
+        before = gain
+        for improve in (_central_filter, _polished):
+            better = improve(normalised, best, records, solver=solver)
+            reached = np.inf if better is None else problem.achieved_gain(better)
+            if better is not None and reached < gain:
+                best, gain = better, reached
+                normalised = coordinates(problem, solver=solver, start=best)
+        if gain >= before * (1.0 - PASS_IMPROVEMENT) or gain <= NEGLIGIBLE_GAIN * starting:
             break
     return LeastGain(gain, normalised, best, starting, (gain, gain), records)
 
 
-def _pass(
-    normalised: NormalisedProblem, records: list[dict[str, Any]], *, solver: str
-) -> gain_design.GainSolution | None:
-    """Minimise once, with the bound on P that lets the solver through; ``None`` when none does."""
+def _central_filter(
+    normalised: NormalisedProblem, best: Injection, records: list[dict[str, Any]], *, solver: str
+) -> Injection | None:
+    """Return the best central filter in the given coordinates, where the artificial noise is of a natural size."""
+    work, start = with_least_weight(normalised.problem), normalised.contracted(best)
+    if work.order == 0:
+        return None
+    if not work.weight_is_free:
+        start = Injection(start.R, np.zeros_like(start.V))
+    found, gain = search_central_filter(work, start)
+    records.append({"what": "least gain", "solver": "central filter", "status": "optimal", "gain": gain})
+    return normalised.restore(found)
+
+
+def _polished(
+    normalised: NormalisedProblem, _best: Injection, records: list[dict[str, Any]], *, solver: str
+) -> Injection | None:
+    """Minimise by the inequality, with the bound on P that lets the solver through; ``None`` when none does."""
     for ceiling in CEILINGS:
         try:
             found = gain_design.least_gain(normalised.problem, solver=solver, ceiling=ceiling)
@@ -106,28 +119,8 @@ def _pass(
             continue
         records.append(found.record)
         if np.isfinite(normalised.problem.achieved_gain(found.injection)):
-            return found
+            return normalised.restore(found.injection)
     return None
-
-
-def search_by_bisection(problem: GainProblem, *, tolerance: float, solver: str) -> LeastGain:
-    """Minimise the gain by bisection (the paper's Algorithm 1, made to end)."""
-    normalised = coordinates(problem, solver=solver)
-    gain = problem.achieved_gain(normalised.start)
-    if problem.measured == 0 or gain == 0.0:
-        return LeastGain(gain, normalised, normalised.start, gain, (gain, gain))
-    start = normalised.contracted(normalised.start)
-    high, low, found, records = gain_design.bisected_gain(normalised.problem, start, tolerance=tolerance, solver=solver)
-    injection = normalised.restore(found)
-    better = coordinates(problem, solver=solver, start=injection)
-    return LeastGain(
-        problem.achieved_gain(injection),
-        better,
-        injection,
-        gain,
-        (low * normalised.gain, high * normalised.gain),
-        records,
-    )
 
 
 def small_gain_design(

@@ -25,8 +25,9 @@ def verify(design: ObserverDesign, *, printed_digits: int | None = None) -> Veri
     design : ObserverDesign
         Made by a method, loaded from a file, or put together by hand.
     printed_digits : int, optional
-        Decimals to which the gains were printed, for gains from a paper: equalities are then judged against what
-        such rounding can do.  By default they are judged against double precision.
+        Decimals to which the gains T, N, L and W were printed, for gains from a paper: equalities are then judged
+        against what half a unit in the last decimal of every entry can do, to first order.  By default they are judged
+        against double precision.
 
     Returns
     -------

@@ -20,7 +20,8 @@ def discretise(plant: DescriptorSystem, sample_time: float) -> Transformation:
     """Sample a continuous plant with a zero-order hold.
 
     Exact for inputs, faults and disturbances that are constant between samples.  Algebraic states are
-    eliminated first.
+    eliminated first.  A fault that changes within an interval acts there like its mean over it, weighted by how much
+    of the effect of each moment is left at the next sample: for short intervals the plain mean.
 
     Parameters
     ----------

@@ -36,6 +36,7 @@ from obsynth.results.design import Certificate
 from obsynth.synthesis import gain_search
 from obsynth.synthesis.certify import bounded_real_certificate
 from obsynth.synthesis.filter_realisation import realise_filter
+from obsynth.synthesis.gain_bisection import search_by_bisection
 from obsynth.synthesis.gain_bound import require_reachable
 from obsynth.synthesis.gain_design import null_basis
 from obsynth.synthesis.gain_problem import GainProblem, Injection, WeightLimit
@@ -224,7 +225,7 @@ def gain_problem(prepared: PreparedPlant, *, free_weight: bool) -> tuple[GainPro
 def _least_gain(problem: GainProblem, asked: FilterOptions) -> gain_search.LeastGain:
     if asked.gamma_search == "direct":
         return gain_search.search_least_gain(problem, solver=asked.solver)
-    return gain_search.search_by_bisection(problem, tolerance=asked.tolerance, solver=asked.solver)
+    return search_by_bisection(problem, tolerance=asked.tolerance, solver=asked.solver)
 
 
 def _gain_to_ship(asked: FilterOptions, problem: GainProblem, least: gain_search.LeastGain, *, noisy: bool) -> float:

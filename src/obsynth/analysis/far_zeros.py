@@ -1,0 +1,76 @@
+"""Zeros far outside the unit circle: which of those computed are zeros, and in which units to look at them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.pencils import FiniteZeros, finite_zeros
+from obsynth.numerics.ranks import BOUNDARY_RANK_TOLERANCE, CLUSTER_TOLERANCE
+from obsynth.numerics.scaling import EquilibratedPencil, equilibrate_pencil, power_of_two_below
+
+#: Steps in which a computed zero is improved before the pencil there is judged.
+NEWTON_STEPS = 4
+
+
+def system_zeros(E: FloatArray, A: FloatArray, *, nx: int) -> FiniteZeros:
+    """Return the finite zeros of a system pencil without those that are only nearly infinite.
+
+    Far out a pencil with zeros at infinity is nearly singular everywhere, beside ``z E``: a chain of k states
+    shows with ``z^-k``.  A candidate there counts only when the pencil is singular to rounding in units that suit
+    its size.
+
+    Parameters
+    ----------
+    E, A : FloatArray
+        ``(nx + ny, nx + nu)``, the pencil ``[A - z E, B; C, D]``.
+    nx : int
+        Number of states: the leading columns.
+    """
+    found = finite_zeros(E, A)
+    # Both of a pair are judged by the upper one.
+    upper = [complex(z.real, abs(z.imag)) for z in found.values]
+    kept = np.array([abs(z) <= 1.0 or _is_singular(E, A, z, found.normal_rank, nx=nx) for z in upper], dtype=bool)
+    values = found.values[kept]
+    values.setflags(write=False)
+    return replace(found, values=values)
+
+
+def _is_singular(E: FloatArray, A: FloatArray, value: complex, normal_rank: int, *, nx: int) -> bool:
+    """Whether the rank drops at, or within the accuracy of, a computed zero."""
+    pencil = equilibrated_at(E, A, value, nx=nx)
+    point, best = value, np.inf
+    for _ in range(NEWTON_STEPS):
+        left, sizes, right = np.linalg.svd(pencil.A - point * pencil.E)
+        best = min(best, sizes[normal_rank - 1] / sizes[0])
+        u, v = left[:, normal_rank - 1].conj(), right[normal_rank - 1].conj()
+        slope = u @ pencil.E @ v
+        # A zero far out is known only to the rounding of the largest: Newton's method on u' (A - z E) v finds the rest.
+        step = (u @ (pencil.A - point * pencil.E) @ v) / slope if slope != 0.0 else 0.0
+        if abs(point + step - value) > CLUSTER_TOLERANCE * abs(value):
+            break
+        point = point + step
+    return bool(best <= BOUNDARY_RANK_TOLERANCE)
+
+
+def equilibrated_at(E: FloatArray, A: FloatArray, value: complex, *, nx: int) -> EquilibratedPencil:
+    """Return the pencil with states, equations and outputs in units that suit a point of this modulus.
+
+    Beside a large ``z E`` the inputs and outputs would vanish: the states are measured in the units that ``z x`` has.
+
+    Parameters
+    ----------
+    E, A : FloatArray
+        ``(nx + ny, nx + nu)``.
+    value : complex
+        The point; within the unit circle this is `equilibrate_pencil`.
+    nx : int
+        Number of states: the leading columns.
+    """
+    size = float(power_of_two_below(np.array(max(1.0, abs(value)))))
+    columns = np.where(np.arange(E.shape[1]) < nx, 1.0 / size, 1.0)
+    # Scaled with the modulus at that point, then taken apart again, so that the factors are those of A - z E.
+    scaled = equilibrate_pencil(size * columns * E, columns * A)
+    return EquilibratedPencil(scaled.E / size, scaled.A, scaled.rows, read_only(scaled.columns * columns))

@@ -1,0 +1,113 @@
+r"""Central H-infinity filters: the gain of a `GainProblem` by Riccati equations, without matrix inequalities.
+
+For a level g the filtering equation, with :math:`h = [C; Z]`, :math:`k = [D; Z_d]`,
+
+.. math::
+    Y = A Y A^T - (A Y h^T + B k^T)(k k^T - \mathrm{diag}(0, g^2 I) + h Y h^T)^{-1}(\cdot)^T + B B^T,
+
+has a stabilising solution with the right signs exactly when a filter of gain below g exists, and then gives one.  A
+little artificial noise on states and measurements makes the equation regular; it can only raise the gain, and the true
+gain of the true problem decides whether a level counts as reached.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from obsynth.numerics.arrays import FloatArray
+from obsynth.synthesis.gain_problem import GainProblem, Injection
+from obsynth.synthesis.riccati import doubled_riccati_solution
+
+#: Artificial noise relative to the disturbance, in turn: the more of it, the better the equation is conditioned.
+NOISE_LADDER = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
+#: Relative width of the bracket at which the bisection of one rung ends.
+LEVEL_TOLERANCE = 1e-8
+MOST_LEVELS = 40
+#: A level counts as reached when the true gain is below it up to the tolerance of the norm.
+NORM_ALLOWANCE = 1e-8
+
+
+def central_injection(problem: GainProblem, level: float, *, noise: float) -> Injection | None:
+    """Return the gains of the central filter at ``level``, or ``None`` when the equation gives none.
+
+    Parameters
+    ----------
+    problem : GainProblem
+        With measurements; a limit on the weight is not looked at.
+    level : float
+        Gain level, positive.
+    noise : float
+        Artificial noise relative to the disturbance.
+    """
+    n, m, q = problem.order, problem.measured, problem.Z.shape[0]
+    size = float(np.linalg.norm(problem.B, 2))
+    through = max(float(np.linalg.norm(problem.D, 2)), float(np.linalg.norm(problem.C, 2)) * size)
+    h, k = np.vstack([problem.C, problem.Z]), np.vstack([problem.D, problem.Zd])
+    process = problem.B @ problem.B.T + (noise * size) ** 2 * np.eye(n)
+    weight = k @ k.T + np.diag([(noise * through) ** 2] * m + [-(level**2)] * q)
+    cross = problem.B @ k.T
+    try:
+        y = doubled_riccati_solution(problem.A, h, process, weight, cross)
+        if y is None:
+            return None
+        found = _gains(problem, weight + h @ y @ h.T, problem.A @ y @ h.T + cross)
+    except np.linalg.LinAlgError:
+        return None
+    return found if np.all(np.isfinite(found.R)) and np.all(np.isfinite(found.V)) else None
+
+
+def _gains(problem: GainProblem, total: FloatArray, through: FloatArray) -> Injection:
+    m, q = problem.measured, problem.Z.shape[0]
+    if problem.weight_is_free:
+        # The estimate may use the measurement of the same sample.
+        solved = np.linalg.solve(total[:m, :m], np.vstack([through[:, :m], total[m:, :m]]).T).T
+        return Injection(np.asarray(solved[: problem.order]), np.asarray(-solved[problem.order :]))
+    change = np.linalg.solve(total[m:, m:], total[m:, :m])
+    reduced = total[:m, :m] - total[:m, m:] @ change
+    gain = np.linalg.solve(reduced.T, (through[:, :m] - through[:, m:] @ change).T).T
+    return Injection(np.asarray(gain), np.zeros((q, m)))
+
+
+def central_filter_at(problem: GainProblem, level: float) -> Injection | None:
+    """Return a filter whose true gain is below ``level``, from the first rung of noise that gives one, or ``None``."""
+    if problem.order == 0 or problem.measured == 0:
+        return None
+    work = with_least_weight(problem)
+    for noise in NOISE_LADDER:
+        found = central_injection(work, level, noise=noise)
+        if found is not None and problem.achieved_gain(found) < level:
+            return found
+    return None
+
+
+def with_least_weight(problem: GainProblem) -> GainProblem:
+    """Return the problem with V = 0 where the weight has a limit: the least weight there is meets every limit."""
+    return problem if problem.weight_limit is None else replace(problem, free_weight=False, weight_limit=None)
+
+
+def search_central_filter(problem: GainProblem, start: Injection) -> tuple[Injection, float]:
+    """Return the best central filter found by bisection, one rung of noise after the other, and its true gain.
+
+    Parameters
+    ----------
+    problem : GainProblem
+        With measurements and a disturbance.
+    start : Injection
+        A stable filter: what is returned is at least as good.
+    """
+    best, gain = start, problem.achieved_gain(start)
+    for noise in NOISE_LADDER:
+        low, high = 0.0, gain
+        for _ in range(MOST_LEVELS):
+            if high - low <= LEVEL_TOLERANCE * high:
+                break
+            level = 0.5 * (low + high)
+            found = central_injection(problem, level, noise=noise)
+            reached = np.inf if found is None else problem.achieved_gain(found)
+            if found is not None and reached < gain:
+                best, gain = found, reached
+            low, high = (low, min(level, reached)) if reached <= level * (1.0 + NORM_ALLOWANCE) else (level, high)
+            high = min(high, gain) if gain > low else high
+    return best, gain

@@ -1,0 +1,189 @@
+"""Identities that must hold between plant and observer, and how far they are from holding.
+
+An identity is a sum of terms that vanishes.  Its residual is judged entry by entry against what double precision can
+do to the terms, and, for gains that were printed to some decimals, against what that rounding can do.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from obsynth.models.descriptor import DescriptorSystem
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.scaling import balance_by_least_squares
+from obsynth.observers.linear import LinearObserver
+from obsynth.results.report import Check, upper_bound_check
+from obsynth.verification.error_system import LaggedPlant
+
+#: Equalities may miss by this much, relative to the terms they are made of.
+EQUALITY_TOLERANCE = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Residual:
+    """How far an identity is from holding, at its worst entry.
+
+    Parameters
+    ----------
+    error : float
+        Absolute value of the sum there.
+    scale : float
+        Size of the terms it is made of.
+    allowance : float, optional
+        What the rounding of printed gains may add to the error.
+    """
+
+    error: float
+    scale: float
+    allowance: float = 0.0
+
+    @property
+    def relative(self) -> float:
+        """The error in units of its terms."""
+        return self._in_terms(self.error)
+
+    @property
+    def bound(self) -> float:
+        """What ``relative`` may be."""
+        return EQUALITY_TOLERANCE + self._in_terms(self.allowance)
+
+    @property
+    def severity(self) -> float:
+        """The error in units of what is allowed."""
+        return self.relative / self.bound
+
+    def _in_terms(self, size: float) -> float:
+        return size / self.scale if self.scale > 0.0 else size
+
+
+@dataclass(frozen=True, eq=False)
+class Identity:
+    """A sum of terms that must vanish: ``terms[0] + terms[1] + ... = 0``.
+
+    Parameters
+    ----------
+    terms : tuple of FloatArray
+        All of one shape.
+    factors : tuple of tuple of FloatArray, optional
+        The products inside the terms, which also say what rounding can do.
+    units : FloatArray, optional
+        Sizes of the columns' signals: multiplied by them, entries of one row compare.
+    entrywise : bool, optional
+        Whether each entry is judged by its own terms; by default it is by the largest ones of its row.
+    """
+
+    terms: tuple[FloatArray, ...]
+    factors: tuple[tuple[FloatArray, ...], ...] = ()
+    units: FloatArray | None = None
+    entrywise: bool = False
+
+    @property
+    def total(self) -> FloatArray:
+        """The sum of the terms."""
+        return np.asarray(sum(self.terms[1:], start=self.terms[0].copy()))
+
+    def residual(self, allowance: FloatArray | None = None) -> Residual:
+        """Return the residual at the entry that is worst beside what is allowed there.
+
+        Parameters
+        ----------
+        allowance : FloatArray, optional
+            What printed gains may add to each entry; nothing by default.
+        """
+        total = self.total
+        if total.size == 0:
+            return Residual(0.0, 1.0)
+        size = sum((np.abs(term) for term in self.terms), start=np.zeros_like(total))
+        for product in self.factors:
+            bound = np.abs(product[0])
+            for factor in product[1:]:
+                bound = bound @ np.abs(factor)
+            size = size + bound
+        more = np.zeros_like(total) if allowance is None else allowance
+        if not all(np.all(np.isfinite(part)) for part in (total, size, more)):
+            return Residual(float("nan"), 1.0)
+        scale = self._scale(size)
+        worst = np.unravel_index(int(np.argmax(np.abs(total) / (EQUALITY_TOLERANCE * scale + more))), total.shape)
+        return Residual(float(np.abs(total[worst])), float(scale[worst]), float(more[worst]))
+
+    def _scale(self, size: FloatArray) -> FloatArray:
+        if self.entrywise:
+            # Nothing is a sum of nothing but zero itself: the least number makes any miss there a large one.
+            return np.where(size > 0.0, size, np.finfo(np.float64).tiny)
+        columns = np.ones(size.shape[1]) if self.units is None else self.units
+        rows = np.max(size * columns, axis=1, keepdims=True)
+        return np.asarray(np.where(rows > 0.0, rows, 1.0) / columns)
+
+
+def worst(found: list[Residual]) -> Residual:
+    """Return the residual that misses most of what it is allowed; one that is no number outdoes them all."""
+    for item in found:
+        if np.isnan(item.relative):
+            return item
+    return max(found, key=lambda item: item.severity)
+
+
+def equality(name: str, claim: str, found: Residual, source: str) -> Check:
+    """Return the row of a report for an identity."""
+    printed = f"; printed digits allow {found.allowance:.1e}" if found.allowance else ""
+    return upper_bound_check(
+        name,
+        claim,
+        found.relative,
+        found.bound,
+        source=source,
+        kind="equality",
+        detail=f"largest miss {found.error:.1e} among terms of size {found.scale:.1e}{printed}",
+    )
+
+
+def tracking_identities(
+    plant: DescriptorSystem, observer: LinearObserver, tracking: FloatArray, lag: int
+) -> dict[str, Identity]:
+    """Return the identities that make the observer unbiased without faults and disturbances.
+
+    Parameters
+    ----------
+    plant : DescriptorSystem
+        The plant.
+    observer : LinearObserver
+        What is shipped.
+    tracking : FloatArray
+        ``(nz, nx (lag + 1))``.
+    lag : int
+        Samples of past states appended to the plant.
+    """
+    lagged = LaggedPlant.of(plant, lag)
+    ve = tracking @ lagged.E
+    states, cz, dy, du = observer.state_rows, observer.Cz, observer.Dy, observer.Du
+    # A state in small units must not hide behind one in large units.
+    units = np.tile(balance_by_least_squares(plant.E, plant.A, outputs=[plant.C]).states, lag + 1)
+
+    # An observer state that tracks nothing but a sensor fault cancels what it is formed of down to rounding.
+    formed = np.abs(tracking) @ np.abs(lagged.A) + np.abs(observer.By) @ np.abs(lagged.C)
+
+    def unseen(rows: slice) -> Identity:
+        factors = ((cz[rows], tracking, lagged.E), (dy[rows], lagged.C), (cz[rows], formed))
+        return Identity((cz[rows] @ ve, dy[rows] @ lagged.C), factors, units)
+
+    return {
+        "dynamics": Identity(
+            (observer.Az @ ve, observer.By @ lagged.C, -tracking @ lagged.A),
+            ((observer.Az, tracking, lagged.E), (observer.By, lagged.C), (tracking, lagged.A)),
+            units,
+        ),
+        "inputs": Identity(
+            (observer.Bu, observer.By @ plant.D, -tracking @ lagged.B),
+            ((observer.By, plant.D), (tracking, lagged.B)),
+        ),
+        "state estimate": Identity(
+            (cz[states] @ ve, dy[states] @ lagged.C, -lagged.oldest),
+            ((cz[states], tracking, lagged.E), (dy[states], lagged.C)),
+            units,
+        ),
+        "fault estimate": unseen(observer.fault_rows),
+        "residual": unseen(observer.residual_rows),
+        "input feedthrough": Identity((du, dy @ plant.D), ((dy, plant.D),)),
+    }

@@ -1,0 +1,124 @@
+"""Gains from paper: designs rounded to a few decimals keep every identity within what that rounding can do."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from obsynth import (
+    Certificate,
+    DescriptorSystem,
+    ObserverDesign,
+    fault_estimation_filter,
+    fault_estimation_filter_from_gains,
+    verify,
+)
+from obsynth.analysis.fault_detectability import fault_detectability
+from obsynth.analysis.fault_filter import with_sensor_faults_as_states
+from obsynth.results.report import Check
+from obsynth.synthesis.filter_realisation import realise_filter
+
+sys.path.append(str(Path(__file__).parents[1] / "property"))
+from plants import build, random_recipe
+
+#: Seed -> longest detectability index of the random plant.
+LONGEST = {seed: 1 + seed % 3 for seed in range(24)}
+DIGITS = (3, 4, 5, 6)
+PERTURBED_DIGITS = 4
+
+
+@cache
+def designed(seed: int) -> ObserverDesign:
+    rng = np.random.default_rng(seed)
+    kind = {"sensor_faults": 1} if seed % 4 == 0 else {}
+    recipe = random_recipe(rng, largest=6, longest_index=LONGEST[seed], feedthrough=bool(seed % 2), **kind)
+    return fault_estimation_filter(build(rng, recipe).plant)
+
+
+def rounded(seed: int, digits: int) -> dict[str, np.ndarray]:
+    return {letter: np.round(designed(seed).gains[letter], digits) for letter in "TNLW"}
+
+
+def of_gains(seed: int, gains: dict[str, np.ndarray]) -> ObserverDesign:
+    """The filter of these gains, with the detectability indexes of the plant.
+
+    From a rounded T alone an index above one cannot be found: what should vanish in the outputs no longer does.
+    """
+    design = designed(seed)
+    plant, delays = design.plant, design.observer.fault_delays
+    if max(delays) == 1:
+        gamma = design.certificate.claims.get("gamma")
+        return fault_estimation_filter_from_gains(plant, **gains, gamma=gamma)
+    work = with_sensor_faults_as_states(plant)
+    ta, tf = gains["T"] @ work.A, gains["T"] @ work.Bf
+    found = dataclasses.replace(fault_detectability(ta, work.C, tf), indexes=delays)
+    observer, tracking, _ = realise_filter(plant, work, gains, found)
+    psi = np.column_stack([np.linalg.matrix_power(ta, rho - 1) @ tf[:, i] for i, rho in enumerate(delays)])
+    certificate = Certificate({**design.certificate.matrices, "tracking": tracking}, design.certificate.claims)
+    letters = {**gains, "Psi": psi, "Upsilon": work.C @ psi}
+    return design.replace(gains=letters, observer=observer, certificate=certificate)
+
+
+def equalities(design: ObserverDesign, digits: int | None) -> list[Check]:
+    return [check for check in verify(design, printed_digits=digits).checks if check.kind == "equality"]
+
+
+def test_the_plants_have_short_and_long_indexes() -> None:
+    longest = [max(designed(seed).observer.fault_delays) for seed in LONGEST]
+    assert {1, 2, 3} == set(longest)
+
+
+@pytest.mark.parametrize("digits", DIGITS)
+@pytest.mark.parametrize("seed", LONGEST)
+def test_every_equality_holds_to_the_printed_digits(seed: int, digits: int) -> None:
+    design = of_gains(seed, rounded(seed, digits))
+    assert [check for check in equalities(design, digits) if not check.passed] == []
+    assert [check for check in equalities(design, None) if not check.passed] != []
+
+
+def test_an_allowance_relative_to_the_terms_would_refuse_some_of_them() -> None:
+    """Roundings of gains are absolute: half a unit in each of nx + ny products may be too little, or far too much."""
+    refused = 0
+    for seed in LONGEST:
+        plant = designed(seed).plant
+        relative = 0.5 * 10.0**-PERTURBED_DIGITS * (plant.nx + plant.ny)
+        found = equalities(of_gains(seed, rounded(seed, PERTURBED_DIGITS)), PERTURBED_DIGITS)
+        refused += any(check.value > relative for check in found)
+    assert refused > 0
+
+
+def test_a_gain_wrong_by_a_hundred_units_fails_in_nearly_all_entries() -> None:
+    noticed = total = 0
+    for seed in LONGEST:
+        rng = np.random.default_rng(100 + seed)
+        for letter in "TNLW":
+            gains = rounded(seed, PERTURBED_DIGITS)
+            entry = tuple(rng.integers(0, size) for size in gains[letter].shape)
+            gains[letter][entry] += rng.choice([-100.0, 100.0]) * 10.0**-PERTURBED_DIGITS
+            found = equalities(of_gains(seed, gains), PERTURBED_DIGITS)
+            noticed += any(not check.passed for check in found)
+            total += 1
+    # An output in which a fault hardly shows makes little of a wrong entry of L or W.
+    assert noticed >= 0.9 * total
+
+
+def test_the_allowance_is_the_sum_of_the_cofactors() -> None:
+    """W Upsilon = 1 of one fault, where the sum can be written down by hand.
+
+    x+ = a x + f, y = x: with T and N = 1 - T, Upsilon = T and the identity is W T - 1, so one row of the gain set may
+    miss by half a unit times |T| + |W|, and T E + N C = I by half a unit times two.
+    """
+    plant = DescriptorSystem([[1.0]], [[0.5]], C=[[1.0]], Bf=[[1.0]], dt=1.0)
+    gains = {"T": [[0.3]], "N": [[0.7]], "L": [[0.15]], "W": [[3.333]]}
+    report = verify(fault_estimation_filter_from_gains(plant, **gains), printed_digits=3)
+    weight, restricted = report["gains: W"], report["gains: T and N"]
+    # Sizes of the terms: W T twice (as a term and as a product) and one; T, N twice and one.
+    assert weight.value == pytest.approx(1e-4 / (2.0 * 0.9999 + 1.0), rel=1e-9)
+    assert weight.bound == pytest.approx(1e-9 + 0.5e-3 * (0.3 + 3.333) / (2.0 * 0.9999 + 1.0), rel=1e-9)
+    assert restricted.bound == pytest.approx(1e-9 + 0.5e-3 * 2.0 / 3.0, rel=1e-9)
+    assert report.passed

@@ -1,0 +1,70 @@
+"""Riccati equations of filters: against SciPy's solver and against what the equation says."""
+
+import numpy as np
+import pytest
+from scipy.linalg import solve_discrete_are
+
+from obsynth.numerics.norms import hinf_norm, spectral_radius
+from obsynth.synthesis.central_filter import central_filter_at, central_injection, search_central_filter
+from obsynth.synthesis.gain_problem import GainProblem, Injection
+from obsynth.synthesis.riccati import doubled_riccati_solution
+
+
+def random_problem(rng, n=5, m=2, q=1, nd=3, free_weight=False):
+    a = rng.normal(size=(n, n))
+    return GainProblem(
+        A=1.2 * a / spectral_radius(a),
+        C=rng.normal(size=(m, n)),
+        Z=rng.normal(size=(q, n)),
+        B=rng.normal(size=(n, nd)),
+        D=rng.normal(size=(m, nd)),
+        Zd=0.2 * rng.normal(size=(q, nd)),
+        Bn=np.zeros((n, m)),
+        Dn=-np.eye(m),
+        Zn=np.zeros((q, m)),
+        free_weight=free_weight,
+    )
+
+
+@pytest.mark.parametrize("level", [np.inf, 8.0])
+def test_doubling_agrees_with_scipy(level):
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        n, p = 6, 3
+        a, h, b = rng.normal(size=(n, n)), rng.normal(size=(p, n)), rng.normal(size=(n, n))
+        k = rng.normal(size=(p, n))
+        weight = k @ k.T + np.diag([0.1, 0.1, 0.1 if level == np.inf else -((level * 10.0) ** 2)])
+        found = doubled_riccati_solution(a, h, b @ b.T, weight, b @ k.T)
+        expected = solve_discrete_are(a.T, h.T, b @ b.T, weight, s=b @ k.T)
+        assert found is not None
+        assert np.linalg.norm(found - expected) <= 1e-8 * np.linalg.norm(expected)
+
+
+def test_doubling_says_so_when_there_is_no_solution():
+    # x grows and nothing is measured of it.
+    assert doubled_riccati_solution(2.0 * np.eye(1), np.zeros((1, 1)), np.eye(1), np.eye(1), np.zeros((1, 1))) is None
+
+
+@pytest.mark.parametrize("free_weight", [False, True])
+def test_central_filter_meets_its_level_and_none_exists_far_below(free_weight):
+    rng = np.random.default_rng(2)
+    for _ in range(10):
+        problem = random_problem(rng, free_weight=free_weight)
+        start = central_injection(problem, 1e6, noise=1e-1)
+        assert start is not None
+        best, gain = search_central_filter(problem, start)
+        a, b, z, zd = problem.closed_loop(best)
+        assert spectral_radius(a) < 1.0
+        assert hinf_norm(a, b, z, zd).upper == gain
+        for level in (1.0001 * gain, 2.0 * gain, 100.0 * gain):
+            found = central_filter_at(problem, level)
+            assert found is not None
+            assert problem.achieved_gain(found) < level
+        assert central_filter_at(problem, 0.999 * gain) is None
+
+
+def test_a_fixed_weight_is_left_alone():
+    problem = random_problem(np.random.default_rng(3))
+    found = central_injection(problem, 1e3, noise=1e-2)
+    assert isinstance(found, Injection)
+    assert not np.any(found.V)
