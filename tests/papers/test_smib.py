@@ -77,10 +77,10 @@ def test_a_torque_step_is_followed_within_the_stated_noise(design: obsynth.Obser
     errors = estimates[1:] - torque[:-1, 0]
     stated = design.report["noise in fhat[tm GENCLS 1]"].value
     deviation = np.sqrt(np.mean(errors[settled:] ** 2))
-    # The estimate's autocorrelation is -0.50, 0.03, ...: 1 + 2 sum rho^2 = 1.51, so that the relative spread of the
-    # deviation over 19 000 samples is sqrt(1.51 / (2 * 19 000)) = 0.63 %; four of them are allowed.
+    # The estimate's autocorrelation is -0.51, 0.03, ...: 1 + 2 sum rho^2 = 1.52, so that the relative spread of the
+    # deviation over 19 000 samples is sqrt(1.52 / (2 * 19 000)) = 0.63 %; four of them are allowed.
     assert deviation == pytest.approx(stated, rel=4 * 0.0063)
-    # Its mean is 0.14 of that of white noise: three times 0.0403 sqrt(0.14 / 10 000).
+    # Its mean is 0.14 of that of white noise: three times 0.0402 sqrt(0.14 / 10 000).
     spread = stated * np.sqrt(0.14 / first)
     assert np.mean(estimates[first + 1 :]) == pytest.approx(0.1, abs=3 * spread)
     assert np.mean(estimates[settled:first]) == pytest.approx(0.0, abs=3 * stated * np.sqrt(0.14 / (first - settled)))
@@ -95,7 +95,7 @@ def test_without_noise_the_torque_comes_back_one_sample_late(design: obsynth.Obs
     torque = rng.standard_normal((400, 1))
     run = simulate_plant(PLANT, steps=400, f=torque)
     estimates = design.observer.run(run.outputs, np.zeros((400, 0)))
-    # Outputs of size one are multiplied by 288: rounding is 1e-13 of that.
+    # Outputs of size one are multiplied by 289: rounding is 1e-13 of that.
     np.testing.assert_allclose(estimates.faults[1:, 0], torque[:-1, 0], rtol=0, atol=1e-9)
     np.testing.assert_allclose(estimates.states, run.states, rtol=0, atol=1e-9)
 
@@ -109,7 +109,7 @@ def test_a_disturbance_stays_below_the_gain_at_every_horizon(design: obsynth.Obs
         "step": np.where(k >= 100, 0.5, 0.0),
         "pulse": np.where((k >= 100) & (k < 110), 1.0, 0.0),
         # The peak of the norm, as the report says it in hertz.
-        "resonance": np.sin(2.0 * np.pi * 1.603 * PLANT.dt * k),
+        "resonance": np.sin(2.0 * np.pi * 2.520 * PLANT.dt * k),
         "random": np.random.default_rng(3).standard_normal(steps),
     }[kind]
     run = simulate_plant(PLANT, steps=steps, d=power)

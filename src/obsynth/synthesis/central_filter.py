@@ -25,6 +25,8 @@ NOISE_LADDER = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
 #: Relative width of the bracket at which the bisection of one rung ends.
 LEVEL_TOLERANCE = 1e-8
 MOST_LEVELS = 40
+#: A level this far above anything a disturbance could do is no limit.
+WITHOUT_LIMIT = 1e4
 #: A level counts as reached when the true gain is below it up to the tolerance of the norm.
 NORM_ALLOWANCE = 1e-8
 
@@ -111,3 +113,12 @@ def search_central_filter(problem: GainProblem, start: Injection) -> tuple[Injec
             low, high = (low, min(level, reached)) if reached <= level * (1.0 + NORM_ALLOWANCE) else (level, high)
             high = min(high, gain) if gain > low else high
     return best, gain
+
+
+def least_noise_filter(problem: GainProblem) -> Injection | None:
+    """Return the filter with the least variance of xi under the noise of the problem: a level without limit."""
+    noise = replace(with_least_weight(problem), B=problem.Bn, D=problem.Dn, Zd=problem.Zn)
+    if noise.order == 0 or noise.measured == 0:
+        return None
+    found = central_injection(noise, WITHOUT_LIMIT * max(noise.disturbance_size, 1.0), noise=NOISE_LADDER[-1])
+    return found if found is not None and np.isfinite(problem.noise_variance(found)) else None

@@ -106,7 +106,7 @@ def _eliminated_constraints(problem: GainProblem, p: Any, squared: Any) -> list[
     return constraints
 
 
-def _full_inequality(problem: GainProblem, p: Any, squared: Any) -> _Inequality:
+def _full_inequality(problem: GainProblem, p: Any, squared: Any, *, decay: float = 1.0) -> _Inequality:
     n, m, q, nd = problem.order, problem.measured, problem.Z.shape[0], problem.disturbances
     y = lmi.matrix_variable(n, m)
     v = lmi.matrix_variable(q, m) if problem.weight_is_free else np.zeros((q, m))
@@ -114,7 +114,7 @@ def _full_inequality(problem: GainProblem, p: Any, squared: Any) -> _Inequality:
         [
             [p],
             [np.zeros((nd, n)), squared * np.eye(nd)],
-            [p @ problem.A - y @ problem.C, p @ problem.B - y @ problem.D, p],
+            [(p @ problem.A - y @ problem.C) / decay, p @ problem.B - y @ problem.D, p],
             [problem.Z + v @ problem.C, problem.Zd + v @ problem.D, np.zeros((q, n)), np.eye(q)],
         ]
     )
@@ -195,7 +195,7 @@ def feasible_point(problem: GainProblem, gain: float, *, solver: str) -> GainSol
     return found if problem.achieved_gain(found.injection) < gain else None
 
 
-def small_gains(problem: GainProblem, gain: float, *, solver: str) -> GainSolution:
+def small_gains(problem: GainProblem, gain: float, *, solver: str, decay: float = 1.0) -> GainSolution:
     """Return gains of least size (or least noise) at level ``gain``, by the full inequality.
 
     Minimises the trace of X, a bound on ``(Bn - R Dn)' P (Bn - R Dn) + (Zn + V Dn)'(Zn + V Dn)``: the variance of
@@ -210,6 +210,9 @@ def small_gains(problem: GainProblem, gain: float, *, solver: str) -> GainSoluti
         Level g; of no effect without disturbances.
     solver : str
         Name of the solver.
+    decay : float, optional
+        Bound on the spectral radius, at most 1: the inequality is asked for with ``(A - R C) / decay``, which costs a
+        little gain.
 
     Raises
     ------
@@ -218,7 +221,7 @@ def small_gains(problem: GainProblem, gain: float, *, solver: str) -> GainSoluti
     """
     n, q, nw = problem.order, problem.Z.shape[0], problem.Bn.shape[1]
     p, x = lmi.symmetric_variable(n), lmi.symmetric_variable(nw)
-    inequality = _full_inequality(problem, p, gain**2)
+    inequality = _full_inequality(problem, p, gain**2, decay=decay)
     noise = p @ problem.Bn - inequality.y @ problem.Dn
     variance = lmi.symmetric_blocks(
         [

@@ -14,12 +14,16 @@ REGULARISATIONS = (1e-6, 1e-4, 1e-2, 1.0)
 #: Doubling stops when a step changes the solution by less than this, relative to it; each step squares the error.
 DOUBLING_TOLERANCE = 1e-14
 MOST_DOUBLINGS = 60
+#: A starting filter with this spectral radius forgets fast enough.
+FAST_ENOUGH = 0.999
 #: Eigenvalues of a normalising matrix are kept above this fraction of the largest.
 CONDITION_LIMIT = 1e-20
 
 
 def stabilising_gain(a: FloatArray, c: FloatArray, noise_a: FloatArray, noise_c: FloatArray) -> FloatArray | None:
     """Return R ``(n, m)`` such that ``A - R C`` is Schur stable, by a Kalman filter Riccati equation.
+
+    The first regularisation that forgets fast enough is taken, or the fastest filter of all.
 
     Parameters
     ----------
@@ -33,26 +37,26 @@ def stabilising_gain(a: FloatArray, c: FloatArray, noise_a: FloatArray, noise_c:
     FloatArray or None
         ``None`` when no regularisation gave a stable result.
     """
-    from scipy.linalg import solve_discrete_are
-
     n, m = a.shape[0], c.shape[0]
     if m == 0:
         return np.zeros((n, 0)) if spectral_radius(a) < 1.0 else None
     process, cross, measured = noise_a @ noise_a.T, noise_a @ noise_c.T, noise_c @ noise_c.T
+    best, least = None, 1.0
     process_size = max(float(np.linalg.norm(process, 2)), 1e-8 * float(np.linalg.norm(a, 2)) ** 2, 1e-8)
     for epsilon in REGULARISATIONS:
         q = process + epsilon * process_size * np.eye(n)
-        r = measured + epsilon * (float(np.linalg.norm(c @ q @ c.T, 2)) + float(np.linalg.norm(measured, 2))) * np.eye(
-            m
-        )
-        try:
-            x = solve_discrete_are(a.T, c.T, q, r, s=cross)
-        except (np.linalg.LinAlgError, ValueError):
+        size = float(np.linalg.norm(c @ q @ c.T, 2)) + float(np.linalg.norm(measured, 2))
+        r = measured + epsilon * size * np.eye(m)
+        x = riccati_solution(a, c, q, r, cross)
+        if x is None:
             continue
         gain = np.linalg.solve(c @ x @ c.T + r, c @ x @ a.T + cross.T).T
-        if np.all(np.isfinite(gain)) and spectral_radius(a - gain @ c) < 1.0:
-            return np.asarray(gain)
-    return None
+        radius = spectral_radius(a - gain @ c) if np.all(np.isfinite(gain)) else np.inf
+        if radius < least:
+            best, least = np.asarray(gain), radius
+        if least <= FAST_ENOUGH:
+            break
+    return best
 
 
 def bounded_real_matrix(
@@ -76,25 +80,45 @@ def bounded_real_matrix(
     if n == 0:
         return np.zeros((0, 0))
     weight = c.T @ c + slack * np.eye(n)
-    try:
-        with warnings.catch_warnings():
-            # An ill-conditioned equation only makes a worse certificate, which is then not proved.
-            warnings.simplefilter("ignore")
-            p = _riccati_solution(a, b, weight, c.T @ d, d.T @ d - level**2 * np.eye(b.shape[1]))
-    except (np.linalg.LinAlgError, ValueError):
+    cross, gap = c.T @ d, d.T @ d - level**2 * np.eye(b.shape[1])
+    p = riccati_solution(a.T, b.T, weight, gap, cross) if b.shape[1] else _lyapunov_solution(a, weight)
+    if p is None:
         return None
     p = 0.5 * (p + p.T)
     return p if np.all(np.isfinite(p)) and float(np.linalg.eigvalsh(p)[0]) > 0.0 else None
 
 
-def _riccati_solution(
-    a: FloatArray, b: FloatArray, weight: FloatArray, cross: FloatArray, level: FloatArray
-) -> FloatArray:
-    from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
+def _lyapunov_solution(a: FloatArray, weight: FloatArray) -> FloatArray | None:
+    from scipy.linalg import solve_discrete_lyapunov
 
-    if b.shape[1] == 0:
-        return np.asarray(solve_discrete_lyapunov(a.T, weight))
-    return np.asarray(solve_discrete_are(a, b, weight, level, s=cross))
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return np.asarray(solve_discrete_lyapunov(a.T, weight))
+    except (np.linalg.LinAlgError, ValueError):
+        return None
+
+
+def riccati_solution(
+    a: FloatArray, h: FloatArray, process: FloatArray, weight: FloatArray, cross: FloatArray
+) -> FloatArray | None:
+    """Return the stabilising solution by doubling, or where that breaks down by SciPy; ``None`` without one.
+
+    Parameters
+    ----------
+    a, h, process, weight, cross : FloatArray
+        As for `doubled_riccati_solution`.
+    """
+    from scipy.linalg import solve_discrete_are
+
+    try:
+        with warnings.catch_warnings():
+            # An ill-conditioned equation only makes a worse filter or certificate, which is then not taken.
+            warnings.simplefilter("ignore")
+            doubled = doubled_riccati_solution(a, h, process, weight, cross)
+            return np.asarray(solve_discrete_are(a.T, h.T, process, weight, s=cross)) if doubled is None else doubled
+    except (np.linalg.LinAlgError, ValueError):
+        return None
 
 
 def normalising_change(p: FloatArray) -> FloatArray:

@@ -152,10 +152,18 @@ def _free_part_identities(work: DescriptorSystem, gains: Mapping[str, FloatArray
     span = scaling.states[:, None] * basis[:, sizes > 0.0]
     shares = (basis[:, sizes > 0.0] / scaling.states[:, None]).T
     upsilon = gains["Upsilon"]
+    # R is the difference of L and the fixed part: it is judged against these, however small it is itself.
+    parts = np.abs(gains["L"]) + np.abs(fixed) + np.abs(free)
+    rows = np.max(parts * outputs, axis=1, keepdims=True)
+    columns = np.max(np.abs(upsilon) / outputs[:, None], axis=0, keepdims=True)
+    products = ((rows, columns), (gains["T"], work.A, gains["Psi"]))
+    formed = parts + np.abs(gains["T"]) @ np.abs(work.A) @ np.abs(gains["Psi"]) @ np.abs(gains["W"])
+    # The projection mixes the rows in balanced units.
+    mixed = scaling.states[:, None] * np.max(formed / scaling.states[:, None], axis=0, initial=0.0)
     return [
-        Identity((free @ upsilon,), ((gains["L"], upsilon),)),
-        Identity((fixed @ upsilon, -moved), ((gains["L"], upsilon), (gains["T"], work.A, gains["Psi"]))),
-        Identity((fixed, -span @ (shares @ fixed)), ((np.abs(gains["L"]),), (span, shares, gains["L"])), outputs),
+        Identity((free @ upsilon,), products),
+        Identity((fixed @ upsilon, -moved), products),
+        Identity((fixed, -span @ (shares @ fixed)), ((mixed,),), outputs),
     ]
 
 
