@@ -48,6 +48,30 @@ def explicit_certificate(
     return 0.5 * (p1 + p1.T), (x / units[:, None] / units) @ inverse, delta
 
 
+def symmetric_certificate(Az: FloatArray, *, decay: float) -> tuple[FloatArray, float] | None:
+    """Return Q ``(n, n)``, to be taken for P1 and P3 of an observer with L = 0, and the delta below which it serves.
+
+    With P1 = P3 = Q the inequality is ``He(Q A) + (delta / 2) A' Q A < 0``.  ``None`` when errors do not decay so fast.
+
+    Parameters
+    ----------
+    Az : FloatArray
+        ``(n, n)``, the observer's dynamics.
+    decay : float, 1/seconds
+        Rate to certify.
+    """
+    from scipy.linalg import eigvalsh, matrix_balance, solve_continuous_lyapunov
+
+    moving = Az + decay * np.eye(len(Az))
+    if not spectral_abscissa(moving) < 0.0:
+        return None
+    balanced, (units, _) = matrix_balance(moving, permute=False, separate=True)
+    q = np.asarray(solve_continuous_lyapunov(balanced.T, -np.linalg.norm(balanced) * np.eye(len(Az))))
+    q = 0.5 * (q + q.T)
+    largest = float(eigvalsh(balanced.T @ q @ balanced)[-1]) / float(np.linalg.norm(balanced))
+    return q / units[:, None] / units, 2.0 / largest
+
+
 def _coupling(a: FloatArray, p: FloatArray) -> tuple[FloatArray, float]:
     """Return X and delta with ``He([a'; -I] X [I, delta I]) + [0, p; p, 0] < 0`` for a stable ``a`` with Gram matrix p.
 

@@ -12,6 +12,7 @@ from obsynth.analysis.structure import analyse_structure
 from obsynth.errors import SolverError
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray
+from obsynth.synthesis.pd_certificate import symmetric_certificate
 from obsynth.synthesis.pd_gains import PdGains, certified
 from obsynth.synthesis.pd_options import PdOptions, default_delta, fastest_mode, require_possible
 from obsynth.synthesis.pd_problem import PdSolution, PdTask, solve
@@ -90,9 +91,49 @@ def gains_for(plant: DescriptorSystem, asked: PdOptions, *, decay: float) -> PdG
             continue
         if found is not None and found.proved:
             return found
+    spare = riccati_gains(plant, asked, delta=delta, decay=decay)
+    if spare is not None and spare.proved:
+        return spare
     raise SolverError(
         f"{failure} {_advice(asked)}", record={**failure.record, "delta": delta, "decay": decay}
     ) from failure
+
+
+#: What the inequalities ask for besides stability and a decay rate: a Riccati equation cannot give it.
+_FURTHER = ("disk", "gain_bound", "fault_rate_gain", "noise_gain", "adaptation_range")
+
+
+def riccati_gains(plant: DescriptorSystem, asked: PdOptions, *, delta: float, decay: float) -> PdGains | None:
+    """Return gains with L = 0 and J from a Riccati equation: a solution of the theorem that no solver has to find.
+
+    ``None`` where more is asked than a decay rate, when the equation is not solved, or when a delta that is asked for
+    is too large for these gains and Theorem 2.
+    """
+    from scipy.linalg import solve_continuous_are
+
+    if any(getattr(asked, name) is not None for name in _FURTHER):
+        return None
+    augmented = with_faults_as_states(plant)
+    *_, (states, outputs) = _units(plant, asked)
+    shifted = augmented.A * states / states[:, None] + decay * np.eye(augmented.nx)
+    c = augmented.C * states / outputs[:, None]
+    try:
+        p = np.asarray(solve_continuous_are(shifted.T, c.T, np.eye(len(shifted)), np.eye(len(c))))
+    except (np.linalg.LinAlgError, ValueError):
+        return None
+    gain = states[:, None] * (p @ c.T) / outputs
+    record = {
+        "what": "a PD observer with L = 0, after the solver failed",
+        "solver": "scipy.linalg.solve_continuous_are",
+    }
+    found = symmetric_certificate(augmented.A - gain @ augmented.C, decay=decay)
+    if found is None:
+        return None
+    q, limit = found
+    if asked.delta is None:
+        delta = min(delta, 0.5 * limit)
+    solution = PdSolution(gain, np.zeros_like(gain), (q,), q, record)
+    return certified(plant, asked, solution, delta=delta, decay=decay)
 
 
 def _advice(asked: PdOptions) -> str:

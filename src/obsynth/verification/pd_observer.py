@@ -123,7 +123,8 @@ def _gains_row(design: ObserverDesign, augmented: DescriptorSystem, tolerance: f
 
 def _spectra(design: ObserverDesign, errors: PdErrorSystem) -> Iterator[Check]:
     plant, claims = design.plant, design.certificate.claims
-    singular_values = np.linalg.svd(errors.estimate, compute_uv=False)
+    # The matrix maps states to states: in units that balance it, the condition number is that of the observer.
+    singular_values = np.linalg.svd(_balanced(errors.estimate), compute_uv=False)
     largest, smallest = float(singular_values[0]), float(singular_values[-1])
     yield lower_bound_check(
         "det(I + L C)", "I + L C is nonsingular, so that the observer exists without derivatives",
@@ -150,6 +151,12 @@ def _spectra(design: ObserverDesign, errors: PdErrorSystem) -> Iterator[Check]:
             source="ours",
         )  # fmt: skip
     yield from _parts(plant, errors)
+
+
+def _balanced(matrix: FloatArray) -> FloatArray:
+    from scipy.linalg import matrix_balance
+
+    return np.asarray(matrix_balance(matrix, permute=False)[0])
 
 
 def _parts(plant: DescriptorSystem, errors: PdErrorSystem) -> Iterator[Check]:

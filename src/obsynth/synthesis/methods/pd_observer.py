@@ -128,6 +128,8 @@ def notes(plant: DescriptorSystem, asked: PdOptions, gains: PdGains) -> tuple[st
             "reachable with moderate gains; without it errors would die out more slowly. decay: 0 takes the smallest "
             "gains."
         )
+    if not np.any(gains.L):
+        found.append("The semidefinite solver failed: these gains come from a Riccati equation, with L = 0 and N = 0.")
     return (*found, *_noise_notes(plant, gains))
 
 
