@@ -18,6 +18,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import spectral_abscissa
 from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.ranks import RANK_TOLERANCE
+from obsynth.numerics.scaling import balance_by_least_squares
 from obsynth.observers.linear import LinearObserver
 from obsynth.results.design import ObserverDesign
 from obsynth.results.report import Check, information, lower_bound_check, upper_bound_check
@@ -104,14 +105,17 @@ def _gains_row(design: ObserverDesign, augmented: DescriptorSystem, tolerance: f
     """Check that the listed gains are those of the realisation: ``S L = T`` and ``By = J + Az L``."""
     observer, (gain_j, gain_l) = design.observer, stacked_gains(design)
     estimate, direct = observer.Cz[: observer.order], observer.Dy[: observer.order]
+    # A gain on an output in small units must not hide behind one on an output in large units.
+    units = 1.0 / balance_by_least_squares(augmented.E, augmented.A, outputs=[augmented.C]).outputs
     found = [
-        residual(estimate @ gain_l, -direct, factors=((estimate, gain_l),)),
+        residual(estimate @ gain_l, -direct, factors=((estimate, gain_l),), units=units),
         residual(
             gain_j, observer.Az @ gain_l, -observer.By,
             factors=(
                 (observer.Az, gain_l), (augmented.A, gain_l), (observer.By, augmented.C, gain_l),
                 (gain_j, augmented.C, gain_l),
             ),
+            units=units,
         ),
     ]  # fmt: skip
     worst = max(found, key=lambda item: np.inf if np.isnan(item.relative) else item.relative)
