@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 #: Inches: width of the figure and height of one panel.
 WIDTH = 7.5
 PANEL_HEIGHT = 2.1
+#: Where a decade has its marks.
+TICKS = (1.0, 2.0, 5.0)
 #: One panel each: its label and the curves in it, with their names and styles.
 PANELS: tuple[tuple[str, tuple[tuple[str, str, dict[str, Any]], ...]], ...] = (
     ("decay (1/s)", (("decay", "rate at which errors die out", {"color": "black", "marker": "o"}),)),
@@ -69,7 +71,7 @@ def plot_delta_scan(scan: DeltaScan, *, axes: Iterable[Axes] | None = None) -> l
             values = getattr(scan, name)[order]
             panel.plot(scan.delta[order], np.where(values > 0.0, values, np.nan), label=text, markersize=4, **style)
         panel.set_xscale("log")
-        panel.set_yscale("log")
+        _logarithmic(panel)
         panel.set_ylabel(label)
         panel.legend(loc="best")
         panel.grid(True, which="major", color="0.9", linewidth=0.6)
@@ -77,4 +79,22 @@ def plot_delta_scan(scan: DeltaScan, *, axes: Iterable[Axes] | None = None) -> l
         for side in ("top", "right"):
             panel.spines[side].set_visible(False)
     panels[-1].set_xlabel("delta (s)")
+    if (figure := panels[0].get_figure()) is not None:
+        figure.align_ylabels(panels)
     return panels
+
+
+def _logarithmic(panel: Axes) -> None:
+    """Give a panel a logarithmic scale with plain numbers at 1, 2 and 5, from one such number to another."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+
+    panel.set_yscale("log")
+    shown = np.concatenate([np.asarray(line.get_ydata(), dtype=np.float64) for line in panel.get_lines()])
+    shown = shown[np.isfinite(shown)]
+    if shown.size:
+        steps = np.ravel(np.outer(10.0 ** np.arange(-12, 13), TICKS))
+        below, above = steps[steps < shown.min()], steps[steps > shown.max()]
+        panel.set_ylim(below[-1] if below.size else None, above[0] if above.size else None)
+    panel.yaxis.set_major_locator(LogLocator(subs=TICKS))
+    panel.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    panel.yaxis.set_minor_locator(NullLocator())
