@@ -230,6 +230,14 @@ class TestDefaults:
         assert design.certificate.claims["decay"] <= 0.025
         assert design.report["error system"].value == pytest.approx(-0.05)
 
+    def test_a_fast_mode_that_dies_out_by_itself_does_not_set_the_pace(self) -> None:
+        """An unstable mode at 0.5 and a sensor at -1e5: gains are those of the slow plant."""
+        a = np.diag([-1e5, -1.0, 0.5]) + 0.3 * np.triu(np.ones((3, 3)), 1)
+        plant = obsynth.DescriptorSystem(None, a, C=[[0.1, 0.1, 1.1]], Bf=[[0.0], [1.0], [1.0]])
+        design = obsynth.pd_observer(plant)
+        assert design.options["delta"] == pytest.approx(1.0, rel=1e-4)
+        assert design.report["gain"].value < 100.0
+
     def test_integrators_have_no_time_scale(self) -> None:
         plant = obsynth.DescriptorSystem(None, [[0.0, 1.0], [0.0, 0.0]], C=[[1.0, 0.0]], Bf=[[0.0], [1.0]])
         assert obsynth.pd_observer(plant).options["delta"] == 1.0

@@ -99,6 +99,12 @@ class PdOptions:
         return None if self.adaptation_gain is None else checked_adaptation_gain(self.adaptation_gain, nf)
 
 
+#: Damping ratio from which a mode dies out by itself.
+WELL_DAMPED = 0.5
+#: Well-damped modes this many times faster than the plant's pace are none of the observer's business.
+FAR_BEYOND = 100.0
+
+
 def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float, np.floating, np.integer)) and bool(np.isfinite(value))
 
@@ -118,12 +124,24 @@ def checked_adaptation_gain(value: Any, nf: int) -> FloatArray:
 
 
 def fastest_mode(a: FloatArray) -> float:
-    """Return the largest modulus of an eigenvalue, 1/seconds; 1 for a plant of integrators, which has no time scale."""
+    """Return the largest modulus of an eigenvalue that an observer has to follow, 1/seconds.
+
+    A well-damped mode far beyond all others (that of a sensor, say) is left aside: it dies out by itself.  1 for a
+    plant of integrators, which has no time scale.
+    """
     from scipy.linalg import matrix_balance
 
     balanced = matrix_balance(a, permute=False)[0]
-    largest, size = float(np.max(np.abs(np.linalg.eigvals(balanced)))), float(np.linalg.norm(balanced, 2))
-    return largest if largest > NEGLIGIBLE_MODE * size else 1.0
+    modes = np.linalg.eigvals(balanced)
+    sizes = np.abs(modes)
+    if not np.max(sizes) > NEGLIGIBLE_MODE * float(np.linalg.norm(balanced, 2)):
+        return 1.0
+    damped = modes.real < -WELL_DAMPED * sizes
+    # What is not damped sets the pace; where all is damped or at rest, the slowest mode does.
+    pace = float(np.max(sizes[~damped], initial=0.0))
+    if pace <= NEGLIGIBLE_MODE * float(np.max(sizes)):
+        pace = float(np.min(sizes[damped]))
+    return float(np.max(sizes[(sizes <= FAR_BEYOND * pace) | ~damped]))
 
 
 def default_delta(plant: DescriptorSystem, asked: PdOptions, decay: float) -> float:
