@@ -159,3 +159,33 @@ def test_theorem_2_knows_its_limit_of_delta():
             obsynth.pd_observer(plant, theorem=2, delta=1.0001 * limit, decay=0.0)
         solved += outcome_of(plant, theorem=2, delta=0.5 * limit, decay=0.0) == ""
     assert solved == 10
+
+
+def asked_beside(plain: obsynth.ObserverDesign, option: str) -> dict[str, Any]:
+    """Return an option that asks for a little more than the plain design gives, or for half."""
+    report = plain.report
+    reach = 2.0 * float(np.max(np.abs(np.linalg.eigvals(plain.observer.Az))))
+    return {
+        "disk": {"disk": [reach, 0.999 * reach]},
+        "noise gain": {"noise_gain": 1.2 * report["noise and its derivative in the fault estimate"].value},
+        "adaptation range": {"adaptation_range": [0.5, 3.0]},
+        "adaptation gain": {"adaptation_gain": 5.0},
+        "gain bound": {"gain_bound": 1.5 * report["gain"].value},
+        "fault rate gain": {"fault_rate_gain": 0.5 * report["fault rate in the fault estimate"].value},
+    }[option]
+
+
+@pytest.mark.parametrize(
+    ("option", "least"),
+    [("disk", 15), ("noise gain", 15), ("adaptation range", 15), ("adaptation gain", 15), ("gain bound", 13),
+     ("fault rate gain", 11)],
+)  # fmt: skip
+def test_what_is_asked_is_given_or_nothing_is_known(option, least):
+    """The last two are sufficient conditions: where they fail, nothing is shipped, and nothing is claimed either."""
+    solved = 0
+    for plant, recipe in plants_of("random")[:15]:
+        options = asked_beside(obsynth.pd_observer(plant, decay=0.0), option)
+        text = outcome_of(plant, decay=0.0, **options)
+        assert text == "" or text.startswith("SolverError"), f"{text}\n    {recipe}"
+        solved += text == ""
+    assert solved >= least

@@ -157,6 +157,13 @@ class TestOptions:
             np.testing.assert_array_equal(design.gains["G"], g)
             assert np.max(eigenvalues(design).real) < -0.7
 
+    def test_a_gain_bound_is_on_the_gains_in_the_loop(self) -> None:
+        design = obsynth.pd_observer(PLANT, delta=0.1, decay=2.0, adaptation_gain=12.0, gain_bound=5.5)
+        gains = design.gains
+        stacked = np.block([[gains["J"], gains["L"]], [12.0 * gains["M"], 12.0 * gains["N"]]])
+        assert np.linalg.norm(stacked, 2) <= 5.5
+        assert np.max(eigenvalues(design).real) < -2.0
+
     def test_a_number_stands_for_a_multiple_of_the_identity(self) -> None:
         design = obsynth.pd_observer(PLANT, adaptation_gain=4.0)
         np.testing.assert_array_equal(design.gains["G"], 4.0 * np.eye(2))

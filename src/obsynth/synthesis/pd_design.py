@@ -152,7 +152,7 @@ def _units(plant: DescriptorSystem, asked: PdOptions) -> Iterator[tuple[FloatArr
     yield np.ones(n), np.ones(ny)
     if asked.gain_bound is not None:
         return  # it is a bound in the user's units
-    augmented = with_faults_as_states(plant, asked.gain_matrix(plant.nf))
+    augmented = with_faults_as_states(plant, _inner_gain(plant, asked))
     system = np.zeros((n + ny, n + ny))
     system[:n, :n], system[n:, :n] = augmented.A, augmented.C
     factors = matrix_balance(system, permute=False, separate=True)[1][0]
@@ -164,6 +164,15 @@ def _units(plant: DescriptorSystem, asked: PdOptions) -> Iterator[tuple[FloatArr
     yield columns, np.exp2(np.round(np.log2(np.where(rows > 0.0, rows, 1.0))))
 
 
+def _inner_gain(plant: DescriptorSystem, asked: PdOptions) -> FloatArray | None:
+    """Return the G to design with.
+
+    A design for F G is one for F in other coordinates of the fault: any gains in the loop can be listed with any G.  A
+    bound on the gains is one on those in the loop, so that it takes the fault's own coordinates.
+    """
+    return None if asked.gain_bound is not None else asked.gain_matrix(plant.nf)
+
+
 def _solved(
     plant: DescriptorSystem, asked: PdOptions, delta: float, decay: float, states: FloatArray, outputs: FloatArray
 ) -> PdGains | None:
@@ -171,7 +180,7 @@ def _solved(
     unit = float(np.exp2(np.round(np.log2(TIME_UNITS / fastest_mode(plant.A)))))
     task = _task(plant, asked, delta, decay, states, outputs, unit)
     found = solve(task, solver=asked.solver)
-    g = asked.gain_matrix(plant.nf)
+    g = _inner_gain(plant, asked)
     loop = np.eye(len(states))
     if g is not None:
         loop[plant.nx :, plant.nx :] = g
@@ -186,7 +195,7 @@ def _task(
     unit: float,
 ) -> PdTask:  # fmt: skip
     nx, nf = plant.nx, plant.nf
-    g = asked.gain_matrix(nf)
+    g = _inner_gain(plant, asked)
     ends = asked.range_numbers
     gains = [g] if ends is None else [end * np.eye(nf) for end in ends]
     plants = [with_faults_as_states(plant, gain) for gain in gains]
