@@ -237,6 +237,17 @@ class TestDefaults:
         assert design.certificate.claims["decay"] <= 0.025
         assert design.report["error system"].value == pytest.approx(-0.05)
 
+    def test_a_default_decay_rate_never_makes_a_design_impossible(self) -> None:
+        """Theorem 2 with delta = 0.35 serves the hidden pair -0.4 +- 2j, but not with a decay rate of 0.2."""
+        pair = obsynth.DescriptorSystem(
+            None, [[0.1, 0, 0], [0, -0.4, 2], [0, -2, -0.4]], C=[[1, 0, 0]], Bf=[[1], [0], [0]]
+        )
+        with pytest.raises(obsynth.InfeasibleError, match="delta <"):
+            obsynth.pd_observer(pair, theorem=2, delta=0.35, decay=0.2)
+        design = obsynth.pd_observer(pair, theorem=2, delta=0.35)
+        assert design.report.passed
+        assert design.certificate.claims["decay"] < 0.1
+
     def test_a_fast_mode_that_dies_out_by_itself_does_not_set_the_pace(self) -> None:
         """An unstable mode at 0.5 and a sensor at -1e5: gains are those of the slow plant."""
         a = np.diag([-1e5, -1.0, 0.5]) + 0.3 * np.triu(np.ones((3, 3)), 1)

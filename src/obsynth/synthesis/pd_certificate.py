@@ -7,6 +7,8 @@ off-diagonal block of what P1 contributes.
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
@@ -34,17 +36,19 @@ def explicit_certificate(
     decay : float, 1/seconds
         Rate to certify.
     """
-    from scipy.linalg import matrix_balance, solve_continuous_lyapunov
+    from scipy.linalg import matrix_balance
 
-    n = len(Az)
-    moving = Az + decay * np.eye(n)
+    moving = Az + decay * np.eye(len(Az))
     if not spectral_abscissa(moving) < 0.0:
         return None
     balanced, (units, _) = matrix_balance(moving, permute=False, separate=True)
-    p = np.asarray(solve_continuous_lyapunov(balanced.T, -np.linalg.norm(balanced) * np.eye(n)))
-    x, delta = _coupling(balanced, 0.5 * (p + p.T))
-    inverse = np.linalg.inv(estimate)
-    p1 = inverse.T @ ((0.5 * (p + p.T)) / units[:, None] / units) @ inverse
+    try:
+        p = _gram(balanced)
+        x, delta = _coupling(balanced, p)
+        inverse = np.linalg.inv(estimate)
+    except np.linalg.LinAlgError:
+        return None
+    p1 = inverse.T @ (p / units[:, None] / units) @ inverse
     return 0.5 * (p1 + p1.T), (x / units[:, None] / units) @ inverse, delta
 
 
@@ -60,16 +64,29 @@ def symmetric_certificate(Az: FloatArray, *, decay: float) -> tuple[FloatArray, 
     decay : float, 1/seconds
         Rate to certify.
     """
-    from scipy.linalg import eigvalsh, matrix_balance, solve_continuous_lyapunov
+    from scipy.linalg import eigvalsh, matrix_balance
 
     moving = Az + decay * np.eye(len(Az))
     if not spectral_abscissa(moving) < 0.0:
         return None
     balanced, (units, _) = matrix_balance(moving, permute=False, separate=True)
-    q = np.asarray(solve_continuous_lyapunov(balanced.T, -np.linalg.norm(balanced) * np.eye(len(Az))))
-    q = 0.5 * (q + q.T)
+    try:
+        q = _gram(balanced)
+    except np.linalg.LinAlgError:
+        return None
     largest = float(eigvalsh(balanced.T @ q @ balanced)[-1]) / float(np.linalg.norm(balanced))
     return q / units[:, None] / units, 2.0 / largest
+
+
+def _gram(a: FloatArray) -> FloatArray:
+    """Return P with ``a' P + P a = -norm(a) I`` for a stable ``a (n, n)``."""
+    from scipy.linalg import solve_continuous_lyapunov
+
+    with warnings.catch_warnings():
+        # "An eigenvalue pair whose sum is very close to zero": what comes of it is proved or thrown away.
+        warnings.simplefilter("ignore")
+        p = np.asarray(solve_continuous_lyapunov(a.T, -np.linalg.norm(a) * np.eye(len(a))))
+    return np.asarray(0.5 * (p + p.T))
 
 
 def _coupling(a: FloatArray, p: FloatArray) -> tuple[FloatArray, float]:

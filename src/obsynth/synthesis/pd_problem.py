@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from obsynth.errors import SolverError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.synthesis import lmi
 
@@ -123,7 +124,10 @@ def solve(task: PdTask, *, solver: str) -> PdSolution:
     size = lmi.frobenius_norm(found.Y, found.Z) + lmi.frobenius_norm(p3)
     record = lmi.minimise(size, constraints, what=f"a PD observer by Theorem {task.theorem}", solver=solver)
     p3_value = lmi.value_of(p3)
-    gain_j, gain_l = (np.asarray(np.linalg.solve(p3_value.T, lmi.value_of(part))) for part in (found.Y, found.Z))
+    try:
+        gain_j, gain_l = (np.asarray(np.linalg.solve(p3_value.T, lmi.value_of(part))) for part in (found.Y, found.Z))
+    except np.linalg.LinAlgError as error:
+        raise SolverError("The solver returned a singular P3: nothing is known.", record=record) from error
     p1 = tuple(_symmetric(lmi.value_of(p)) for p in own)
     return PdSolution(
         gain_j + task.decay * gain_l, gain_l, p1, _symmetric(p3_value) if task.theorem == 2 else p3_value, record
