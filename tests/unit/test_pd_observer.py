@@ -14,7 +14,7 @@ from obsynth.analysis.pd_conditions import pd_observer_conditions
 from obsynth.numerics.continuous import continuous_hinf_norm
 from obsynth.simulation import simulate_plant
 from obsynth.spec import load_spec
-from obsynth.synthesis import pd_design
+from obsynth.synthesis import lmi, pd_design
 from obsynth.synthesis.pd_certificate import explicit_certificate, symmetric_certificate
 from obsynth.synthesis.pd_options import least_noise_gain
 from obsynth.verification.pd_inequality import prove_gains, prove_shipped_stability, prove_symmetric_positive
@@ -204,6 +204,15 @@ class TestOptions:
         assert design.report.passed
         assert design.report["P part alone"].value == pytest.approx(0.786, abs=2e-3)
         assert design.report["error system"].value == pytest.approx(-0.124, abs=2e-3)
+        a, zero = loop(design)[0], np.zeros((1, 6))
+        for delta in (0.01, 0.1):
+            p1, q = lmi.symmetric_variable(6), lmi.symmetric_variable(6)
+            w = lmi.symmetric_blocks([[q @ a + a.T @ q], [p1 - q + delta * q @ a, -2.0 * delta * q]])
+            constraints = [lmi.at_most(w, -1e-3), lmi.at_least(p1, 1e-3), lmi.at_least(q, 1.0)]
+            lmi.minimise(lmi.trace(p1), constraints, what="Theorem 2 for gains with L = 0")
+            found = [0.5 * (value + value.T) for value in (lmi.value_of(p1), lmi.value_of(q))]
+            assert all(prove_symmetric_positive(matrix).proved for matrix in found)
+            assert prove_gains(a, zero, zero.T, zero.T, *found, delta=delta, decay=0.0).proved
 
 
 class TestDefaults:
@@ -403,6 +412,16 @@ class TestRefusals:
             obsynth.pd_observer(PLANT, noise_gain=0.999 * least)
         assert (caught.value.necessary, caught.value.lower_bound) == (True, least)
         assert obsynth.pd_observer(PLANT, decay=0.0, noise_gain=2.0 * least).report.passed
+
+    def test_units_of_states_and_faults_do_not_move_that_bound(self) -> None:
+        x, f = np.array([1e4, 1e-3, 1.0, 1e2]), np.array([1e3, 1e-2])
+        moved = PLANT.replace(
+            A=PLANT.A * x / x[:, None], B=PLANT.B / x[:, None], C=PLANT.C * x, Bf=PLANT.Bf * f / x[:, None]
+        )
+        expected = np.linalg.norm(
+            np.linalg.inv(np.block([[PLANT.A, PLANT.Bf], [PLANT.C, PLANT.Df]]))[4:, 4:] / f[:, None], 2
+        )
+        assert least_noise_gain(moved) == pytest.approx(expected, rel=1e-9)
 
     def test_no_design_has_less_noise_than_that(self) -> None:
         for plant in (PLANT, rich().replace(Bw=np.zeros((3, 3)), Dw=np.eye(3), noise_names=None)):

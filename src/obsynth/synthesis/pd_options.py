@@ -14,6 +14,7 @@ from obsynth.errors import InfeasibleError, SpecError
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.ranks import NEGLIGIBLE_MODE, decide_rank
+from obsynth.numerics.scaling import equilibrate_pencil
 from obsynth.synthesis.lmi import SOLVER_SETTINGS
 
 
@@ -226,8 +227,9 @@ def least_noise_gain(plant: DescriptorSystem) -> float:
     noise = noisy.Dw[:, ~np.any(noisy.Bw != 0.0, axis=0)]
     if not decide_rank(noise, expected=plant.ny).full:
         return 0.0
-    right = np.linalg.svd(np.hstack([plant.A, plant.Bf]))[2]
-    rank = decide_rank(np.hstack([plant.A, plant.Bf])).rank
-    still = right[rank:].T
+    equations = np.hstack([plant.A, plant.Bf])
+    scaled = equilibrate_pencil(np.zeros_like(equations), equations)
+    rank = decide_rank(scaled.A, equilibrated=False).rank
+    still = scaled.columns[:, None] * np.linalg.svd(scaled.A)[2][rank:].T
     seen, faults = np.hstack([plant.C, plant.Df]) @ still, still[plant.nx :]
     return float(np.linalg.norm(faults @ np.linalg.pinv(np.linalg.pinv(noise) @ seen), 2)) if still.size else 0.0
