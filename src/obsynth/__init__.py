@@ -21,6 +21,13 @@ if TYPE_CHECKING:
     from obsynth.observers.sampling import sample_observer
     from obsynth.pipeline.designing import design
     from obsynth.pipeline.fault_estimation_filter import fault_estimation_filter, fault_estimation_filter_from_gains
+    from obsynth.pipeline.pd_observer import (
+        apply_adaptation_gain,
+        pd_delta_scan,
+        pd_observer,
+        pd_observer_from_gains,
+    )
+    from obsynth.results.delta_scan import DeltaScan
     from obsynth.results.design import Certificate, ObserverDesign
     from obsynth.results.report import Check, VerificationReport
     from obsynth.results.serialise import load
@@ -32,6 +39,7 @@ __version__ = "0.1.0"
 _HOMES = {
     "Certificate": "obsynth.results.design",
     "Check": "obsynth.results.report",
+    "DeltaScan": "obsynth.results.delta_scan",
     "DescriptorSystem": "obsynth.models.descriptor",
     "Estimates": "obsynth.observers.linear",
     "InfeasibleError": "obsynth.errors",
@@ -45,12 +53,16 @@ _HOMES = {
     "VerificationError": "obsynth.errors",
     "VerificationReport": "obsynth.results.report",
     "analyse_structure": "obsynth.analysis.structure",
+    "apply_adaptation_gain": "obsynth.pipeline.pd_observer",
     "design": "obsynth.pipeline.designing",
     "discretise": "obsynth.analysis.transformations",
     "eliminate_algebraic_states": "obsynth.analysis.transformations",
     "fault_estimation_filter": "obsynth.pipeline.fault_estimation_filter",
     "fault_estimation_filter_from_gains": "obsynth.pipeline.fault_estimation_filter",
     "load": "obsynth.results.serialise",
+    "pd_delta_scan": "obsynth.pipeline.pd_observer",
+    "pd_observer": "obsynth.pipeline.pd_observer",
+    "pd_observer_from_gains": "obsynth.pipeline.pd_observer",
     "sample_observer": "obsynth.observers.sampling",
     "verify": "obsynth.verification",
 }
@@ -58,6 +70,7 @@ _HOMES = {
 __all__ = [
     "Certificate",
     "Check",
+    "DeltaScan",
     "DescriptorSystem",
     "Estimates",
     "InfeasibleError",
@@ -71,12 +84,16 @@ __all__ = [
     "VerificationError",
     "VerificationReport",
     "analyse_structure",
+    "apply_adaptation_gain",
     "design",
     "discretise",
     "eliminate_algebraic_states",
     "fault_estimation_filter",
     "fault_estimation_filter_from_gains",
     "load",
+    "pd_delta_scan",
+    "pd_observer",
+    "pd_observer_from_gains",
     "sample_observer",
     "verify",
 ]

@@ -34,6 +34,8 @@ NEGLIGIBLE_INPUT = 1e-6
 NAMED_SHARE = 1e-3
 #: Result of a sum or product, relative to the sizes of its terms, below which it is only rounding.
 CANCELLATION_TOLERANCE = 1e-14
+#: Largest eigenvalue, relative to the norm of the balanced matrix, below which all of them are rounding errors of zero.
+NEGLIGIBLE_MODE = 1e-6
 #: Fault zeros of a sampled plant between this radius and 1 make the fault estimate ring for long.
 SLOW_ZERO_RADIUS = 0.98
 

@@ -1,5 +1,6 @@
 """Pictures of results, readable without colour; nothing is shown or saved here."""
 
+from obsynth.plotting.delta_scan import plot_delta_scan
 from obsynth.plotting.faults import plot_faults, plot_poles, plot_residuals
 
-__all__ = ["plot_faults", "plot_poles", "plot_residuals"]
+__all__ = ["plot_delta_scan", "plot_faults", "plot_poles", "plot_residuals"]

@@ -11,6 +11,18 @@ _MEANINGS = {
         "gamma_bracket_high": "upper end of the bisection's bracket",
         "state_lag": "samples by which the state estimate lags",
     },
+    "pd-observer": {
+        "theorem": "theorem whose inequality is proved",
+        "delta": "s, the theorem's parameter in the certificate",
+        "decay": "1/s, rate at which errors die out: imposed, proved (0: stability alone)",
+        "disk_centre": "1/s, c of the disk |s + c| < r that holds every eigenvalue",
+        "disk_radius": "1/s, r of that disk",
+        "gain_bound": "bound on the norm of the gains",
+        "fault_rate_gain": "s, bound on the l2 gain from the rate of the faults to the fault error",
+        "noise_gain": "bound on the l2 gain from noise and its derivative to the fault error",
+        "adaptation_low": "stable for every adaptation gain from here, proved",
+        "adaptation_high": "to here",
+    },
 }
 
 

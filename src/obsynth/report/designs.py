@@ -14,6 +14,7 @@ from obsynth.models.descriptor import DescriptorSystem
 from obsynth.report.claims import meaning_of
 from obsynth.report.layout import facts_table, headed_table, name_list, number, print_section
 from obsynth.report.verification import verification_report
+from obsynth.results.delta_scan import DeltaScan
 from obsynth.results.design import ObserverDesign
 
 
@@ -55,6 +56,10 @@ def design_report(design: ObserverDesign, *, console: Console, file: Path | None
     print_section(console, "What is promised", facts_table(_promises(design)))
     if design.observer.fault_names:
         print_section(console, "Fault estimates", _fault_estimates(design))
+    if "delta_scan" in design.solver:
+        print_section(
+            console, "Other values of delta", delta_scan_table(DeltaScan.from_dict(design.solver["delta_scan"]))
+        )
     if design.recovery is not None:
         print_section(console, "States of the plant as written", facts_table(_recovered_states(design.recovery)))
     verification_report(design.report, console=console)
@@ -63,6 +68,21 @@ def design_report(design: ObserverDesign, *, console: Console, file: Path | None
     if file is not None:
         # A path must stay in one piece, so that it can be copied.
         console.print(Text(f"Gain set: {file}"), soft_wrap=True)
+
+
+def delta_scan_table(scan: DeltaScan) -> Table:
+    """Return the table of a scan of delta: decay against gains against noise.
+
+    Parameters
+    ----------
+    scan : DeltaScan
+        One row per delta.
+    """
+    table = headed_table("delta (s)", "decay (1/s)", "norm of gains", "f' to fault (s)", "noise to fault", "fast noise")
+    for row in scan.rows():
+        names = ("delta", "decay", "gain", "rate_gain", "noise_gain", "fast_noise_gain")
+        table.add_row(*(Text(number(float(row[name]))) for name in names))
+    return table
 
 
 def _recovered_states(recovery: StateRecovery) -> Iterator[tuple[str, str]]:
@@ -89,6 +109,7 @@ def _fault_estimates(design: ObserverDesign) -> Table:
     table = headed_table("fault", "delay in samples", "delay in s", "std under the stated noise")
     for name, delay in zip(observer.fault_names, observer.fault_delays, strict=True):
         deviation = deviations.get(f"noise in fhat[{name}]")
-        shown = "no noise stated" if deviation is None else f"{number(deviation)} {units.get(name, '')}".strip()
+        missing = "-" if design.plant.nw else "no noise stated"
+        shown = missing if deviation is None else f"{number(deviation)} {units.get(name, '')}".strip()
         table.add_row(Text(name), str(delay), number(delay * observer.dt), Text(shown))
     return table

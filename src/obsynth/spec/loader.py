@@ -18,7 +18,7 @@ from obsynth.spec.matrices import read_matrix
 
 if TYPE_CHECKING:
     from obsynth.analysis.transformations import Transformation
-    from obsynth.spec.schema import PlantSection
+    from obsynth.spec.schema import PlantSection, TransformSection
 
 _MATRICES = ("E", "A", "B", "C", "D", "Bf", "Df", "Bd", "Dd", "Bw", "Dw")
 _NAME_LISTS = ("state_names", "input_names", "output_names", "fault_names", "disturbance_names", "noise_names")
@@ -82,8 +82,9 @@ def load_spec(path: str | Path) -> Spec:
     checked, raw_options = checked_spec(read_yaml(source), source)
     section: Any = checked.plant
     plant_source, prefix = source, "plant"
-    if hasattr(section, "file"):
-        plant_source, prefix = source.parent / section.file, ""
+    reference = section if hasattr(section, "file") else None
+    if reference is not None:
+        plant_source, prefix = source.parent / reference.file, ""
         section = checked_plant(read_yaml(plant_source, where="plant.file"), plant_source)
     problems = DocumentProblems(source, what="spec")
     options = {
@@ -91,7 +92,11 @@ def load_spec(path: str | Path) -> Spec:
     }
     problems.raise_if_any()
     as_written = _built_plant(section, plant_source, prefix)
-    transformation = _transformed(section, as_written, plant_source, prefix)
+    if reference is not None and reference.transform is not None:
+        # A plant may serve several methods: the spec's own transform takes the place of the plant's.
+        transformation = _transformed(reference.transform, as_written, source, "plant")
+    else:
+        transformation = _transformed(section.transform, as_written, plant_source, prefix)
     return Spec(
         name=checked.name, description=checked.description or "", path=source,
         plant=as_written if transformation is None else transformation.plant, transformation=transformation,
@@ -168,8 +173,9 @@ def _noise_arguments(plant: DescriptorSystem, sensor_noise: Mapping[str, float] 
     }
 
 
-def _transformed(section: PlantSection, plant: DescriptorSystem, source: Path, prefix: str) -> Transformation | None:
-    wanted = section.transform
+def _transformed(
+    wanted: TransformSection | None, plant: DescriptorSystem, source: Path, prefix: str
+) -> Transformation | None:
     if wanted is None or not (wanted.eliminate_algebraic_states or wanted.sample_time is not None):
         return None
     where = _joined(prefix, "transform")

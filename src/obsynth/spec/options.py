@@ -25,5 +25,27 @@ class FaultEstimationFilterOptions(Section):
     tolerance: Annotated[float, Field(gt=0.0, lt=1.0)] = 1e-6
 
 
+Two = Annotated[list[float], Field(min_length=2, max_length=2)]
+
+
+class PdObserverOptions(Section):
+    """Options of the method ``pd-observer``."""
+
+    theorem: Literal[1, 2] = 1
+    delta: Positive | None = None
+    decay: Annotated[float, Field(ge=0.0)] | None = None
+    disk: Two | None = None
+    gain_bound: Positive | None = None
+    fault_rate_gain: Positive | None = None
+    noise_gain: Positive | None = None
+    adaptation_gain: Matrix | None = None
+    adaptation_range: Two | None = None
+    delta_scan: Annotated[list[Positive], Field(min_length=1)] | None = None
+    solver: Literal["CLARABEL", "SCS"] = "CLARABEL"
+
+
 #: Options of every method, by its identifier.
-METHOD_OPTIONS: dict[str, type[Section]] = {"fault-estimation-filter": FaultEstimationFilterOptions}
+METHOD_OPTIONS: dict[str, type[Section]] = {
+    "fault-estimation-filter": FaultEstimationFilterOptions,
+    "pd-observer": PdObserverOptions,
+}

@@ -153,9 +153,10 @@ class PlantDocument(PlantSection):
 
 
 class PlantReference(Section):
-    """A plant in another file: ``{file: plant.yaml}``."""
+    """A plant in another file: ``{file: plant.yaml}``; a transform given here takes the place of the file's."""
 
     file: Text
+    transform: TransformSection | None = None
 
 
 class MethodSection(Section):

@@ -87,6 +87,20 @@ def trace(expression: Any) -> Any:
     return cvxpy.trace(expression)
 
 
+def frobenius_norm(*blocks: Any) -> Any:
+    """Return the Frobenius norm of blocks side by side, as a convex expression."""
+    import cvxpy
+
+    return cvxpy.norm(cvxpy.hstack(blocks), "fro")
+
+
+def stacked(*blocks: Any) -> Any:
+    """Return blocks with the same number of columns, one above the other."""
+    import cvxpy
+
+    return cvxpy.vstack(blocks)
+
+
 def scalar_block(expression: Any) -> Any:
     """Return a scalar expression as a matrix ``(1, 1)``."""
     import cvxpy
@@ -103,7 +117,7 @@ def value_of(variable: Any) -> FloatArray:
 
 
 def minimise(objective: Any, constraints: Sequence[Any], *, what: str, solver: str = "CLARABEL") -> dict[str, Any]:
-    """Minimise a linear objective under the constraints and return the record of the run.
+    """Minimise a linear or convex objective under the constraints and return the record of the run.
 
     Parameters
     ----------

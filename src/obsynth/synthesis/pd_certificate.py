@@ -1,0 +1,107 @@
+r"""A certificate of Theorem 1 for gains in hand, without a solver.
+
+For a stable observer a solution P1, P3 of the inequality exists for every delta > 0 (elimination lemma): with P from a
+Lyapunov equation and coordinates in which the two factors around P3 are unit columns, P3 only has to cancel the
+off-diagonal block of what P1 contributes.
+"""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.continuous import spectral_abscissa
+
+#: delta is moved by this factor when -1/delta is close to an eigenvalue, where the construction breaks down.
+DELTA_STEP = 1.7
+#: Condition number of the change of coordinates that is good enough.
+GOOD_CONDITION = 1e3
+#: As many values of delta are tried.
+DELTA_TRIES = 12
+
+
+def explicit_certificate(
+    Az: FloatArray, estimate: FloatArray, *, decay: float
+) -> tuple[FloatArray, FloatArray, float] | None:
+    """Return P1, P3 ``(n, n)`` and delta for a shipped observer; ``None`` when its errors do not decay so fast.
+
+    Parameters
+    ----------
+    Az : FloatArray
+        ``(n, n)``, the observer's dynamics.
+    estimate : FloatArray
+        ``(n, n)``, from the observer's states to the estimates of states and faults, ``(I + L C)^-1``.
+    decay : float, 1/seconds
+        Rate to certify.
+    """
+    from scipy.linalg import matrix_balance
+
+    moving = Az + decay * np.eye(len(Az))
+    if not spectral_abscissa(moving) < 0.0:
+        return None
+    balanced, (units, _) = matrix_balance(moving, permute=False, separate=True)
+    try:
+        p = _gram(balanced)
+        x, delta = _coupling(balanced, p)
+        inverse = np.linalg.inv(estimate)
+    except np.linalg.LinAlgError:
+        return None
+    p1 = inverse.T @ (p / units[:, None] / units) @ inverse
+    return 0.5 * (p1 + p1.T), (x / units[:, None] / units) @ inverse, delta
+
+
+def symmetric_certificate(Az: FloatArray, *, decay: float) -> tuple[FloatArray, float] | None:
+    """Return Q ``(n, n)``, to be taken for P1 and P3 of an observer with L = 0, and the delta below which it serves.
+
+    With P1 = P3 = Q the inequality is ``He(Q A) + (delta / 2) A' Q A < 0``.  ``None`` when errors do not decay so fast.
+
+    Parameters
+    ----------
+    Az : FloatArray
+        ``(n, n)``, the observer's dynamics.
+    decay : float, 1/seconds
+        Rate to certify.
+    """
+    from scipy.linalg import eigvalsh, matrix_balance
+
+    moving = Az + decay * np.eye(len(Az))
+    if not spectral_abscissa(moving) < 0.0:
+        return None
+    balanced, (units, _) = matrix_balance(moving, permute=False, separate=True)
+    try:
+        q = _gram(balanced)
+    except np.linalg.LinAlgError:
+        return None
+    largest = float(eigvalsh(balanced.T @ q @ balanced)[-1]) / float(np.linalg.norm(balanced))
+    return q / units[:, None] / units, 2.0 / largest
+
+
+def _gram(a: FloatArray) -> FloatArray:
+    """Return P with ``a' P + P a = -norm(a) I`` for a stable ``a (n, n)``."""
+    from scipy.linalg import solve_continuous_lyapunov
+
+    with warnings.catch_warnings():
+        # "An eigenvalue pair whose sum is very close to zero": what comes of it is proved or thrown away.
+        warnings.simplefilter("ignore")
+        p = np.asarray(solve_continuous_lyapunov(a.T, -np.linalg.norm(a) * np.eye(len(a))))
+    return np.asarray(0.5 * (p + p.T))
+
+
+def _coupling(a: FloatArray, p: FloatArray) -> tuple[FloatArray, float]:
+    """Return X and delta with ``He([a'; -I] X [I, delta I]) + [0, p; p, 0] < 0`` for a stable ``a`` with Gram matrix p.
+
+    With ``[xi1; xi2] = T [alpha; beta]``, ``alpha = a xi1 - xi2`` and ``beta = xi1 + delta xi2``, the first term is
+    ``2 alpha' X beta``; the second is negative on alpha = 0 and on beta = 0, whatever delta is.
+    """
+    n, one = len(a), np.eye(len(a))
+    middle = 1.0 / float(np.exp(np.mean(np.log(np.abs(np.linalg.eigvals(a))))))
+    steps = sorted(range(-DELTA_TRIES // 2, DELTA_TRIES // 2), key=abs)
+    candidates = [middle * DELTA_STEP**step for step in steps]
+    conditions = [float(np.linalg.cond(one + delta * a)) for delta in candidates]
+    good = [i for i, condition in enumerate(conditions) if condition <= GOOD_CONDITION]
+    delta = candidates[good[0] if good else int(np.argmin(conditions))]
+    change = np.linalg.inv(np.block([[a, -one], [one, delta * one]]))
+    form = change.T @ np.block([[np.zeros((n, n)), p], [p, np.zeros((n, n))]]) @ change
+    return -form[:n, n:], delta

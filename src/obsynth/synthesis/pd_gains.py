@@ -1,0 +1,138 @@
+"""Gains of a PD observer with their realisation and a certificate that is proved."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from obsynth.analysis.pd_augmentation import with_faults_as_states
+from obsynth.models.descriptor import DescriptorSystem
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.continuous import spectral_abscissa
+from obsynth.observers.linear import LinearObserver
+from obsynth.synthesis.pd_certificate import explicit_certificate
+from obsynth.synthesis.pd_options import PdOptions
+from obsynth.synthesis.pd_problem import PdSolution
+from obsynth.synthesis.pd_realisation import realise_pd_observer
+from obsynth.verification.pd_inequality import prove_gains, prove_shipped_stability, prove_symmetric_positive
+
+
+@dataclass(frozen=True, eq=False)
+class PdGains:
+    """Gains in the loop with what proves them.
+
+    Parameters
+    ----------
+    J, L : FloatArray
+        ``(nx + nf, ny)``: the paper's ``[J; G M]`` and ``[L; G N]``.
+    P1, P3 : FloatArray
+        Certificate ``(nx + nf, nx + nf)`` for the state ``[x; f]``.
+    ends : tuple of FloatArray
+        P1 at the ends of the range of adaptation gains, empty without one.
+    theorem : int
+        The theorem that the certificate belongs to.
+    asked_delta, delta, decay : float
+        The delta that the gains were designed with and that of the certificate (seconds), and alpha (1/seconds).
+    observer : LinearObserver
+        The realisation.
+    proved : bool
+        Whether the certificate was proved.
+    record : mapping
+        Of the solver run.
+    """
+
+    J: FloatArray
+    L: FloatArray
+    P1: FloatArray
+    P3: FloatArray
+    ends: tuple[FloatArray, ...]
+    theorem: int
+    asked_delta: float
+    delta: float
+    decay: float
+    observer: LinearObserver
+    proved: bool
+    record: Mapping[str, Any]
+
+    @property
+    def abscissa(self) -> float:
+        """Largest real part of an eigenvalue of the error system, 1/seconds."""
+        return spectral_abscissa(self.observer.Az)
+
+    @property
+    def size(self) -> float:
+        """Spectral norm of ``[J L]``."""
+        return float(np.linalg.norm(np.hstack([self.J, self.L]), 2))
+
+
+def certified(
+    plant: DescriptorSystem, asked: PdOptions, found: PdSolution, *, delta: float, decay: float
+) -> PdGains | None:
+    """Return the gains with a certificate: the solver's, or else one that is computed from the gains.
+
+    ``None`` when there is no realisation; not ``proved`` when there is no certificate.
+    """
+    augmented = with_faults_as_states(plant)
+    try:
+        observer = realise_pd_observer(plant, augmented, found.J, found.L)
+    except np.linalg.LinAlgError:
+        return None
+    ends = asked.range_numbers
+    p1, p3 = _symmetric(found.P1[0]), _symmetric(found.P3) if asked.theorem == 2 else found.P3
+    gains = PdGains(
+        found.J, found.L, p1, p3, (), asked.theorem, delta, delta, decay, observer, proved=False, record=found.record
+    )
+    if ends is not None:
+        return _certified_range(plant, replace(gains, ends=found.P1), ends)
+    if _is_proved(gains):
+        return replace(gains, proved=True)
+    own = explicit_certificate(observer.Az, observer.Cz[: observer.order], decay=decay) if asked.theorem == 1 else None
+    if own is None:
+        return gains
+    gains = replace(gains, P1=own[0], P3=own[1], delta=own[2])
+    return replace(gains, proved=_is_proved(gains))
+
+
+def _symmetric(matrix: FloatArray) -> FloatArray:
+    return 0.5 * (matrix + matrix.T)
+
+
+def _is_proved(gains: PdGains) -> bool:
+    positive = prove_symmetric_positive(gains.P1).proved
+    symmetric = gains.theorem == 1 or prove_symmetric_positive(gains.P3).proved
+    return bool(
+        positive
+        and symmetric
+        and prove_shipped_stability(gains.observer, gains.P1, gains.P3, delta=gains.delta, decay=gains.decay).proved
+    )
+
+
+def _certified_range(plant: DescriptorSystem, gains: PdGains, ends: tuple[float, float]) -> PdGains:
+    """Certify every adaptation gain ``g I`` of a range by its ends: the inequality is affine in g.
+
+    What is shipped has g = 1 where the range holds it, else the end nearer to it; P1 is interpolated.
+    """
+    p1 = tuple(map(_symmetric, gains.ends))
+    plants = [with_faults_as_states(plant, end * np.eye(plant.nf)) for end in ends]
+    proved = all(
+        prove_symmetric_positive(matrix).proved
+        and prove_gains(p.A, p.C, gains.J, gains.L, matrix, gains.P3, delta=gains.delta, decay=gains.decay).proved
+        for matrix, p in zip(p1, plants, strict=True)
+    )
+    shipped = min(max(1.0, ends[0]), ends[1])
+    share = (shipped - ends[0]) / (ends[1] - ends[0])
+    middle = (1.0 - share) * p1[0] + share * p1[1]
+    loop = np.eye(len(middle))
+    loop[plant.nx :, plant.nx :] *= shipped
+    back = np.linalg.inv(loop)
+    gain_j, gain_l = loop @ gains.J, loop @ gains.L
+    p3 = back.T @ gains.P3 @ back
+    p3 = _symmetric(p3) if gains.theorem == 2 else p3
+    moved = replace(
+        gains, J=gain_j, L=gain_l, P1=_symmetric(back.T @ middle @ back), P3=p3, ends=p1,
+        observer=realise_pd_observer(plant, with_faults_as_states(plant), gain_j, gain_l),
+    )  # fmt: skip
+    return replace(moved, proved=proved and _is_proved(moved))

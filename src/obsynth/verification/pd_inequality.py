@@ -1,0 +1,87 @@
+r"""The matrix inequality of the PD observer, formed with guaranteed error bounds and proved.
+
+Theorem 1 of Filasova, Krokavec, Serbak is, with ``D = I + L C`` and ``Ae = A - J C`` of the augmented plant,
+
+.. math::
+    \mathrm{He}\left(\begin{bmatrix} A_e^T \\ -D^T \end{bmatrix} P_3 \begin{bmatrix} I & \delta I \end{bmatrix}\right)
+    + \begin{bmatrix} 0 & P_1 \\ P_1 & 0 \end{bmatrix} < 0, \qquad P_1 > 0 ,
+
+their (40)-(43) with Y = P3' J and Z = P3' L put back.  If ``(Ae - s D) x = 0``, then [x; s x] makes of it
+``2 Re(s) x' P1 x < 0``; and ``D x = 0`` contradicts the second diagonal block.  So D is nonsingular and every
+eigenvalue of ``D^-1 Ae`` lies to the left.  A decay rate is the same inequality for ``Ae + alpha D``.
+
+What is shipped is ``Az = Ae D^-1`` and ``S = D^-1``.  A congruence with diag(S, S) gives the inequality for
+``Az + alpha I`` and ``I`` with ``X = P3 S`` and ``P = S' P1 S``: no inverse is formed, and its lower right block proves
+that S is nonsingular, so that the congruence is one.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.balls import Ball, block
+from obsynth.numerics.definiteness import DefinitenessProof, prove_positive_definite
+from obsynth.observers.linear import LinearObserver
+
+
+def prove_shipped_stability(
+    observer: LinearObserver, P1: FloatArray, P3: FloatArray, *, delta: float, decay: float
+) -> DefinitenessProof:
+    """Try to prove that the shipped observer's errors decay faster than ``exp(-decay t)``.
+
+    Parameters
+    ----------
+    observer : LinearObserver
+        What is shipped, ``nz = nx + nf`` states.
+    P1, P3 : FloatArray
+        Certificate ``(nz, nz)`` each; that P1 is positive definite is proved by `prove_symmetric_positive`.
+    delta : float, seconds
+        Parameter of the inequality.
+    decay : float, 1/seconds
+        Claimed rate alpha.
+    """
+    size = observer.order
+    moving = Ball.exact(observer.Az) + Ball.exact(decay * np.eye(size))
+    estimate = Ball.exact(observer.Cz[:size])
+    x = Ball.exact(P3) @ estimate
+    p = estimate.T @ Ball.exact(P1) @ estimate
+    return _prove(moving, Ball.exact(np.eye(size)), x, p, delta)
+
+
+def prove_gains(
+    A: FloatArray, C: FloatArray, J: FloatArray, L: FloatArray, P1: FloatArray, P3: FloatArray, *, delta: float,
+    decay: float,
+) -> DefinitenessProof:  # fmt: skip
+    """Try to prove the inequality for gains on an augmented plant ``A (n, n)``, ``C (ny, n)``.
+
+    Parameters
+    ----------
+    A, C, J, L, P1, P3 : FloatArray
+        Augmented plant, gains ``(n, ny)`` and certificate ``(n, n)``.
+    delta : float, seconds
+        Parameter of the inequality.
+    decay : float, 1/seconds
+        Claimed rate alpha.
+    """
+    c = Ball.exact(C)
+    ae = Ball.exact(A) - Ball.exact(J) @ c
+    d = Ball.exact(np.eye(len(A))) + Ball.exact(L) @ c
+    moving = ae + Ball.exact(decay * np.eye(len(A))) @ d
+    return _prove(moving, d, Ball.exact(P3), Ball.exact(P1), delta)
+
+
+def prove_symmetric_positive(matrix: FloatArray) -> DefinitenessProof:
+    """Try to prove that a matrix is symmetric, exactly, and positive definite."""
+    if not np.array_equal(matrix, matrix.T):
+        return DefinitenessProof(False, -np.inf, 0.0)
+    return prove_positive_definite(matrix)
+
+
+def _prove(moving: Ball, still: Ball, x: Ball, p: Ball, delta: float) -> DefinitenessProof:
+    """Prove that minus the inequality for the pencil ``moving - s still`` is positive definite."""
+    scale = Ball.exact(delta * np.eye(x.shape[0]))
+    first, second = moving.T @ x, still.T @ x
+    lower = p - second + scale @ (x.T @ moving)
+    upper_left, lower_right = first + first.T, scale @ (second + second.T)
+    return prove_positive_definite(block([[-upper_left, -lower.T], [-lower, lower_right]]))
