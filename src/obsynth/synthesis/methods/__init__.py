@@ -8,6 +8,7 @@ from typing import Any
 #: Method id -> module; each module offers ``conditions(plant)`` and ``synthesise(plant, **options)``.
 REGISTRY = {
     "fault-estimation-filter": "obsynth.synthesis.methods.fault_estimation_filter",
+    "ui-pi-observer": "obsynth.synthesis.methods.ui_pi_observer",
 }
 
 

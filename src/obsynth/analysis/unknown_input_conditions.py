@@ -1,0 +1,331 @@
+r"""When an unknown-input PI observer exists, decided before any gain is looked for.
+
+Source: Share Pasand, Aliyari, Taghirad, Lemma 4, Theorems 1 and 2, Lemma 6, all four replaced: Theorems 1 and 2 and
+Lemma 6 are false as printed (the column of ``Bd`` is missing from the test of the fault model), and ``rank C E# Bd``
+depends on the choice of ``E#``.  On the plant's own data:
+
+(D1) ``rank [E 0 Bd; C Dd 0; 0 0 Dd] = nx + rank Dd + rank [Bd; Dd]``,
+(D2) ``rank [sE - A, -Bd; C, Dd] = nx + rank [Bd; Dd]`` for every s on or outside the boundary of stability,
+(D3) at each unstable eigenvalue of Phi, tested exactly there, with V a basis of ``ker (lambda I - Phi)``:
+``rank [lambda E - A, -Bf Cw V, -Bd; C, Df Cw V, Dd] = nx + dim V + rank [Bd; Dd]``.
+
+(D2) and (D3) are necessary for any observer of state and fault; (D1) for any that does not differentiate.  Neither
+regularity nor index 1 is needed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.analysis.conditions import Condition
+from obsynth.analysis.transformations import Transformation, eliminate_algebraic_states
+from obsynth.analysis.unknown_inputs import AugmentedPlant
+from obsynth.analysis.zeros import Zero, are_outside, invariant_zeros, is_outside, leading_names
+from obsynth.errors import PreconditionError
+from obsynth.models.descriptor import DescriptorSystem
+from obsynth.models.exosystems import Exosystem
+from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.numerics.pencils import finite_zeros
+from obsynth.numerics.ranks import RANK_TOLERANCE, RankDecision, decide_rank
+from obsynth.numerics.scaling import equilibrate_pencil
+
+#: At most this many signals of a kind are named in a failed condition.
+MOST_NAMES = 4
+_SOURCE = "Share Pasand, Lemma 4 (9.1), in a form without E#"
+
+
+@dataclass(frozen=True, eq=False)
+class Existence:
+    """What was decided about a plant.
+
+    Parameters
+    ----------
+    conditions : tuple of Condition
+        In order; after a failed (D2) there is no (D3), and fixed modes come last, when all others hold.
+    plant : DescriptorSystem
+        For which they were decided: the plant as given, or without its algebraic states.
+    transformation : Transformation or None
+        The elimination, where there was one.
+    fixed_modes : ComplexArray
+        Poles that every such observer has; all stable when the conditions hold.
+    """
+
+    conditions: tuple[Condition, ...]
+    plant: DescriptorSystem
+    transformation: Transformation | None
+    fixed_modes: ComplexArray
+
+
+def existence(plant: DescriptorSystem, model: Exosystem) -> Existence:
+    """Return the existence conditions of the unknown-input PI observer, and the plant to design for.
+
+    Parameters
+    ----------
+    plant : DescriptorSystem
+        Any plant, either time, regular or not, of any index.
+    model : Exosystem
+        Of its faults.
+    """
+    nothing = np.zeros(0, dtype=np.complex128)
+    enough = _enough_outputs(plant)
+    if not enough.holds:
+        return Existence((enough,), plant, None, nothing)
+    working, transformation, solvable = _decoupling_data(plant)
+    # (D1) and the others fail independently: a user wants to know both.
+    found = [enough, solvable, _zero_condition(working)]
+    if found[-1].holds:
+        found += _model_conditions(working, model)
+    if not all(condition.holds for condition in found):
+        return Existence(tuple(found), working, transformation, nothing)
+    fixed, condition = _fixed_modes(working, model)
+    return Existence((*found, condition), working, transformation, fixed)
+
+
+def decoupling_rank(plant: DescriptorSystem) -> RankDecision:
+    """Decide (D1): ``rank [E 0 Bd; C Dd 0; 0 0 Dd]``, with what it must be."""
+    nx, ny, nd = plant.nx, plant.ny, plant.nd
+    matrix = np.zeros((nx + 2 * ny, nx + 2 * nd))
+    matrix[:nx, :nx], matrix[:nx, nx + nd :] = plant.E, plant.Bd
+    matrix[nx : nx + ny, :nx], matrix[nx : nx + ny, nx : nx + nd] = plant.C, plant.Dd
+    matrix[nx + ny :, nx + nd :] = plant.Dd
+    return decide_rank(matrix, expected=nx + _rank(plant.Dd) + disturbance_rank(plant))
+
+
+def disturbance_rank(plant: DescriptorSystem) -> int:
+    """Return ``rank [Bd; Dd]``: repeated disturbances count once."""
+    return _rank(np.vstack([plant.Bd, plant.Dd]))
+
+
+def _rank(matrix: FloatArray) -> int:
+    return decide_rank(matrix).rank
+
+
+def _enough_outputs(plant: DescriptorSystem) -> Condition:
+    rank = disturbance_rank(plant)
+    holds = rank <= plant.ny
+    return Condition(
+        "nd <= ny",
+        "no more independent unknown inputs than outputs",
+        holds,
+        float(rank),
+        float(plant.ny),
+        _SOURCE,
+        f"{rank} unknown input(s), {plant.ny} output(s)"
+        + ("" if holds else ". Measure more, or leave an unknown input out."),
+        signals=() if holds else plant.disturbance_names,
+    )
+
+
+def _decoupling_data(plant: DescriptorSystem) -> tuple[DescriptorSystem, Transformation | None, Condition]:
+    """Return the plant on which (D1) holds, if the algebraic states can be eliminated where it does not."""
+    written = decoupling_rank(plant)
+    said = f"rank {written.rank} of {written.expected}"
+    if written.full:
+        return plant, None, _decoupling_condition(plant, written, written.describe())
+    try:
+        transformation = eliminate_algebraic_states(plant)
+    except PreconditionError as error:
+        reason = f"{written.describe()}, and the algebraic states cannot be eliminated: {error}"
+        return plant, None, _decoupling_condition(plant, written, reason)
+    if transformation.plant is plant:
+        return plant, None, _decoupling_condition(plant, written, written.describe())
+    reduced = transformation.plant
+    again = decoupling_rank(reduced)
+    detail = f"{said} as written; {again.describe()} without the algebraic states"
+    return reduced, transformation, _decoupling_condition(reduced, again, detail)
+
+
+def _decoupling_condition(plant: DescriptorSystem, decision: RankDecision, detail: str) -> Condition:
+    signals: tuple[str, ...] = ()
+    if not decision.full:
+        signals = _undecoupled(plant)
+        detail += ": " + (
+            f"the unknown input {', '.join(map(repr, signals))} moves states that no output shows at once, so nothing "
+            "but a derivative of the outputs could remove it. Measure such a state, or leave the input out."
+            if set(signals) & set(plant.disturbance_names)
+            else f"the states {', '.join(map(repr, signals))} are neither dynamic nor measured."
+        )
+    return Condition(
+        "(D1) decoupling",
+        "rank [E 0 Bd; C Dd 0; 0 0 Dd] = nx + rank Dd + rank [Bd; Dd]",
+        decision.full,
+        float(decision.rank),
+        float(decision.expected),
+        _SOURCE,
+        detail,
+        signals=signals,
+    )
+
+
+def _undecoupled(plant: DescriptorSystem) -> tuple[str, ...]:
+    """Return the unknown inputs in a null vector of [E Bd; C 0] beyond Dd's, or else the states in it."""
+    free = np.linalg.svd(plant.Dd)[2][_rank(plant.Dd) :].T if plant.ny else np.eye(plant.nd)
+    stacked = np.block([[plant.E, plant.Bd @ free], [plant.C, np.zeros((plant.ny, free.shape[1]))]])
+    scaled = equilibrate_pencil(np.zeros_like(stacked), stacked).A
+    kernel = np.linalg.svd(scaled)[2][decide_rank(stacked).rank :].T
+    inputs = free @ kernel[plant.nx :]
+    shares = np.linalg.norm(inputs, axis=1)
+    if shares.size and np.max(shares) > RANK_TOLERANCE:
+        return leading_names(shares, plant.disturbance_names, most=MOST_NAMES)
+    return leading_names(np.linalg.norm(kernel[: plant.nx], axis=1), plant.state_names, most=MOST_NAMES)
+
+
+def _zero_condition(plant: DescriptorSystem) -> Condition:
+    claim = "rank [sE - A, -Bd; C, Dd] = nx + rank [Bd; Dd] on and outside the boundary of stability"
+    source = "Share Pasand, Lemma 4 (9.2)"
+    inputs, direct = _independent(plant)
+    wide_e, wide_a = _pencil(plant.E, plant.A, inputs, plant.C, direct)
+    found = finite_zeros(wide_e, wide_a)
+    full = wide_e.shape[1]
+    if found.normal_rank < full:
+        detail = f"normal rank {found.normal_rank} of {full}: the plant hides whole trajectories from its outputs."
+        return Condition("(D2) zeros", claim, False, float(found.normal_rank), float(full), source, detail)
+    zeros = invariant_zeros(plant.E, plant.A, inputs, plant.C, direct)
+    outside = [zero for zero, out in zip(zeros, are_outside(wide_e, wide_a, found, plant.dt), strict=True) if out]
+    if outside:
+        worst = max(outside, key=lambda zero: _instability(zero.value, plant.dt))
+        return _zero_failure(plant, worst, inputs, direct, claim, source)
+    return Condition(
+        "(D2) zeros", claim, True, float(found.normal_rank), float(full), source, f"{len(zeros)} stable zero(s)"
+    )
+
+
+def _zero_failure(
+    plant: DescriptorSystem, zero: Zero, inputs: FloatArray, direct: FloatArray, claim: str, source: str
+) -> Condition:
+    states = leading_names(np.abs(zero.state_direction), plant.state_names, most=MOST_NAMES)
+    shares = _in_disturbances(plant, inputs, direct, zero.input_direction)
+    disturbances = () if zero.is_unobservable_mode else leading_names(shares, plant.disturbance_names, most=MOST_NAMES)
+    where = f"s = {number(zero.value)}" if plant.dt == 0.0 else f"z = {number(zero.value)}"
+    masked = f" under the unknown input {', '.join(map(repr, disturbances))}" if disturbances else ""
+    detail = (
+        f"at {where} the states {', '.join(map(repr, states))} move{masked} without showing in any output, and do not "
+        "come to rest: no observer can know them. Measure something they move."
+    )
+    return Condition(
+        "(D2) zeros", claim, False, zero.value.real if plant.dt == 0.0 else abs(zero.value), 0.0, source, detail,
+        mode=zero.value, signals=(*states, *disturbances),
+    )  # fmt: skip
+
+
+def _model_conditions(plant: DescriptorSystem, model: Exosystem) -> list[Condition]:
+    """Test (D3) at each unstable eigenvalue of the fault model, upper half plane only."""
+    unstable = [complex(value) for value in model.eigenvalues if value.imag >= 0.0 and is_outside(value, plant.dt)]
+    found = []
+    for value in sorted(unstable, key=lambda value: (value.real, value.imag)):
+        found.append(_model_condition(plant, model, value))
+        if not found[-1].holds:
+            break
+    return found
+
+
+def _model_condition(plant: DescriptorSystem, model: Exosystem, value: complex) -> Condition:
+    inputs, direct = _independent(plant)
+    courses = model.Cw @ _kernel(model.Phi - value * np.eye(model.order))
+    width = courses.shape[1]
+    matrix = np.block([
+        [value * plant.E - plant.A, -plant.Bf @ courses, -inputs],
+        [plant.C.astype(complex), plant.Df @ courses, direct],
+    ])  # fmt: skip
+    scaled, columns = _equilibrated(matrix)
+    decision = decide_rank(scaled, expected=matrix.shape[1], equilibrated=False)
+    where = f"{'s' if plant.dt == 0.0 else 'z'} = {number(value)}"
+    signals: tuple[str, ...] = ()
+    detail = decision.describe()
+    if not decision.full:
+        direction = columns * np.linalg.svd(scaled)[2][-1].conj()
+        faults = leading_names(np.abs(courses @ direction[plant.nx : plant.nx + width]), plant.fault_names)
+        shares = _in_disturbances(plant, inputs, direct, direction[plant.nx + width :])
+        disturbances = _masking(scaled, plant, width, shares)
+        signals = (*faults, *disturbances)
+        masked = f" is masked by the unknown input {', '.join(map(repr, disturbances))}" if disturbances else ""
+        detail += (
+            f": at {where} the fault {', '.join(map(repr, faults))}{masked or ' can persist'} without showing in any "
+            "output, so no observer can estimate it. Measure another signal, or leave one of them out."
+        )
+    return Condition(
+        f"(D3) fault model at {number(value)}",
+        f"rank [lambda E - A, -Bf Cw V, -Bd; C, Df Cw V, Dd] full at {where}, an eigenvalue of Phi",
+        decision.full,
+        float(decision.rank),
+        float(decision.expected),
+        "in place of Share Pasand, Theorems 1 and 2, which are false",
+        detail,
+        mode=None if decision.full else value,
+        signals=signals,
+    )
+
+
+def _masking(scaled: NDArray[Any], plant: DescriptorSystem, width: int, shares: FloatArray) -> tuple[str, ...]:
+    """Return the disturbances of a null vector; none where states alone already hide the fault."""
+    without = scaled[:, : plant.nx + width]
+    alone = decide_rank(without, expected=plant.nx + width, equilibrated=False)
+    return leading_names(shares, plant.disturbance_names, most=MOST_NAMES) if alone.full else ()
+
+
+def _fixed_modes(plant: DescriptorSystem, model: Exosystem) -> tuple[ComplexArray, Condition]:
+    augmented = AugmentedPlant.of(plant, model)
+    inputs, direct = _independent(plant)
+    below = np.vstack([inputs, np.zeros((model.order, inputs.shape[1]))])
+    zeros = finite_zeros(*_pencil(augmented.E, augmented.A, below, augmented.C, direct)).values
+    text = ", ".join(number(complex(value)) for value in zeros if value.imag >= 0.0)
+    return zeros, Condition(
+        "fixed modes",
+        "every pole that no gain moves is stable",
+        True,
+        float(len(zeros)),
+        float(augmented.order),
+        "drops of the augmented pencil",
+        f"{len(zeros)} of {augmented.order} poles are fixed" + (f": {text}" if text else ""),
+    )
+
+
+def number(value: complex) -> str:
+    """Return a real or complex eigenvalue as text, a pair by its upper half."""
+    return f"{value.real:.6g}" if value.imag == 0.0 else f"{value.real:.6g} +- {abs(value.imag):.6g}j"
+
+
+def _instability(value: complex, dt: float) -> float:
+    return abs(value) if dt > 0.0 else value.real
+
+
+def _independent(plant: DescriptorSystem) -> tuple[FloatArray, FloatArray]:
+    """Return ``[Bd; Dd]`` as a basis of its range: repeated disturbances would make every rank too low."""
+    whole = np.vstack([plant.Bd, plant.Dd])
+    rank = _rank(whole)
+    if rank == plant.nd:
+        return plant.Bd, plant.Dd
+    left = np.linalg.svd(whole, full_matrices=False)[0][:, :rank]
+    return left[: plant.nx], left[plant.nx :]
+
+
+def _in_disturbances(
+    plant: DescriptorSystem, inputs: FloatArray, direct: FloatArray, direction: NDArray[Any]
+) -> FloatArray:
+    whole, basis = np.vstack([plant.Bd, plant.Dd]), np.vstack([inputs, direct])
+    return np.abs(np.linalg.pinv(whole) @ (basis @ direction)) if whole.size else np.zeros(0)
+
+
+def _pencil(
+    e: FloatArray, a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    padded = np.zeros((e.shape[0] + c.shape[0], e.shape[1] + b.shape[1]))
+    padded[: e.shape[0], : e.shape[1]] = e
+    return padded, np.block([[a, b], [c, d]])
+
+
+def _kernel(matrix: NDArray[Any]) -> NDArray[Any]:
+    _, values, right = np.linalg.svd(matrix)
+    rank = int(np.sum(values > RANK_TOLERANCE * max(float(values[0]), 1.0))) if values.size else 0
+    return np.asarray(right[rank:].conj().T)
+
+
+def _equilibrated(matrix: NDArray[Any]) -> tuple[NDArray[Any], FloatArray]:
+    """Return a complex matrix with rows and columns scaled by powers of two, and the factors of the columns."""
+    size = np.abs(matrix)
+    pencil = equilibrate_pencil(np.zeros_like(size), size)
+    return pencil.rows[:, None] * matrix * pencil.columns, pencil.columns

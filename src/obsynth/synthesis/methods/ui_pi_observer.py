@@ -1,0 +1,207 @@
+r"""Unknown-input PI observer for descriptor systems, continuous or discrete time.
+
+Source: M. M. Share Pasand, M. Aliyari Sh., H. D. Taghirad, *Unknown Input-Proportional Integral Observer for Singular
+Systems: Application to fault detection*: observer (4), identities (19), procedures 1 and 2.
+
+Our deviations
+    1. Existence by (D1)-(D3) on the plant's own data; Theorems 1 and 2 and Lemma 6 are false as printed.
+    2. Vector faults, each with its own exosystem, block-diagonal (6); faults and disturbances in the outputs.
+    3. U with full rank by construction; ``E#, C#, G`` (10), (11) only on request: with the Moore-Penrose ``E#`` U loses
+       rank and the unobservable modes change.
+    4. Poles of the observable part only; fixed modes are kept and named; repeated poles by Jordan chains.
+    5. Poles in a region, Kalman gains with a prescribed rate, and a default that needs no numbers.
+    6. K and the free part of the decoupling (the paper's G) can be designed together.
+    7. Where (D1) fails on the plant as written and it has index 1, its algebraic states are eliminated first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from obsynth.analysis.conditions import Condition, require_all
+from obsynth.analysis.unknown_input_conditions import existence, number
+from obsynth.analysis.unknown_inputs import direct_part
+from obsynth.errors import PreconditionError, SolverError, SpecError
+from obsynth.models.descriptor import DescriptorSystem
+from obsynth.models.exosystems import Exosystem, exosystem
+from obsynth.numerics.arrays import ComplexArray, as_matrix
+from obsynth.numerics.spectra import abscissa, decay_rates, noise_covariance
+from obsynth.observers.linear import LinearObserver
+from obsynth.results.design import Certificate
+from obsynth.synthesis.lyapunov import lyapunov_factor
+from obsynth.synthesis.placement.eigenstructure import place
+from obsynth.synthesis.placement.kalman import compromise
+from obsynth.synthesis.placement.region import region_gain
+from obsynth.synthesis.result import Synthesis
+from obsynth.synthesis.ui_pi_options import UiPiOptions, checked_poles, plain
+from obsynth.synthesis.ui_pi_problem import PlacementProblem, kalman_problem, placement_problem, with_faults
+from obsynth.synthesis.ui_pi_realisation import ObserverGains, realise
+
+def conditions(plant: DescriptorSystem, *, fault_model: Any = "step") -> tuple[Condition, ...]:
+    """Return the existence conditions; they are independent of each other, so several may fail."""
+    return existence(plant, exosystem(fault_model, plant.fault_names, plant.dt)).conditions
+
+
+def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **options: Any) -> Synthesis:
+    """Design the observer; see `obsynth.ui_pi_observer` for the options, results and errors."""
+    asked = UiPiOptions(**options)
+    model = exosystem(asked.fault_model, plant.fault_names, plant.dt)
+    region = asked.checked_region(plant.dt)
+    weights = asked.checked_noise(plant.output_names)
+    progress("checking the existence conditions")
+    found = existence(plant, model)
+    require_all(found.conditions)
+    working = found.plant
+    progress("decoupling the unknown inputs")
+    problem = placement_problem(working, model, found.fixed_modes, joint=asked.joint, given=asked.given_decoupling())
+    _require_stable(problem, working.dt)
+    progress("choosing the gains")
+    claims: dict[str, float] = {}
+    runs: list[dict[str, Any]] = []
+    if asked.poles is not None:
+        wanted = checked_poles(asked.poles, problem.split.order, problem.split.fixed_modes, working.dt)
+        placement = place(
+            problem.split.F, problem.split.C, wanted, objective=asked.objective, weight=problem.split.lift(np.eye(problem.split.order))
+        )
+        placed = placement.K
+        claims |= {"condition": placement.condition}
+        poles = np.array([*wanted, *problem.split.fixed_modes])
+    else:
+        kalman = kalman_problem(problem, weights)
+        if region is not None:
+            placed, record = region_gain(kalman, region, solver=asked.solver)
+            runs.append(record)
+        elif asked.decay is not None:
+            gain = kalman.gain(asked.decay)
+            if gain is None:
+                raise SolverError(
+                    f"The Riccati equation for decay {asked.decay:g} 1/s has no usable solution: some mode shows too "
+                    "little to be made that fast. Ask for less, or leave decay out."
+                )
+            placed = gain
+        else:
+            chosen = compromise(kalman, problem.rate)
+            if chosen is None:
+                raise SolverError("The Riccati equation has no usable solution: give poles= or a slow decay=.")
+            placed = chosen.K
+            claims |= {"noise_price": chosen.deviation / chosen.quietest if chosen.quietest > 0.0 else 1.0}
+        closed = problem.split.F - placed @ problem.split.C
+        poles = np.array([*np.linalg.eigvals(closed), *problem.split.fixed_modes])
+    progress("building the realisation and its certificate")
+    gains = problem.gains(placed)
+    synthesis = _assembled(working, model, gains, poles, claims, structured=not asked.joint)
+    return Synthesis(
+        asked.resolved(model, plant.fault_names),
+        synthesis.gains,
+        synthesis.observer,
+        synthesis.certificate,
+        {"runs": runs},
+        (*_elimination_note(found.conditions, found.transformation is not None), *_notes(problem, asked)),
+        found.transformation,
+    )
+
+
+def _require_stable(problem: PlacementProblem, dt: float) -> None:
+    """Raise when a mode that no gain moves is not stable: only a given ``E#`` or ``G`` can bring one in."""
+    modes = problem.split.fixed_modes
+    unstable = [complex(value) for value in modes if not decay_rates([complex(value)], dt)[0] > 0.0]
+    if unstable:
+        raise PreconditionError(
+            f"With these E_sharp, C_sharp and G the mode {number(unstable[0])} is fixed and not stable: U has lost rank "
+            "and with it equations of the plant. Leave E_sharp, C_sharp and G out.",
+            condition="fixed modes",
+            mode=unstable[0],
+        )
+
+
+def synthesis_from_gains(
+    plant: DescriptorSystem, *, U: Any, D: Any, K: Any, F: Any, fault_model: Any
+) -> Synthesis:
+    """Return the realisation of given gains; see `obsynth.ui_pi_observer_from_gains`."""
+    model = exosystem(fault_model, plant.fault_names, plant.dt)
+    nx, ny, count = plant.nx, plant.ny, model.order
+    given = {name: as_matrix(value, name) for name, value in (("U", U), ("D", D), ("K", K), ("F", F))}
+    shapes = {"U": (nx, nx), "D": (nx, ny), "K": (nx, ny), "F": (count, ny)}
+    for name, shape in shapes.items():
+        if given[name].shape != shape:
+            raise SpecError(f"{name} is {given[name].shape}, but {shape} is needed.", path=name)
+    u, d = with_faults(given["U"], given["D"], plant, model)
+    gains = ObserverGains(u, d, np.vstack([given["K"], given["F"]]))
+    closed = realise(plant, model, gains, np.eye(ny))[0].Az
+    options = {"from_gains": True, "fault_model": plain(fault_model)}
+    found = _assembled(plant, model, gains, np.linalg.eigvals(closed), {}, structured=True)
+    return Synthesis(options, found.gains, found.observer, found.certificate)
+
+
+def _assembled(
+    plant: DescriptorSystem,
+    model: Exosystem,
+    gains: ObserverGains,
+    poles: ComplexArray,
+    claims: dict[str, float],
+    *,
+    structured: bool,
+) -> Synthesis:
+    """Return realisation and certificate of gains in the plant's units."""
+    seen = direct_part(plant)[0]
+    observer, letters = realise(plant, model, gains, seen)
+    nx = plant.nx
+    if structured:
+        letters |= {"U": gains.U[:nx, :nx], "D": gains.D[:nx], "K": gains.K[:nx], "F": gains.K[nx:]}
+        letters["Hhat"] = letters["U"] @ plant.Bf
+    letters |= {"Phi": model.Phi, "Cw": model.Cw}
+    order = np.lexsort((poles.imag, poles.real))
+    matrices = {
+        "tracking": gains.U,
+        "Phi": model.Phi,
+        "Cw": model.Cw,
+        "poles": np.column_stack([poles.real, poles.imag])[order] if poles.size else np.zeros((0, 2)),
+        "stability": lyapunov_factor(observer.Az, plant.dt),
+    }
+    slowest = float(np.min(decay_rates([complex(value) for value in poles], plant.dt), initial=np.inf))
+    claims = {"decay": slowest, "noise_amplification": noise_amplification(observer), **claims}
+    finite = {name: value for name, value in claims.items() if np.isfinite(value)}
+    return Synthesis({}, letters, observer, Certificate(matrices, finite))
+
+
+def noise_amplification(observer: LinearObserver) -> float:
+    """Return the largest H2 norm from unit white noise on every output to a fault estimate, the direct part left out.
+
+    Times the square root of the sample time it is a standard deviation, for dt = 0 and noise held between samples.
+    """
+    rows = observer.Cz[observer.fault_rows]
+    direct = observer.Dy[observer.fault_rows] * (observer.dt > 0.0)
+    stable = abscissa(observer.Az, observer.dt) < (1.0 if observer.dt > 0.0 else 0.0)
+    if not len(rows) or not stable:
+        return 0.0 if not len(rows) else float("inf")
+    covariance = noise_covariance(observer.Az, observer.By, rows, direct, observer.dt)
+    return float(np.sqrt(np.max(np.maximum(np.diag(covariance), 0.0))))
+
+
+def _elimination_note(found: tuple[Condition, ...], eliminated: bool) -> tuple[str, ...]:
+    if not eliminated:
+        return ()
+    detail = next(condition.detail for condition in found if condition.name.startswith("(D1)"))
+    return (f"(D1) holds only without the algebraic states, which were eliminated: {detail}.",)
+
+
+def _notes(problem: PlacementProblem, asked: UiPiOptions) -> tuple[str, ...]:
+    found = []
+    fixed, dt = problem.split.fixed_modes, problem.plant.dt
+    if fixed.size:
+        text = ", ".join(number(complex(value)) for value in fixed if value.imag >= 0.0)
+        rates = decay_rates(fixed, dt)
+        slow = asked.slowest_asked(dt)
+        found.append(
+            f"{fixed.size} of {len(problem.F)} poles are fixed, whatever the gains: {text}"
+            + (
+                f"; the slowest decays at {np.min(rates):.3g} 1/s, slower than asked."
+                if slow is not None and np.min(rates) < slow
+                else "."
+            )
+        )
+    return tuple(found)
