@@ -17,14 +17,17 @@ if TYPE_CHECKING:
         VerificationError,
     )
     from obsynth.models.descriptor import DescriptorSystem
+    from obsynth.models.fault_models import FaultModel, fault_model
     from obsynth.observers.linear import Estimates, LinearObserver, RunningObserver
     from obsynth.observers.sampling import sample_observer
     from obsynth.pipeline.designing import design
     from obsynth.pipeline.fault_estimation_filter import fault_estimation_filter, fault_estimation_filter_from_gains
+    from obsynth.pipeline.ui_pi_observer import ui_pi_observer, ui_pi_observer_from_gains
     from obsynth.results.design import Certificate, ObserverDesign
     from obsynth.results.report import Check, VerificationReport
     from obsynth.results.serialise import load
     from obsynth.verification import verify
+    from obsynth.verification.fault_tracking import fault_response
 
 __version__ = "0.1.0"
 
@@ -34,6 +37,7 @@ _HOMES = {
     "Check": "obsynth.results.report",
     "DescriptorSystem": "obsynth.models.descriptor",
     "Estimates": "obsynth.observers.linear",
+    "FaultModel": "obsynth.models.fault_models",
     "InfeasibleError": "obsynth.errors",
     "LinearObserver": "obsynth.observers.linear",
     "ObserverDesign": "obsynth.results.design",
@@ -50,8 +54,12 @@ _HOMES = {
     "eliminate_algebraic_states": "obsynth.analysis.transformations",
     "fault_estimation_filter": "obsynth.pipeline.fault_estimation_filter",
     "fault_estimation_filter_from_gains": "obsynth.pipeline.fault_estimation_filter",
+    "fault_model": "obsynth.models.fault_models",
+    "fault_response": "obsynth.verification.fault_tracking",
     "load": "obsynth.results.serialise",
     "sample_observer": "obsynth.observers.sampling",
+    "ui_pi_observer": "obsynth.pipeline.ui_pi_observer",
+    "ui_pi_observer_from_gains": "obsynth.pipeline.ui_pi_observer",
     "verify": "obsynth.verification",
 }
 
@@ -60,6 +68,7 @@ __all__ = [
     "Check",
     "DescriptorSystem",
     "Estimates",
+    "FaultModel",
     "InfeasibleError",
     "LinearObserver",
     "ObserverDesign",
@@ -76,8 +85,12 @@ __all__ = [
     "eliminate_algebraic_states",
     "fault_estimation_filter",
     "fault_estimation_filter_from_gains",
+    "fault_model",
+    "fault_response",
     "load",
     "sample_observer",
+    "ui_pi_observer",
+    "ui_pi_observer_from_gains",
     "verify",
 ]
 

@@ -23,6 +23,15 @@ from numpy.typing import NDArray
 
 from obsynth.analysis.conditions import Condition
 from obsynth.analysis.transformations import Transformation, eliminate_algebraic_states
+from obsynth.analysis.unknown_input_pencils import (
+    equilibrated,
+    in_disturbances,
+    independent_disturbances,
+    instability,
+    kernel,
+    number,
+    system_pencil,
+)
 from obsynth.analysis.unknown_inputs import AugmentedPlant
 from obsynth.analysis.zeros import Zero, are_outside, invariant_zeros, is_outside, leading_names
 from obsynth.errors import PreconditionError
@@ -80,6 +89,9 @@ def existence(plant: DescriptorSystem, model: Exosystem) -> Existence:
     if found[-1].holds:
         found += _model_conditions(working, model)
     if not all(condition.holds for condition in found):
+        return Existence(tuple(found), working, transformation, nothing)
+    found += _order_conditions(working, model)
+    if not found[-1].holds:
         return Existence(tuple(found), working, transformation, nothing)
     fixed, condition = _fixed_modes(working, model)
     return Existence((*found, condition), working, transformation, fixed)
@@ -166,19 +178,19 @@ def _undecoupled(plant: DescriptorSystem) -> tuple[str, ...]:
     free = np.linalg.svd(plant.Dd)[2][_rank(plant.Dd) :].T if plant.ny else np.eye(plant.nd)
     stacked = np.block([[plant.E, plant.Bd @ free], [plant.C, np.zeros((plant.ny, free.shape[1]))]])
     scaled = equilibrate_pencil(np.zeros_like(stacked), stacked).A
-    kernel = np.linalg.svd(scaled)[2][decide_rank(stacked).rank :].T
-    inputs = free @ kernel[plant.nx :]
+    hidden = np.linalg.svd(scaled)[2][decide_rank(stacked).rank :].T
+    inputs = free @ hidden[plant.nx :]
     shares = np.linalg.norm(inputs, axis=1)
     if shares.size and np.max(shares) > RANK_TOLERANCE:
         return leading_names(shares, plant.disturbance_names, most=MOST_NAMES)
-    return leading_names(np.linalg.norm(kernel[: plant.nx], axis=1), plant.state_names, most=MOST_NAMES)
+    return leading_names(np.linalg.norm(hidden[: plant.nx], axis=1), plant.state_names, most=MOST_NAMES)
 
 
 def _zero_condition(plant: DescriptorSystem) -> Condition:
     claim = "rank [sE - A, -Bd; C, Dd] = nx + rank [Bd; Dd] on and outside the boundary of stability"
     source = "Share Pasand, Lemma 4 (9.2)"
-    inputs, direct = _independent(plant)
-    wide_e, wide_a = _pencil(plant.E, plant.A, inputs, plant.C, direct)
+    inputs, direct = independent_disturbances(plant)
+    wide_e, wide_a = system_pencil(plant.E, plant.A, inputs, plant.C, direct)
     found = finite_zeros(wide_e, wide_a)
     full = wide_e.shape[1]
     if found.normal_rank < full:
@@ -187,7 +199,7 @@ def _zero_condition(plant: DescriptorSystem) -> Condition:
     zeros = invariant_zeros(plant.E, plant.A, inputs, plant.C, direct)
     outside = [zero for zero, out in zip(zeros, are_outside(wide_e, wide_a, found, plant.dt), strict=True) if out]
     if outside:
-        worst = max(outside, key=lambda zero: _instability(zero.value, plant.dt))
+        worst = max(outside, key=lambda zero: instability(zero.value, plant.dt))
         return _zero_failure(plant, worst, inputs, direct, claim, source)
     return Condition(
         "(D2) zeros", claim, True, float(found.normal_rank), float(full), source, f"{len(zeros)} stable zero(s)"
@@ -198,7 +210,7 @@ def _zero_failure(
     plant: DescriptorSystem, zero: Zero, inputs: FloatArray, direct: FloatArray, claim: str, source: str
 ) -> Condition:
     states = leading_names(np.abs(zero.state_direction), plant.state_names, most=MOST_NAMES)
-    shares = _in_disturbances(plant, inputs, direct, zero.input_direction)
+    shares = in_disturbances(plant, inputs, direct, zero.input_direction)
     disturbances = () if zero.is_unobservable_mode else leading_names(shares, plant.disturbance_names, most=MOST_NAMES)
     where = f"s = {number(zero.value)}" if plant.dt == 0.0 else f"z = {number(zero.value)}"
     masked = f" under the unknown input {', '.join(map(repr, disturbances))}" if disturbances else ""
@@ -224,14 +236,14 @@ def _model_conditions(plant: DescriptorSystem, model: Exosystem) -> list[Conditi
 
 
 def _model_condition(plant: DescriptorSystem, model: Exosystem, value: complex) -> Condition:
-    inputs, direct = _independent(plant)
-    courses = model.Cw @ _kernel(model.Phi - value * np.eye(model.order))
+    inputs, direct = independent_disturbances(plant)
+    courses = model.Cw @ kernel(model.Phi - value * np.eye(model.order))
     width = courses.shape[1]
     matrix = np.block([
         [value * plant.E - plant.A, -plant.Bf @ courses, -inputs],
         [plant.C.astype(complex), plant.Df @ courses, direct],
     ])  # fmt: skip
-    scaled, columns = _equilibrated(matrix)
+    scaled, columns = equilibrated(matrix)
     decision = decide_rank(scaled, expected=matrix.shape[1], equilibrated=False)
     where = f"{'s' if plant.dt == 0.0 else 'z'} = {number(value)}"
     signals: tuple[str, ...] = ()
@@ -239,7 +251,7 @@ def _model_condition(plant: DescriptorSystem, model: Exosystem, value: complex) 
     if not decision.full:
         direction = columns * np.linalg.svd(scaled)[2][-1].conj()
         faults = leading_names(np.abs(courses @ direction[plant.nx : plant.nx + width]), plant.fault_names)
-        shares = _in_disturbances(plant, inputs, direct, direction[plant.nx + width :])
+        shares = in_disturbances(plant, inputs, direct, direction[plant.nx + width :])
         disturbances = _masking(scaled, plant, width, shares)
         signals = (*faults, *disturbances)
         masked = f" is masked by the unknown input {', '.join(map(repr, disturbances))}" if disturbances else ""
@@ -260,6 +272,46 @@ def _model_condition(plant: DescriptorSystem, model: Exosystem, value: complex) 
     )
 
 
+def _order_conditions(plant: DescriptorSystem, model: Exosystem) -> list[Condition]:
+    """Test that the fault model is not lost in rounding, at the zeros where faults can hide longest.
+
+    At a zero z0 of (f, d) -> y outside the region of stability, a polynomial model of order n is seen with a strength
+    of about abs(z0)^(n + 1) only: a high order is observable on paper and lost in double precision.
+    """
+    inputs, direct = np.hstack([plant.Bf, plant.Bd]), np.hstack([plant.Df, plant.Dd])
+    wide_e, wide_a = system_pencil(plant.E, plant.A, inputs, plant.C, direct)
+    zeros = finite_zeros(wide_e, wide_a)
+    if zeros.normal_rank < wide_e.shape[1]:
+        return []
+    points = [complex(value) for value in zeros.values if value.imag >= 0.0 and is_outside(value, plant.dt)]
+    augmented = AugmentedPlant.of(plant, model)
+    own, shown = independent_disturbances(plant)
+    below = np.vstack([own, np.zeros((model.order, own.shape[1]))])
+    found = []
+    for point in points[:MOST_NAMES]:
+        matrix = np.block([[point * augmented.E - augmented.A, -below], [augmented.C.astype(complex), shown]])
+        scaled, _ = equilibrated(matrix)
+        decision = decide_rank(scaled, expected=matrix.shape[1], equilibrated=False)
+        lost = (
+            f": at the zero {number(point)} of (f, d) -> y the fault model (order {model.order}) cannot be told from "
+            "nothing in double precision. Lower its order."
+        )
+        found.append(
+            Condition(
+                f"fault model seen at {number(point)}",
+                "the augmented plant is observable in double precision where faults can hide longest",
+                decision.full,
+                float(decision.rank),
+                float(decision.expected),
+                "ours: observable on paper is not enough",
+                decision.describe() + ("" if decision.full else lost),
+                mode=None if decision.full else point,
+                signals=() if decision.full else plant.fault_names,
+            )
+        )
+    return found
+
+
 def _masking(scaled: NDArray[Any], plant: DescriptorSystem, width: int, shares: FloatArray) -> tuple[str, ...]:
     """Return the disturbances of a null vector; none where states alone already hide the fault."""
     without = scaled[:, : plant.nx + width]
@@ -269,9 +321,9 @@ def _masking(scaled: NDArray[Any], plant: DescriptorSystem, width: int, shares: 
 
 def _fixed_modes(plant: DescriptorSystem, model: Exosystem) -> tuple[ComplexArray, Condition]:
     augmented = AugmentedPlant.of(plant, model)
-    inputs, direct = _independent(plant)
+    inputs, direct = independent_disturbances(plant)
     below = np.vstack([inputs, np.zeros((model.order, inputs.shape[1]))])
-    zeros = finite_zeros(*_pencil(augmented.E, augmented.A, below, augmented.C, direct)).values
+    zeros = finite_zeros(*system_pencil(augmented.E, augmented.A, below, augmented.C, direct)).values
     text = ", ".join(number(complex(value)) for value in zeros if value.imag >= 0.0)
     return zeros, Condition(
         "fixed modes",
@@ -282,50 +334,3 @@ def _fixed_modes(plant: DescriptorSystem, model: Exosystem) -> tuple[ComplexArra
         "drops of the augmented pencil",
         f"{len(zeros)} of {augmented.order} poles are fixed" + (f": {text}" if text else ""),
     )
-
-
-def number(value: complex) -> str:
-    """Return a real or complex eigenvalue as text, a pair by its upper half."""
-    return f"{value.real:.6g}" if value.imag == 0.0 else f"{value.real:.6g} +- {abs(value.imag):.6g}j"
-
-
-def _instability(value: complex, dt: float) -> float:
-    return abs(value) if dt > 0.0 else value.real
-
-
-def _independent(plant: DescriptorSystem) -> tuple[FloatArray, FloatArray]:
-    """Return ``[Bd; Dd]`` as a basis of its range: repeated disturbances would make every rank too low."""
-    whole = np.vstack([plant.Bd, plant.Dd])
-    rank = _rank(whole)
-    if rank == plant.nd:
-        return plant.Bd, plant.Dd
-    left = np.linalg.svd(whole, full_matrices=False)[0][:, :rank]
-    return left[: plant.nx], left[plant.nx :]
-
-
-def _in_disturbances(
-    plant: DescriptorSystem, inputs: FloatArray, direct: FloatArray, direction: NDArray[Any]
-) -> FloatArray:
-    whole, basis = np.vstack([plant.Bd, plant.Dd]), np.vstack([inputs, direct])
-    return np.abs(np.linalg.pinv(whole) @ (basis @ direction)) if whole.size else np.zeros(0)
-
-
-def _pencil(
-    e: FloatArray, a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    padded = np.zeros((e.shape[0] + c.shape[0], e.shape[1] + b.shape[1]))
-    padded[: e.shape[0], : e.shape[1]] = e
-    return padded, np.block([[a, b], [c, d]])
-
-
-def _kernel(matrix: NDArray[Any]) -> NDArray[Any]:
-    _, values, right = np.linalg.svd(matrix)
-    rank = int(np.sum(values > RANK_TOLERANCE * max(float(values[0]), 1.0))) if values.size else 0
-    return np.asarray(right[rank:].conj().T)
-
-
-def _equilibrated(matrix: NDArray[Any]) -> tuple[NDArray[Any], FloatArray]:
-    """Return a complex matrix with rows and columns scaled by powers of two, and the factors of the columns."""
-    size = np.abs(matrix)
-    pencil = equilibrate_pencil(np.zeros_like(size), size)
-    return pencil.rows[:, None] * matrix * pencil.columns, pencil.columns

@@ -77,9 +77,7 @@ def exosystem(data: Any, fault_names: Sequence[str], dt: float) -> Exosystem:
         values += [value for value in model.eigenvalues(dt) if value not in values]
         start += model.order
     descriptions = tuple(model.description for model in models)
-    return Exosystem(
-        read_only(phi), read_only(cw), tuple(names), np.array(values, dtype=np.complex128), descriptions
-    )
+    return Exosystem(read_only(phi), read_only(cw), tuple(names), np.array(values, dtype=np.complex128), descriptions)
 
 
 def _by_fault(data: Any, fault_names: Sequence[str]) -> list[FaultModel]:

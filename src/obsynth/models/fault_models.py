@@ -27,7 +27,7 @@ MULTIPLE_EIGENVALUE = 1e-4
 #: The same for built-in models, whose matrices are triangular or diagonalisable: only rounding separates copies.
 SAME_EIGENVALUE = 1e-9
 #: A polynomial of higher order has no meaning in data of double precision.
-HIGHEST_ORDER = 20
+HIGHEST_ORDER = 60
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,6 +231,26 @@ def _observable(model: FaultModel) -> FaultModel:
                 path="fault_model",
             )
     return model
+
+
+def stated_eigenvalues(phi: FloatArray) -> ComplexArray:
+    """Return the distinct eigenvalues of a stacked transition ``(nw, nw)``, block by block where it falls apart.
+
+    Parameters
+    ----------
+    phi : FloatArray
+        Block-diagonal; multiple eigenvalues, which rounding scatters, count once for each block.
+    """
+    linked = (phi != 0.0) | (phi.T != 0.0) | np.eye(len(phi), dtype=bool)
+    for _ in range(len(phi)):
+        linked = (linked.astype(float) @ linked.astype(float)) > 0.0
+    values: list[complex] = []
+    for members in sorted({tuple(np.flatnonzero(row).tolist()) for row in linked}):
+        block = phi[np.ix_(members, members)]
+        triangular = not np.any(np.tril(block, -1))
+        found = np.unique(np.diag(block)) if triangular else _distinct(block, MULTIPLE_EIGENVALUE)
+        values += [complex(value) for value in found if complex(value) not in values]
+    return np.array(values, dtype=np.complex128)
 
 
 def _distinct(matrix: FloatArray, tolerance: float) -> ComplexArray:

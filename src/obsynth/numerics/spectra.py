@@ -16,6 +16,12 @@ SAME_POLE = 1e-3
 DEAD_BEAT = 1e-6
 
 
+def eigenvalues(matrix: FloatArray) -> ComplexArray:
+    """Return the eigenvalues of ``matrix (n, n)``; none of an empty one."""
+    values = np.linalg.eigvals(matrix) if matrix.size else np.zeros(0)
+    return np.asarray(values, dtype=np.complex128)
+
+
 def spectrum_error(matrix: FloatArray, wanted: Sequence[complex] | ComplexArray) -> float:
     """Return how far the eigenvalues of ``matrix (n, n)`` are from n wanted ones, relative to their size.
 
@@ -28,7 +34,7 @@ def spectrum_error(matrix: FloatArray, wanted: Sequence[complex] | ComplexArray)
         return float("inf")
     if goal.size == 0:
         return 0.0
-    found = np.linalg.eigvals(matrix)
+    found = eigenvalues(matrix)
     rows, columns = linear_sum_assignment(np.abs(found[:, None] - goal[None, :]))
     assigned = np.empty_like(goal)
     assigned[columns] = found[rows]
@@ -45,12 +51,12 @@ def spectrum_error(matrix: FloatArray, wanted: Sequence[complex] | ComplexArray)
 
 
 def abscissa(matrix: FloatArray, dt: float) -> float:
-    """Return the largest real part (``dt == 0``) or modulus of an eigenvalue; the empty matrix is as stable as can be."""
+    """Return the largest real part (``dt == 0``) or modulus of an eigenvalue; the empty matrix is stable."""
     if matrix.shape[0] == 0:
         return 0.0 if dt > 0.0 else -np.inf
     if not np.all(np.isfinite(matrix)):
         return np.inf
-    values = np.linalg.eigvals(matrix)
+    values = eigenvalues(matrix)
     return float(np.max(np.abs(values))) if dt > 0.0 else float(np.max(values.real))
 
 
@@ -91,9 +97,7 @@ def noise_covariance(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray,
     return np.asarray(c @ solve_continuous_lyapunov(a, -b @ b.T) @ c.T)
 
 
-def response(
-    a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, points: ComplexArray
-) -> ComplexArray:
+def response(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, points: ComplexArray) -> ComplexArray:
     """Return ``C (s I - A)^-1 B + D`` at each point s (z in discrete time), ``(len(points), rows, cols)``."""
     if a.shape[0] == 0:
         return np.broadcast_to(d.astype(complex), (len(points), *d.shape)).copy()

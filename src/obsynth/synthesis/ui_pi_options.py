@@ -50,8 +50,6 @@ class UiPiOptions:
             problems.append(f"decay is {self.decay!r}: give a rate in 1/s, 0 or more.")
         if self.objective not in OBJECTIVES:
             problems.append(f"objective is {self.objective!r}: use one of {', '.join(OBJECTIVES)}.")
-        if not isinstance(self.joint, bool):
-            problems.append(f"joint is {self.joint!r}: use true or false.")
         if self.solver not in SOLVER_SETTINGS:
             problems.append(f"solver is {self.solver!r}: use one of {', '.join(SOLVER_SETTINGS)}.")
         given = [getattr(self, name) is not None for name in ("E_sharp", "C_sharp", "G")]
@@ -81,7 +79,8 @@ class UiPiOptions:
         if self.noise is None:
             return NoiseWeights()
         if not isinstance(self.noise, Mapping):
-            raise SpecError(f"noise is {self.noise!r}: give measurement, process, fault by name.", path=f"{_PATH}.noise")
+            message = f"noise is {self.noise!r}: give measurement, process, fault by name."
+            raise SpecError(message, path=f"{_PATH}.noise")
         given = {key: value for key, value in self.noise.items() if value is not None}
         problems = [f"unknown key {key!r}." for key in given if key not in ("measurement", "process", "fault")]
         for key in ("process", "fault"):
@@ -173,9 +172,8 @@ def checked_poles(given: Any, count: int, fixed: ComplexArray, dt: float) -> lis
     problems = []
     if len(listed) != count:
         kept = ", ".join(f"{complex(value):.6g}" for value in fixed)
-        problems.append(
-            f"{len(listed)} are given, but {count} can be placed" + (f" (fixed, not to be listed: {kept})." if kept else ".")
-        )
+        besides = f" (fixed, not to be listed: {kept})" if kept else ""
+        problems.append(f"{len(listed)} are given, but {count} can be placed{besides}.")
     rates = decay_rates(listed, dt)
     unstable = [pole for pole, rate in zip(listed, rates, strict=True) if not rate > 0.0]
     if unstable:
@@ -210,6 +208,8 @@ def _as_complex(pole: Any) -> complex:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool) and bool(
-        np.isfinite(value)
+    return (
+        isinstance(value, (int, float, np.integer, np.floating))
+        and not isinstance(value, bool)
+        and bool(np.isfinite(value))
     )

@@ -27,7 +27,7 @@ from obsynth.models.exosystems import Exosystem
 from obsynth.numerics.arrays import ComplexArray, FloatArray, as_matrix
 from obsynth.numerics.pencils import finite_zeros, pencil_structure
 from obsynth.numerics.scaling import Scaling
-from obsynth.numerics.spectra import DEAD_BEAT, speeds
+from obsynth.numerics.spectra import DEAD_BEAT, eigenvalues, speeds
 from obsynth.synthesis.placement.kalman import KalmanProblem
 from obsynth.synthesis.placement.observable import ObservableSplit, observable_split
 from obsynth.synthesis.ui_pi_realisation import ObserverGains
@@ -180,8 +180,8 @@ def _given_decoupling(plant: DescriptorSystem, scaling: Scaling, given: Mapping[
 def _own_rate(plant: DescriptorSystem, f: FloatArray) -> float:
     """Return the median speed of the plant's modes; of the pair's where it has none; or its size."""
     structure = pencil_structure(plant.E, plant.A)
-    for values in (structure.finite_eigenvalues, np.linalg.eigvals(f) if f.size else np.zeros(0)):
-        found = speeds(np.asarray(values, dtype=np.complex128), plant.dt)
+    for values in (structure.finite_eigenvalues, eigenvalues(f)):
+        found = speeds(values, plant.dt)
         found = found[np.isfinite(found)]
         found = found[found > max(SLOW_SHARE * float(np.max(found, initial=0.0)), DEAD_BEAT)]
         if found.size:

@@ -17,7 +17,6 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear import LinearObserver
 
 
-
 @dataclass(frozen=True, eq=False)
 class ObserverGains:
     """Gains for the augmented plant.
@@ -59,9 +58,7 @@ def realise(
     direct = rows @ gains.D
     direct[nx + plant.nf :] += seen
     names = (
-        plant.output_names
-        if np.array_equal(seen, np.eye(plant.ny))
-        else tuple(f"r{i + 1}" for i in range(len(seen)))
+        plant.output_names if np.array_equal(seen, np.eye(plant.ny)) else tuple(f"r{i + 1}" for i in range(len(seen)))
     )
     observer = LinearObserver(
         Az=a_hat, Bu=j_hat - b_hat @ plant.D, By=b_hat, Cz=rows, Du=-direct @ plant.D, Dy=direct, dt=plant.dt,

@@ -14,7 +14,10 @@ if TYPE_CHECKING:
     from obsynth.results.design import ObserverDesign
 
 #: Method id -> module with ``checks(design, printed_digits)``.
-_CHECKERS = {"fault-estimation-filter": "obsynth.verification.fault_estimation_filter"}
+_CHECKERS = {
+    "fault-estimation-filter": "obsynth.verification.fault_estimation_filter",
+    "ui-pi-observer": "obsynth.verification.ui_pi_observer",
+}
 
 
 def verify(design: ObserverDesign, *, printed_digits: int | None = None) -> VerificationReport:

@@ -16,30 +16,38 @@ Our deviations
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from obsynth.analysis.conditions import Condition, require_all
-from obsynth.analysis.unknown_input_conditions import existence, number
+from obsynth.analysis.unknown_input_conditions import existence
+from obsynth.analysis.unknown_input_pencils import number
 from obsynth.analysis.unknown_inputs import direct_part
 from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.models.exosystems import Exosystem, exosystem
-from obsynth.numerics.arrays import ComplexArray, as_matrix
-from obsynth.numerics.spectra import abscissa, decay_rates, noise_covariance
+from obsynth.numerics.arrays import ComplexArray, FloatArray, as_matrix
+from obsynth.numerics.spectra import abscissa, decay_rates, eigenvalues, noise_covariance
 from obsynth.observers.linear import LinearObserver
 from obsynth.results.design import Certificate
 from obsynth.synthesis.lyapunov import lyapunov_factor
 from obsynth.synthesis.placement.eigenstructure import place
 from obsynth.synthesis.placement.kalman import compromise
-from obsynth.synthesis.placement.region import region_gain
+from obsynth.synthesis.placement.region import Region, region_gain
 from obsynth.synthesis.result import Synthesis
 from obsynth.synthesis.ui_pi_options import UiPiOptions, checked_poles, plain
-from obsynth.synthesis.ui_pi_problem import PlacementProblem, kalman_problem, placement_problem, with_faults
+from obsynth.synthesis.ui_pi_problem import (
+    NoiseWeights,
+    PlacementProblem,
+    kalman_problem,
+    placement_problem,
+    with_faults,
+)
 from obsynth.synthesis.ui_pi_realisation import ObserverGains, realise
+
 
 def conditions(plant: DescriptorSystem, *, fault_model: Any = "step") -> tuple[Condition, ...]:
     """Return the existence conditions; they are independent of each other, so several may fail."""
@@ -60,49 +68,60 @@ def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **op
     problem = placement_problem(working, model, found.fixed_modes, joint=asked.joint, given=asked.given_decoupling())
     _require_stable(problem, working.dt)
     progress("choosing the gains")
-    claims: dict[str, float] = {}
-    runs: list[dict[str, Any]] = []
-    if asked.poles is not None:
-        wanted = checked_poles(asked.poles, problem.split.order, problem.split.fixed_modes, working.dt)
-        placement = place(
-            problem.split.F, problem.split.C, wanted, objective=asked.objective, weight=problem.split.lift(np.eye(problem.split.order))
-        )
-        placed = placement.K
-        claims |= {"condition": placement.condition}
-        poles = np.array([*wanted, *problem.split.fixed_modes])
-    else:
-        kalman = kalman_problem(problem, weights)
-        if region is not None:
-            placed, record = region_gain(kalman, region, solver=asked.solver)
-            runs.append(record)
-        elif asked.decay is not None:
-            gain = kalman.gain(asked.decay)
-            if gain is None:
-                raise SolverError(
-                    f"The Riccati equation for decay {asked.decay:g} 1/s has no usable solution: some mode shows too "
-                    "little to be made that fast. Ask for less, or leave decay out."
-                )
-            placed = gain
-        else:
-            chosen = compromise(kalman, problem.rate)
-            if chosen is None:
-                raise SolverError("The Riccati equation has no usable solution: give poles= or a slow decay=.")
-            placed = chosen.K
-            claims |= {"noise_price": chosen.deviation / chosen.quietest if chosen.quietest > 0.0 else 1.0}
-        closed = problem.split.F - placed @ problem.split.C
-        poles = np.array([*np.linalg.eigvals(closed), *problem.split.fixed_modes])
+    chosen = _chosen(asked, problem, region, weights)
     progress("building the realisation and its certificate")
-    gains = problem.gains(placed)
-    synthesis = _assembled(working, model, gains, poles, claims, structured=not asked.joint)
+    poles = np.array([*chosen.poles, *problem.split.fixed_modes], dtype=np.complex128)
+    gains = problem.gains(chosen.gain)
+    synthesis = _assembled(working, model, gains, poles, dict(chosen.claims), structured=not asked.joint)
     return Synthesis(
         asked.resolved(model, plant.fault_names),
         synthesis.gains,
         synthesis.observer,
         synthesis.certificate,
-        {"runs": runs},
+        {"runs": list(chosen.runs)},
         (*_elimination_note(found.conditions, found.transformation is not None), *_notes(problem, asked)),
         found.transformation,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _Chosen:
+    """A gain of the observable part, its poles, and what is claimed about the choice."""
+
+    gain: FloatArray
+    poles: Sequence[complex] | ComplexArray
+    claims: Mapping[str, float]
+    runs: tuple[Mapping[str, Any], ...] = ()
+
+
+def _chosen(asked: UiPiOptions, problem: PlacementProblem, region: Region | None, weights: NoiseWeights) -> _Chosen:
+    split = problem.split
+    if asked.poles is not None:
+        wanted = checked_poles(asked.poles, split.order, split.fixed_modes, problem.plant.dt)
+        # The size of a gain is that in balanced units, not that in the coordinates of the split.
+        weight = split.lift(np.eye(split.order))
+        placement = place(split.F, split.C, wanted, objective=asked.objective, weight=weight)
+        return _Chosen(placement.K, wanted, {"condition": placement.condition})
+    kalman = kalman_problem(problem, weights)
+    claims: dict[str, float] = {}
+    runs: tuple[Mapping[str, Any], ...] = ()
+    if region is not None:
+        gain, record = region_gain(kalman, region, solver=asked.solver)
+        runs = (record,)
+    elif asked.decay is not None:
+        found = kalman.gain(asked.decay)
+        if found is None:
+            raise SolverError(
+                f"The Riccati equation for decay {asked.decay:g} 1/s has no usable solution: some mode shows too "
+                "little to be made that fast. Ask for less, or leave decay out."
+            )
+        gain = found
+    else:
+        fair = compromise(kalman, problem.rate)
+        if fair is None:
+            raise SolverError("The Riccati equation has no usable solution: give poles= or a slow decay=.")
+        gain, claims = fair.K, {"noise_price": fair.deviation / fair.quietest if fair.quietest > 0.0 else 1.0}
+    return _Chosen(gain, eigenvalues(split.F - gain @ split.C), claims, runs)
 
 
 def _require_stable(problem: PlacementProblem, dt: float) -> None:
@@ -111,16 +130,14 @@ def _require_stable(problem: PlacementProblem, dt: float) -> None:
     unstable = [complex(value) for value in modes if not decay_rates([complex(value)], dt)[0] > 0.0]
     if unstable:
         raise PreconditionError(
-            f"With these E_sharp, C_sharp and G the mode {number(unstable[0])} is fixed and not stable: U has lost rank "
-            "and with it equations of the plant. Leave E_sharp, C_sharp and G out.",
+            f"With these E_sharp, C_sharp and G the mode {number(unstable[0])} is fixed and not stable: U has lost "
+            "rank and with it equations of the plant. Leave E_sharp, C_sharp and G out.",
             condition="fixed modes",
             mode=unstable[0],
         )
 
 
-def synthesis_from_gains(
-    plant: DescriptorSystem, *, U: Any, D: Any, K: Any, F: Any, fault_model: Any
-) -> Synthesis:
+def synthesis_from_gains(plant: DescriptorSystem, *, U: Any, D: Any, K: Any, F: Any, fault_model: Any) -> Synthesis:
     """Return the realisation of given gains; see `obsynth.ui_pi_observer_from_gains`."""
     model = exosystem(fault_model, plant.fault_names, plant.dt)
     nx, ny, count = plant.nx, plant.ny, model.order
@@ -133,7 +150,7 @@ def synthesis_from_gains(
     gains = ObserverGains(u, d, np.vstack([given["K"], given["F"]]))
     closed = realise(plant, model, gains, np.eye(ny))[0].Az
     options = {"from_gains": True, "fault_model": plain(fault_model)}
-    found = _assembled(plant, model, gains, np.linalg.eigvals(closed), {}, structured=True)
+    found = _assembled(plant, model, gains, eigenvalues(closed), {}, structured=True)
     return Synthesis(options, found.gains, found.observer, found.certificate)
 
 
@@ -162,7 +179,7 @@ def _assembled(
         "poles": np.column_stack([poles.real, poles.imag])[order] if poles.size else np.zeros((0, 2)),
         "stability": lyapunov_factor(observer.Az, plant.dt),
     }
-    slowest = float(np.min(decay_rates([complex(value) for value in poles], plant.dt), initial=np.inf))
+    slowest = float(np.min(decay_rates(eigenvalues(observer.Az), plant.dt), initial=np.inf))
     claims = {"decay": slowest, "noise_amplification": noise_amplification(observer), **claims}
     finite = {name: value for name, value in claims.items() if np.isfinite(value)}
     return Synthesis({}, letters, observer, Certificate(matrices, finite))

@@ -15,6 +15,7 @@ import numpy as np
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, HIDDEN_MODE_TOLERANCE, RANK_TOLERANCE
+from obsynth.numerics.spectra import eigenvalues
 
 #: Fixed modes closer than this, relative to their size, are peeled off together, at their mean: a double one that
 #: rounding split lies at about the square root of the unit roundoff from it.
@@ -106,7 +107,7 @@ def observable_split(f: FloatArray, c: FloatArray, fixed_modes: ComplexArray) ->
         seen -= kernel.shape[1]
         for other in cluster[:found]:
             waiting.remove(other)
-    hidden = np.asarray(np.linalg.eigvals(work_f[seen:, seen:]), dtype=np.complex128)
+    hidden = eigenvalues(work_f[seen:, seen:])
     return ObservableSplit(basis, units, work_f[:seen, :seen], work_c[:, :seen], hidden)
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from obsynth.errors import SolverError, SpecError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.spectra import speeds
+from obsynth.numerics.spectra import eigenvalues, speeds
 from obsynth.synthesis import lmi
 from obsynth.synthesis.placement.kalman import KalmanProblem
 
@@ -94,9 +94,7 @@ class Region:
         return bool(inside)
 
 
-def region_gain(
-    problem: KalmanProblem, region: Region, *, solver: str
-) -> tuple[FloatArray, dict[str, Any]]:
+def region_gain(problem: KalmanProblem, region: Region, *, solver: str) -> tuple[FloatArray, dict[str, Any]]:
     """Return K ``(n, ny)`` with all poles of ``F - K C`` in the region and little noise, and the solver's record.
 
     Parameters
@@ -145,7 +143,7 @@ def region_gain(
         constraints += _continuous_region(region, p, moved)
     record = lmi.minimise(lmi.trace(z), constraints, what="poles in a region", solver=solver)
     gain = change @ np.linalg.solve(lmi.value_of(p), lmi.value_of(y))
-    poles = np.linalg.eigvals(problem.F - gain @ problem.C)
+    poles = eigenvalues(problem.F - gain @ problem.C)
     if not region.holds(poles, dt):
         raise SolverError(
             f"{solver} ended with poles outside the region: nothing is known. Widen the region, or use decay= instead.",
