@@ -15,7 +15,7 @@ regularity nor index 1 is needed.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -32,7 +32,7 @@ from obsynth.analysis.unknown_input_pencils import (
     number,
     system_pencil,
 )
-from obsynth.analysis.unknown_inputs import AugmentedPlant
+from obsynth.analysis.unknown_inputs import AugmentedPlant, balancing
 from obsynth.analysis.zeros import Zero, are_outside, invariant_zeros, is_outside, leading_names
 from obsynth.errors import PreconditionError
 from obsynth.models.descriptor import DescriptorSystem
@@ -42,6 +42,9 @@ from obsynth.numerics.pencils import finite_zeros
 from obsynth.numerics.ranks import RANK_TOLERANCE, RankDecision, decide_rank
 from obsynth.numerics.scaling import equilibrate_pencil
 
+#: A direct effect on an output, relative to the effect on the states (both in balanced units), that elimination may
+#: leave by rounding.
+ELIMINATION_ROUNDING = 1e-13
 #: At most this many signals of a kind are named in a failed condition.
 MOST_NAMES = 4
 _SOURCE = "Share Pasand, Lemma 4 (9.1), in a form without E#"
@@ -139,16 +142,29 @@ def _decoupling_data(plant: DescriptorSystem) -> tuple[DescriptorSystem, Transfo
     if written.full:
         return plant, None, _decoupling_condition(plant, written, written.describe())
     try:
-        transformation = eliminate_algebraic_states(plant)
+        transformation = _without_rounding(eliminate_algebraic_states(plant))
     except PreconditionError as error:
         reason = f"{written.describe()}, and the algebraic states cannot be eliminated: {error}"
         return plant, None, _decoupling_condition(plant, written, reason)
-    if transformation.plant is plant:
+    if not transformation.description:
         return plant, None, _decoupling_condition(plant, written, written.describe())
     reduced = transformation.plant
     again = decoupling_rank(reduced)
     detail = f"{said} as written; {again.describe()} without the algebraic states"
     return reduced, transformation, _decoupling_condition(reduced, again, detail)
+
+
+def _without_rounding(transformation: Transformation) -> Transformation:
+    """Set to zero what elimination left of a direct effect that is none: a rank decision would take it for one."""
+    plant = transformation.plant
+    scaling = balancing(plant)
+    changes = {}
+    for direct, entering in (("Dd", plant.Bd), ("Df", plant.Bf)):
+        matrix = getattr(plant, direct)
+        sizes = np.max(np.abs(scaling.scale_input(entering)), axis=0, initial=0.0)
+        negligible = np.abs(scaling.scale_feedthrough(matrix)) <= ELIMINATION_ROUNDING * sizes
+        changes[direct] = np.where(negligible, 0.0, matrix)
+    return replace(transformation, plant=plant.replace(**changes))
 
 
 def _decoupling_condition(plant: DescriptorSystem, decision: RankDecision, detail: str) -> Condition:
