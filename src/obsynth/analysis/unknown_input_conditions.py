@@ -102,12 +102,16 @@ def existence(plant: DescriptorSystem, model: Exosystem) -> Existence:
 
 def decoupling_rank(plant: DescriptorSystem) -> RankDecision:
     """Decide (D1): ``rank [E 0 Bd; C Dd 0; 0 0 Dd]``, with what it must be."""
+    return decide_rank(_decoupling_matrix(plant), expected=plant.nx + _rank(plant.Dd) + disturbance_rank(plant))
+
+
+def _decoupling_matrix(plant: DescriptorSystem) -> FloatArray:
     nx, ny, nd = plant.nx, plant.ny, plant.nd
     matrix = np.zeros((nx + 2 * ny, nx + 2 * nd))
     matrix[:nx, :nx], matrix[:nx, nx + nd :] = plant.E, plant.Bd
     matrix[nx : nx + ny, :nx], matrix[nx : nx + ny, nx : nx + nd] = plant.C, plant.Dd
     matrix[nx + ny :, nx + nd :] = plant.Dd
-    return decide_rank(matrix, expected=nx + _rank(plant.Dd) + disturbance_rank(plant))
+    return matrix
 
 
 def disturbance_rank(plant: DescriptorSystem) -> int:
@@ -190,16 +194,17 @@ def _decoupling_condition(plant: DescriptorSystem, decision: RankDecision, detai
 
 
 def _undecoupled(plant: DescriptorSystem) -> tuple[str, ...]:
-    """Return the unknown inputs in a null vector of [E Bd; C 0] beyond Dd's, or else the states in it."""
-    free = np.linalg.svd(plant.Dd)[2][_rank(plant.Dd) :].T if plant.ny else np.eye(plant.nd)
-    stacked = np.block([[plant.E, plant.Bd @ free], [plant.C, np.zeros((plant.ny, free.shape[1]))]])
-    scaled = equilibrate_pencil(np.zeros_like(stacked), stacked).A
-    hidden = np.linalg.svd(scaled)[2][decide_rank(stacked).rank :].T
-    inputs = free @ hidden[plant.nx :]
-    shares = np.linalg.norm(inputs, axis=1)
-    if shares.size and np.max(shares) > RANK_TOLERANCE:
+    """Return the unknown inputs that move what no output shows at once, or else the states in question."""
+    matrix = _decoupling_matrix(plant)
+    pencil = equilibrate_pencil(np.zeros_like(matrix), matrix)
+    hidden = np.linalg.svd(pencil.A)[2][decide_rank(matrix).rank :].T
+    # Of all null vectors the one that moves the states most: some are there only because disturbances repeat.
+    rotation = np.linalg.svd(hidden[: plant.nx])[2]
+    direction = hidden @ rotation[0]
+    shares = np.abs(direction[plant.nx + plant.nd :])
+    if np.max(shares, initial=0.0) > RANK_TOLERANCE:
         return leading_names(shares, plant.disturbance_names, most=MOST_NAMES)
-    return leading_names(np.linalg.norm(hidden[: plant.nx], axis=1), plant.state_names, most=MOST_NAMES)
+    return leading_names(np.abs(direction[: plant.nx]), plant.state_names, most=MOST_NAMES)
 
 
 def _zero_condition(plant: DescriptorSystem) -> Condition:

@@ -22,8 +22,10 @@ def eigenvalues(matrix: FloatArray) -> ComplexArray:
     return np.asarray(values, dtype=np.complex128)
 
 
-def spectrum_error(matrix: FloatArray, wanted: Sequence[complex] | ComplexArray) -> float:
+def spectrum_error(matrix: FloatArray, wanted: Sequence[complex] | ComplexArray, dt: float) -> float:
     """Return how far the eigenvalues of ``matrix (n, n)`` are from n wanted ones, relative to their size.
+
+    In discrete time (``dt > 0``) the size is that of the unit circle: near zero, relative distances mean nothing.
 
     Eigenvalues are assigned to wanted ones with the least total distance, and the means of groups are compared.
     """
@@ -42,11 +44,12 @@ def spectrum_error(matrix: FloatArray, wanted: Sequence[complex] | ComplexArray)
     worst, waiting = 0.0, list(range(goal.size))
     while waiting:
         first = goal[waiting[0]]
-        group = [i for i in waiting if abs(goal[i] - first) <= SAME_POLE * abs(first)] or [waiting[0]]
+        reach = SAME_POLE * (1.0 if dt > 0.0 else abs(first))
+        group = [i for i in waiting if abs(goal[i] - first) <= reach] or [waiting[0]]
         waiting = [i for i in waiting if i not in group]
         miss = abs(complex(np.mean(assigned[group] - goal[group])))
         # A pole at zero is compared with the others.
-        worst = max(worst, miss / max(abs(first), SAME_POLE * largest))
+        worst = max(worst, miss / (1.0 if dt > 0.0 else max(abs(first), SAME_POLE * largest)))
     return worst
 
 

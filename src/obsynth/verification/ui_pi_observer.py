@@ -189,7 +189,7 @@ def _stability_rows(design: ObserverDesign, poles: FloatArray, factor: FloatArra
     yield upper_bound_check(
         "poles",
         "the eigenvalues of Ahat are the claimed ones",
-        spectrum_error(observer.Az, claimed),
+        spectrum_error(observer.Az, claimed, dt),
         SPECTRUM_TOLERANCE,
         source="Share Pasand, procedure 1, step 7",
         detail="means are compared for multiple poles; " + _some(claimed),
@@ -219,7 +219,7 @@ def _stability_rows(design: ObserverDesign, poles: FloatArray, factor: FloatArra
         "significant digits of Ahat with which every mode stays stable",
         float(_least_digits(observer.Az, dt)),
         source="recomputed eigenvalues",
-        detail=f"with {PRINTED_DIGITS} digits the poles move by {spectrum_error(rounded, claimed):.1e} of their size",
+        detail=f"with {PRINTED_DIGITS} digits the poles move by {spectrum_error(rounded, claimed, dt):.1e} of their size",
     )
 
 

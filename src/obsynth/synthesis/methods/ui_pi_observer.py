@@ -70,8 +70,8 @@ def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **op
     progress("choosing the gains")
     chosen = _chosen(asked, problem, region, weights)
     progress("building the realisation and its certificate")
-    poles = np.array([*chosen.poles, *problem.split.fixed_modes], dtype=np.complex128)
     gains = problem.gains(chosen.gain)
+    poles = None if chosen.poles is None else np.array([*chosen.poles, *problem.split.fixed_modes])
     synthesis = _assembled(working, model, gains, poles, dict(chosen.claims), structured=not asked.joint)
     return Synthesis(
         asked.resolved(model, plant.fault_names),
@@ -86,10 +86,10 @@ def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **op
 
 @dataclass(frozen=True, eq=False)
 class _Chosen:
-    """A gain of the observable part, its poles, and what is claimed about the choice."""
+    """A gain of the observable part, its poles where they were asked for, and what is claimed about the choice."""
 
     gain: FloatArray
-    poles: Sequence[complex] | ComplexArray
+    poles: Sequence[complex] | None
     claims: Mapping[str, float]
     runs: tuple[Mapping[str, Any], ...] = ()
 
@@ -100,7 +100,7 @@ def _chosen(asked: UiPiOptions, problem: PlacementProblem, region: Region | None
         wanted = checked_poles(asked.poles, split.order, split.fixed_modes, problem.plant.dt)
         # The size of a gain is that in balanced units, not that in the coordinates of the split.
         weight = split.lift(np.eye(split.order))
-        placement = place(split.F, split.C, wanted, objective=asked.objective, weight=weight)
+        placement = place(split.F, split.C, wanted, dt=problem.plant.dt, objective=asked.objective, weight=weight)
         return _Chosen(placement.K, wanted, {"condition": placement.condition})
     kalman = kalman_problem(problem, weights)
     claims: dict[str, float] = {}
@@ -121,7 +121,7 @@ def _chosen(asked: UiPiOptions, problem: PlacementProblem, region: Region | None
         if fair is None:
             raise SolverError("The Riccati equation has no usable solution: give poles= or a slow decay=.")
         gain, claims = fair.K, {"noise_price": fair.deviation / fair.quietest if fair.quietest > 0.0 else 1.0}
-    return _Chosen(gain, eigenvalues(split.F - gain @ split.C), claims, runs)
+    return _Chosen(gain, None, claims, runs)
 
 
 def _require_stable(problem: PlacementProblem, dt: float) -> None:
@@ -148,9 +148,8 @@ def synthesis_from_gains(plant: DescriptorSystem, *, U: Any, D: Any, K: Any, F: 
             raise SpecError(f"{name} is {given[name].shape}, but {shape} is needed.", path=name)
     u, d = with_faults(given["U"], given["D"], plant, model)
     gains = ObserverGains(u, d, np.vstack([given["K"], given["F"]]))
-    closed = realise(plant, model, gains, np.eye(ny))[0].Az
     options = {"from_gains": True, "fault_model": plain(fault_model)}
-    found = _assembled(plant, model, gains, eigenvalues(closed), {}, structured=True)
+    found = _assembled(plant, model, gains, None, {}, structured=True)
     return Synthesis(options, found.gains, found.observer, found.certificate)
 
 
@@ -158,12 +157,12 @@ def _assembled(
     plant: DescriptorSystem,
     model: Exosystem,
     gains: ObserverGains,
-    poles: ComplexArray,
+    poles: ComplexArray | None,
     claims: dict[str, float],
     *,
     structured: bool,
 ) -> Synthesis:
-    """Return realisation and certificate of gains in the plant's units."""
+    """Return realisation and certificate of gains in the plant's units; poles that were not asked for are computed."""
     seen = direct_part(plant)[0]
     observer, letters = realise(plant, model, gains, seen)
     nx = plant.nx
@@ -171,6 +170,7 @@ def _assembled(
         letters |= {"U": gains.U[:nx, :nx], "D": gains.D[:nx], "K": gains.K[:nx], "F": gains.K[nx:]}
         letters["Hhat"] = letters["U"] @ plant.Bf
     letters |= {"Phi": model.Phi, "Cw": model.Cw}
+    poles = eigenvalues(observer.Az) if poles is None else poles
     order = np.lexsort((poles.imag, poles.real))
     matrices = {
         "tracking": gains.U,

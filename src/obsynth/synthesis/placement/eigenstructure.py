@@ -95,6 +95,7 @@ def place(
     c: FloatArray,
     poles: Sequence[complex],
     *,
+    dt: float = 0.0,
     objective: str = "conditioning",
     weight: FloatArray | None = None,
 ) -> Placement:
@@ -106,6 +107,8 @@ def place(
         ``(n, n)`` and ``(ny, n)``, observable.
     poles : sequence of complex
         n of them, closed under conjugation; any multiplicity.
+    dt : float, optional, seconds
+        0 for continuous time: how misses are judged.
     objective : {"conditioning", "gain"}, optional
         Well-conditioned eigenvectors, or a small Frobenius norm of ``weight @ K``.
     weight : FloatArray, optional
@@ -137,7 +140,7 @@ def place(
         raise SolverError("No gain for these poles was found: the Sylvester equation stayed singular.")
     x, gain = problem.solution(best[1])
     k = first + gain.T
-    error = spectrum_error(f - k @ c, poles)
+    error = spectrum_error(f - k @ c, poles, dt)
     if not error <= PLACEMENT_TOLERANCE:
         raise SolverError(
             f"The poles could not be placed: they miss by {error:.2g} of their size. The pair is "
