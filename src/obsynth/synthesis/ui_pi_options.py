@@ -199,7 +199,7 @@ def checked_poles(given: Any, count: int, fixed: ComplexArray, dt: float) -> lis
 
 def _as_complex(pole: Any) -> complex:
     try:
-        value = complex(*pole) if isinstance(pole, (list, tuple)) and len(pole) == 2 else complex(pole)
+        value = complex(*pole) if isinstance(pole, (list, tuple, np.ndarray)) and len(pole) == 2 else complex(pole)
     except (TypeError, ValueError):
         raise SpecError(f"{pole!r} is no pole: give a number, or [re, im].", path=f"{_PATH}.poles") from None
     if isinstance(pole, (bool, str)) or not np.isfinite(value):

@@ -161,7 +161,7 @@ def _identities(
         ),
     }
     for name, (rows, goal, claim) in wanted.items():
-        factors = ((cz[rows], tracking, augmented.E), (dy[rows], augmented.C))
+        factors = ((cz[rows], tracking, augmented.E), (dy[rows], augmented.C), (own_dy[rows], augmented.C))
         yield name, claim, residual(cz[rows] @ ve, dy[rows] @ augmented.C, -goal, factors=factors, units=units), _PAPER
     yield (
         "feedthrough",
@@ -219,7 +219,7 @@ def _stability_rows(design: ObserverDesign, poles: FloatArray, factor: FloatArra
         "significant digits of Ahat with which every mode stays stable",
         float(_least_digits(observer.Az, dt)),
         source="recomputed eigenvalues",
-        detail=f"with {PRINTED_DIGITS} digits the poles move by {spectrum_error(rounded, claimed, dt):.1e} of their size",
+        detail=f"with {PRINTED_DIGITS} digits poles move by {spectrum_error(rounded, claimed, dt):.1e} of their size",
     )
 
 

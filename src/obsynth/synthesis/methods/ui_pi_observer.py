@@ -62,7 +62,7 @@ def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **op
     weights = asked.checked_noise(plant.output_names)
     progress("checking the existence conditions")
     found = existence(plant, model)
-    require_all(found.conditions)
+    _require_all(found.conditions)
     working = found.plant
     progress("decoupling the unknown inputs")
     problem = placement_problem(working, model, found.fixed_modes, joint=asked.joint, given=asked.given_decoupling())
@@ -94,14 +94,24 @@ class _Chosen:
     runs: tuple[Mapping[str, Any], ...] = ()
 
 
+def _placed(problem: PlacementProblem, wanted: Sequence[complex], objective: str) -> _Chosen:
+    """Return the gain for given poles; its size is that in the user's units where outputs are not mixed."""
+    split, plant = problem.split, problem.plant
+    states = np.concatenate([problem.scaling.states, np.ones(problem.model.order)])
+    plain_outputs = problem.free == 0 and np.array_equal(problem.decoupled.seen, np.eye(plant.ny))
+    outputs = problem.scaling.outputs if plain_outputs else np.ones(len(split.C))
+    found = place(
+        split.F, split.C / outputs[:, None], wanted, dt=plant.dt, objective=objective,
+        weight=states[:, None] * split.lift(np.eye(split.order)),
+    )  # fmt: skip
+    return _Chosen(found.K / outputs, wanted, {"condition": found.condition})
+
+
 def _chosen(asked: UiPiOptions, problem: PlacementProblem, region: Region | None, weights: NoiseWeights) -> _Chosen:
     split = problem.split
     if asked.poles is not None:
         wanted = checked_poles(asked.poles, split.order, split.fixed_modes, problem.plant.dt)
-        # The size of a gain is that in balanced units, not that in the coordinates of the split.
-        weight = split.lift(np.eye(split.order))
-        placement = place(split.F, split.C, wanted, dt=problem.plant.dt, objective=asked.objective, weight=weight)
-        return _Chosen(placement.K, wanted, {"condition": placement.condition})
+        return _placed(problem, wanted, asked.objective)
     kalman = kalman_problem(problem, weights)
     claims: dict[str, float] = {}
     runs: tuple[Mapping[str, Any], ...] = ()
@@ -122,6 +132,23 @@ def _chosen(asked: UiPiOptions, problem: PlacementProblem, region: Region | None
             raise SolverError("The Riccati equation has no usable solution: give poles= or a slow decay=.")
         gain, claims = fair.K, {"noise_price": fair.deviation / fair.quietest if fair.quietest > 0.0 else 1.0}
     return _Chosen(gain, None, claims, runs)
+
+
+def _require_all(found: Sequence[Condition]) -> None:
+    """Raise for the first condition that fails, and say which others fail too."""
+    failed = [condition for condition in found if not condition.holds]
+    if len(failed) <= 1:
+        require_all(found)
+        return
+    others = "; ".join(f"{condition.name}: {condition.detail}" for condition in failed[1:])
+    try:
+        failed[0].require()
+    except PreconditionError as error:
+        mode = next((condition.mode for condition in failed if condition.mode is not None), None)
+        signals = tuple(dict.fromkeys(name for condition in failed for name in condition.signals))
+        raise PreconditionError(
+            f"{error} Also fails: {others}", condition=failed[0].name, mode=mode, signals=signals
+        ) from None
 
 
 def _require_stable(problem: PlacementProblem, dt: float) -> None:

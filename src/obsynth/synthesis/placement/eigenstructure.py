@@ -18,7 +18,7 @@ References
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -29,9 +29,11 @@ from obsynth.numerics.spectra import SAME_POLE, spectrum_error
 
 #: Objectives of the choice among all gains with the same poles.
 OBJECTIVES = ("conditioning", "gain")
-#: Random starts of the search, and its longest run; each start costs two Sylvester equations per step.
-STARTS = 4
-MOST_STEPS = 400
+#: Random starts of the search, and fewer for large pairs; each step costs two Sylvester equations.
+STARTS, FEW_STARTS, LARGE = 8, 2, 20
+#: Longest run of the search, and how often it is taken up again from where it ended, with eigenvectors of unit length,
+#: as long as the logarithm of the objective falls by more than this.
+MOST_STEPS, RESTARTS, LEAST_PROGRESS = 400, 8, 1e-3
 #: Seed of the starts: the same question gives the same gains.
 SEED = 20240
 #: Spectra of F and L closer than this, relative to the size of F, make the Sylvester equation nearly singular: F is
@@ -132,8 +134,13 @@ def place(
     scale = np.eye(n) if weight is None else weight
     problem = _Sylvester.of((f - first @ c).T, c.T, target, first.T, objective, scale.T @ scale)
     best: tuple[float, FloatArray] | None = None
-    for _ in range(STARTS):
-        found = problem.minimised(rng.standard_normal((outputs, n)))
+    starts = [rng.standard_normal((outputs, n)) for _ in range(STARTS if n <= LARGE else FEW_STARTS)]
+    if objective == "gain":
+        # Well-conditioned eigenvectors are a good place to start from.
+        other = replace(problem, objective="conditioning").minimised(starts[0])
+        starts = starts if other is None else [other[1], *starts]
+    for start in starts:
+        found = problem.minimised(start)
         if found is not None and (best is None or found[0] < best[0]):
             best = found
     if best is None:
@@ -220,11 +227,30 @@ class _Sylvester:
         from scipy.optimize import minimize
 
         evaluate: Callable[[FloatArray], Any] = self.value_and_gradient
+        best: tuple[float, FloatArray] | None = None
+        g = start
         try:
-            with np.errstate(all="ignore"):
-                done = minimize(evaluate, start.ravel(), jac=True, method="L-BFGS-B", options={"maxiter": MOST_STEPS})
+            for _ in range(RESTARTS):
+                g = self.normalised(g)
+                with np.errstate(all="ignore"):
+                    done = minimize(evaluate, g.ravel(), jac=True, method="L-BFGS-B", options={"maxiter": MOST_STEPS})
+                if not np.isfinite(done.fun):
+                    break
+                gained = np.inf if best is None else best[0] - float(done.fun)
+                g = np.asarray(done.x).reshape(start.shape)
+                if best is None or gained > 0.0:
+                    best = (float(done.fun), g)
+                if gained < LEAST_PROGRESS:
+                    break
         except np.linalg.LinAlgError:
-            return None
-        if not np.isfinite(done.fun):
-            return None
-        return float(done.fun), np.asarray(done.x).reshape(start.shape)
+            return best
+        return best
+
+    def normalised(self, g: FloatArray) -> FloatArray:
+        """Return G with each Jordan chain scaled so that its part of X has unit size; the gain stays the same."""
+        lengths = np.linalg.norm(self.states(g), axis=0)
+        linked = (self.L != 0.0) | (self.L.T != 0.0) | np.eye(len(self.L), dtype=bool)
+        for _ in range(len(self.L).bit_length()):
+            linked = (linked.astype(float) @ linked.astype(float)) > 0.0
+        chains = np.array([np.max(lengths[row]) for row in linked])
+        return np.asarray(g / np.where(chains > 0.0, chains, 1.0))
