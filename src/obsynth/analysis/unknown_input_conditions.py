@@ -308,29 +308,33 @@ def _order_conditions(plant: DescriptorSystem, model: Exosystem) -> list[Conditi
     augmented = AugmentedPlant.of(plant, model)
     own, shown = independent_disturbances(plant)
     below = np.vstack([own, np.zeros((model.order, own.shape[1]))])
-    found = []
-    for point in points[:MOST_NAMES]:
+    worst: tuple[RankDecision, complex] | None = None
+    for point in points:
         matrix = np.block([[point * augmented.E - augmented.A, -below], [augmented.C.astype(complex), shown]])
         scaled, _ = equilibrated(matrix)
         decision = decide_rank(scaled, expected=matrix.shape[1], equilibrated=False)
-        lost = (
-            f": at the zero {number(point)} of (f, d) -> y the fault model (order {model.order}) cannot be told from "
-            "nothing in double precision. Lower its order."
+        if worst is None or (decision.rank, decision.smallest_kept) < (worst[0].rank, worst[0].smallest_kept):
+            worst = (decision, point)
+    if worst is None:
+        return []
+    decision, point = worst
+    lost = (
+        f": at the zero {number(point)} of (f, d) -> y the fault model (order {model.order}) cannot be told from "
+        "nothing in double precision. Lower its order."
+    )
+    return [
+        Condition(
+            "order of the fault model",
+            "the augmented plant is observable in double precision where faults can hide longest",
+            decision.full,
+            float(decision.rank),
+            float(decision.expected),
+            "ours: observable on paper is not enough",
+            f"{decision.describe()} at {number(point)}" + ("" if decision.full else lost),
+            mode=None if decision.full else point,
+            signals=() if decision.full else plant.fault_names,
         )
-        found.append(
-            Condition(
-                f"fault model seen at {number(point)}",
-                "the augmented plant is observable in double precision where faults can hide longest",
-                decision.full,
-                float(decision.rank),
-                float(decision.expected),
-                "ours: observable on paper is not enough",
-                decision.describe() + ("" if decision.full else lost),
-                mode=None if decision.full else point,
-                signals=() if decision.full else plant.fault_names,
-            )
-        )
-    return found
+    ]
 
 
 def _masking(scaled: NDArray[Any], plant: DescriptorSystem, width: int, shares: FloatArray) -> tuple[str, ...]:

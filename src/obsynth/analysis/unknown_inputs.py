@@ -225,10 +225,10 @@ def paper_decoupling(
     remaining = np.eye(nx) - g @ plant.C
     if not decide_rank(remaining, expected=nx, equilibrated=False).full:
         raise SpecError("I - G C is singular, which adds an unobservable mode: choose another G.", path="G")
-    inverse = np.zeros((0, ny))
+    inverse: FloatArray = np.zeros((0, ny))
     if plant.nd:
         # By normal equations, so that simple numbers stay exact; one refinement makes up for their condition.
-        inverse = np.linalg.solve(shown.T @ shown, shown.T)
+        inverse = np.asarray(np.linalg.solve(shown.T @ shown, shown.T), dtype=np.float64)
         inverse = inverse + (np.eye(plant.nd) - inverse @ shown) @ inverse
     basis = e_sharp @ plant.Bd @ inverse
     correction = basis + g @ (np.eye(ny) - plant.C @ basis)

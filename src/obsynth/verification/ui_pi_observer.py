@@ -56,7 +56,12 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
         return
     tracking, phi, cw, poles, factor = (certificate.matrices[name] for name in _MATRICES)
     model = Exosystem(phi, cw, tuple(f"w{i + 1}" for i in range(len(phi))), stated_eigenvalues(phi), ())
-    yield from condition_rows(existence(plant, model).conditions)
+    *conditions, last = existence(plant, model).conditions
+    yield from condition_rows(conditions)
+    if last.name == "fixed modes":
+        yield information(last.name, "poles that no gain moves", last.value, source=last.source, detail=last.detail)
+    else:
+        yield from condition_rows([last])
     tolerance = EQUALITY_TOLERANCE
     if printed_digits is not None:
         # Half a unit in the last printed place, in each of the products that an identity sums up.
