@@ -15,16 +15,16 @@ equations of the states, and what is left is a plant without ``Dd`` (`Decoupled.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.models.exosystems import Exosystem
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.ranks import RANK_TOLERANCE, decide_rank
-from obsynth.numerics.scaling import Scaling, balance_system
+from obsynth.numerics.scaling import Scaling, balance_system, power_of_two_below
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,8 +128,16 @@ def _range_basis(matrix: FloatArray) -> FloatArray:
 
 
 def balancing(plant: DescriptorSystem) -> Scaling:
-    """Return the power-of-two factors in which a plant is decoupled."""
-    return balance_system(plant.E, plant.A, inputs=[plant.Bd, plant.Bf], outputs=[plant.C])
+    """Return the power-of-two factors in which a plant is decoupled.
+
+    Equations with derivatives are scaled by their row of E alone, so that the unit of time plays no role: how much of
+    a state is read from the outputs and how much is integrated must not depend on it.
+    """
+    scaling = balance_system(plant.E, plant.A, inputs=[plant.Bd, plant.Bf], outputs=[plant.C])
+    rows = np.max(np.abs(plant.E) * scaling.states, axis=1, initial=0.0)
+    moving = rows > RANK_TOLERANCE * np.max(rows, initial=0.0)
+    equations = np.where(moving, 1.0 / power_of_two_below(rows), scaling.equations)
+    return replace(scaling, equations=read_only(equations))
 
 
 def balanced(plant: DescriptorSystem, scaling: Scaling) -> DescriptorSystem:

@@ -62,7 +62,13 @@ class FaultModel:
         return int(self.Phi.shape[0])
 
     def transition(self, dt: float) -> FloatArray:
-        """Return ``Phi`` for a plant with ``dt`` seconds between samples (0: continuous time)."""
+        """Return ``Phi`` in the time of a plant.
+
+        Parameters
+        ----------
+        dt : float, seconds
+            Between samples of the plant; 0 for continuous time.
+        """
         if dt == 0.0 or self.sampled:
             return self.Phi
         from scipy.linalg import expm
@@ -70,7 +76,13 @@ class FaultModel:
         return np.asarray(expm(self.Phi * dt))
 
     def eigenvalues(self, dt: float) -> ComplexArray:
-        """Return each eigenvalue of `transition` once; a multiple one, which rounding scatters, as a mean."""
+        """Return each eigenvalue of `transition` once; a multiple one, which rounding scatters, as a mean.
+
+        Parameters
+        ----------
+        dt : float, seconds
+            As for `transition`.
+        """
         return _distinct(self.transition(dt), MULTIPLE_EIGENVALUE if self.sampled else SAME_EIGENVALUE)
 
 
@@ -193,6 +205,11 @@ def fault_model(data: Any) -> FaultModel:
     data : str, mapping or FaultModel
         ``step``, ``ramp``, ``parabola``; ``{polynomial: order}``, ``{sinusoid: rad/s}``, ``{exponential: 1/s}``,
         ``{Phi: ..., Cw: ...}``, or ``{sum: [...]}`` of such.
+
+    Returns
+    -------
+    FaultModel
+        The exosystem of one fault.
 
     Raises
     ------
