@@ -72,7 +72,8 @@ CASES: dict[str, tuple[dict, dict, str, int, tuple[str, ...], dict]] = {
         {"mode": [0.5, 0.0], "signals": ["f1", "d1"]}),
     "an unknown input that no output shows at once": (
         {"dt": 0.0, "A": [[0, 1], [0, -1]], "C": [[1, 0]], "Bf": [[1], [0]], "Bd": [[0], [1]]}, {},
-        "PreconditionError", 3, ("(D1) decoupling", "nothing but a derivative", "Also fails"), {"signals": ["d1", "f1"]}),
+        "PreconditionError", 3, ("(D1) decoupling", "nothing but a derivative", "Also fails"),
+        {"signals": ["d1", "f1"]}),
     "an unknown fault model": (
         PAPER, {"fault_model": "wobble"}, "SpecError", 2, ("'wobble'", "step, ramp, parabola"), {}),
     "a sinusoid without frequency": (

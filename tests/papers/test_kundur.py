@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from exact_runs import ONE, Together, ramp_and_sine
+from exact_runs import Together, ramp_and_sine
 
 import obsynth
 from obsynth.analysis.unknown_input_conditions import decoupling_rank, existence
@@ -31,7 +31,7 @@ def design() -> obsynth.ObserverDesign:
 def with_unknown_input(state: str) -> obsynth.DescriptorSystem:
     direction = np.zeros((PLANT.nx, 1))
     direction[PLANT.state_names.index(state)] = 1.0
-    return PLANT.replace(Bd=direction, disturbance_names=[state])
+    return PLANT.replace(Bd=direction, disturbance_names=[state], units=None)
 
 
 def test_the_plant_is_what_the_notes_say() -> None:
@@ -62,14 +62,25 @@ def test_the_design_passes_and_keeps_the_fixed_modes(design: obsynth.ObserverDes
 
 
 def test_it_is_not_slow(design: obsynth.ObserverDesign) -> None:
-    """An untuned Kalman filter (unit weights) stays near -0.0085; the default must not, with weights or without."""
+    """An untuned Kalman filter leaves poles near zero; the default must not, with weights or without."""
     assert design.certificate.claims["decay"] == pytest.approx(SHIPPED["decay"], rel=0.02)
     assert design.certificate.claims["noise_amplification"] == pytest.approx(SHIPPED["noise_amplification"], rel=0.02)
-    untuned = obsynth.ui_pi_observer(PLANT, decay=0.0, noise={"process": 0.3, "fault": 0.3})
-    bare = obsynth.ui_pi_observer(PLANT)
-    assert untuned.certificate.claims["decay"] < 0.05
-    assert bare.certificate.claims["decay"] == pytest.approx(EXPECTED["default_without_weights"]["decay"], rel=0.02)
-    assert bare.certificate.claims["decay"] > 10.0 * untuned.certificate.claims["decay"]
+    found = [design.report[f"noise in fhat[{name}]"].value for name in PLANT.fault_names]
+    np.testing.assert_allclose(found, SHIPPED["deviations"], rtol=0.02)
+    quiet = PLANT.replace(Bw=None, Dw=None, noise_names=None, units=None)
+    for options, key in (({}, "without_weights"), ({"decay": 0.0}, "plain_kalman")):
+        claims = obsynth.ui_pi_observer(quiet, **options).certificate.claims
+        assert claims["decay"] == pytest.approx(EXPECTED[key]["decay"], rel=0.02)
+        assert claims["noise_amplification"] == pytest.approx(EXPECTED[key]["noise_amplification"], rel=0.02)
+    assert EXPECTED["without_weights"]["decay"] > 30.0 * EXPECTED["plain_kalman"]["decay"]
+
+
+def test_faster_costs_noise() -> None:
+    for asked, slowest, deviations in EXPECTED["trade_off"]:
+        found = obsynth.ui_pi_observer(PLANT, decay=asked)
+        assert found.certificate.claims["decay"] == pytest.approx(slowest, rel=0.02)
+        noise = [found.report[f"noise in fhat[{name}]"].value for name in PLANT.fault_names]
+        np.testing.assert_allclose(noise, deviations, rtol=0.02)
 
 
 def test_the_states_of_the_network_come_back(design: obsynth.ObserverDesign) -> None:
@@ -97,7 +108,6 @@ def test_torques_are_followed_whatever_bus_7_draws(design: obsynth.ObserverDesig
     assert np.max(np.abs(loaded - calm)) > 1.0
     states = together.estimates[together.state_rows]
     np.testing.assert_allclose((loaded @ states.T)[-1], (loaded @ together.x.T)[-1], atol=1e-5)
-    assert ONE[0].shape == (1, 1)
 
 
 @pytest.mark.parametrize("h", [0.02, 0.01])
@@ -112,7 +122,7 @@ def test_on_samples(design: obsynth.ObserverDesign, h: float) -> None:
     run = simulate_plant(sampled, steps=count, f=torque, d=load)
     estimates = obsynth.sample_observer(design.observer, h).run(run.outputs, np.zeros((count, 0)))
     late = time > 40.0
-    assert np.max(np.abs(estimates.faults[late] - torque[late])) < 0.25 * h
+    assert np.max(np.abs(estimates.faults[late] - torque[late])) < 0.5 * h
 
 
 @pytest.mark.parametrize("state", ["vref EXDC2 1", "pref TGOV1 1"])
