@@ -155,7 +155,8 @@ def tracking_rows(
             source=source,
             detail=f"largest |fhat/f| {abs(own[peak]):.3g} at {frequencies[peak]:.3g} rad/s; |fhat/f| = 1 is faithful",
         )
-        course = {0: "a step of 1", 1: "a ramp of 1 per s"}.get(errors[fault].order, f"t^{errors[fault].order}/n!")
+        order = errors[fault].order
+        course = {0: "a step of 1", 1: "a ramp of 1 per s"}.get(order, f"t^{order} / {order}!")
         yield information(
             f"steady error[{name}]",
             f"fhat - f in the end when the fault is {course}, one order above its model",
