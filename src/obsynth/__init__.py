@@ -17,6 +17,7 @@ if TYPE_CHECKING:
         VerificationError,
     )
     from obsynth.models.descriptor import DescriptorSystem
+    from obsynth.models.fault_models import FaultModel, fault_model
     from obsynth.observers.linear import Estimates, LinearObserver, RunningObserver
     from obsynth.observers.sampling import sample_observer
     from obsynth.pipeline.designing import design
@@ -28,10 +29,12 @@ if TYPE_CHECKING:
         pd_observer_from_gains,
     )
     from obsynth.results.delta_scan import DeltaScan
+    from obsynth.pipeline.ui_pi_observer import ui_pi_observer, ui_pi_observer_from_gains
     from obsynth.results.design import Certificate, ObserverDesign
     from obsynth.results.report import Check, VerificationReport
     from obsynth.results.serialise import load
     from obsynth.verification import verify
+    from obsynth.verification.fault_tracking import fault_response
 
 __version__ = "0.1.0"
 
@@ -42,6 +45,7 @@ _HOMES = {
     "DeltaScan": "obsynth.results.delta_scan",
     "DescriptorSystem": "obsynth.models.descriptor",
     "Estimates": "obsynth.observers.linear",
+    "FaultModel": "obsynth.models.fault_models",
     "InfeasibleError": "obsynth.errors",
     "LinearObserver": "obsynth.observers.linear",
     "ObserverDesign": "obsynth.results.design",
@@ -59,11 +63,15 @@ _HOMES = {
     "eliminate_algebraic_states": "obsynth.analysis.transformations",
     "fault_estimation_filter": "obsynth.pipeline.fault_estimation_filter",
     "fault_estimation_filter_from_gains": "obsynth.pipeline.fault_estimation_filter",
+    "fault_model": "obsynth.models.fault_models",
+    "fault_response": "obsynth.verification.fault_tracking",
     "load": "obsynth.results.serialise",
     "pd_delta_scan": "obsynth.pipeline.pd_observer",
     "pd_observer": "obsynth.pipeline.pd_observer",
     "pd_observer_from_gains": "obsynth.pipeline.pd_observer",
     "sample_observer": "obsynth.observers.sampling",
+    "ui_pi_observer": "obsynth.pipeline.ui_pi_observer",
+    "ui_pi_observer_from_gains": "obsynth.pipeline.ui_pi_observer",
     "verify": "obsynth.verification",
 }
 
@@ -73,6 +81,7 @@ __all__ = [
     "DeltaScan",
     "DescriptorSystem",
     "Estimates",
+    "FaultModel",
     "InfeasibleError",
     "LinearObserver",
     "ObserverDesign",
@@ -90,11 +99,15 @@ __all__ = [
     "eliminate_algebraic_states",
     "fault_estimation_filter",
     "fault_estimation_filter_from_gains",
+    "fault_model",
+    "fault_response",
     "load",
     "pd_delta_scan",
     "pd_observer",
     "pd_observer_from_gains",
     "sample_observer",
+    "ui_pi_observer",
+    "ui_pi_observer_from_gains",
     "verify",
 ]
 

@@ -107,7 +107,7 @@ def run_check(options: argparse.Namespace) -> int:
     if spec.transformation is not None:
         structures = {"as written": analyse_structure(spec.transformation.source), **structures}
     done = "" if spec.transformation is None else spec.transformation.description
-    methods = check(spec.plant)
+    methods = check(spec.plant, {spec.method: spec.options})
     passed = methods[spec.method].passed
     if options.json:
         print_json({

@@ -18,6 +18,8 @@ RANK_TOLERANCE = 1e-10
 CLEAR_GAP = 1e3
 #: Distance from the stability boundary below which an eigenvalue or zero counts as lying on it.
 BOUNDARY_TOLERANCE = 1e-8
+#: Singular value of a pair's observability pencil, relative to the pair, below which a known zero is a hidden mode.
+HIDDEN_MODE_TOLERANCE = 1e-9
 #: Relative size below which a Markov parameter of a fault counts as zero.
 MARKOV_TOLERANCE = 1e-9
 #: A chain ``(TA)^k T f`` that shrank below this fraction of its a-priori bound has died out.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from importlib import import_module
 from typing import Any
 
@@ -73,17 +73,25 @@ def design(
     return verified(plant, method, found, name=name, recovery=recovery)
 
 
-def check(plant: DescriptorSystem) -> dict[str, VerificationReport]:
+def check(
+    plant: DescriptorSystem, options: Mapping[str, Mapping[str, Any]] | None = None
+) -> dict[str, VerificationReport]:
     """Return, for every method, the report of its existence conditions; nothing is designed or raised.
 
     Parameters
     ----------
     plant : DescriptorSystem
         The plant.
+    options : mapping, optional
+        Method id -> options of a spec; those that decide about existence, such as the fault model, are used.
     """
-    return {
-        method: VerificationReport.of(condition_rows(method_module(method).conditions(plant))) for method in REGISTRY
-    }
+    found = {}
+    for method in REGISTRY:
+        conditions = method_module(method).conditions
+        known = set(inspect.signature(conditions).parameters)
+        given = {name: value for name, value in (options or {}).get(method, {}).items() if name in known}
+        found[method] = VerificationReport.of(condition_rows(conditions(plant, **given)))
+    return found
 
 
 def door_of(method: str) -> Callable[..., ObserverDesign]:

@@ -23,6 +23,12 @@ _MEANINGS = {
         "adaptation_low": "stable for every adaptation gain from here, proved",
         "adaptation_high": "to here",
     },
+    "ui-pi-observer": {
+        "decay": "rate of the slowest pole, 1/s: every error decays at least like this in the end",
+        "noise_amplification": "H2 norm from unit white noise on every output to the noisiest fault estimate",
+        "noise_price": "noise of the fault estimates against the quietest Kalman filter of the same plant",
+        "condition": "condition number of the (generalised) eigenvectors",
+    },
 }
 
 

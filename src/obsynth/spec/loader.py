@@ -109,16 +109,18 @@ def _joined(prefix: str, name: str) -> str:
 
 
 def _matrix(value: Any, folder: Path, where: str, problems: DocumentProblems) -> Any:
-    """Return rows as an array, files read, picks as lists of names, and anything else as it is."""
+    """Return rows as an array, files read, picks as lists of names, sections as mappings, all else as it is."""
     if isinstance(value, list):
-        return np.array(value, dtype=np.float64)
+        return np.array(value, dtype=np.float64) if all(isinstance(row, list) for row in value) else value
     if hasattr(value, "file"):
         try:
             return read_matrix(folder / value.file, variable=value.variable, where=where)
         except SpecError as error:
             problems.add(where, str(error))
             return None
-    return getattr(value, "outputs", getattr(value, "states", value))
+    if hasattr(value, "outputs") or hasattr(value, "states"):
+        return getattr(value, "outputs", getattr(value, "states", None))
+    return value.model_dump(exclude_unset=True) if hasattr(value, "model_dump") else value
 
 
 def _names(value: Any, folder: Path, where: str, problems: DocumentProblems) -> list[str] | None:

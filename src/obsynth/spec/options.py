@@ -5,11 +5,11 @@ This module imports pydantic, so it is imported only when a spec is read.
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from obsynth.spec.schema import Matrix, Positive, Section
+from obsynth.spec.schema import Matrix, Positive, Section, Text
 
 
 class FaultEstimationFilterOptions(Section):
@@ -44,8 +44,41 @@ class PdObserverOptions(Section):
     solver: Literal["CLARABEL", "SCS"] = "CLARABEL"
 
 
+class PoleRegion(Section):
+    """Where all movable poles must lie."""
+
+    decay: Annotated[float, Field(ge=0.0)] | None = None
+    radius: Positive | None = None
+    damping: Annotated[float, Field(gt=0.0, lt=1.0)] | None = None
+
+
+class NoiseSection(Section):
+    """What the Kalman filter believes."""
+
+    measurement: Positive | dict[Text, Positive] | None = None
+    process: Positive = 1.0
+    fault: Positive = 1.0
+
+
+class UiPiObserverOptions(Section):
+    """Options of the method ``ui-pi-observer``; the fault model is checked by `obsynth.models.fault_models`."""
+
+    fault_model: Text | dict[Text, Any] = "step"
+    poles: list[float | Annotated[list[float], Field(min_length=2, max_length=2)]] | None = None
+    decay: Annotated[float, Field(ge=0.0)] | None = None
+    region: PoleRegion | None = None
+    noise: NoiseSection | None = None
+    objective: Literal["conditioning", "gain"] = "conditioning"
+    joint: bool = False
+    E_sharp: Matrix | None = None
+    C_sharp: Matrix | None = None
+    G: Matrix | None = None
+    solver: Literal["CLARABEL", "SCS"] = "CLARABEL"
+
+
 #: Options of every method, by its identifier.
 METHOD_OPTIONS: dict[str, type[Section]] = {
     "fault-estimation-filter": FaultEstimationFilterOptions,
     "pd-observer": PdObserverOptions,
+    "ui-pi-observer": UiPiObserverOptions,
 }

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 _CHECKERS = {
     "fault-estimation-filter": "obsynth.verification.fault_estimation_filter",
     "pd-observer": "obsynth.verification.pd_observer",
+    "ui-pi-observer": "obsynth.verification.ui_pi_observer",
 }
 
 

@@ -9,6 +9,7 @@ from typing import Any
 REGISTRY = {
     "fault-estimation-filter": "obsynth.synthesis.methods.fault_estimation_filter",
     "pd-observer": "obsynth.synthesis.methods.pd_observer",
+    "ui-pi-observer": "obsynth.synthesis.methods.ui_pi_observer",
 }
 
 

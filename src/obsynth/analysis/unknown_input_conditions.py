@@ -1,0 +1,361 @@
+r"""When an unknown-input PI observer exists, decided before any gain is looked for.
+
+Source: Share Pasand, Aliyari, Taghirad, Lemma 4, Theorems 1 and 2, Lemma 6, all four replaced: Theorems 1 and 2 and
+Lemma 6 are false as printed (the column of ``Bd`` is missing from the test of the fault model), and ``rank C E# Bd``
+depends on the choice of ``E#``.  On the plant's own data:
+
+(D1) ``rank [E 0 Bd; C Dd 0; 0 0 Dd] = nx + rank Dd + rank [Bd; Dd]``,
+(D2) ``rank [sE - A, -Bd; C, Dd] = nx + rank [Bd; Dd]`` for every s on or outside the boundary of stability,
+(D3) at each unstable eigenvalue of Phi, tested exactly there, with V a basis of ``ker (lambda I - Phi)``:
+``rank [lambda E - A, -Bf Cw V, -Bd; C, Df Cw V, Dd] = nx + dim V + rank [Bd; Dd]``.
+
+(D2) and (D3) are necessary for any observer of state and fault; (D1) for any that does not differentiate.  Neither
+regularity nor index 1 is needed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.analysis.conditions import Condition
+from obsynth.analysis.transformations import Transformation, eliminate_algebraic_states
+from obsynth.analysis.unknown_input_pencils import (
+    equilibrated,
+    in_disturbances,
+    independent_disturbances,
+    instability,
+    kernel,
+    number,
+    system_pencil,
+)
+from obsynth.analysis.unknown_inputs import AugmentedPlant, balancing
+from obsynth.analysis.zeros import Zero, are_outside, invariant_zeros, is_outside, leading_names
+from obsynth.errors import PreconditionError
+from obsynth.models.descriptor import DescriptorSystem
+from obsynth.models.exosystems import Exosystem
+from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.numerics.pencils import finite_zeros
+from obsynth.numerics.ranks import RANK_TOLERANCE, RankDecision, decide_rank
+from obsynth.numerics.scaling import equilibrate_pencil
+
+#: A direct effect on an output, relative to the effect on the states (both in balanced units), that elimination may
+#: leave by rounding.
+ELIMINATION_ROUNDING = 1e-13
+#: At most this many signals of a kind are named in a failed condition.
+MOST_NAMES = 4
+_SOURCE = "Share Pasand, Lemma 4 (9.1), in a form without E#"
+
+
+@dataclass(frozen=True, eq=False)
+class Existence:
+    """What was decided about a plant.
+
+    Parameters
+    ----------
+    conditions : tuple of Condition
+        In order; after a failed (D2) there is no (D3), and fixed modes come last, when all others hold.
+    plant : DescriptorSystem
+        For which they were decided: the plant as given, or without its algebraic states.
+    transformation : Transformation or None
+        The elimination, where there was one.
+    fixed_modes : ComplexArray
+        Poles that every such observer has; all stable when the conditions hold.
+    """
+
+    conditions: tuple[Condition, ...]
+    plant: DescriptorSystem
+    transformation: Transformation | None
+    fixed_modes: ComplexArray
+
+
+def existence(plant: DescriptorSystem, model: Exosystem) -> Existence:
+    """Return the existence conditions of the unknown-input PI observer, and the plant to design for.
+
+    Parameters
+    ----------
+    plant : DescriptorSystem
+        Any plant, either time, regular or not, of any index.
+    model : Exosystem
+        Of its faults.
+    """
+    nothing = np.zeros(0, dtype=np.complex128)
+    enough = _enough_outputs(plant)
+    if not enough.holds:
+        return Existence((enough,), plant, None, nothing)
+    working, transformation, solvable = _decoupling_data(plant)
+    # (D1) and the others fail independently: a user wants to know both.
+    found = [enough, solvable, _zero_condition(working)]
+    if found[-1].holds:
+        found += _model_conditions(working, model)
+    if not all(condition.holds for condition in found):
+        return Existence(tuple(found), working, transformation, nothing)
+    found += _order_conditions(working, model)
+    if not found[-1].holds:
+        return Existence(tuple(found), working, transformation, nothing)
+    fixed, condition = _fixed_modes(working, model)
+    return Existence((*found, condition), working, transformation, fixed)
+
+
+def decoupling_rank(plant: DescriptorSystem) -> RankDecision:
+    """Decide (D1): ``rank [E 0 Bd; C Dd 0; 0 0 Dd]``, with what it must be."""
+    return decide_rank(_decoupling_matrix(plant), expected=plant.nx + _rank(plant.Dd) + disturbance_rank(plant))
+
+
+def _decoupling_matrix(plant: DescriptorSystem) -> FloatArray:
+    nx, ny, nd = plant.nx, plant.ny, plant.nd
+    matrix = np.zeros((nx + 2 * ny, nx + 2 * nd))
+    matrix[:nx, :nx], matrix[:nx, nx + nd :] = plant.E, plant.Bd
+    matrix[nx : nx + ny, :nx], matrix[nx : nx + ny, nx : nx + nd] = plant.C, plant.Dd
+    matrix[nx + ny :, nx + nd :] = plant.Dd
+    return matrix
+
+
+def disturbance_rank(plant: DescriptorSystem) -> int:
+    """Return ``rank [Bd; Dd]``: repeated disturbances count once."""
+    return _rank(np.vstack([plant.Bd, plant.Dd]))
+
+
+def _rank(matrix: FloatArray) -> int:
+    return decide_rank(matrix).rank
+
+
+def _enough_outputs(plant: DescriptorSystem) -> Condition:
+    rank = disturbance_rank(plant)
+    holds = rank <= plant.ny
+    return Condition(
+        "nd <= ny",
+        "no more independent unknown inputs than outputs",
+        holds,
+        float(rank),
+        float(plant.ny),
+        _SOURCE,
+        f"{rank} unknown input(s), {plant.ny} output(s)"
+        + ("" if holds else ". Measure more, or leave an unknown input out."),
+        signals=() if holds else plant.disturbance_names,
+    )
+
+
+def _decoupling_data(plant: DescriptorSystem) -> tuple[DescriptorSystem, Transformation | None, Condition]:
+    """Return the plant on which (D1) holds, if the algebraic states can be eliminated where it does not."""
+    written = decoupling_rank(plant)
+    said = f"rank {written.rank} of {written.expected}"
+    if written.full:
+        return plant, None, _decoupling_condition(plant, written, written.describe())
+    try:
+        transformation = _without_rounding(eliminate_algebraic_states(plant))
+    except PreconditionError as error:
+        reason = f"{written.describe()}, and the algebraic states cannot be eliminated: {error}"
+        return plant, None, _decoupling_condition(plant, written, reason)
+    if not transformation.description:
+        return plant, None, _decoupling_condition(plant, written, written.describe())
+    reduced = transformation.plant
+    again = decoupling_rank(reduced)
+    detail = f"{said} as written; {again.describe()} without the algebraic states"
+    return reduced, transformation, _decoupling_condition(reduced, again, detail)
+
+
+def _without_rounding(transformation: Transformation) -> Transformation:
+    """Set to zero what elimination left of a direct effect that is none: a rank decision would take it for one."""
+    plant = transformation.plant
+    scaling = balancing(plant)
+    changes = {}
+    for direct, entering in (("Dd", plant.Bd), ("Df", plant.Bf)):
+        matrix = getattr(plant, direct)
+        sizes = np.max(np.abs(scaling.scale_input(entering)), axis=0, initial=0.0)
+        negligible = np.abs(scaling.scale_feedthrough(matrix)) <= ELIMINATION_ROUNDING * sizes
+        changes[direct] = np.where(negligible, 0.0, matrix)
+    return replace(transformation, plant=plant.replace(**changes))
+
+
+def _decoupling_condition(plant: DescriptorSystem, decision: RankDecision, detail: str) -> Condition:
+    signals: tuple[str, ...] = ()
+    if not decision.full:
+        signals = _undecoupled(plant)
+        detail += ": " + (
+            f"the unknown input {', '.join(map(repr, signals))} moves states that no output shows at once, so nothing "
+            "but a derivative of the outputs could remove it. Measure such a state, or leave the input out."
+            if set(signals) & set(plant.disturbance_names)
+            else f"the states {', '.join(map(repr, signals))} are neither dynamic nor measured."
+        )
+    return Condition(
+        "(D1) decoupling",
+        "rank [E 0 Bd; C Dd 0; 0 0 Dd] = nx + rank Dd + rank [Bd; Dd]",
+        decision.full,
+        float(decision.rank),
+        float(decision.expected),
+        _SOURCE,
+        detail,
+        signals=signals,
+    )
+
+
+def _undecoupled(plant: DescriptorSystem) -> tuple[str, ...]:
+    """Return the unknown inputs that move what no output shows at once, or else the states in question."""
+    matrix = _decoupling_matrix(plant)
+    pencil = equilibrate_pencil(np.zeros_like(matrix), matrix)
+    hidden = np.linalg.svd(pencil.A)[2][decide_rank(matrix).rank :].T
+    # Of all null vectors the one that moves the states most: some are there only because disturbances repeat.
+    rotation = np.linalg.svd(hidden[: plant.nx])[2]
+    direction = hidden @ rotation[0]
+    shares = np.abs(direction[plant.nx + plant.nd :])
+    if np.max(shares, initial=0.0) > RANK_TOLERANCE:
+        return leading_names(shares, plant.disturbance_names, most=MOST_NAMES)
+    return leading_names(np.abs(direction[: plant.nx]), plant.state_names, most=MOST_NAMES)
+
+
+def _zero_condition(plant: DescriptorSystem) -> Condition:
+    claim = "rank [sE - A, -Bd; C, Dd] = nx + rank [Bd; Dd] on and outside the boundary of stability"
+    source = "Share Pasand, Lemma 4 (9.2)"
+    inputs, direct = independent_disturbances(plant)
+    wide_e, wide_a = system_pencil(plant.E, plant.A, inputs, plant.C, direct)
+    found = finite_zeros(wide_e, wide_a)
+    full = wide_e.shape[1]
+    if found.normal_rank < full:
+        detail = f"normal rank {found.normal_rank} of {full}: the plant hides whole trajectories from its outputs."
+        return Condition("(D2) zeros", claim, False, float(found.normal_rank), float(full), source, detail)
+    zeros = invariant_zeros(plant.E, plant.A, inputs, plant.C, direct)
+    outside = [zero for zero, out in zip(zeros, are_outside(wide_e, wide_a, found, plant.dt), strict=True) if out]
+    if outside:
+        worst = max(outside, key=lambda zero: instability(zero.value, plant.dt))
+        return _zero_failure(plant, worst, inputs, direct, claim, source)
+    return Condition(
+        "(D2) zeros", claim, True, float(found.normal_rank), float(full), source, f"{len(zeros)} stable zero(s)"
+    )
+
+
+def _zero_failure(
+    plant: DescriptorSystem, zero: Zero, inputs: FloatArray, direct: FloatArray, claim: str, source: str
+) -> Condition:
+    states = leading_names(np.abs(zero.state_direction), plant.state_names, most=MOST_NAMES)
+    shares = in_disturbances(plant, inputs, direct, zero.input_direction)
+    disturbances = () if zero.is_unobservable_mode else leading_names(shares, plant.disturbance_names, most=MOST_NAMES)
+    where = f"s = {number(zero.value)}" if plant.dt == 0.0 else f"z = {number(zero.value)}"
+    masked = f" under the unknown input {', '.join(map(repr, disturbances))}" if disturbances else ""
+    detail = (
+        f"at {where} the states {', '.join(map(repr, states))} move{masked} without showing in any output, and do not "
+        "come to rest: no observer can know them. Measure something they move."
+    )
+    return Condition(
+        "(D2) zeros", claim, False, zero.value.real if plant.dt == 0.0 else abs(zero.value), 0.0, source, detail,
+        mode=zero.value, signals=(*states, *disturbances),
+    )  # fmt: skip
+
+
+def _model_conditions(plant: DescriptorSystem, model: Exosystem) -> list[Condition]:
+    """Test (D3) at each unstable eigenvalue of the fault model, upper half plane only."""
+    unstable = [complex(value) for value in model.eigenvalues if value.imag >= 0.0 and is_outside(value, plant.dt)]
+    found = []
+    for value in sorted(unstable, key=lambda value: (value.real, value.imag)):
+        found.append(_model_condition(plant, model, value))
+        if not found[-1].holds:
+            break
+    return found
+
+
+def _model_condition(plant: DescriptorSystem, model: Exosystem, value: complex) -> Condition:
+    inputs, direct = independent_disturbances(plant)
+    courses = model.Cw @ kernel(model.Phi - value * np.eye(model.order))
+    width = courses.shape[1]
+    matrix = np.block([
+        [value * plant.E - plant.A, -plant.Bf @ courses, -inputs],
+        [plant.C.astype(complex), plant.Df @ courses, direct],
+    ])  # fmt: skip
+    scaled, columns = equilibrated(matrix)
+    decision = decide_rank(scaled, expected=matrix.shape[1], equilibrated=False)
+    where = f"{'s' if plant.dt == 0.0 else 'z'} = {number(value)}"
+    signals: tuple[str, ...] = ()
+    detail = decision.describe()
+    if not decision.full:
+        direction = columns * np.linalg.svd(scaled)[2][-1].conj()
+        faults = leading_names(np.abs(courses @ direction[plant.nx : plant.nx + width]), plant.fault_names)
+        shares = in_disturbances(plant, inputs, direct, direction[plant.nx + width :])
+        disturbances = _masking(scaled, plant, width, shares)
+        signals = (*faults, *disturbances)
+        masked = f" is masked by the unknown input {', '.join(map(repr, disturbances))}" if disturbances else ""
+        detail += (
+            f": at {where} the fault {', '.join(map(repr, faults))}{masked or ' can persist'} without showing in any "
+            "output, so no observer can estimate it. Measure another signal, or leave one of them out."
+        )
+    return Condition(
+        f"(D3) fault model at {number(value)}",
+        f"rank [lambda E - A, -Bf Cw V, -Bd; C, Df Cw V, Dd] full at {where}, an eigenvalue of Phi",
+        decision.full,
+        float(decision.rank),
+        float(decision.expected),
+        "in place of Share Pasand, Theorems 1 and 2, which are false",
+        detail,
+        mode=None if decision.full else value,
+        signals=signals,
+    )
+
+
+def _order_conditions(plant: DescriptorSystem, model: Exosystem) -> list[Condition]:
+    """Test that the fault model is not lost in rounding, at the zeros where faults can hide longest.
+
+    At a zero z0 of (f, d) -> y outside the region of stability, a polynomial model of order n is seen with a strength
+    of about abs(z0)^(n + 1) only: a high order is observable on paper and lost in double precision.
+    """
+    inputs, direct = np.hstack([plant.Bf, plant.Bd]), np.hstack([plant.Df, plant.Dd])
+    wide_e, wide_a = system_pencil(plant.E, plant.A, inputs, plant.C, direct)
+    zeros = finite_zeros(wide_e, wide_a)
+    if zeros.normal_rank < wide_e.shape[1]:
+        return []
+    points = [complex(value) for value in zeros.values if value.imag >= 0.0 and is_outside(value, plant.dt)]
+    augmented = AugmentedPlant.of(plant, model)
+    own, shown = independent_disturbances(plant)
+    below = np.vstack([own, np.zeros((model.order, own.shape[1]))])
+    worst: tuple[RankDecision, complex] | None = None
+    for point in points:
+        matrix = np.block([[point * augmented.E - augmented.A, -below], [augmented.C.astype(complex), shown]])
+        scaled, _ = equilibrated(matrix)
+        decision = decide_rank(scaled, expected=matrix.shape[1], equilibrated=False)
+        if worst is None or (decision.rank, decision.smallest_kept) < (worst[0].rank, worst[0].smallest_kept):
+            worst = (decision, point)
+    if worst is None:
+        return []
+    decision, point = worst
+    lost = (
+        f": at the zero {number(point)} of (f, d) -> y the fault model (order {model.order}) cannot be told from "
+        "nothing in double precision. Lower its order."
+    )
+    return [
+        Condition(
+            "order of the fault model",
+            "the augmented plant is observable in double precision where faults can hide longest",
+            decision.full,
+            float(decision.rank),
+            float(decision.expected),
+            "ours: observable on paper is not enough",
+            f"{decision.describe()} at {number(point)}" + ("" if decision.full else lost),
+            mode=None if decision.full else point,
+            signals=() if decision.full else plant.fault_names,
+        )
+    ]
+
+
+def _masking(scaled: NDArray[Any], plant: DescriptorSystem, width: int, shares: FloatArray) -> tuple[str, ...]:
+    """Return the disturbances of a null vector; none where states alone already hide the fault."""
+    without = scaled[:, : plant.nx + width]
+    alone = decide_rank(without, expected=plant.nx + width, equilibrated=False)
+    return leading_names(shares, plant.disturbance_names, most=MOST_NAMES) if alone.full else ()
+
+
+def _fixed_modes(plant: DescriptorSystem, model: Exosystem) -> tuple[ComplexArray, Condition]:
+    augmented = AugmentedPlant.of(plant, model)
+    inputs, direct = independent_disturbances(plant)
+    below = np.vstack([inputs, np.zeros((model.order, inputs.shape[1]))])
+    zeros = finite_zeros(*system_pencil(augmented.E, augmented.A, below, augmented.C, direct)).values
+    text = ", ".join(number(complex(value)) for value in zeros if value.imag >= 0.0)
+    return zeros, Condition(
+        "fixed modes",
+        "every pole that no gain moves is stable",
+        True,
+        float(len(zeros)),
+        float(augmented.order),
+        "drops of the augmented pencil",
+        f"{len(zeros)} of {augmented.order} poles are fixed" + (f": {text}" if text else ""),
+    )

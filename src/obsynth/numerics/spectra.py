@@ -1,0 +1,114 @@
+"""Comparing spectra, with multiple eigenvalues; decay rates in either time; H2 norms and responses in either time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.numerics.norms import output_covariance
+
+#: Wanted poles closer than this, relative to their size, are compared as a group: rounding scatters a multiple
+#: eigenvalue by a root of the unit roundoff, but hardly moves the mean of the group.
+SAME_POLE = 1e-3
+#: Modulus below which a discrete eigenvalue counts as zero: it forgets in a few samples, and has no useful rate.
+DEAD_BEAT = 1e-6
+
+
+def eigenvalues(matrix: FloatArray) -> ComplexArray:
+    """Return the eigenvalues of ``matrix (n, n)``; none of an empty one."""
+    values = np.linalg.eigvals(matrix) if matrix.size else np.zeros(0)
+    return np.asarray(values, dtype=np.complex128)
+
+
+def spectrum_error(matrix: FloatArray, wanted: Sequence[complex] | ComplexArray, dt: float) -> float:
+    """Return how far the eigenvalues of ``matrix (n, n)`` are from n wanted ones, relative to their size.
+
+    In discrete time (``dt > 0``) the size is that of the unit circle: near zero, relative distances mean nothing.
+
+    Eigenvalues are assigned to wanted ones with the least total distance, and the means of groups are compared.
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    goal = np.asarray(wanted, dtype=np.complex128)
+    if matrix.shape[0] != goal.size or not np.all(np.isfinite(matrix)):
+        return float("inf")
+    if goal.size == 0:
+        return 0.0
+    found = eigenvalues(matrix)
+    rows, columns = linear_sum_assignment(np.abs(found[:, None] - goal[None, :]))
+    assigned = np.empty_like(goal)
+    assigned[columns] = found[rows]
+    largest = float(np.max(np.abs(goal))) or 1.0
+    worst, waiting = 0.0, list(range(goal.size))
+    while waiting:
+        first = goal[waiting[0]]
+        reach = SAME_POLE * (1.0 if dt > 0.0 else abs(first))
+        group = [i for i in waiting if abs(goal[i] - first) <= reach] or [waiting[0]]
+        waiting = [i for i in waiting if i not in group]
+        miss = abs(complex(np.mean(assigned[group] - goal[group])))
+        # A pole at zero is compared with the others.
+        worst = max(worst, miss / (1.0 if dt > 0.0 else max(abs(first), SAME_POLE * largest)))
+    return worst
+
+
+def abscissa(matrix: FloatArray, dt: float) -> float:
+    """Return the largest real part (``dt == 0``) or modulus of an eigenvalue; the empty matrix is stable."""
+    if matrix.shape[0] == 0:
+        return 0.0 if dt > 0.0 else -np.inf
+    if not np.all(np.isfinite(matrix)):
+        return np.inf
+    values = eigenvalues(matrix)
+    return float(np.max(np.abs(values))) if dt > 0.0 else float(np.max(values.real))
+
+
+def decay_rates(values: ComplexArray | Sequence[complex], dt: float) -> FloatArray:
+    """Return the rate in 1/s at which each mode decays; negative for one that grows."""
+    given = np.asarray(values, dtype=np.complex128)
+    if dt == 0.0:
+        return np.asarray(-given.real, dtype=np.float64)
+    with np.errstate(divide="ignore"):
+        return np.asarray(-np.log(np.abs(given)) / dt, dtype=np.float64)
+
+
+def speeds(values: ComplexArray | Sequence[complex], dt: float) -> FloatArray:
+    """Return the speed ``abs(s)`` of each mode in 1/s; infinite for a mode that dies in one sample."""
+    given = np.asarray(values, dtype=np.complex128)
+    if dt == 0.0:
+        return np.asarray(np.abs(given), dtype=np.float64)
+    alive = np.abs(given) > DEAD_BEAT
+    found = np.full(given.shape, np.inf)
+    found[alive] = np.abs(np.log(given[alive])) / dt
+    return found
+
+
+def noise_covariance(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, dt: float) -> FloatArray:
+    """Return the stationary covariance of the output under unit white noise, in either time.
+
+    In continuous time the noise has unit intensity, and ``d`` must be left out by the caller: white noise that reaches
+    an output directly has no variance.  Infinite when ``a`` is not stable.
+    """
+    if dt > 0.0:
+        return output_covariance(a, b, c, d)
+    from scipy.linalg import solve_continuous_lyapunov
+
+    if not a.size:
+        return np.zeros((c.shape[0], c.shape[0]))
+    if not abscissa(a, dt) < 0.0:
+        return np.full((c.shape[0], c.shape[0]), np.inf)
+    return np.asarray(c @ solve_continuous_lyapunov(a, -b @ b.T) @ c.T)
+
+
+def response(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, points: ComplexArray) -> ComplexArray:
+    """Return ``C (s I - A)^-1 B + D`` at each point s (z in discrete time), ``(len(points), rows, cols)``."""
+    if a.shape[0] == 0:
+        return np.broadcast_to(d.astype(complex), (len(points), *d.shape)).copy()
+    resolvents = np.asarray(points)[:, None, None] * np.eye(a.shape[0]) - a
+    right_sides = np.broadcast_to(b.astype(complex), (len(points), *b.shape))
+    return np.asarray(c @ np.linalg.solve(resolvents, right_sides) + d)
+
+
+def boundary_points(frequencies: FloatArray, dt: float) -> ComplexArray:
+    """Return ``j w`` or ``exp(j w dt)`` for frequencies in rad/s."""
+    return np.asarray(np.exp(1j * frequencies * dt) if dt > 0.0 else 1j * frequencies, dtype=np.complex128)

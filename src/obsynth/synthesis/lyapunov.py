@@ -1,0 +1,72 @@
+"""Finding a Lyapunov factor with which the stability of a matrix in hand can be proved."""
+
+from __future__ import annotations
+
+import warnings
+from itertools import product
+
+import numpy as np
+
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.spectra import abscissa
+from obsynth.verification.lyapunov import prove_stable
+
+#: Shares of the decay that the Lyapunov function is asked to show, largest first: more makes a tighter fit to the slow
+#: modes and a larger condition number.
+SHARES = (0.9, 0.5, 0.99, 0.0)
+#: Times the equation is solved again in the coordinates of its last solution.
+ROUNDS = 3
+
+
+def lyapunov_factor(a: FloatArray, dt: float) -> FloatArray:
+    """Return Q ``(n, n)``, upper triangular, with which `prove_stable` succeeds; the last try when none does.
+
+    Parameters
+    ----------
+    a : FloatArray
+        ``(n, n)``, stable.
+    dt : float
+        Seconds between samples, 0 for continuous time.
+    """
+    n = a.shape[0]
+    best = np.eye(n)
+    edge = abscissa(a, dt)
+    if n == 0 or not edge < (1.0 if dt > 0.0 else 0.0):
+        return best
+    for rounds, share in product(range(1, ROUNDS + 1), SHARES):
+        found = _factor(a, dt, share, rounds, edge)
+        if found is None:
+            continue
+        best = found
+        if prove_stable(a, best, dt).proved:
+            break
+    return best
+
+
+def _factor(a: FloatArray, dt: float, share: float, rounds: int, edge: float) -> FloatArray | None:
+    from scipy.linalg import matrix_balance, solve_continuous_lyapunov, solve_discrete_lyapunov
+
+    n = a.shape[0]
+    scale = matrix_balance(a, permute=False, separate=True)[1][0]
+    change = np.diag(scale)
+    for _ in range(rounds):
+        moved = np.linalg.solve(change, a @ change)
+        try:
+            with warnings.catch_warnings(), np.errstate(all="ignore"):
+                # What a badly conditioned equation gives is judged by whether it proves anything.
+                warnings.simplefilter("ignore")
+                if dt > 0.0:
+                    p = solve_discrete_lyapunov((moved / max(edge, 1e-300) ** share).T, np.eye(n))
+                else:
+                    p = solve_continuous_lyapunov((moved - share * edge * np.eye(n)).T, -np.eye(n))
+        except (np.linalg.LinAlgError, ValueError):
+            return None
+        values, vectors = np.linalg.eigh(0.5 * (p + p.T))
+        if not np.all(np.isfinite(values)) or values[0] <= 0.0:
+            return None
+        change = change @ (vectors / np.sqrt(values))
+    try:
+        factor = np.triu(np.linalg.qr(np.linalg.inv(change), mode="r"))
+    except np.linalg.LinAlgError:
+        return None
+    return np.asarray(factor) if np.all(np.isfinite(factor)) else None

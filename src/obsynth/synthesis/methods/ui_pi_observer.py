@@ -1,0 +1,251 @@
+r"""Unknown-input PI observer for descriptor systems, continuous or discrete time.
+
+Source: M. M. Share Pasand, M. Aliyari Sh., H. D. Taghirad, *Unknown Input-Proportional Integral Observer for Singular
+Systems: Application to fault detection*: observer (4), identities (19), procedures 1 and 2.
+
+Our deviations
+    1. Existence by (D1)-(D3) on the plant's own data; Theorems 1 and 2 and Lemma 6 are false as printed.
+    2. Vector faults, each with its own exosystem, block-diagonal (6); faults and disturbances in the outputs.
+    3. U with full rank by construction; ``E#, C#, G`` (10), (11) only on request: with the Moore-Penrose ``E#`` U loses
+       rank and the unobservable modes change.
+    4. Poles of the observable part only; fixed modes are kept and named; repeated poles by Jordan chains.
+    5. Poles in a region, Kalman gains with a prescribed rate, and a default that needs no numbers.
+    6. K and the free part of the decoupling (the paper's G) can be designed together.
+    7. Where (D1) fails on the plant as written and it has index 1, its algebraic states are eliminated first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from obsynth.analysis.conditions import Condition, require_all
+from obsynth.analysis.unknown_input_conditions import existence
+from obsynth.analysis.unknown_input_pencils import number
+from obsynth.analysis.unknown_inputs import direct_part
+from obsynth.errors import PreconditionError, SolverError, SpecError
+from obsynth.models.descriptor import DescriptorSystem
+from obsynth.models.exosystems import Exosystem, exosystem
+from obsynth.numerics.arrays import ComplexArray, FloatArray, as_matrix
+from obsynth.numerics.spectra import abscissa, decay_rates, eigenvalues, noise_covariance
+from obsynth.observers.linear import LinearObserver
+from obsynth.results.design import Certificate
+from obsynth.synthesis.lyapunov import lyapunov_factor
+from obsynth.synthesis.placement.eigenstructure import place
+from obsynth.synthesis.placement.kalman import compromise
+from obsynth.synthesis.placement.region import Region, region_gain
+from obsynth.synthesis.result import Synthesis
+from obsynth.synthesis.ui_pi_options import UiPiOptions, checked_poles, plain
+from obsynth.synthesis.ui_pi_problem import (
+    NoiseWeights,
+    PlacementProblem,
+    kalman_problem,
+    placement_problem,
+    with_faults,
+)
+from obsynth.synthesis.ui_pi_realisation import ObserverGains, realise
+
+
+def conditions(plant: DescriptorSystem, *, fault_model: Any = "step") -> tuple[Condition, ...]:
+    """Return the existence conditions; they are independent of each other, so several may fail."""
+    return existence(plant, exosystem(fault_model, plant.fault_names, plant.dt)).conditions
+
+
+def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **options: Any) -> Synthesis:
+    """Design the observer; see `obsynth.ui_pi_observer` for the options, results and errors."""
+    asked = UiPiOptions(**options)
+    model = exosystem(asked.fault_model, plant.fault_names, plant.dt)
+    region = asked.checked_region(plant.dt)
+    weights = asked.checked_noise(plant.output_names)
+    progress("checking the existence conditions")
+    found = existence(plant, model)
+    _require_all(found.conditions)
+    working = found.plant
+    progress("decoupling the unknown inputs")
+    problem = placement_problem(working, model, found.fixed_modes, joint=asked.joint, given=asked.given_decoupling())
+    _require_stable(problem, working.dt)
+    progress("choosing the gains")
+    chosen = _chosen(asked, problem, region, weights)
+    progress("building the realisation and its certificate")
+    gains = problem.gains(chosen.gain)
+    poles = None if chosen.poles is None else np.array([*chosen.poles, *problem.split.fixed_modes])
+    synthesis = _assembled(working, model, gains, poles, dict(chosen.claims), structured=not asked.joint)
+    return Synthesis(
+        asked.resolved(model, plant.fault_names),
+        synthesis.gains,
+        synthesis.observer,
+        synthesis.certificate,
+        {"runs": list(chosen.runs)},
+        (*_elimination_note(found.conditions, found.transformation is not None), *_notes(problem, asked)),
+        found.transformation,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Chosen:
+    """A gain of the observable part, its poles where they were asked for, and what is claimed about the choice."""
+
+    gain: FloatArray
+    poles: Sequence[complex] | None
+    claims: Mapping[str, float]
+    runs: tuple[Mapping[str, Any], ...] = ()
+
+
+def _placed(problem: PlacementProblem, wanted: Sequence[complex], objective: str) -> _Chosen:
+    """Return the gain for given poles; its size is that in the user's units where outputs are not mixed."""
+    split, plant = problem.split, problem.plant
+    states = np.concatenate([problem.scaling.states, np.ones(problem.model.order)])
+    plain_outputs = problem.free == 0 and np.array_equal(problem.decoupled.seen, np.eye(plant.ny))
+    outputs = problem.scaling.outputs if plain_outputs else np.ones(len(split.C))
+    found = place(
+        split.F, split.C / outputs[:, None], wanted, dt=plant.dt, objective=objective,
+        weight=states[:, None] * split.lift(np.eye(split.order)),
+    )  # fmt: skip
+    return _Chosen(found.K / outputs, wanted, {"condition": found.condition})
+
+
+def _chosen(asked: UiPiOptions, problem: PlacementProblem, region: Region | None, weights: NoiseWeights) -> _Chosen:
+    split = problem.split
+    if asked.poles is not None:
+        wanted = checked_poles(asked.poles, split.order, split.fixed_modes, problem.plant.dt)
+        return _placed(problem, wanted, asked.objective)
+    kalman = kalman_problem(problem, weights)
+    claims: dict[str, float] = {}
+    runs: tuple[Mapping[str, Any], ...] = ()
+    if region is not None:
+        gain, record = region_gain(kalman, region, solver=asked.solver)
+        runs = (record,)
+    elif asked.decay is not None:
+        found = kalman.gain(asked.decay)
+        if found is None:
+            raise SolverError(
+                f"The Riccati equation for decay {asked.decay:g} 1/s has no usable solution: some mode shows too "
+                "little to be made that fast. Ask for less, or leave decay out."
+            )
+        gain = found
+    else:
+        fair = compromise(kalman, problem.rate)
+        if fair is None:
+            raise SolverError("The Riccati equation has no usable solution: give poles= or a slow decay=.")
+        gain, claims = fair.K, {"noise_price": fair.deviation / fair.quietest if fair.quietest > 0.0 else 1.0}
+    return _Chosen(gain, None, claims, runs)
+
+
+def _require_all(found: Sequence[Condition]) -> None:
+    """Raise for the first condition that fails, and say which others fail too."""
+    failed = [condition for condition in found if not condition.holds]
+    if len(failed) <= 1:
+        require_all(found)
+        return
+    others = "; ".join(f"{condition.name}: {condition.detail}" for condition in failed[1:])
+    try:
+        failed[0].require()
+    except PreconditionError as error:
+        mode = next((condition.mode for condition in failed if condition.mode is not None), None)
+        signals = tuple(dict.fromkeys(name for condition in failed for name in condition.signals))
+        raise PreconditionError(
+            f"{error} Also fails: {others}", condition=failed[0].name, mode=mode, signals=signals
+        ) from None
+
+
+def _require_stable(problem: PlacementProblem, dt: float) -> None:
+    """Raise when a mode that no gain moves is not stable: only a given ``E#`` or ``G`` can bring one in."""
+    modes = problem.split.fixed_modes
+    unstable = [complex(value) for value in modes if not decay_rates([complex(value)], dt)[0] > 0.0]
+    if unstable:
+        raise PreconditionError(
+            f"With these E_sharp, C_sharp and G the mode {number(unstable[0])} is fixed and not stable: U has lost "
+            "rank and with it equations of the plant. Leave E_sharp, C_sharp and G out.",
+            condition="fixed modes",
+            mode=unstable[0],
+        )
+
+
+def synthesis_from_gains(plant: DescriptorSystem, *, U: Any, D: Any, K: Any, F: Any, fault_model: Any) -> Synthesis:
+    """Return the realisation of given gains; see `obsynth.ui_pi_observer_from_gains`."""
+    model = exosystem(fault_model, plant.fault_names, plant.dt)
+    nx, ny, count = plant.nx, plant.ny, model.order
+    given = {name: as_matrix(value, name) for name, value in (("U", U), ("D", D), ("K", K), ("F", F))}
+    shapes = {"U": (nx, nx), "D": (nx, ny), "K": (nx, ny), "F": (count, ny)}
+    for name, shape in shapes.items():
+        if given[name].shape != shape:
+            raise SpecError(f"{name} is {given[name].shape}, but {shape} is needed.", path=name)
+    u, d = with_faults(given["U"], given["D"], plant, model)
+    gains = ObserverGains(u, d, np.vstack([given["K"], given["F"]]))
+    options = {"from_gains": True, "fault_model": plain(fault_model)}
+    found = _assembled(plant, model, gains, None, {}, structured=True)
+    return Synthesis(options, found.gains, found.observer, found.certificate)
+
+
+def _assembled(
+    plant: DescriptorSystem,
+    model: Exosystem,
+    gains: ObserverGains,
+    poles: ComplexArray | None,
+    claims: dict[str, float],
+    *,
+    structured: bool,
+) -> Synthesis:
+    """Return realisation and certificate of gains in the plant's units; poles that were not asked for are computed."""
+    seen = direct_part(plant)[0]
+    observer, letters = realise(plant, model, gains, seen)
+    nx = plant.nx
+    if structured:
+        letters |= {"U": gains.U[:nx, :nx], "D": gains.D[:nx], "K": gains.K[:nx], "F": gains.K[nx:]}
+        letters["Hhat"] = letters["U"] @ plant.Bf
+    letters |= {"Phi": model.Phi, "Cw": model.Cw}
+    poles = eigenvalues(observer.Az) if poles is None else poles
+    order = np.lexsort((poles.imag, poles.real))
+    matrices = {
+        "tracking": gains.U,
+        "Phi": model.Phi,
+        "Cw": model.Cw,
+        "poles": np.column_stack([poles.real, poles.imag])[order] if poles.size else np.zeros((0, 2)),
+        "stability": lyapunov_factor(observer.Az, plant.dt),
+    }
+    slowest = float(np.min(decay_rates(eigenvalues(observer.Az), plant.dt), initial=np.inf))
+    claims = {"decay": slowest, "noise_amplification": noise_amplification(observer), **claims}
+    finite = {name: value for name, value in claims.items() if np.isfinite(value)}
+    return Synthesis({}, letters, observer, Certificate(matrices, finite))
+
+
+def noise_amplification(observer: LinearObserver) -> float:
+    """Return the largest H2 norm from unit white noise on every output to a fault estimate, the direct part left out.
+
+    Times the square root of the sample time it is a standard deviation, for dt = 0 and noise held between samples.
+    """
+    rows = observer.Cz[observer.fault_rows]
+    direct = observer.Dy[observer.fault_rows] * (observer.dt > 0.0)
+    stable = abscissa(observer.Az, observer.dt) < (1.0 if observer.dt > 0.0 else 0.0)
+    if not len(rows) or not stable:
+        return 0.0 if not len(rows) else float("inf")
+    covariance = noise_covariance(observer.Az, observer.By, rows, direct, observer.dt)
+    return float(np.sqrt(np.max(np.maximum(np.diag(covariance), 0.0))))
+
+
+def _elimination_note(found: tuple[Condition, ...], eliminated: bool) -> tuple[str, ...]:
+    if not eliminated:
+        return ()
+    detail = next(condition.detail for condition in found if condition.name.startswith("(D1)"))
+    return (f"(D1) holds only without the algebraic states, which were eliminated: {detail}.",)
+
+
+def _notes(problem: PlacementProblem, asked: UiPiOptions) -> tuple[str, ...]:
+    found = []
+    fixed, dt = problem.split.fixed_modes, problem.plant.dt
+    if fixed.size:
+        text = ", ".join(number(complex(value)) for value in fixed if value.imag >= 0.0)
+        rates = decay_rates(fixed, dt)
+        slow = asked.slowest_asked(dt)
+        found.append(
+            f"{fixed.size} of {len(problem.F)} poles are fixed, whatever the gains: {text}"
+            + (
+                f"; the slowest decays at {np.min(rates):.3g} 1/s, slower than asked."
+                if slow is not None and np.min(rates) < slow
+                else "."
+            )
+        )
+    return tuple(found)

@@ -1,0 +1,155 @@
+"""Splitting a pair into its observable part and the modes that no gain moves.
+
+Source: Share Pasand, Aliyari, Taghirad, step 7 of procedure 1.  Difference: Lemma 6 promises that the pair is always
+observable, which is false; a library that places the poles of a pair that is not returns garbage without a word.  A
+staircase of rank decisions loses its way on large stiff pairs (three of four fixed modes of the Kundur network); the
+fixed modes are known from the zeros of the plant's pencil, so they are peeled off one eigenspace at a time instead.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from obsynth.errors import PreconditionError
+from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, HIDDEN_MODE_TOLERANCE, RANK_TOLERANCE
+from obsynth.numerics.spectra import eigenvalues
+
+#: Fixed modes closer than this, relative to their size, are peeled off together, at their mean: a double one that
+#: rounding split lies at about the square root of the unit roundoff from it.
+SAME_MODE = 1e-5
+#: Weight of leaving the states' units alone.
+SMALL_RIDGE = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class ObservableSplit:
+    """A pair in coordinates that show its observable part.
+
+    With ``x = units * basis @ [observable; hidden]``: ``F = [F_o 0; F_ho F_h]`` and ``C = [C_o 0]``.
+
+    Parameters
+    ----------
+    basis : FloatArray
+        ``(n, n)``, orthogonal.
+    units : FloatArray
+        ``(n,)``, powers of two: the states are balanced first.
+    F, C : FloatArray
+        The observable part, ``(no, no)`` and ``(ny, no)``.
+    fixed_modes : ComplexArray
+        Eigenvalues of the hidden part.
+    """
+
+    basis: FloatArray
+    units: FloatArray
+    F: FloatArray
+    C: FloatArray
+    fixed_modes: ComplexArray
+
+    @property
+    def order(self) -> int:
+        """Number of observable states."""
+        return int(self.F.shape[0])
+
+    def lift(self, gain: FloatArray) -> FloatArray:
+        """Return the gain ``(n, ny)`` of the whole pair for one of the observable part ``(no, ny)``."""
+        return np.asarray(self.units[:, None] * (self.basis[:, : self.order] @ gain))
+
+    def lower(self, matrix: FloatArray) -> FloatArray:
+        """Return the observable rows of an input matrix ``(n, *)`` of the whole pair."""
+        return np.asarray(self.basis[:, : self.order].T @ (matrix / self.units[:, None]))
+
+    def shown(self, matrix: FloatArray) -> FloatArray:
+        """Return the observable columns of an output matrix ``(*, n)`` of the whole pair."""
+        return np.asarray((matrix * self.units) @ self.basis[:, : self.order])
+
+
+def observable_split(f: FloatArray, c: FloatArray, fixed_modes: ComplexArray) -> ObservableSplit:
+    """Split the pair ``(F, C)`` at its fixed modes.
+
+    Parameters
+    ----------
+    f, c : FloatArray
+        ``(n, n)`` and ``(ny, n)``.
+    fixed_modes : ComplexArray
+        Zeros of ``[F - s I; C]``, with multiplicity, conjugate pairs together.
+
+    Raises
+    ------
+    PreconditionError
+        The zeros are none of the pair's: the two numerical views of the plant contradict each other.
+    """
+    n = f.shape[0]
+    units = _balancing(f, c)
+    work_f, work_c, basis = f * units / units[:, None], c * units, np.eye(n)
+    size = max(float(np.linalg.norm(work_f, 2)), float(np.linalg.norm(work_c, 2))) if n else 1.0
+    waiting = [complex(value) for value in fixed_modes if value.imag >= 0.0]
+    seen = n
+    while waiting:
+        value = waiting[0]
+        cluster = [other for other in waiting if abs(other - value) <= SAME_MODE * max(1.0, abs(value))]
+        kernel = _hidden_directions(work_f[:seen, :seen], work_c[:, :seen], sum(cluster) / len(cluster), size)
+        found = kernel.shape[1] // (2 if value.imag > 0.0 else 1)
+        if found == 0 or found > len(cluster):
+            raise PreconditionError(
+                f"The mode {value:.6g} is fixed by the plant's zeros, but the pair (U A, C) shows it: the data are too "
+                "badly scaled to tell. Rescale the plant, or lower the order of the fault model.",
+                condition="fixed modes",
+                mode=value,
+            )
+        turn = np.eye(n)
+        # Observable directions first, the hidden ones behind them.
+        left = np.linalg.svd(kernel)[0]
+        turn[:seen, :seen] = np.hstack([left[:, kernel.shape[1] :], left[:, : kernel.shape[1]]])
+        work_f, work_c, basis = turn.T @ work_f @ turn, work_c @ turn, basis @ turn
+        seen -= kernel.shape[1]
+        for other in cluster[:found]:
+            waiting.remove(other)
+    hidden = eigenvalues(work_f[seen:, seen:])
+    return ObservableSplit(basis, units, work_f[:seen, :seen], work_c[:, :seen], hidden)
+
+
+def _hidden_directions(f: FloatArray, c: FloatArray, value: complex, size: float) -> FloatArray:
+    """Return a real orthonormal basis of the states that stay invisible at the mode, and at its conjugate."""
+    shifted = f - (value if value.imag else value.real) * np.eye(f.shape[0])
+    _, values, right = np.linalg.svd(np.vstack([shifted, c]))
+    kernel = right[values <= HIDDEN_MODE_TOLERANCE * max(size, abs(value))].conj().T
+    if value.imag == 0.0:
+        return np.asarray(kernel.real)
+    both = np.hstack([kernel.real, kernel.imag])
+    if both.shape[1] == 0:
+        return both
+    left, lengths, _ = np.linalg.svd(both, full_matrices=False)
+    return np.asarray(left[:, lengths > RANK_TOLERANCE])
+
+
+def _balancing(f: FloatArray, c: FloatArray) -> FloatArray:
+    """Return powers of two by which the states are scaled, so that the entries of F, and of each row of C, are alike.
+
+    Least squares on the logarithms, with the common size of F free: unlike the usual balancing it does not run away
+    where F is reducible, as that of a fault model is.
+    """
+    n, outputs = f.shape[0], c.shape[0]
+    if n == 0:
+        return np.ones(0)
+    rows, right = [], []
+
+    floor = CANCELLATION_TOLERANCE * float(np.max(np.abs(f), initial=0.0))
+    for i, j in zip(*np.nonzero(np.abs(f) > floor), strict=True):
+        if i != j:
+            row = np.zeros(n + 1 + outputs)
+            row[j], row[i], row[n] = 1.0, -1.0, -1.0
+            rows.append(row)
+            right.append(-np.log2(abs(f[i, j])))
+    floor = CANCELLATION_TOLERANCE * float(np.max(np.abs(c), initial=0.0))
+    for k, j in zip(*np.nonzero(np.abs(c) > floor), strict=True):
+        row = np.zeros(n + 1 + outputs)
+        row[j], row[n + 1 + k] = 1.0, -1.0
+        rows.append(row)
+        right.append(-np.log2(abs(c[k, j])))
+    # The ridge leaves a state alone that nothing ties to the others.
+    whole = np.vstack([*rows, SMALL_RIDGE * np.eye(n + 1 + outputs)])
+    exponents = np.linalg.lstsq(whole, np.concatenate([right, np.zeros(n + 1 + outputs)]), rcond=None)[0][:n]
+    return np.asarray(np.exp2(np.round(exponents)))

@@ -1,0 +1,258 @@
+"""The pair behind an unknown-input PI observer: what is decoupled, what can be placed, and the noise on it.
+
+Source: Share Pasand, Aliyari, Taghirad, Lemma 5 and procedure 1; the joint design over K and Z is ours: their free
+matrix G is itself an output injection, from the rows ``N_U A`` that the decoupling leaves over.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from obsynth.analysis.unknown_inputs import (
+    AugmentedPlant,
+    Decoupled,
+    balanced,
+    balancing,
+    decouple,
+    direct_part,
+    paper_decoupling,
+)
+from obsynth.errors import SpecError
+from obsynth.models.descriptor import DescriptorSystem
+from obsynth.models.exosystems import Exosystem
+from obsynth.numerics.arrays import ComplexArray, FloatArray, as_matrix
+from obsynth.numerics.pencils import finite_zeros, pencil_structure
+from obsynth.numerics.scaling import Scaling
+from obsynth.numerics.spectra import DEAD_BEAT, eigenvalues, speeds
+from obsynth.synthesis.placement.kalman import KalmanProblem
+from obsynth.synthesis.placement.observable import ObservableSplit, observable_split
+from obsynth.synthesis.ui_pi_realisation import ObserverGains
+
+#: Modes slower than this share of the fastest do not count for the plant's time scale: integrators and rounding.
+SLOW_SHARE = 1e-6
+#: Noise on innovations that have none of their own, relative to the outputs' noise.
+BACKGROUND_NOISE = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class PlacementProblem:
+    """A decoupled plant in balanced units, and the pair whose poles are to be placed.
+
+    Parameters
+    ----------
+    plant : DescriptorSystem
+        As given, in the user's units.
+    scaled : DescriptorSystem
+        Balanced.
+    scaling : Scaling
+        Between the two.
+    model : Exosystem
+        Of the faults.
+    decoupled : Decoupled
+        Of the balanced plant.
+    U, D : FloatArray
+        ``(na, na)`` and ``(na, ny)`` of the balanced augmented plant, without the free part.
+    F, C : FloatArray
+        The pair ``(na, na)`` and ``(rows, na)``; the first ``free`` rows of C are those of the free part Z.
+    free : int
+        Number of rows of the free part; 0 unless K and Z are designed together.
+    split : ObservableSplit
+        Of the pair.
+    rate : float, 1/s
+        The plant's own speed: the median of ``abs(s)`` over its modes.
+    """
+
+    plant: DescriptorSystem
+    scaled: DescriptorSystem
+    scaling: Scaling
+    model: Exosystem
+    decoupled: Decoupled
+    U: FloatArray
+    D: FloatArray
+    F: FloatArray
+    C: FloatArray
+    free: int
+    split: ObservableSplit
+    rate: float
+
+    def gains(self, placed: FloatArray) -> ObserverGains:
+        """Return the gains in the user's units for one of the observable part ``(no, rows)``."""
+        k = self.split.lift(placed)
+        u, d, k = _completed(self, k)
+        states = np.concatenate([self.scaling.states, np.ones(self.model.order)])
+        equations = np.concatenate([self.scaling.equations, np.ones(self.model.order)])
+        outputs = self.scaling.outputs
+        return ObserverGains(states[:, None] * u * equations, states[:, None] * d * outputs,
+                             states[:, None] * k * outputs)  # fmt: skip
+
+
+def placement_problem(
+    plant: DescriptorSystem,
+    model: Exosystem,
+    fixed_modes: ComplexArray,
+    *,
+    joint: bool = False,
+    given: Mapping[str, Any] | None = None,
+) -> PlacementProblem:
+    """Return the pair to place; the existence conditions must hold.
+
+    Parameters
+    ----------
+    plant : DescriptorSystem
+        For which (D1) holds.
+    model : Exosystem
+        Of its faults.
+    fixed_modes : ComplexArray
+        Poles that no gain moves.
+    joint : bool, optional
+        Whether the free part Z of the decoupling is designed together with K.
+    given : mapping, optional
+        The paper's ``E_sharp, C_sharp, G``, in the user's units.
+
+    Raises
+    ------
+    SpecError
+        The given matrices do not decouple.
+    """
+    scaling = balancing(plant)
+    scaled = balanced(plant, scaling)
+    decoupled = decouple(scaled) if given is None else _given_decoupling(plant, scaling, given)
+    u, d = with_faults(decoupled.U, decoupled.Dhat, scaled, model)
+    augmented = AugmentedPlant.of(scaled, model)
+    injected = augmented.A - np.vstack([decoupled.injection, np.zeros((model.order, plant.ny))]) @ augmented.C
+    f, c = u @ injected, decoupled.seen @ augmented.C
+    free = 0
+    if joint:
+        more, _ = _free_part(decoupled, scaled, model)
+        c, free = np.vstack([more @ injected, c]), len(more)
+    if given is not None:
+        # Another U may have other unobservable modes than the plant's pencil.
+        n = len(f)
+        fixed_modes = finite_zeros(np.vstack([np.eye(n), np.zeros((len(c), n))]), np.vstack([f, c])).values
+    split = observable_split(f, c, fixed_modes)
+    return PlacementProblem(
+        plant, scaled, scaling, model, decoupled, u, d, f, c, free, split, _own_rate(plant, split.F)
+    )
+
+
+def with_faults(
+    u: FloatArray, d: FloatArray, plant: DescriptorSystem, model: Exosystem
+) -> tuple[FloatArray, FloatArray]:
+    """Return ``U_a = [U, -Dhat Df Cw; 0, I]`` and ``D_a = [Dhat; 0]``: the faults are never read from y directly."""
+    nx, count = plant.nx, model.order
+    whole = np.eye(nx + count)
+    whole[:nx, :nx], whole[:nx, nx:] = u, -d @ plant.Df @ model.Cw
+    return whole, np.vstack([d, np.zeros((count, plant.ny))])
+
+
+def _free_part(decoupled: Decoupled, plant: DescriptorSystem, model: Exosystem) -> tuple[FloatArray, FloatArray]:
+    return np.hstack([decoupled.free_U, -decoupled.free_D @ plant.Df @ model.Cw]), decoupled.free_D
+
+
+def _completed(problem: PlacementProblem, k: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return U_a, D_a, K_a of the balanced plant: the gain of the pair is ``[-Z K]``."""
+    decoupled, plant, model = problem.decoupled, problem.scaled, problem.model
+    u, d = problem.U, problem.D
+    if problem.free:
+        more_u, more_d = _free_part(decoupled, plant, model)
+        z = -k[:, : problem.free]
+        u, d = u + z @ more_u, d + z @ more_d
+    injection = np.vstack([decoupled.injection, np.zeros((model.order, plant.ny))])
+    return u, d, k[:, problem.free :] @ decoupled.seen + u @ injection
+
+
+def _given_decoupling(plant: DescriptorSystem, scaling: Scaling, given: Mapping[str, Any]) -> Decoupled:
+    if plant.Dd.any():
+        raise SpecError("E_sharp, C_sharp and G are for plants without Dd: leave them out.", path="E_sharp")
+    matrices = [as_matrix(given[name], name) for name in ("E_sharp", "C_sharp", "G")]
+    _, u, d = paper_decoupling(plant, e_sharp=matrices[0], c_sharp=matrices[1], g=matrices[2])
+    seen, injection, _ = direct_part(plant)
+    # x = states * x_balanced: U and D of the balanced plant; the factors are powers of two, so this is exact.
+    u = u / scaling.states[:, None] / scaling.equations
+    d = d / scaling.states[:, None] / scaling.outputs
+    return Decoupled(u, d, np.zeros((0, plant.nx)), np.zeros((0, plant.ny)), seen, injection)
+
+
+def _own_rate(plant: DescriptorSystem, f: FloatArray) -> float:
+    """Return the median speed of the plant's modes; of the pair's where it has none; or its size."""
+    structure = pencil_structure(plant.E, plant.A)
+    for values in (structure.finite_eigenvalues, eigenvalues(f)):
+        found = speeds(values, plant.dt)
+        found = found[np.isfinite(found)]
+        found = found[found > max(SLOW_SHARE * float(np.max(found, initial=0.0)), DEAD_BEAT)]
+        if found.size:
+            return float(np.median(found))
+    size = float(np.linalg.norm(f, 2)) if f.size else 0.0
+    return 1.0 / plant.dt if plant.dt > 0.0 else size or 1.0
+
+
+@dataclass(frozen=True)
+class NoiseWeights:
+    """What the Kalman filter believes, beside what the plant states.
+
+    Parameters
+    ----------
+    measurement : float or mapping, optional
+        Standard deviation of each output's noise, one number or by name, in the output's unit (times the square root
+        of a second in continuous time); the plant's own noise, or one in balanced units, by default.
+    process, fault : float
+        How strongly states and fault models are driven, relative to the default.
+    """
+
+    measurement: Any = None
+    process: float = 1.0
+    fault: float = 1.0
+
+
+def kalman_problem(problem: PlacementProblem, weights: NoiseWeights) -> KalmanProblem:
+    """Return the observable part of the pair with its noise, in the coordinates of the split."""
+    plant, scaled, split = problem.plant, problem.scaled, problem.split
+    order = problem.model.order
+    bw, dw = _noise(problem, weights)
+    augmented_bw = np.vstack([bw, np.zeros((order, bw.shape[1]))])
+    injection = np.vstack([problem.decoupled.injection, np.zeros((order, plant.ny))])
+    entering = problem.U @ augmented_bw - problem.F @ problem.D @ dw - problem.U @ injection @ dw
+    shown = np.eye(plant.ny) - AugmentedPlant.of(scaled, problem.model).C @ problem.D
+    measured = problem.decoupled.seen @ shown @ dw
+    size = float(np.sqrt(np.mean(np.sum(dw**2, axis=1)))) if dw.any() else 1.0
+    if problem.free:
+        # The free outputs carry the noise of derivatives; as a stand-in they get the size of the others.
+        entering = np.hstack([entering, np.zeros((len(entering), problem.free))])
+        measured = np.block([
+            [np.zeros((problem.free, measured.shape[1])), size * np.eye(problem.free)],
+            [measured, np.zeros((len(measured), problem.free))],
+        ])  # fmt: skip
+    per_step = problem.rate * (plant.dt if plant.dt > 0.0 else 1.0)
+    strength = np.concatenate([np.full(plant.nx, weights.process), np.full(order, weights.fault)])
+    faults = np.hstack([np.zeros((plant.nf, plant.nx)), problem.model.Cw])
+    return KalmanProblem(
+        F=split.F,
+        C=split.C,
+        B=split.lower(entering),
+        D=measured,
+        drive=split.basis[:, : split.order].T @ np.diag(per_step * size * strength),
+        background=BACKGROUND_NOISE * size * np.eye(len(problem.C)),
+        estimates=split.shown(faults),
+        dt=plant.dt,
+    )
+
+
+def _noise(problem: PlacementProblem, weights: NoiseWeights) -> tuple[FloatArray, FloatArray]:
+    """Return the noise inputs of the balanced plant."""
+    plant, scaled, outputs = problem.plant, problem.scaled, problem.scaling.outputs
+    if weights.measurement is None:
+        if scaled.Dw.any():
+            return scaled.Bw, scaled.Dw
+        return np.hstack([scaled.Bw, np.zeros((plant.nx, plant.ny))]), np.hstack([
+            np.zeros((plant.ny, plant.nw)), np.eye(plant.ny),
+        ])  # fmt: skip
+    given = weights.measurement
+    deviations = np.array([given[name] if isinstance(given, Mapping) else given for name in plant.output_names])
+    return (
+        np.hstack([scaled.Bw, np.zeros((plant.nx, plant.ny))]),
+        np.hstack([np.zeros((plant.ny, plant.nw)), np.diag(deviations * outputs)]),
+    )

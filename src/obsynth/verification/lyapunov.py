@@ -1,0 +1,53 @@
+r"""Stability of a shipped matrix, proved with a Lyapunov factor and bounds on every rounding error.
+
+With P = Q'Q, Q triangular and nonsingular, and S close to the inverse of Q (a congruence with any nonsingular S keeps
+definiteness):
+
+.. math::
+    -S^T (A^T Q^T Q + Q^T Q A) S > 0 \quad (\dot z = A z), \qquad
+    \begin{bmatrix} (QS)^T QS & (QAS)^T \\ QAS & I \end{bmatrix} > 0 \quad (z^+ = A z).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.balls import Ball, block
+from obsynth.numerics.definiteness import DefinitenessProof, prove_positive_definite
+
+
+def prove_stable(a: FloatArray, factor: FloatArray, dt: float) -> DefinitenessProof:
+    """Try to prove that every mode of ``a`` dies out.
+
+    Parameters
+    ----------
+    a : FloatArray
+        ``(n, n)``.
+    factor : FloatArray
+        Q ``(n, n)``, upper triangular with a nonzero diagonal.
+    dt : float
+        Seconds between samples, 0 for continuous time.
+
+    Returns
+    -------
+    DefinitenessProof
+        ``proved`` is never true for a matrix that is not stable.
+    """
+    nothing = DefinitenessProof(False, -np.inf, 0.0)
+    if factor.shape != a.shape or not np.all(np.isfinite(factor)) or not np.all(np.isfinite(a)):
+        return nothing
+    if a.shape[0] == 0:
+        return DefinitenessProof(True, np.inf, 0.0)
+    if np.any(np.tril(factor, -1) != 0.0) or np.any(np.diag(factor) == 0.0):
+        return nothing
+    inverse = np.triu(np.linalg.inv(factor))
+    if not np.all(np.isfinite(inverse)) or np.any(np.diag(inverse) == 0.0):
+        return nothing
+    q, s = Ball.exact(factor), Ball.exact(inverse)
+    whole, moved = q @ s, q @ (Ball.exact(a) @ s)
+    if dt > 0.0:
+        identity = Ball.exact(np.eye(a.shape[0]))
+        return prove_positive_definite(block([[whole.T @ whole, moved.T], [moved, identity]]))
+    half = whole.T @ moved
+    return prove_positive_definite(-(half + half.T))

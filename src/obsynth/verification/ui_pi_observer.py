@@ -1,0 +1,290 @@
+"""Checks of an unknown-input PI observer, from the plant and the shipped realisation alone.
+
+Source of the claims: Share Pasand, Aliyari, Taghirad, eqs. (7), (19); (D1)-(D3) and the checks of numbers are ours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from obsynth.analysis.unknown_input_conditions import existence
+from obsynth.analysis.unknown_input_pencils import number
+from obsynth.analysis.unknown_inputs import AugmentedPlant
+from obsynth.models.descriptor import DescriptorSystem
+from obsynth.models.exosystems import Exosystem
+from obsynth.models.fault_models import stated_eigenvalues
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.scaling import balance_by_least_squares
+from obsynth.numerics.spectra import abscissa, decay_rates, eigenvalues, noise_covariance, spectrum_error
+from obsynth.observers.linear import LinearObserver
+from obsynth.results.design import ObserverDesign
+from obsynth.results.report import Check, information, lower_bound_check, upper_bound_check
+from obsynth.verification.decoupling import decoupling_norm
+from obsynth.verification.error_system import Residual, residual
+from obsynth.verification.fault_tracking import tracking_rows
+from obsynth.verification.lyapunov import prove_stable
+from obsynth.verification.plant import condition_rows, plant_information
+
+#: Equalities may miss by this much, relative to the terms they are made of.
+EQUALITY_TOLERANCE = 1e-9
+#: The same for estimates at a frequency, whose terms pass through the inverse of ``sI - Az``.
+DECOUPLING_TOLERANCE = 1e-8
+#: Recomputed poles may miss the claimed ones by this, relative to their size; claimed rates and norms likewise.
+SPECTRUM_TOLERANCE = 1e-4
+CLAIM_TOLERANCE = 1e-4
+#: Significant digits with which gains are commonly printed in full: the observer must stay stable with them.
+PRINTED_DIGITS = 9
+_PAPER = "Share Pasand, eq. (19)"
+_MATRICES = ("tracking", "Phi", "Cw", "poles", "stability")
+
+
+def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
+    """Yield every check of ``design``; see `obsynth.verification.verify`."""
+    plant, observer, certificate = design.plant, design.observer, design.certificate
+    yield from plant_information(plant)
+    fitting = _fits(design)
+    yield upper_bound_check(
+        "fits the plant",
+        "observer, certificate and plant have matching signals and shapes",
+        0.0 if fitting else 1.0,
+        0.0,
+        source="shipped realisation",
+    )
+    if not fitting:
+        return
+    tracking, phi, cw, poles, factor = (certificate.matrices[name] for name in _MATRICES)
+    model = Exosystem(phi, cw, tuple(f"w{i + 1}" for i in range(len(phi))), stated_eigenvalues(phi), ())
+    *conditions, last = existence(plant, model).conditions
+    yield from condition_rows(conditions)
+    if last.name == "fixed modes":
+        yield information(last.name, "poles that no gain moves", last.value, source=last.source, detail=last.detail)
+    else:
+        yield from condition_rows([last])
+    tolerance = EQUALITY_TOLERANCE
+    if printed_digits is not None:
+        # Half a unit in the last printed place, in each of the products that an identity sums up.
+        tolerance = 0.5 * 10.0 ** (-printed_digits) * (plant.nx + len(phi) + plant.ny)
+    for name, claim, found, source in _identities(plant, observer, AugmentedPlant.of(plant, model), tracking, cw):
+        yield upper_bound_check(
+            name, claim, found.relative, tolerance, source=source, kind="equality",
+            detail=f"largest miss {found.error:.1e} among terms of size {found.scale:.1e}",
+        )  # fmt: skip
+    yield from _stability_rows(design, poles, factor)
+    norm = decoupling_norm(plant, observer)
+    yield upper_bound_check(
+        "decoupling",
+        "the transfer functions from the unknown inputs to the errors of all estimates are zero",
+        norm.relative,
+        DECOUPLING_TOLERANCE if printed_digits is None else max(DECOUPLING_TOLERANCE, 10.0 * tolerance),
+        source="measured on the plant, without the tracking map",
+        detail=f"relative to the terms; absolute gain to a fault estimate up to {norm.fault_gain:.1e}; "
+        f"worst at {norm.frequency:.3g} rad/s",
+    )
+    yield from _noise_rows(design)
+    yield from tracking_rows(plant, observer, tracking, phi, cw)
+
+
+def _fits(design: ObserverDesign) -> bool:
+    plant, observer, matrices = design.plant, design.observer, design.certificate.matrices
+    if any(name not in matrices for name in _MATRICES):
+        return False
+    order = matrices["Phi"].shape[0]
+    shapes = {
+        "tracking": (observer.order, plant.nx + order), "Phi": (order, order), "Cw": (plant.nf, order),
+        "poles": (observer.order, 2), "stability": (observer.order, observer.order),
+    }  # fmt: skip
+    return bool(
+        all(matrices[name].shape == shape and np.all(np.isfinite(matrices[name])) for name, shape in shapes.items())
+        and observer.order == plant.nx + order
+        and observer.input_names == plant.input_names
+        and observer.output_names == plant.output_names
+        and observer.state_names == plant.state_names
+        and observer.fault_names == plant.fault_names
+        and observer.dt == plant.dt
+        and all(delay == 0 for delay in (*observer.state_delays, *observer.fault_delays))
+    )
+
+
+def _identities(
+    plant: DescriptorSystem,
+    observer: LinearObserver,
+    augmented: AugmentedPlant,
+    tracking: FloatArray,
+    cw: FloatArray,
+) -> Iterator[tuple[str, str, Residual, str]]:
+    """Yield the identities (19) of the shipped realisation: name, claim, residual, source."""
+    az, bu, by, cz, du, dy = observer.Az, observer.Bu, observer.By, observer.Cz, observer.Du, observer.Dy
+    ve = tracking @ augmented.E
+    # A row that is nothing but rounding is judged in the units of what it stands for, not against itself.
+    scaling = balance_by_least_squares(augmented.E, augmented.A, outputs=[augmented.C])
+    units = scaling.states
+    own_u = np.outer(units, scaling.equations)
+    own_dy = np.outer(np.max(np.abs(cz) * units, axis=1, initial=0.0), scaling.outputs)
+    yield (
+        "Sylvester",
+        "Ahat U_a E_a + Bhat C_a = U_a A_a",
+        residual(
+            az @ ve, by @ augmented.C, -tracking @ augmented.A,
+            factors=((az, tracking, augmented.E), (by, augmented.C), (tracking, augmented.A)), units=units,
+        ),
+        _PAPER,
+    )  # fmt: skip
+    yield (
+        "inputs",
+        "Jhat = U_a B_a (and Bhat D, where u reaches y)",
+        residual(bu, by @ plant.D, -tracking @ augmented.B, factors=((by, plant.D), (tracking, augmented.B))),
+        _PAPER,
+    )
+    yield (
+        "disturbance in the error",
+        "U_a Bd_a = 0 (Bhat Dd, where d reaches y)",
+        residual(
+            tracking @ augmented.Bd, -by @ plant.Dd,
+            factors=((tracking, augmented.Bd), (by, plant.Dd), (own_u, augmented.Bd)),
+        ),
+        _PAPER,
+    )  # fmt: skip
+    yield (
+        "disturbance in the estimates",
+        "D_a Dd = 0: no estimate sees d directly",
+        residual(dy @ plant.Dd, factors=((dy, plant.Dd), (own_dy, plant.Dd))),
+        "our extension",
+    )
+    wanted = {
+        "state": (observer.state_rows, np.eye(plant.nx, augmented.order), "U_a E_a + D_a C_a = I, rows of the state"),
+        "fault": (
+            observer.fault_rows,
+            np.hstack([np.zeros((plant.nf, plant.nx)), cw]),
+            "Cw (U_a E_a + D_a C_a) = Cw: the fault estimate follows the fault model",
+        ),
+        "residual": (
+            observer.residual_rows,
+            np.zeros((len(observer.residual_names), augmented.order)),
+            "the residual sees neither state nor modelled fault",
+        ),
+    }
+    for name, (rows, goal, claim) in wanted.items():
+        factors = ((cz[rows], tracking, augmented.E), (dy[rows], augmented.C), (own_dy[rows], augmented.C))
+        yield name, claim, residual(cz[rows] @ ve, dy[rows] @ augmented.C, -goal, factors=factors, units=units), _PAPER
+    yield (
+        "feedthrough",
+        "no estimate sees the input directly (Du + Dy D = 0)",
+        residual(du, dy @ plant.D, factors=((dy, plant.D),)),
+        "our extension",
+    )
+
+
+def _stability_rows(design: ObserverDesign, poles: FloatArray, factor: FloatArray) -> Iterator[Check]:
+    observer, dt, claims = design.observer, design.plant.dt, design.certificate.claims
+    proof = prove_stable(observer.Az, factor, dt)
+    yield Check(
+        "stability",
+        "every error dies out: the Lyapunov inequality is positive definite",
+        proof.lower_bound,
+        0.0,
+        proof.lower_bound,
+        proof.proved,
+        "Share Pasand, eq. (7)",
+        "proved",
+        f"Cholesky with rounding bound {proof.error_bound:.1e}, on a unit diagonal",
+    )
+    claimed = [complex(*row) for row in poles]
+    yield upper_bound_check(
+        "poles",
+        "the eigenvalues of Ahat are the claimed ones",
+        spectrum_error(observer.Az, claimed, dt),
+        SPECTRUM_TOLERANCE,
+        source="Share Pasand, procedure 1, step 7",
+        detail="means are compared for multiple poles; " + _some(claimed),
+    )
+    rates = decay_rates(eigenvalues(observer.Az), dt)
+    slowest = float(np.min(rates, initial=np.inf))
+    if "decay" in claims:
+        yield lower_bound_check(
+            "decay",
+            "every mode decays at the claimed rate (1/s) or faster",
+            slowest,
+            claims["decay"] - CLAIM_TOLERANCE * abs(claims["decay"]) - _scatter(claimed, claims["decay"]),
+            source="recomputed eigenvalues",
+            detail=f"slowest time constant {1.0 / slowest:.3g} s" if slowest > 0.0 else "",
+        )
+    rounded = _rounded(observer.Az, PRINTED_DIGITS)
+    bound = 1.0 if dt > 0.0 else 0.0
+    found = abscissa(rounded, dt)
+    yield Check(
+        f"stable with {PRINTED_DIGITS} digits",
+        f"Ahat rounded to {PRINTED_DIGITS} significant digits is still stable (strictly below the bound)",
+        found,
+        bound,
+        bound - found,
+        bool(found < bound),
+        "ours: gains of high-order placements do not survive short printing",
+    )
+    yield information(
+        "digits needed",
+        "significant digits of Ahat with which every mode stays stable",
+        float(_least_digits(observer.Az, dt)),
+        source="recomputed eigenvalues",
+        detail=f"with {PRINTED_DIGITS} digits poles move by {spectrum_error(rounded, claimed, dt):.1e} of their size",
+    )
+
+
+def _scatter(claimed: list[complex], decay: float) -> float:
+    """Return how far rounding may scatter the slowest pole when it is a multiple one: a root of the unit roundoff."""
+    rates = [abs(pole) for pole in claimed if abs(abs(pole.real) - decay) <= CLAIM_TOLERANCE * max(decay, 1e-300)]
+    multiplicity = max((sum(abs(p - q) <= CLAIM_TOLERANCE * abs(p) for q in claimed) for p in claimed), default=1)
+    if multiplicity <= 1 or not rates:
+        return 0.0
+    return float(abs(decay) * (1e4 * np.finfo(np.float64).eps) ** (1.0 / multiplicity))
+
+
+def _some(poles: list[complex], most: int = 8) -> str:
+    shown = [number(pole) for pole in sorted(poles, key=lambda pole: -pole.real) if pole.imag >= 0.0]
+    return "slowest " + ", ".join(shown[:most]) if shown else "none"
+
+
+def _rounded(matrix: FloatArray, digits: int) -> FloatArray:
+    sizes = np.where(matrix != 0.0, np.abs(matrix), 1.0)
+    places = 10.0 ** (digits - 1 - np.floor(np.log10(sizes)))
+    return np.asarray(np.round(matrix * places) / places)
+
+
+def _least_digits(matrix: FloatArray, dt: float) -> int:
+    bound = 1.0 if dt > 0.0 else 0.0
+    stable = [abscissa(_rounded(matrix, digits), dt) < bound for digits in range(1, 17)]
+    return next((digits for digits in range(1, 17) if all(stable[digits - 1 :])), 17)
+
+
+def _noise_rows(design: ObserverDesign) -> Iterator[Check]:
+    plant, observer, claims = design.plant, design.observer, design.certificate.claims
+    rows = observer.Cz[observer.fault_rows]
+    direct = observer.Dy[observer.fault_rows]
+    discrete = float(plant.dt > 0.0)
+    unit = noise_covariance(observer.Az, observer.By, rows, discrete * direct, plant.dt)
+    if "noise_amplification" in claims:
+        largest = float(np.sqrt(np.max(np.maximum(np.diag(unit), 0.0), initial=0.0)))
+        yield upper_bound_check(
+            "noise amplification",
+            "H2 norm from white noise on every output to a fault estimate is at most the claimed one",
+            largest,
+            claims["noise_amplification"] * (1.0 + CLAIM_TOLERANCE),
+            source="recomputed, Lyapunov equation",
+            detail="outputs in their own units" + ("" if plant.dt else "; times the root of the sample time in s")
+            + (f"; besides, y enters fhat directly by {float(np.linalg.norm(direct, 2)):.3g}" if direct.any() else ""),
+        )  # fmt: skip
+    if not plant.nw:
+        return
+    tracking = design.certificate.matrices["tracking"][:, : plant.nx]
+    entering = tracking @ plant.Bw - observer.By @ plant.Dw
+    stated = noise_covariance(observer.Az, entering, rows, discrete * (direct @ plant.Dw), plant.dt)
+    for name, variance in zip(plant.fault_names, np.diag(stated), strict=True):
+        yield information(
+            f"noise in fhat[{name}]",
+            "standard deviation of the fault estimate under the stated noise"
+            + ("" if plant.dt else ", for a sample time of 1 s (times its root for others)"),
+            float(np.sqrt(max(variance, 0.0))),
+            source="recomputed, Lyapunov equation",
+            detail=plant.units.get(name, ""),
+        )
