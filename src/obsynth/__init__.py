@@ -17,6 +17,7 @@ if TYPE_CHECKING:
         VerificationError,
     )
     from obsynth.models.descriptor import DescriptorSystem
+    from obsynth.models.time_varying import TimeVaryingDescriptorSystem
     from obsynth.observers.linear import Estimates, LinearObserver, RunningObserver
     from obsynth.observers.sampling import sample_observer
     from obsynth.pipeline.designing import design
@@ -42,6 +43,7 @@ _HOMES = {
     "RunningObserver": "obsynth.observers.linear",
     "SolverError": "obsynth.errors",
     "SpecError": "obsynth.errors",
+    "TimeVaryingDescriptorSystem": "obsynth.models.time_varying",
     "VerificationError": "obsynth.errors",
     "VerificationReport": "obsynth.results.report",
     "analyse_structure": "obsynth.analysis.structure",
@@ -68,6 +70,7 @@ __all__ = [
     "RunningObserver",
     "SolverError",
     "SpecError",
+    "TimeVaryingDescriptorSystem",
     "VerificationError",
     "VerificationReport",
     "analyse_structure",
