@@ -74,7 +74,7 @@ def update(
     regular : FloatArray, optional
         ``(nq, nq)``, with ``M_reg = regular' regular``.
     directional : bool, optional
-        Forget only in directions that G excites (after Cao and Schwartz).
+        Forget only in directions that G excites: ``M - (1 - lambda) G' (G S G')^-1 G`` takes the place of ``lambda M``.
     noise : FloatArray, optional
         ``W (m, any)``: square root of the covariance of the noise in v; the identity by default.
 
@@ -121,7 +121,7 @@ def _scalar(
 
 
 def _directional(triangle: FloatArray, G: FloatArray, forgetting: float) -> FloatArray:
-    r"""Return the triangle after forgetting where G excites: ``M - (1 - lambda) M V (V' M V)^-1 V' M``."""
+    """Return the triangle after forgetting where G excites: ``M - (1 - lambda) G' (G S G')^-1 G``."""
     if not len(G):
         return triangle
     # In coordinates in which the present information is the identity, the directions that G excites are orthogonal.
