@@ -18,8 +18,14 @@ if TYPE_CHECKING:
     )
     from obsynth.models.descriptor import DescriptorSystem
     from obsynth.models.time_varying import TimeVaryingDescriptorSystem
+    from obsynth.observers.gain_schedule import BatchEstimates, run_batch
     from obsynth.observers.linear import Estimates, LinearObserver, RunningObserver
+    from obsynth.observers.recursive import Adaptation, RecursiveObserver
+    from obsynth.observers.recursive_estimates import RecursiveEstimates
+    from obsynth.observers.recursive_running import RunningRecursiveObserver
     from obsynth.observers.sampling import sample_observer
+    from obsynth.pipeline.adaptive_observer import adaptive_observer
+    from obsynth.pipeline.descriptor_kalman import descriptor_kalman
     from obsynth.pipeline.designing import design
     from obsynth.pipeline.fault_estimation_filter import fault_estimation_filter, fault_estimation_filter_from_gains
     from obsynth.results.design import Certificate, ObserverDesign
@@ -31,6 +37,8 @@ __version__ = "0.1.0"
 
 # Names are imported when they are first used, so that `import obsynth` stays fast.
 _HOMES = {
+    "Adaptation": "obsynth.observers.recursive",
+    "BatchEstimates": "obsynth.observers.gain_schedule",
     "Certificate": "obsynth.results.design",
     "Check": "obsynth.results.report",
     "DescriptorSystem": "obsynth.models.descriptor",
@@ -40,24 +48,32 @@ _HOMES = {
     "ObserverDesign": "obsynth.results.design",
     "ObsynthError": "obsynth.errors",
     "PreconditionError": "obsynth.errors",
+    "RecursiveEstimates": "obsynth.observers.recursive_estimates",
+    "RecursiveObserver": "obsynth.observers.recursive",
     "RunningObserver": "obsynth.observers.linear",
+    "RunningRecursiveObserver": "obsynth.observers.recursive_running",
     "SolverError": "obsynth.errors",
     "SpecError": "obsynth.errors",
     "TimeVaryingDescriptorSystem": "obsynth.models.time_varying",
     "VerificationError": "obsynth.errors",
     "VerificationReport": "obsynth.results.report",
+    "adaptive_observer": "obsynth.pipeline.adaptive_observer",
     "analyse_structure": "obsynth.analysis.structure",
+    "descriptor_kalman": "obsynth.pipeline.descriptor_kalman",
     "design": "obsynth.pipeline.designing",
     "discretise": "obsynth.analysis.transformations",
     "eliminate_algebraic_states": "obsynth.analysis.transformations",
     "fault_estimation_filter": "obsynth.pipeline.fault_estimation_filter",
     "fault_estimation_filter_from_gains": "obsynth.pipeline.fault_estimation_filter",
     "load": "obsynth.results.serialise",
+    "run_batch": "obsynth.observers.gain_schedule",
     "sample_observer": "obsynth.observers.sampling",
     "verify": "obsynth.verification",
 }
 
 __all__ = [
+    "Adaptation",
+    "BatchEstimates",
     "Certificate",
     "Check",
     "DescriptorSystem",
@@ -67,19 +83,25 @@ __all__ = [
     "ObserverDesign",
     "ObsynthError",
     "PreconditionError",
+    "RecursiveEstimates",
+    "RecursiveObserver",
     "RunningObserver",
+    "RunningRecursiveObserver",
     "SolverError",
     "SpecError",
     "TimeVaryingDescriptorSystem",
     "VerificationError",
     "VerificationReport",
+    "adaptive_observer",
     "analyse_structure",
+    "descriptor_kalman",
     "design",
     "discretise",
     "eliminate_algebraic_states",
     "fault_estimation_filter",
     "fault_estimation_filter_from_gains",
     "load",
+    "run_batch",
     "sample_observer",
     "verify",
 ]

@@ -7,9 +7,9 @@ import pytest
 from time_varying_plants import maximum_likelihood, observer_for, printed, record, textbook, varying
 
 from obsynth import PreconditionError
+from obsynth.analysis.time_varying import horizon_ranks, residual_condition
 from obsynth.numerics.paper_filter import PaperState, paper_step
 from obsynth.numerics.recursive_least_squares import ParameterState, start_of, update
-from obsynth.observers.literal_form import require_learning
 from obsynth.observers.recursive_running import RawEstimate
 
 SAMPLES = 40
@@ -169,11 +169,11 @@ class TestLearning:
 
     def test_the_refusal(self) -> None:
         with pytest.raises(PreconditionError, match=r"sees only rank E \+ ny - nx residual directions") as caught:
-            require_learning(0, 7)
-        assert "k = 7 there are 0" in str(caught.value)
+            residual_condition(horizon_ranks(printed(horizon=50))).require()
+        assert "= 0 residual directions" in str(caught.value)
         assert "'innovation'" in str(caught.value)
         assert caught.value.condition == "residual directions"
-        require_learning(1, 7)
+        residual_condition(horizon_ranks(varying(horizon=50))).require()
 
     def test_a_singular_r_is_refused_by_the_literal_form_only(self) -> None:
         plant = varying()

@@ -10,7 +10,7 @@ from obsynth.numerics.least_squares_step import LeastSquaresStep, least_squares_
 
 
 def posterior_residual(
-    found: LeastSquaresStep, H: FloatArray, S: FloatArray, right: FloatArray, ne: int
+    found: LeastSquaresStep, H: FloatArray, S: FloatArray, right: FloatArray, ne: int, *, columns: int = 1
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return what (18f) learns from: ``y - C x`` weighted by R, its regressor (18d), and a root of its covariance.
 
@@ -22,6 +22,8 @@ def posterior_residual(
         What it was found from.
     ne : int
         Number of equations; the outputs follow.
+    columns : int, optional
+        How many columns of ``right`` are data; the regressors follow.
 
     Raises
     ------
@@ -45,28 +47,5 @@ def posterior_residual(
         )  # fmt: skip
     spread = S[ne:] - H[ne:] @ gains.estimate @ S
     weighted = np.linalg.solve(triangle, np.hstack((gaps, spread)))
-    columns = gaps.shape[1]
-    return weighted[:, 0], -weighted[:, 1:columns], weighted[:, columns:]
-
-
-def require_learning(directions: int, k: int) -> None:
-    """Refuse the literal form where it can never learn.
-
-    Parameters
-    ----------
-    directions : int
-        ``rank E + ny - nx`` at k.
-    k : int
-        Where it is least.
-
-    Raises
-    ------
-    PreconditionError
-        There is no residual direction.
-    """
-    if directions < 1:
-        raise PreconditionError(
-            f"The literal form (18) sees only rank E + ny - nx residual directions, and at k = {k} there are "
-            f"{max(directions, 0)}: y - C xhat is zero whatever the parameters are, so it would never learn. Use form "
-            "'innovation', which sees all the parity directions.", condition="residual directions",
-        )  # fmt: skip
+    regressor, end = slice(columns, gaps.shape[1]), gaps.shape[1]
+    return weighted[:, :columns], -weighted[:, regressor], weighted[:, end:]

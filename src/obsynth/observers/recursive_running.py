@@ -207,7 +207,8 @@ class RunningRecursiveObserver:
             return
         v, G, noise = found.innovation[:, 0], -found.innovation[:, 1:], None
         if self.literal and len(H) > ne:
-            v, G, noise = posterior_residual(found, H, S, right, ne)
+            seen, G, noise = posterior_residual(found, H, S, right, ne)
+            v = seen[:, 0]
         self.parameters, _ = update(
             self.parameters, v, G, forgetting=adaptation.forgetting, regular=self.regular,
             directional=self.directional, noise=noise,

@@ -2,6 +2,13 @@
 
 from __future__ import annotations
 
+_RECURSIVE = {
+    "condition": "largest condition number of [E_k; C_k]",
+    "condition_k": "step at which it is",
+    "residual_directions": "least rank E_k + ny - nx: what the literal form (18) sees",
+    "contraction": "mean factor per step by which an error shrinks",
+    "steps": "steps that were looked at",
+}
 #: Method id -> claim -> meaning.
 _MEANINGS = {
     "fault-estimation-filter": {
@@ -10,6 +17,12 @@ _MEANINGS = {
         "gamma_bracket_low": "lower end of the bisection's bracket",
         "gamma_bracket_high": "upper end of the bisection's bracket",
         "state_lag": "samples by which the state estimate lags",
+    },
+    "descriptor-kalman": _RECURSIVE,
+    "adaptive-observer": {
+        **_RECURSIVE,
+        "excitation": "least information on the parameters in a window, per parameter unit squared",
+        "excitation_k": "sample that ends that window",
     },
 }
 

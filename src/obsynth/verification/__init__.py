@@ -14,7 +14,11 @@ if TYPE_CHECKING:
     from obsynth.results.design import ObserverDesign
 
 #: Method id -> module with ``checks(design, printed_digits)``.
-_CHECKERS = {"fault-estimation-filter": "obsynth.verification.fault_estimation_filter"}
+_CHECKERS = {
+    "fault-estimation-filter": "obsynth.verification.fault_estimation_filter",
+    "descriptor-kalman": "obsynth.verification.recursive",
+    "adaptive-observer": "obsynth.verification.recursive",
+}
 
 
 def verify(design: ObserverDesign, *, printed_digits: int | None = None) -> VerificationReport:

@@ -47,7 +47,7 @@ _IDENTITIES = {
 
 def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
     """Yield every check of ``design``; see `obsynth.verification.verify`."""
-    plant, observer = design.plant, design.observer
+    plant, observer = design.linear
     yield from plant_information(plant)
     yield from condition_rows(fault_filter_conditions(plant))
     tracking, factor = design.certificate.matrices.get("tracking"), design.certificate.matrices.get("P_factor")
@@ -212,9 +212,9 @@ def _worst(found: list[Residual]) -> Residual:
 def _gain_rows(
     design: ObserverDesign, errors: ErrorSystem, tracking: FloatArray, factor: FloatArray, lag: int
 ) -> Iterator[Check]:
-    plant, claims = design.plant, design.certificate.claims
+    (plant, observer), claims = design.linear, design.certificate.claims
     gamma = float(claims.get("gamma", np.nan))
-    proof = prove_bounded_real(plant, design.observer, tracking, factor, gamma if plant.nd else 1.0, lag=lag)
+    proof = prove_bounded_real(plant, observer, tracking, factor, gamma if plant.nd else 1.0, lag=lag)
     what = f"stable, and l2 gain d -> fault error < {gamma:.6g}" if plant.nd else "stable (Lyapunov)"
     yield Check(
         "LMI",

@@ -8,7 +8,11 @@ from typing import Any
 #: Method id -> module; each module offers ``conditions(plant)`` and ``synthesise(plant, **options)``.
 REGISTRY = {
     "fault-estimation-filter": "obsynth.synthesis.methods.fault_estimation_filter",
+    "descriptor-kalman": "obsynth.synthesis.methods.descriptor_kalman",
+    "adaptive-observer": "obsynth.synthesis.methods.adaptive_observer",
 }
+#: Methods that take plants whose matrices change with k.
+TIME_VARYING = ("descriptor-kalman", "adaptive-observer")
 
 
 def method_module(method: str) -> Any:
