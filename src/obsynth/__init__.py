@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     )
     from obsynth.models.descriptor import DescriptorSystem
     from obsynth.models.time_varying import TimeVaryingDescriptorSystem
+    from obsynth.observers.decisions import Alarm, Decision, decide
     from obsynth.observers.gain_schedule import BatchEstimates, run_batch
     from obsynth.observers.linear import Estimates, LinearObserver, RunningObserver
     from obsynth.observers.recursive import Adaptation, RecursiveObserver
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
     from obsynth.results.design import Certificate, ObserverDesign
     from obsynth.results.report import Check, VerificationReport
     from obsynth.results.serialise import load
+    from obsynth.simulation.time_varying import simulate_time_varying
+    from obsynth.synthesis.steady_filter import SteadyState, steady_state_filter
     from obsynth.verification import verify
 
 __version__ = "0.1.0"
@@ -38,9 +41,11 @@ __version__ = "0.1.0"
 # Names are imported when they are first used, so that `import obsynth` stays fast.
 _HOMES = {
     "Adaptation": "obsynth.observers.recursive",
+    "Alarm": "obsynth.observers.decisions",
     "BatchEstimates": "obsynth.observers.gain_schedule",
     "Certificate": "obsynth.results.design",
     "Check": "obsynth.results.report",
+    "Decision": "obsynth.observers.decisions",
     "DescriptorSystem": "obsynth.models.descriptor",
     "Estimates": "obsynth.observers.linear",
     "InfeasibleError": "obsynth.errors",
@@ -54,11 +59,13 @@ _HOMES = {
     "RunningRecursiveObserver": "obsynth.observers.recursive_running",
     "SolverError": "obsynth.errors",
     "SpecError": "obsynth.errors",
+    "SteadyState": "obsynth.synthesis.steady_filter",
     "TimeVaryingDescriptorSystem": "obsynth.models.time_varying",
     "VerificationError": "obsynth.errors",
     "VerificationReport": "obsynth.results.report",
     "adaptive_observer": "obsynth.pipeline.adaptive_observer",
     "analyse_structure": "obsynth.analysis.structure",
+    "decide": "obsynth.observers.decisions",
     "descriptor_kalman": "obsynth.pipeline.descriptor_kalman",
     "design": "obsynth.pipeline.designing",
     "discretise": "obsynth.analysis.transformations",
@@ -68,14 +75,18 @@ _HOMES = {
     "load": "obsynth.results.serialise",
     "run_batch": "obsynth.observers.gain_schedule",
     "sample_observer": "obsynth.observers.sampling",
+    "simulate_time_varying": "obsynth.simulation.time_varying",
+    "steady_state_filter": "obsynth.synthesis.steady_filter",
     "verify": "obsynth.verification",
 }
 
 __all__ = [
     "Adaptation",
+    "Alarm",
     "BatchEstimates",
     "Certificate",
     "Check",
+    "Decision",
     "DescriptorSystem",
     "Estimates",
     "InfeasibleError",
@@ -89,11 +100,13 @@ __all__ = [
     "RunningRecursiveObserver",
     "SolverError",
     "SpecError",
+    "SteadyState",
     "TimeVaryingDescriptorSystem",
     "VerificationError",
     "VerificationReport",
     "adaptive_observer",
     "analyse_structure",
+    "decide",
     "descriptor_kalman",
     "design",
     "discretise",
@@ -103,6 +116,8 @@ __all__ = [
     "load",
     "run_batch",
     "sample_observer",
+    "simulate_time_varying",
+    "steady_state_filter",
     "verify",
 ]
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from obsynth.analysis.conditions import Condition, rank_condition
 from obsynth.errors import SpecError
@@ -17,6 +19,8 @@ from obsynth.numerics.ranks import RankDecision, decide_rank
 STEPS_WITHOUT_HORIZON = 1000
 #: Condition numbers of H_k above this are worth a note: half the digits of double precision are left.
 WARN_CONDITION = 1e6
+
+IntArray: TypeAlias = NDArray[np.intp]
 
 _SOURCE = "Moussa Ali, Zhang 2013"
 
@@ -161,3 +165,20 @@ def residual_condition(ranks: HorizonRanks) -> Condition:
         + ("" if ranks.directions >= 1 else ": y - C xhat is zero whatever the parameters are, so it never learns. Use "
            "form 'innovation', which sees all the parity directions."),
     )  # fmt: skip
+
+
+def algebraic_rows(plant: TimeVaryingDescriptorSystem, steps: int) -> IntArray:
+    """Return the indexes of the equations in which x(k + 1) never appears, counted from zero.
+
+    Parameters
+    ----------
+    plant : TimeVaryingDescriptorSystem
+        The plant.
+    steps : int
+        How many steps are looked at.
+    """
+    looked_at = 1 if plant.E.is_constant else steps
+    zero = np.ones(plant.ne, dtype=bool)
+    for k in range(1, looked_at + 1):
+        zero &= ~plant.E.at(k).any(axis=1)
+    return np.flatnonzero(zero)

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from obsynth.analysis.time_varying import STEPS_WITHOUT_HORIZON, algebraic_rows
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.covariances import covariance_factor
@@ -23,11 +24,7 @@ from obsynth.observers.step_model import (
     StepMatrices,
     StepModel,
     WalkingSteps,
-    algebraic_rows,
 )
-
-#: Steps that are looked at for algebraic equations where the plant has no horizon.
-STEPS_WITHOUT_HORIZON = 1000
 
 
 class RawEstimate(NamedTuple):

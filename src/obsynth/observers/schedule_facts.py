@@ -7,13 +7,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from obsynth.analysis.time_varying import STEPS_WITHOUT_HORIZON
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.gain_schedule import GainStep, gain_steps
 from obsynth.observers.recursive import RecursiveObserver
 from obsynth.observers.recursive_estimates import excitation_levels
 
-#: Steps that are looked at where the plant has no horizon.
-STEPS_WITHOUT_HORIZON = 1000
 #: Errors that shrank below this are gone; the product starts anew from there, so that it does not underflow.
 UNDERFLOW = 1e-200
 

@@ -11,6 +11,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from obsynth.analysis.time_varying import IntArray
 from obsynth.errors import SpecError
 from obsynth.models.sequences import MatrixSequence
 from obsynth.models.time_varying import TimeVaryingDescriptorSystem
@@ -99,23 +100,6 @@ class PlantSteps:
         return found
 
 
-def algebraic_rows(plant: TimeVaryingDescriptorSystem, steps: int) -> FloatArray:
-    """Return the indexes of the equations in which x(k + 1) never appears, as floats of whole numbers.
-
-    Parameters
-    ----------
-    plant : TimeVaryingDescriptorSystem
-        The plant.
-    steps : int
-        How many steps are looked at.
-    """
-    looked_at = 1 if plant.E.is_constant else steps
-    zero = np.ones(plant.ne, dtype=bool)
-    for k in range(1, looked_at + 1):
-        zero &= ~plant.E.at(k).any(axis=1)
-    return np.flatnonzero(zero).astype(np.float64)
-
-
 @dataclass
 class EarlySteps:
     """The steps of a plant with its algebraic equations used as outputs one step earlier.
@@ -126,8 +110,8 @@ class EarlySteps:
         The plant.
     Q, R : MatrixSequence
         Covariances; Q must not couple algebraic equations with the others.
-    rows : FloatArray
-        The algebraic equations, see `algebraic_rows`.
+    rows : IntArray
+        The algebraic equations, see `obsynth.analysis.time_varying.algebraic_rows`.
 
     Raises
     ------
@@ -138,7 +122,7 @@ class EarlySteps:
     plant: TimeVaryingDescriptorSystem
     Q: MatrixSequence
     R: MatrixSequence
-    rows: FloatArray
+    rows: IntArray
 
     def __post_init__(self) -> None:
         if not self.rows.size:
@@ -147,7 +131,7 @@ class EarlySteps:
                 "k): this plant has none. Bring E into that form, or leave the option out.",
                 path="method.options.early_constraints",
             )
-        self.late = self.rows.astype(int)
+        self.late = self.rows
         self.others = np.setdiff1d(np.arange(self.plant.ne), self.late)
 
     def _factors(self, k: int) -> tuple[FloatArray, FloatArray]:
