@@ -6,6 +6,7 @@ innovation, all from two orthogonal factorisations.  No covariance is ever forme
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -46,6 +47,79 @@ class LeastSquaresStep(NamedTuple):
     diffuse: FloatArray
 
 
+class Projection(NamedTuple):
+    """The orthogonal factorisation of H, which may serve many steps.
+
+    Parameters
+    ----------
+    rotation : FloatArray
+        ``(rows, rows)``: ``[Q_2'; Q_1']``, parity first.
+    head : FloatArray
+        ``(n, n)``: R_H, upper triangular.
+    lower : FloatArray
+        ``(n, n)``: ones on and below the diagonal.
+    """
+
+    rotation: FloatArray
+    head: FloatArray
+    lower: FloatArray
+
+
+def projection_of(H: FloatArray) -> Projection | None:
+    """Return the factorisation of H, or ``None`` where its rank has to be decided.
+
+    Parameters
+    ----------
+    H : FloatArray
+        ``(rows, n)``.
+    """
+    from scipy.linalg.lapack import dgeqrf, dormqr
+
+    rows, n = H.shape
+    if rows < n:
+        return None
+    packed, tau, _, _ = dgeqrf(H)
+    diagonal = np.abs(packed.diagonal())
+    if (diagonal <= DEPENDENT_COLUMN * np.sqrt(np.einsum("ij,ij->j", H, H))).any():
+        return None
+    transposed = dormqr("L", "T", packed, tau, np.eye(rows), 64 * rows)[0]
+    rotation = np.concatenate((transposed[n:], transposed[:n]))
+    return Projection(rotation, np.asfortranarray(packed[:n]), np.tri(n))
+
+
+def projected_step(projection: Projection, noise: FloatArray, data: FloatArray) -> LeastSquaresStep | None:
+    """Solve one step from rotated noise and data, or return ``None`` where the rank of the noise has to be decided.
+
+    Parameters
+    ----------
+    projection : Projection
+        Of H.
+    noise : FloatArray
+        ``(s, rows)``, in Fortran order, overwritten: the transpose of ``rotation S``.
+    data : FloatArray
+        ``(rows, columns)``: ``rotation Y``.
+    """
+    from scipy.linalg.lapack import dgeqrf, dtrtrs
+
+    n = len(projection.head)
+    rows, columns = data.shape
+    m = rows - n
+    suspect = SUSPECT_PARITY * math.sqrt(np.vdot(noise, noise)) if m else 0.0
+    triangle = dgeqrf(noise, overwrite_a=1)[0]
+    right = np.empty((n, columns + n), order="F")
+    innovation = data[:m]
+    if m:
+        if abs(triangle.diagonal()[:m]).min() <= suspect:
+            return None
+        innovation = dtrtrs(triangle[:m, :m], innovation, trans=1)[0]
+        right[:, :columns] = data[m:] - triangle[:m, m:rows].T @ innovation
+    else:
+        right[:, :columns] = data
+    np.multiply(triangle[m:rows, m:rows].T, projection.lower, out=right[:, columns:])
+    solved = dtrtrs(projection.head, right, overwrite_b=1)[0]
+    return LeastSquaresStep(solved[:, :columns], solved[:, columns:], innovation, np.empty((n, 0)))
+
+
 def least_squares_step(H: FloatArray, S: FloatArray, Y: FloatArray) -> LeastSquaresStep | None:
     r"""Solve one step by LAPACK alone, or return ``None`` where a rank has to be decided.
 
@@ -63,32 +137,10 @@ def least_squares_step(H: FloatArray, S: FloatArray, Y: FloatArray) -> LeastSqua
     Y : FloatArray
         ``(rows, columns)``: data, regressors, or the identity.
     """
-    from scipy.linalg.lapack import dgeqrf, dormqr, dtrtrs
-
-    rows, n = H.shape
-    columns = Y.shape[1]
-    if rows < n:
+    projection = projection_of(H)
+    if projection is None:
         return None
-    packed, tau, _, _ = dgeqrf(H)
-    diagonal = packed.diagonal()
-    if (np.abs(diagonal) <= DEPENDENT_COLUMN * np.sqrt(np.einsum("ij,ij->j", H, H))).any():
-        return None
-    right = np.hstack((Y, S))
-    rotated, _, _ = dormqr("L", "T", packed, tau, right, 64 * right.shape[1])
-    m = rows - n
-    noise = np.concatenate((rotated[n:, columns:], rotated[:n, columns:])).T
-    triangle = dgeqrf(noise, overwrite_a=1)[0]
-    data, estimate = rotated[n:, :columns], rotated[:n, :columns]
-    if m:
-        parity = triangle.diagonal()[:m]
-        if (np.abs(parity) <= SUSPECT_PARITY * np.sqrt(np.vdot(S, S))).any():
-            return None
-        innovation = dtrtrs(triangle[:m, :m], data, trans=1)[0]
-        estimate = estimate - triangle[:m, m:rows].T @ innovation
-    else:
-        innovation = data
-    solved = dtrtrs(packed[:n], np.hstack((estimate, np.tril(triangle[m:rows, m:rows].T))))[0]
-    return LeastSquaresStep(solved[:, :columns], solved[:, columns:], innovation, np.zeros((n, 0)))
+    return projected_step(projection, (projection.rotation @ S).T, projection.rotation @ Y)
 
 
 def rank_revealing_step(H: FloatArray, S: FloatArray, Y: FloatArray, unknown: FloatArray) -> LeastSquaresStep:

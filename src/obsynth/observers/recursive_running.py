@@ -12,7 +12,14 @@ from obsynth.analysis.time_varying import STEPS_WITHOUT_HORIZON, algebraic_rows
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.covariances import covariance_factor
-from obsynth.numerics.least_squares_step import LeastSquaresStep, least_squares_step, rank_revealing_step
+from obsynth.numerics.least_squares_step import (
+    LeastSquaresStep,
+    Projection,
+    least_squares_step,
+    projected_step,
+    projection_of,
+    rank_revealing_step,
+)
 from obsynth.numerics.recursive_least_squares import ParameterState, start_of, update
 from obsynth.observers.literal_form import posterior_residual
 from obsynth.observers.records import measured_record, require_horizon
@@ -101,6 +108,10 @@ class RunningRecursiveObserver:
         self.directional = adaptation is not None and adaptation.guard == "directional"
         self.window: deque[FloatArray] = deque(maxlen=1 if adaptation is None else adaptation.window)
         self.u = np.zeros(observer.plant.nu)
+        # What the literal form learns from where it is used, and the factorisation of a step that stays the same.
+        self.lesson: tuple[FloatArray, FloatArray, FloatArray] | None = None
+        self.prepared_for: StepMatrices | None = None
+        self.prepared: tuple[Projection, FloatArray, FloatArray] | None = None
         if adaptation is None:
             return
         spread = covariance_factor(adaptation.initial_covariance, "initial_covariance")
@@ -146,14 +157,13 @@ class RunningRecursiveObserver:
         y, u : FloatArray
             ``(ny,)`` and ``(nu,)``.
         """
-        empty = np.zeros(0), np.zeros((0, self.Upsilon.shape[1]))
         before = self.parameters.theta
         if self.k > 0:
             found = self._advance(self.model.at(self.k - 1), y, u)
         elif isinstance(self.model, EarlySteps):
             found = self._advance(self.model.first(), np.zeros(0), u)
         else:
-            found = empty
+            found = np.zeros(0), np.zeros((0, self.Upsilon.shape[1]))
         self.window.append(found[1])
         self.u = u
         gap = found[0] - found[1] @ before if len(before) else found[0]
@@ -164,26 +174,61 @@ class RunningRecursiveObserver:
     def _advance(self, step: StepMatrices, y: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Take the step that ends at the sample ``y``; return innovation and regressor."""
         ne, nq = len(step.A), self.Upsilon.shape[1]
-        H, noise = step.H, step.noise
-        outputs = np.concatenate((y, step.Dn @ u)) if len(step.Dn) else y
-        right = np.empty((len(H), 1 + nq), order="F")
+        right = np.empty((len(step.H), 1 + nq), order="F")
         right[:ne, 0] = step.A @ self.x + step.B @ self.u
-        right[ne:, 0] = outputs
+        right[ne : ne + len(y), 0] = y
+        if len(step.Dn):
+            right[ne + len(y) :, 0] = step.Dn @ u
         if nq:
             right[:ne, 1:] = step.A @ self.Upsilon + step.Phi
             right[ne:, 1:] = -step.Psi
+        found = None
+        if not (self.literal or self.diffuse.shape[1] or np.isnan(y).any()):
+            found = self._fast(step, right)
+        if found is None:
+            found = self._careful(step, right)
+        self.x, self.Upsilon = found.estimate[:, 0], found.estimate[:, 1:]
+        self.factor, self.diffuse = found.factor, found.diffuse
+        v, G = found.innovation[:, 0], -found.innovation[:, 1:]
+        if nq and self.observer.adaptation is not None:
+            seen, regressor, noise = self.lesson or (v, G, None)
+            self.parameters, _ = update(
+                self.parameters, seen, regressor, forgetting=self.observer.adaptation.forgetting, regular=self.regular,
+                directional=self.directional, noise=noise,
+            )  # fmt: skip
+        return v, G
+
+    def _fast(self, step: StepMatrices, right: FloatArray) -> LeastSquaresStep | None:
+        """Take a step that is complete; what depends on the matrices alone is kept while they stay the same."""
+        if step is not self.prepared_for:
+            projection = projection_of(step.H)
+            self.prepared_for, self.prepared = step, None
+            if projection is not None:
+                rotation = projection.rotation
+                self.prepared = projection, rotation[:, : len(step.A)] @ step.A, (rotation @ step.noise).T
+        if self.prepared is None:
+            return None
+        projection, moved, known = self.prepared
         width = self.factor.shape[1]
-        # As many columns as rows at least: what is missing (rectangular roots) are columns of zeros.
-        S = np.zeros((len(H), max(width + noise.shape[1], len(H))), order="F")
+        # As many rows as the projection has at least: what is missing (rectangular roots) are rows of zeros.
+        noise = np.zeros((max(width + len(known), len(right)), len(right)), order="F")
+        noise[:width] = (moved @ self.factor).T
+        noise[width : width + len(known)] = known
+        return projected_step(projection, noise, projection.rotation @ right)
+
+    def _careful(self, step: StepMatrices, right: FloatArray) -> LeastSquaresStep:
+        """Take a step with missing samples, with undetermined directions, with perfect rows, or of the literal form."""
+        ne, width, H = len(step.A), self.factor.shape[1], step.H
+        S = np.zeros((len(H), max(width + step.noise.shape[1], len(H))))
         S[:ne, :width] = step.A @ self.factor
-        S[:, width : width + noise.shape[1]] = noise
+        S[:, width : width + step.noise.shape[1]] = step.noise
         unknown = np.zeros((len(H), self.diffuse.shape[1]))
         unknown[:ne] = step.A @ self.diffuse
         kept = ~np.isnan(right[:, 0])
         complete = bool(kept.all())
         if not complete:
             H, S, right, unknown = H[kept], S[kept], right[kept], unknown[kept]
-        found = None if unknown.shape[1] else least_squares_step(H, S, right)
+        found = None if unknown.shape[1] or S.shape[1] < len(S) else least_squares_step(H, S, right)
         if found is None:
             found = rank_revealing_step(H, S, right, unknown)
             if complete and found.diffuse.shape[1] > unknown.shape[1]:
@@ -191,25 +236,11 @@ class RunningRecursiveObserver:
                     f"rank H_k is lost at k = {self.k}: the equations and outputs of that step do not determine the "
                     "state.", condition="rank [E; C]",
                 )  # fmt: skip
-        self.x, self.Upsilon = found.estimate[:, 0], found.estimate[:, 1:]
-        self.factor, self.diffuse = found.factor, found.diffuse
-        v, G = found.innovation[:, 0], -found.innovation[:, 1:]
-        if nq:
-            self._learn(found, H, S, right, ne)
-        return v, G
-
-    def _learn(self, found: LeastSquaresStep, H: FloatArray, S: FloatArray, right: FloatArray, ne: int) -> None:
-        adaptation = self.observer.adaptation
-        if adaptation is None:
-            return
-        v, G, noise = found.innovation[:, 0], -found.innovation[:, 1:], None
+        self.lesson = None
         if self.literal and len(H) > ne:
-            seen, G, noise = posterior_residual(found, H, S, right, ne)
-            v = seen[:, 0]
-        self.parameters, _ = update(
-            self.parameters, v, G, forgetting=adaptation.forgetting, regular=self.regular,
-            directional=self.directional, noise=noise,
-        )  # fmt: skip
+            seen, regressor, noise = posterior_residual(found, H, S, right, ne)
+            self.lesson = seen[:, 0], regressor, noise
+        return found
 
     def _estimate(self, innovation: FloatArray, regressor: FloatArray, nis: float) -> RawEstimate:
         if self.walking:
