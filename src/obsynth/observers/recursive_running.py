@@ -201,7 +201,8 @@ class RunningRecursiveObserver:
     def _fast(self, step: StepMatrices, right: FloatArray) -> LeastSquaresStep | None:
         """Take a step that is complete; what depends on the matrices alone is kept while they stay the same."""
         if step is not self.prepared_for:
-            projection = projection_of(step.H)
+            same = self.prepared_for is not None and self.prepared is not None and step.H is self.prepared_for.H
+            projection = self.prepared[0] if same and self.prepared is not None else projection_of(step.H)
             self.prepared_for, self.prepared = step, None
             if projection is not None:
                 rotation = projection.rotation

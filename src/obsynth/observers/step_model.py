@@ -78,7 +78,10 @@ class PlantSteps:
 
     def __post_init__(self) -> None:
         self._constant: StepMatrices | None = None
-        self._is_constant = self.plant.is_time_invariant and self.Q.is_constant and self.R.is_constant
+        self._noise: FloatArray | None = None
+        self._H: FloatArray | None = None
+        self._noise_is_constant = self.Q.is_constant and self.R.is_constant
+        self._H_is_constant = self.plant.E.is_constant and self.plant.C.is_constant
 
     def at(self, k: int) -> StepMatrices:
         """Return the matrices of the step from k to k + 1.
@@ -91,12 +94,20 @@ class PlantSteps:
         if self._constant is not None:
             return self._constant
         plant = self.plant
-        noise = stacked_noise(covariance_factor(self.Q.at(k), f"Q({k})"), covariance_factor(self.R.at(k), f"R({k})"))
+        noise, H = self._noise, self._H
+        if noise is None:
+            noise = stacked_noise(
+                covariance_factor(self.Q.at(k), f"Q({k})"), covariance_factor(self.R.at(k), f"R({k})")
+            )
+            self._noise = noise if self._noise_is_constant else None
+        if H is None:
+            H = np.asfortranarray(np.vstack([plant.E.at(k + 1), plant.C.at(k + 1)]))
+            self._H = H if self._H_is_constant else None
         found = StepMatrices(
-            np.asfortranarray(np.vstack([plant.E.at(k + 1), plant.C.at(k + 1)])), plant.A.at(k), plant.B.at(k),
-            plant.Phi.at(k), plant.Psi.at(k), np.zeros((0, plant.nu)), noise,
-        )  # fmt: skip
-        self._constant = found if self._is_constant else None
+            H, plant.A.at(k), plant.B.at(k), plant.Phi.at(k), plant.Psi.at(k), np.zeros((0, plant.nu)), noise
+        )
+        constant = self._noise_is_constant and self._H_is_constant and plant.is_time_invariant
+        self._constant = found if constant else None
         return found
 
 
