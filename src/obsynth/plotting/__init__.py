@@ -1,5 +1,6 @@
 """Pictures of results, readable without colour; nothing is shown or saved here."""
 
 from obsynth.plotting.faults import plot_faults, plot_poles, plot_residuals
+from obsynth.plotting.recursive import plot_decision, plot_parameters, plot_states
 
-__all__ = ["plot_faults", "plot_poles", "plot_residuals"]
+__all__ = ["plot_decision", "plot_faults", "plot_parameters", "plot_poles", "plot_residuals", "plot_states"]
