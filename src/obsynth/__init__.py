@@ -18,8 +18,16 @@ if TYPE_CHECKING:
     )
     from obsynth.models.descriptor import DescriptorSystem
     from obsynth.models.fault_models import FaultModel, fault_model
+    from obsynth.models.time_varying import TimeVaryingDescriptorSystem
+    from obsynth.observers.decisions import Alarm, Decision, decide
+    from obsynth.observers.gain_schedule import BatchEstimates, run_batch
     from obsynth.observers.linear import Estimates, LinearObserver, RunningObserver
+    from obsynth.observers.recursive import Adaptation, RecursiveObserver
+    from obsynth.observers.recursive_estimates import RecursiveEstimates
+    from obsynth.observers.recursive_running import RunningRecursiveObserver
     from obsynth.observers.sampling import sample_observer
+    from obsynth.pipeline.adaptive_observer import adaptive_observer
+    from obsynth.pipeline.descriptor_kalman import descriptor_kalman
     from obsynth.pipeline.designing import design
     from obsynth.pipeline.fault_estimation_filter import fault_estimation_filter, fault_estimation_filter_from_gains
     from obsynth.pipeline.pd_observer import (
@@ -28,11 +36,13 @@ if TYPE_CHECKING:
         pd_observer,
         pd_observer_from_gains,
     )
-    from obsynth.results.delta_scan import DeltaScan
     from obsynth.pipeline.ui_pi_observer import ui_pi_observer, ui_pi_observer_from_gains
+    from obsynth.results.delta_scan import DeltaScan
     from obsynth.results.design import Certificate, ObserverDesign
     from obsynth.results.report import Check, VerificationReport
     from obsynth.results.serialise import load
+    from obsynth.simulation.time_varying import simulate_time_varying
+    from obsynth.synthesis.steady_filter import SteadyState, steady_state_filter
     from obsynth.verification import verify
     from obsynth.verification.fault_tracking import fault_response
 
@@ -40,8 +50,12 @@ __version__ = "0.1.0"
 
 # Names are imported when they are first used, so that `import obsynth` stays fast.
 _HOMES = {
+    "Adaptation": "obsynth.observers.recursive",
+    "Alarm": "obsynth.observers.decisions",
+    "BatchEstimates": "obsynth.observers.gain_schedule",
     "Certificate": "obsynth.results.design",
     "Check": "obsynth.results.report",
+    "Decision": "obsynth.observers.decisions",
     "DeltaScan": "obsynth.results.delta_scan",
     "DescriptorSystem": "obsynth.models.descriptor",
     "Estimates": "obsynth.observers.linear",
@@ -51,13 +65,21 @@ _HOMES = {
     "ObserverDesign": "obsynth.results.design",
     "ObsynthError": "obsynth.errors",
     "PreconditionError": "obsynth.errors",
+    "RecursiveEstimates": "obsynth.observers.recursive_estimates",
+    "RecursiveObserver": "obsynth.observers.recursive",
     "RunningObserver": "obsynth.observers.linear",
+    "RunningRecursiveObserver": "obsynth.observers.recursive_running",
     "SolverError": "obsynth.errors",
     "SpecError": "obsynth.errors",
+    "SteadyState": "obsynth.synthesis.steady_filter",
+    "TimeVaryingDescriptorSystem": "obsynth.models.time_varying",
     "VerificationError": "obsynth.errors",
     "VerificationReport": "obsynth.results.report",
+    "adaptive_observer": "obsynth.pipeline.adaptive_observer",
     "analyse_structure": "obsynth.analysis.structure",
     "apply_adaptation_gain": "obsynth.pipeline.pd_observer",
+    "decide": "obsynth.observers.decisions",
+    "descriptor_kalman": "obsynth.pipeline.descriptor_kalman",
     "design": "obsynth.pipeline.designing",
     "discretise": "obsynth.analysis.transformations",
     "eliminate_algebraic_states": "obsynth.analysis.transformations",
@@ -69,15 +91,22 @@ _HOMES = {
     "pd_delta_scan": "obsynth.pipeline.pd_observer",
     "pd_observer": "obsynth.pipeline.pd_observer",
     "pd_observer_from_gains": "obsynth.pipeline.pd_observer",
+    "run_batch": "obsynth.observers.gain_schedule",
     "sample_observer": "obsynth.observers.sampling",
+    "simulate_time_varying": "obsynth.simulation.time_varying",
+    "steady_state_filter": "obsynth.synthesis.steady_filter",
     "ui_pi_observer": "obsynth.pipeline.ui_pi_observer",
     "ui_pi_observer_from_gains": "obsynth.pipeline.ui_pi_observer",
     "verify": "obsynth.verification",
 }
 
 __all__ = [
+    "Adaptation",
+    "Alarm",
+    "BatchEstimates",
     "Certificate",
     "Check",
+    "Decision",
     "DeltaScan",
     "DescriptorSystem",
     "Estimates",
@@ -87,13 +116,21 @@ __all__ = [
     "ObserverDesign",
     "ObsynthError",
     "PreconditionError",
+    "RecursiveEstimates",
+    "RecursiveObserver",
     "RunningObserver",
+    "RunningRecursiveObserver",
     "SolverError",
     "SpecError",
+    "SteadyState",
+    "TimeVaryingDescriptorSystem",
     "VerificationError",
     "VerificationReport",
+    "adaptive_observer",
     "analyse_structure",
     "apply_adaptation_gain",
+    "decide",
+    "descriptor_kalman",
     "design",
     "discretise",
     "eliminate_algebraic_states",
@@ -105,7 +142,10 @@ __all__ = [
     "pd_delta_scan",
     "pd_observer",
     "pd_observer_from_gains",
+    "run_batch",
     "sample_observer",
+    "simulate_time_varying",
+    "steady_state_filter",
     "ui_pi_observer",
     "ui_pi_observer_from_gains",
     "verify",

@@ -170,7 +170,11 @@ SCHEMA = [
     Case("no dt", drop("plant", "dt"), "plant.dt: this key is missing"),
     Case("no method", drop("method"), "method: this key is missing"),
     Case("no method id", drop("method", "id"), "method.id: this key is missing"),
-    Case("unknown method", put("method", "id", "kalman"), "the known methods are: fault-estimation-filter"),
+    Case(
+        "unknown method",
+        put("method", "id", "kalman"),
+        "the known methods are: adaptive-observer, descriptor-kalman, fault-estimation-filter",
+    ),
     Case("dt negative", put("plant", "dt", -0.1), "plant.dt: must be at least 0"),
     Case("dt as text", put("plant", "dt", "1.0"), "plant.dt: must be a number, not the text '1.0'"),
     Case("dt NaN", put("plant", "dt", math.nan), "plant.dt: must be a finite number"),

@@ -107,7 +107,7 @@ def test_functions_say_what_they_return_and_raise(name, item):
     "name",
     [
         "fault_estimation_filter", "fault_estimation_filter_from_gains", "pd_observer", "pd_observer_from_gains",
-        "pd_delta_scan",
+        "pd_delta_scan", "descriptor_kalman", "adaptive_observer",
     ],
 )  # fmt: skip
 def test_methods_give_shapes_units_and_source(name):

@@ -101,9 +101,13 @@ def run_check(options: argparse.Namespace) -> int:
 
     spec = load_spec(options.system)
     from obsynth.analysis.structure import analyse_structure
+    from obsynth.models.descriptor import DescriptorSystem
     from obsynth.pipeline.designing import check
 
-    structures = {"as the method sees it": analyse_structure(spec.plant)}
+    # A pencil, its eigenvalues and its index are those of one matrix pair: a plant that changes with k has none.
+    structures = {}
+    if isinstance(spec.plant, DescriptorSystem):
+        structures = {"as the method sees it": analyse_structure(spec.plant)}
     if spec.transformation is not None:
         structures = {"as written": analyse_structure(spec.transformation.source), **structures}
     done = "" if spec.transformation is None else spec.transformation.description

@@ -5,17 +5,21 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Mapping
 from importlib import import_module
-from typing import Any
+from typing import Any, TypeAlias
 
+from obsynth.analysis.conditions import Condition
 from obsynth.analysis.transformations import StateRecovery
 from obsynth.errors import SpecError, VerificationError
 from obsynth.models.descriptor import DescriptorSystem
+from obsynth.models.time_varying import TimeVaryingDescriptorSystem
 from obsynth.results.design import ObserverDesign
 from obsynth.results.report import VerificationReport
-from obsynth.synthesis.methods import REGISTRY, method_module
+from obsynth.synthesis.methods import REGISTRY, TIME_VARYING, method_module
 from obsynth.synthesis.result import Synthesis
 from obsynth.verification import verify
 from obsynth.verification.plant import condition_rows
+
+Plant: TypeAlias = DescriptorSystem | TimeVaryingDescriptorSystem
 
 
 def _silent(_: str) -> None:
@@ -23,7 +27,7 @@ def _silent(_: str) -> None:
 
 
 def design(
-    plant: DescriptorSystem,
+    plant: Plant,
     method: str = "fault-estimation-filter",
     *,
     name: str = "design",
@@ -35,10 +39,10 @@ def design(
 
     Parameters
     ----------
-    plant : DescriptorSystem
+    plant : DescriptorSystem or TimeVaryingDescriptorSystem
         The plant.
     method : str, optional
-        Method id; see `fault_estimation_filter` for the options of ``"fault-estimation-filter"``.
+        Method id; for its options see the function of the same name, such as `fault_estimation_filter`.
     name : str, optional
         Name of the design.
     recovery : StateRecovery, optional
@@ -68,30 +72,45 @@ def design(
     """
     report_stage = progress or _silent
     options = _checked_options(method, options)
+    for condition in _kind_conditions(plant, method):
+        condition.require()
     found = method_module(method).synthesise(plant, progress=report_stage, **options)
     report_stage("verifying the shipped realisation")
     return verified(plant, method, found, name=name, recovery=recovery)
 
 
-def check(
-    plant: DescriptorSystem, options: Mapping[str, Mapping[str, Any]] | None = None
-) -> dict[str, VerificationReport]:
+def check(plant: Plant, options: Mapping[str, Mapping[str, Any]] | None = None) -> dict[str, VerificationReport]:
     """Return, for every method, the report of its existence conditions; nothing is designed or raised.
 
     Parameters
     ----------
-    plant : DescriptorSystem
+    plant : DescriptorSystem or TimeVaryingDescriptorSystem
         The plant.
     options : mapping, optional
         Method id -> options of a spec; those that decide about existence, such as the fault model, are used.
     """
     found = {}
     for method in REGISTRY:
-        conditions = method_module(method).conditions
-        known = set(inspect.signature(conditions).parameters)
-        given = {name: value for name, value in (options or {}).get(method, {}).items() if name in known}
-        found[method] = VerificationReport.of(condition_rows(conditions(plant, **given)))
+        conditions = _kind_conditions(plant, method)
+        if not conditions:
+            judge = method_module(method).conditions
+            known = set(inspect.signature(judge).parameters)
+            given = {name: value for name, value in (options or {}).get(method, {}).items() if name in known}
+            conditions = judge(plant, **given)
+        found[method] = VerificationReport.of(condition_rows(conditions))
     return found
+
+
+def _kind_conditions(plant: Plant, method: str) -> tuple[Condition, ...]:
+    """Return the failing condition where a method does not take plants that change with k, else nothing."""
+    if isinstance(plant, DescriptorSystem) or method in TIME_VARYING:
+        return ()
+    return (
+        Condition(
+            "time-invariant plant", "constant matrices, given as a DescriptorSystem", False, 0.0, 1.0, method,
+            f"the matrices change with k; methods for such plants are: {', '.join(TIME_VARYING)}",
+        ),
+    )  # fmt: skip
 
 
 def door_of(method: str) -> Callable[..., ObserverDesign]:
@@ -120,13 +139,13 @@ def _checked_options(method: str, options: dict[str, Any]) -> dict[str, Any]:
 
 
 def draft_of(
-    plant: DescriptorSystem, method: str, found: Synthesis, *, name: str, recovery: StateRecovery | None = None
+    plant: Plant, method: str, found: Synthesis, *, name: str, recovery: StateRecovery | None = None
 ) -> ObserverDesign:
     """Return the design that a synthesis stands for, without a report.
 
     Parameters
     ----------
-    plant : DescriptorSystem
+    plant : DescriptorSystem or TimeVaryingDescriptorSystem
         The plant that the method was given.
     method : str
         Method id.
@@ -137,6 +156,8 @@ def draft_of(
     recovery : StateRecovery, optional
         Map from the states of ``plant`` back to those before its transformation.
     """
+    if found.plant is not None:
+        plant = found.plant
     if found.transformation is not None:
         own = found.transformation.recovery
         plant, recovery = found.transformation.plant, own if recovery is None else recovery.then(own)
@@ -155,7 +176,7 @@ def draft_of(
 
 
 def verified(
-    plant: DescriptorSystem, method: str, found: Synthesis, *, name: str, recovery: StateRecovery | None = None
+    plant: Plant, method: str, found: Synthesis, *, name: str, recovery: StateRecovery | None = None
 ) -> ObserverDesign:
     """Return the design with its report.
 

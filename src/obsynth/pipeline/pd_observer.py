@@ -193,7 +193,7 @@ def apply_adaptation_gain(design: ObserverDesign, adaptation_gain: ArrayLike) ->
         raise SpecError(f"A design of method {design.method!r} has no adaptation gain.", path="design")
     gains = design.gains
     changed = pd_observer_from_gains(
-        design.plant, J=gains["J"], L=gains["L"], M=gains["M"], N=gains["N"], adaptation_gain=adaptation_gain,
+        design.linear[0], J=gains["J"], L=gains["L"], M=gains["M"], N=gains["N"], adaptation_gain=adaptation_gain,
         name=design.name,
     )  # fmt: skip
     if not changed.report.passed:

@@ -2,5 +2,14 @@
 
 from obsynth.plotting.delta_scan import plot_delta_scan
 from obsynth.plotting.faults import plot_faults, plot_poles, plot_residuals
+from obsynth.plotting.recursive import plot_decision, plot_parameters, plot_states
 
-__all__ = ["plot_delta_scan", "plot_faults", "plot_poles", "plot_residuals"]
+__all__ = [
+    "plot_decision",
+    "plot_delta_scan",
+    "plot_faults",
+    "plot_parameters",
+    "plot_poles",
+    "plot_residuals",
+    "plot_states",
+]

@@ -165,8 +165,9 @@ def plot_poles(design: ObserverDesign, *, axes: Axes | None = None) -> Axes:
     """
     if axes is None:
         (axes,) = _panels(None, 1, size=(5.0, 5.4))
-    poles = np.linalg.eigvals(design.observer.Az)
-    zeros = np.array([zero.value for zero in fault_zeros(design.plant).zeros], dtype=complex)
+    plant, observer = design.linear
+    poles = np.linalg.eigvals(observer.Az)
+    zeros = np.array([zero.value for zero in fault_zeros(plant).zeros], dtype=complex)
     circle = np.exp(2j * np.pi * np.linspace(0.0, 1.0, 361))
     axes.plot(circle.real, circle.imag, color="0.5", linewidth=1.0, linestyle="--", label="unit circle")
     axes.axhline(0.0, color="0.85", linewidth=0.8, zorder=0)

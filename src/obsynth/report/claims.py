@@ -2,6 +2,13 @@
 
 from __future__ import annotations
 
+_RECURSIVE = {
+    "condition": "largest condition number of [E_k; C_k]",
+    "condition_k": "step at which it is",
+    "residual_directions": "least rank E_k + ny - nx: what the literal form (18) sees",
+    "contraction": "mean factor per step by which an error shrinks",
+    "steps": "steps that were looked at",
+}
 #: Method id -> claim -> meaning.
 _MEANINGS = {
     "fault-estimation-filter": {
@@ -28,6 +35,12 @@ _MEANINGS = {
         "noise_amplification": "H2 norm from unit white noise on every output to the noisiest fault estimate",
         "noise_price": "noise of the fault estimates against the quietest Kalman filter of the same plant",
         "condition": "condition number of the (generalised) eigenvectors",
+    },
+    "descriptor-kalman": _RECURSIVE,
+    "adaptive-observer": {
+        **_RECURSIVE,
+        "excitation": "least information on the parameters in a window, per parameter unit squared",
+        "excitation_k": "sample that ends that window",
     },
 }
 

@@ -11,6 +11,8 @@ from rich.text import Text
 
 from obsynth.analysis.transformations import StateRecovery
 from obsynth.models.descriptor import DescriptorSystem
+from obsynth.models.time_varying import TimeVaryingDescriptorSystem
+from obsynth.observers.linear import LinearObserver
 from obsynth.report.claims import meaning_of
 from obsynth.report.layout import facts_table, headed_table, name_list, number, print_section
 from obsynth.report.verification import verification_report
@@ -18,12 +20,12 @@ from obsynth.results.delta_scan import DeltaScan
 from obsynth.results.design import ObserverDesign
 
 
-def plant_facts(plant: DescriptorSystem) -> Iterator[tuple[str, str]]:
+def plant_facts(plant: DescriptorSystem | TimeVaryingDescriptorSystem) -> Iterator[tuple[str, str]]:
     """Yield label and value of what is known about a plant.
 
     Parameters
     ----------
-    plant : DescriptorSystem
+    plant : DescriptorSystem or TimeVaryingDescriptorSystem
         The plant.
 
     Yields
@@ -31,10 +33,27 @@ def plant_facts(plant: DescriptorSystem) -> Iterator[tuple[str, str]]:
     tuple of str
         Label and value.
     """
+    if isinstance(plant, TimeVaryingDescriptorSystem):
+        yield from _varying_facts(plant)
+        return
     yield "time", f"discrete, {plant.dt:g} s between samples" if plant.is_discrete else "continuous"
     signals = {
         "states": plant.state_names, "known inputs": plant.input_names, "outputs": plant.output_names,
         "faults": plant.fault_names, "disturbances": plant.disturbance_names, "noise": plant.noise_names,
+    }  # fmt: skip
+    for label, names in signals.items():
+        yield label, f"{len(names)}: {name_list(names)}" if names else "none"
+
+
+def _varying_facts(plant: TimeVaryingDescriptorSystem) -> Iterator[tuple[str, str]]:
+    steps = "without end" if plant.horizon is None else f"{plant.horizon} steps"
+    yield "time", f"discrete, {plant.dt:g} s between samples, {steps}"
+    varying = [name for name, matrix in plant.matrices.items() if not matrix.is_constant]
+    yield "change with k", name_list(varying) if varying else "nothing"
+    yield "equations", str(plant.ne)
+    signals = {
+        "states": plant.state_names, "known inputs": plant.input_names, "outputs": plant.output_names,
+        "parameters": plant.parameter_names,
     }  # fmt: skip
     for label, names in signals.items():
         yield label, f"{len(names)}: {name_list(names)}" if names else "none"
@@ -55,7 +74,8 @@ def design_report(design: ObserverDesign, *, console: Console, file: Path | None
     print_section(console, f"Design '{design.name}' by {design.method}", facts_table(plant_facts(design.plant)))
     print_section(console, "What is promised", facts_table(_promises(design)))
     if design.observer.fault_names:
-        print_section(console, "Fault estimates", _fault_estimates(design))
+        heading = "Fault estimates" if isinstance(design.observer, LinearObserver) else "Parameter estimates"
+        print_section(console, heading, _fault_estimates(design))
     if "delta_scan" in design.solver:
         print_section(
             console, "Other values of delta", delta_scan_table(DeltaScan.from_dict(design.solver["delta_scan"]))
@@ -106,10 +126,15 @@ def _promises(design: ObserverDesign) -> Iterator[tuple[str, str, str]]:
 def _fault_estimates(design: ObserverDesign) -> Table:
     observer, units = design.observer, design.plant.units
     deviations = {check.name: check.value for check in design.report.checks}
+    if not isinstance(observer, LinearObserver):
+        table = headed_table("parameter", "std at the end of the horizon")
+        for name in observer.fault_names:
+            table.add_row(Text(name), f"{number(deviations[f'noise in fhat[{name}]'])} {units.get(name, '')}".strip())
+        return table
     table = headed_table("fault", "delay in samples", "delay in s", "std under the stated noise")
     for name, delay in zip(observer.fault_names, observer.fault_delays, strict=True):
         deviation = deviations.get(f"noise in fhat[{name}]")
-        missing = "-" if design.plant.nw else "no noise stated"
+        missing = "-" if design.linear[0].nw else "no noise stated"
         shown = missing if deviation is None else f"{number(deviation)} {units.get(name, '')}".strip()
         table.add_row(Text(name), str(delay), number(delay * observer.dt), Text(shown))
     return table

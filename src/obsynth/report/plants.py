@@ -9,6 +9,7 @@ from rich.text import Text
 
 from obsynth.analysis.structure import Structure
 from obsynth.models.descriptor import DescriptorSystem
+from obsynth.models.time_varying import TimeVaryingDescriptorSystem
 from obsynth.report.designs import plant_facts
 from obsynth.report.layout import complex_numbers, facts_table, name_list, print_section
 from obsynth.report.verification import checks_table
@@ -16,7 +17,7 @@ from obsynth.results.report import VerificationReport
 
 
 def check_report(
-    plant: DescriptorSystem,
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem,
     structures: Mapping[str, Structure],
     methods: Mapping[str, VerificationReport],
     *,
@@ -27,10 +28,10 @@ def check_report(
 
     Parameters
     ----------
-    plant : DescriptorSystem
+    plant : DescriptorSystem or TimeVaryingDescriptorSystem
         The plant as the methods see it.
     structures : mapping of str to Structure
-        Structures to compare, by a heading such as ``as written``.
+        Structures to compare, by a heading such as ``as written``; none for a plant that changes with k.
     methods : mapping of str to VerificationReport
         The existence conditions of each method, by its identifier.
     console : Console
@@ -43,9 +44,10 @@ def check_report(
         facts.insert(0, ("transformed", transformation))
     print_section(console, "Plant", facts_table(facts))
     columns = [structure_facts(structure) for structure in structures.values()]
-    rows = [(label, *(column[label] for column in columns)) for label in columns[0]]
-    headings = ["", *structures] if len(columns) > 1 else []
-    print_section(console, "Structure (information, no verdict)", facts_table(rows, headings=headings))
+    if columns:
+        rows = [(label, *(column[label] for column in columns)) for label in columns[0]]
+        headings = ["", *structures] if len(columns) > 1 else []
+        print_section(console, "Structure (information, no verdict)", facts_table(rows, headings=headings))
     for method, report in methods.items():
         title = f"Existence conditions of {method}"
         print_section(console, title, checks_table(report.checks, width=console.width))

@@ -9,9 +9,12 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from obsynth.analysis.transformations import StateRecovery
+from obsynth.errors import SpecError
 from obsynth.models.descriptor import DescriptorSystem
+from obsynth.models.time_varying import TimeVaryingDescriptorSystem
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.linear import LinearObserver
+from obsynth.observers.recursive import RecursiveObserver
 from obsynth.results.report import VerificationReport
 
 if TYPE_CHECKING:
@@ -49,13 +52,13 @@ class ObserverDesign:
         Name of the design, from the spec or the caller.
     method : str
         Identifier of the method.
-    plant : DescriptorSystem
+    plant : DescriptorSystem or TimeVaryingDescriptorSystem
         The plant the observer is for (after the transformations a spec asks for).
     options : mapping
         Options as resolved, plain data.
     gains : mapping of str to FloatArray
         Gains with the paper's letters, for readers; what is shipped is `observer`.
-    observer : LinearObserver
+    observer : LinearObserver or RecursiveObserver
         What is shipped.
     certificate : Certificate
         Enough to recheck every claim without a solver.
@@ -71,10 +74,10 @@ class ObserverDesign:
 
     name: str
     method: str
-    plant: DescriptorSystem
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem
     options: Mapping[str, Any]
     gains: Mapping[str, FloatArray]
-    observer: LinearObserver
+    observer: LinearObserver | RecursiveObserver
     certificate: Certificate
     solver: Mapping[str, Any]
     notes: tuple[str, ...] = ()
@@ -86,6 +89,32 @@ class ObserverDesign:
         object.__setattr__(self, "gains", MappingProxyType(frozen))
         object.__setattr__(self, "options", MappingProxyType(dict(self.options)))
         object.__setattr__(self, "solver", MappingProxyType(dict(self.solver)))
+
+    @property
+    def linear(self) -> tuple[DescriptorSystem, LinearObserver]:
+        """Plant and observer of a linear time-invariant design.
+
+        Raises
+        ------
+        SpecError
+            The design is a recursive one.
+        """
+        if not isinstance(self.plant, DescriptorSystem) or not isinstance(self.observer, LinearObserver):
+            raise SpecError(f"Design {self.name!r} is no linear time-invariant observer.", path="observer")
+        return self.plant, self.observer
+
+    @property
+    def recursive(self) -> tuple[TimeVaryingDescriptorSystem, RecursiveObserver]:
+        """Plant and observer of a recursive design.
+
+        Raises
+        ------
+        SpecError
+            The design is a linear time-invariant one.
+        """
+        if not isinstance(self.plant, TimeVaryingDescriptorSystem) or not isinstance(self.observer, RecursiveObserver):
+            raise SpecError(f"Design {self.name!r} is no recursive observer.", path="observer")
+        return self.plant, self.observer
 
     def replace(self, **changes: Any) -> ObserverDesign:
         """Return the design with some fields changed (its report stays until `verify` is run again).
@@ -120,11 +149,17 @@ class ObserverDesign:
         return save(self, path)
 
     def to_control(self) -> control.StateSpace:
-        """Return the observer as a ``control.StateSpace`` from ``[u; y]`` to ``[xhat; fhat; r]``, with names."""
+        """Return the observer as a ``control.StateSpace`` from ``[u; y]`` to ``[xhat; fhat; r]``, with names.
+
+        Raises
+        ------
+        SpecError
+            The design is recursive: it has no constant realisation.
+        """
         import control
         import numpy as np
 
-        observer = self.observer
+        _, observer = self.linear
         outputs = [
             *(f"xhat[{name}]" for name in observer.state_names),
             *(f"fhat[{name}]" for name in observer.fault_names),

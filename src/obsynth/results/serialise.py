@@ -17,12 +17,16 @@ import numpy as np
 from obsynth.analysis.transformations import StateRecovery
 from obsynth.errors import SpecError
 from obsynth.models.descriptor import DescriptorSystem
+from obsynth.models.time_varying import TimeVaryingDescriptorSystem
 from obsynth.observers.linear import LinearObserver
+from obsynth.observers.recursive import RecursiveObserver
 from obsynth.results.design import Certificate, ObserverDesign
 from obsynth.results.report import VerificationReport
 
 SCHEMA_VERSION = 1
 _KIND = "obsynth gain set"
+# Designs of the other kind, linear and time-invariant, have no tag.
+_RECURSIVE = "recursive"
 # What JSON does not have is marked by these sets of keys; a mapping that happens to have one of them is wrapped.
 _ARRAY, _FLOAT, _MAPPING = {"shape", "data"}, {"float"}, {"mapping"}
 _MARKS = (_ARRAY, _FLOAT, _MAPPING)
@@ -83,6 +87,7 @@ def design_as_dict(design: ObserverDesign) -> dict[str, Any]:
             "notes": design.notes,
             "recovery": None if design.recovery is None else _fields_of(design.recovery),
             "report": design.report.as_dict(),
+            **({"kind": _RECURSIVE} if isinstance(design.observer, RecursiveObserver) else {}),
         }
     )
     return {"kind": _KIND, "schema_version": SCHEMA_VERSION, "sha256": digest_of(body), "design": body}
@@ -176,13 +181,16 @@ def _fields_of(record: StateRecovery) -> dict[str, Any]:
 
 
 def _design_from(data: dict[str, Any]) -> ObserverDesign:
+    recursive = data.get("kind") == _RECURSIVE
+    if data.get("kind") not in (None, _RECURSIVE):
+        raise SpecError(f"A design of the kind {data['kind']!r} is unknown to this obsynth.", path="kind")
     return ObserverDesign(
         name=data["name"],
         method=data["method"],
-        plant=DescriptorSystem(**data["plant"]),
+        plant=TimeVaryingDescriptorSystem(**data["plant"]) if recursive else DescriptorSystem(**data["plant"]),
         options=data["options"],
         gains=data["gains"],
-        observer=LinearObserver.from_dict(data["observer"]),
+        observer=(RecursiveObserver if recursive else LinearObserver).from_dict(data["observer"]),
         certificate=Certificate(**data["certificate"]),
         solver=data["solver"],
         notes=tuple(data["notes"]),

@@ -15,7 +15,7 @@ from obsynth.spec.documents import described
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
-    from obsynth.spec.schema import PlantDocument, SpecDocument
+    from obsynth.spec.schema import PlantDocument, SpecDocument, TimeVaryingDocument
 
     Model = TypeVar("Model", bound=BaseModel)
 
@@ -109,7 +109,7 @@ def checked_spec(document: Mapping[str, Any], source: Path) -> tuple[SpecDocumen
     return checked, {name: getattr(options, name) for name in options.model_fields_set}
 
 
-def checked_plant(document: Mapping[str, Any], source: Path) -> PlantDocument:
+def checked_plant(document: Mapping[str, Any], source: Path) -> PlantDocument | TimeVaryingDocument:
     """Check a plant in a file of its own.
 
     Parameters
@@ -121,7 +121,7 @@ def checked_plant(document: Mapping[str, Any], source: Path) -> PlantDocument:
 
     Returns
     -------
-    PlantDocument
+    PlantDocument or TimeVaryingDocument
         The plant's section.
 
     Raises
@@ -129,11 +129,15 @@ def checked_plant(document: Mapping[str, Any], source: Path) -> PlantDocument:
     SpecError
         The document does not fit the schema; all problems at once.
     """
-    from obsynth.spec.schema import PlantDocument
+    from obsynth.spec.schema import PlantDocument, TimeVaryingDocument
 
     problems = DocumentProblems(source, what="plant")
     _check_version(document, problems)
-    checked = _validated(PlantDocument, document, problems)
+    checked: PlantDocument | TimeVaryingDocument | None
+    if document.get("kind") == "time-varying":
+        checked = _validated(TimeVaryingDocument, document, problems)
+    else:
+        checked = _validated(PlantDocument, document, problems)
     problems.raise_if_any()
     if checked is None:
         raise SpecError(f"{source} is no valid plant.", path=str(source))
@@ -178,6 +182,8 @@ def _explained(item: Any, model: type[BaseModel], prefix: str) -> tuple[str, str
         text = "this key is missing."
     elif kind == "invalid_key" or "[key]" in location:
         text, numbers = f"a key must be a non-empty text, not {described(value)}.", []
+    elif kind == "entry_of_k":
+        text = f"{item['msg']}, not {described(value)}."
     elif kind in ("ragged_rows", "finite_number"):
         text = f"{item['msg']}." if kind == "ragged_rows" else f"must be a finite number, not {value}."
     elif kind == "string_pattern_mismatch":
@@ -219,7 +225,11 @@ def _known_keys(location: Sequence[str | int]) -> list[str]:
     """Return the keys that the section around the last part of ``location`` may have."""
     from obsynth.spec import schema
 
-    by_tag: dict[str, type[BaseModel]] = {"<file>": schema.MatrixFile, "<inline>": schema.PlantSection}
+    by_tag: dict[str, type[BaseModel]] = {
+        "<file>": schema.MatrixFile,
+        "<inline>": schema.PlantSection,
+        "<varying>": schema.TimeVaryingSection,
+    }
     by_name: dict[str, type[BaseModel]] = {"method": schema.MethodSection, "transform": schema.TransformSection}
     if "<pick>" in location:
         return ["outputs" if "C" in location else "states", "file"]

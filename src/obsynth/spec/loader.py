@@ -12,13 +12,14 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.models.names import index_of
+from obsynth.models.time_varying import TimeVaryingDescriptorSystem
 from obsynth.spec.checking import DocumentProblems, checked_plant, checked_spec
 from obsynth.spec.documents import read_names, read_yaml
 from obsynth.spec.matrices import read_matrix
 
 if TYPE_CHECKING:
     from obsynth.analysis.transformations import Transformation
-    from obsynth.spec.schema import PlantSection, TransformSection
+    from obsynth.spec.schema import PlantSection, TimeVaryingSection, TransformSection
 
 _MATRICES = ("E", "A", "B", "C", "D", "Bf", "Df", "Bd", "Dd", "Bw", "Dw")
 _NAME_LISTS = ("state_names", "input_names", "output_names", "fault_names", "disturbance_names", "noise_names")
@@ -38,7 +39,7 @@ class Spec:
         Free text; empty if there is none.
     path : Path
         The file it was read from.
-    plant : DescriptorSystem
+    plant : DescriptorSystem or TimeVaryingDescriptorSystem
         The plant as the method sees it, after the transformation.
     transformation : Transformation, optional
         What was done to the plant as written, and the way back.
@@ -51,7 +52,7 @@ class Spec:
     name: str
     description: str
     path: Path
-    plant: DescriptorSystem
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem
     transformation: Transformation | None
     method: str
     options: Mapping[str, Any]
@@ -91,6 +92,12 @@ def load_spec(path: str | Path) -> Spec:
         name: _matrix(value, source.parent, f"method.options.{name}", problems) for name, value in raw_options.items()
     }
     problems.raise_if_any()
+    if hasattr(section, "kind"):
+        varying = _varying_plant(section, plant_source, prefix)
+        return Spec(
+            name=checked.name, description=checked.description or "", path=source, plant=varying, transformation=None,
+            method=checked.method.id, options=options,
+        )  # fmt: skip
     as_written = _built_plant(section, plant_source, prefix)
     if reference is not None and reference.transform is not None:
         # A plant may serve several methods: the spec's own transform takes the place of the plant's.
@@ -110,6 +117,8 @@ def _joined(prefix: str, name: str) -> str:
 
 def _matrix(value: Any, folder: Path, where: str, problems: DocumentProblems) -> Any:
     """Return rows as an array, files read, picks as lists of names, sections as mappings, all else as it is."""
+    if isinstance(value, list) and any(isinstance(entry, str) for row in value for entry in _listed(row)):
+        return value
     if isinstance(value, list):
         return np.array(value, dtype=np.float64) if all(isinstance(row, list) for row in value) else value
     if hasattr(value, "file"):
@@ -131,6 +140,28 @@ def _names(value: Any, folder: Path, where: str, problems: DocumentProblems) -> 
             problems.add(where, str(error))
             return None
     return None if value is None else list(value)
+
+
+def _listed(row: Any) -> list[Any]:
+    return row if isinstance(row, list) else [row]
+
+
+def _varying_plant(section: TimeVaryingSection, source: Path, prefix: str) -> TimeVaryingDescriptorSystem:
+    problems = DocumentProblems(source, what="plant" if not prefix else "spec")
+    arguments: dict[str, Any] = {name: getattr(section, name) for name in ("dt", "horizon", "constants", "units")}
+    for name in ("E", "A", "B", "C", "Phi", "Psi"):
+        arguments[name] = _matrix(getattr(section, name), source.parent, _joined(prefix, name), problems)
+    for name in ("state_names", "input_names", "output_names", "parameter_names"):
+        arguments[name] = _names(getattr(section, name), source.parent, _joined(prefix, name), problems)
+    problems.raise_if_any()
+    try:
+        return TimeVaryingDescriptorSystem(**arguments)
+    except SpecError as error:
+        raise SpecError(
+            f"{source}: {error.args[0].splitlines()[0]}",
+            path=_joined(prefix, error.path or ""),
+            problems=error.problems,
+        ) from error
 
 
 def _built_plant(section: PlantSection, source: Path, prefix: str) -> DescriptorSystem:

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from obsynth.spec.schema import Matrix, Positive, Section, Text
+from obsynth.spec.schema import Matrix, Positive, Section, Text, VaryingMatrix
 
 
 class FaultEstimationFilterOptions(Section):
@@ -76,9 +76,33 @@ class UiPiObserverOptions(Section):
     solver: Literal["CLARABEL", "SCS"] = "CLARABEL"
 
 
+class DescriptorKalmanOptions(Section):
+    """Options of the method ``descriptor-kalman``."""
+
+    Q: VaryingMatrix | None = None
+    R: VaryingMatrix | None = None
+    initial_state: list[float] | None = None
+    initial_covariance: Matrix | None = None
+    early_constraints: bool = False
+
+
+class AdaptiveObserverOptions(DescriptorKalmanOptions):
+    """Options of the method ``adaptive-observer``."""
+
+    forgetting: Annotated[float, Field(gt=0.0, le=1.0)] = 0.98
+    form: Literal["innovation", "literal", "random-walk"] = "innovation"
+    guard: Literal["regularise", "directional", "none"] | None = None
+    random_walk: Matrix | None = None
+    initial_parameters: list[float] | None = None
+    initial_parameter_covariance: Matrix | None = None
+    window: Annotated[int, Field(ge=1)] = 50
+
+
 #: Options of every method, by its identifier.
 METHOD_OPTIONS: dict[str, type[Section]] = {
     "fault-estimation-filter": FaultEstimationFilterOptions,
     "pd-observer": PdObserverOptions,
     "ui-pi-observer": UiPiObserverOptions,
+    "descriptor-kalman": DescriptorKalmanOptions,
+    "adaptive-observer": AdaptiveObserverOptions,
 }

@@ -5,10 +5,12 @@ This module imports pydantic, so it is imported only when a spec is read.
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+import math
+from typing import Annotated, Any, Literal
 
 from pydantic import (
     BaseModel,
+    BeforeValidator,
     ConfigDict,
     Discriminator,
     Field,
@@ -22,7 +24,7 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 SCHEMA_VERSION = 1
 
 # Tags of unions appear in the locations of pydantic's errors; the bracket marks them for removal.
-_ROWS, _FILE, _PICK, _LIST, _INLINE = "<rows>", "<file>", "<pick>", "<list>", "<inline>"
+_ROWS, _FILE, _PICK, _LIST, _INLINE, _VARYING = "<rows>", "<file>", "<pick>", "<list>", "<inline>", "<varying>"
 
 
 def _rectangular(rows: Any, check_entries: ValidatorFunctionWrapHandler) -> Any:
@@ -61,6 +63,8 @@ def _kind_of_names(value: Any) -> str:
 
 
 def _kind_of_plant(value: Any) -> str:
+    if isinstance(value, dict) and value.get("kind") == "time-varying":
+        return _VARYING
     return _FILE if isinstance(value, dict) and "file" in value else _INLINE
 
 
@@ -112,6 +116,22 @@ OutputMatrix = Annotated[
 Names = Annotated[Annotated[list[Text], Tag(_LIST)] | Annotated[NamesFile, Tag(_FILE)], Discriminator(_kind_of_names)]
 
 
+def _number_or_expression(value: Any) -> Any:
+    """Check one entry of a matrix that may change with k; expressions are parsed later, with the plant's constants."""
+    if isinstance(value, bool) or not isinstance(value, (int, float, str)):
+        raise PydanticCustomError("entry_of_k", "must be a number or an expression in k")
+    if isinstance(value, float) and not math.isfinite(value):
+        raise PydanticCustomError("finite_number", "must be finite")
+    return value
+
+
+VaryingRows = Annotated[
+    list[Annotated[list[Annotated[Any, BeforeValidator(_number_or_expression)]], Field(min_length=1)]],
+    Field(min_length=1), WrapValidator(_rectangular), Tag(_ROWS),
+]  # fmt: skip
+VaryingMatrix = Annotated[VaryingRows | Annotated[MatrixFile, Tag(_FILE)], Discriminator(_kind_without_pick)]
+
+
 class TransformSection(Section):
     """What is done to the plant before a method sees it, in this order."""
 
@@ -152,6 +172,32 @@ class PlantDocument(PlantSection):
     schema_version: int
 
 
+class TimeVaryingSection(Section):
+    """A plant whose matrices change with k: rows of numbers and expressions."""
+
+    kind: Literal["time-varying"]
+    dt: Positive
+    horizon: Annotated[int, Field(ge=1)] | None = None
+    constants: dict[Text, float] | None = None
+    E: VaryingMatrix | None = None
+    A: VaryingMatrix
+    B: VaryingMatrix | None = None
+    C: VaryingMatrix
+    Phi: VaryingMatrix | None = None
+    Psi: VaryingMatrix | None = None
+    state_names: Names | None = None
+    input_names: Names | None = None
+    output_names: Names | None = None
+    parameter_names: Names | None = None
+    units: dict[Text, str] | None = None
+
+
+class TimeVaryingDocument(TimeVaryingSection):
+    """A time-varying plant in a file of its own."""
+
+    schema_version: int
+
+
 class PlantReference(Section):
     """A plant in another file: ``{file: plant.yaml}``; a transform given here takes the place of the file's."""
 
@@ -173,6 +219,9 @@ class SpecDocument(Section):
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$")]
     description: str | None = None
     plant: Annotated[
-        Annotated[PlantReference, Tag(_FILE)] | Annotated[PlantSection, Tag(_INLINE)], Discriminator(_kind_of_plant)
+        Annotated[PlantReference, Tag(_FILE)]
+        | Annotated[PlantSection, Tag(_INLINE)]
+        | Annotated[TimeVaryingSection, Tag(_VARYING)],
+        Discriminator(_kind_of_plant),
     ]
     method: MethodSection

@@ -7,8 +7,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from obsynth.analysis.transformations import Transformation
+from obsynth.models.time_varying import TimeVaryingDescriptorSystem
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear import LinearObserver
+from obsynth.observers.recursive import RecursiveObserver
 from obsynth.results.design import Certificate
 
 
@@ -22,7 +24,7 @@ class Synthesis:
         Options as resolved, plain data.
     gains : mapping
         Gains with the paper's letters.
-    observer : LinearObserver
+    observer : LinearObserver or RecursiveObserver
         The realisation.
     certificate : Certificate
         Witnesses and claims.
@@ -33,12 +35,15 @@ class Synthesis:
     transformation : Transformation, optional
         What the method did to the plant before it designed for it (such as the elimination of algebraic states):
         the design is then for the transformed plant, with the way back.
+    plant : TimeVaryingDescriptorSystem, optional
+        The plant as the recursive methods see it, where they were given another kind.
     """
 
     options: Mapping[str, Any]
     gains: Mapping[str, FloatArray]
-    observer: LinearObserver
+    observer: LinearObserver | RecursiveObserver
     certificate: Certificate
     solver: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     transformation: Transformation | None = None
+    plant: TimeVaryingDescriptorSystem | None = None

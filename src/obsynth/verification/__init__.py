@@ -18,6 +18,8 @@ _CHECKERS = {
     "fault-estimation-filter": "obsynth.verification.fault_estimation_filter",
     "pd-observer": "obsynth.verification.pd_observer",
     "ui-pi-observer": "obsynth.verification.ui_pi_observer",
+    "descriptor-kalman": "obsynth.verification.recursive",
+    "adaptive-observer": "obsynth.verification.recursive",
 }
 
 

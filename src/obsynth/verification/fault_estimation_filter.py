@@ -48,7 +48,7 @@ _IDENTITIES = {
 
 def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
     """Yield every check of ``design``; see `obsynth.verification.verify`."""
-    plant, observer, claims = design.plant, design.observer, design.certificate.claims
+    (plant, observer), claims = design.linear, design.certificate.claims
     yield from plant_information(plant)
     yield from condition_rows(fault_filter_conditions(plant))
     yield from claim_rows(plant, claims)
@@ -88,7 +88,7 @@ def _gain_set_rows(
     design: ObserverDesign, tracking: FloatArray, printed_digits: int | None
 ) -> Generator[Check, None, dict[str, FloatArray]]:
     """Yield the rows on the gain set, and return what its printed digits allow the identities to miss."""
-    plant, observer, gains = design.plant, design.observer, design.gains
+    (plant, observer), gains = design.linear, design.gains
     if not gains:
         return {}  # nothing is said about gains: the realisation stands for itself
     try:
@@ -136,9 +136,9 @@ def _fits(
 def _norm_rows(
     design: ObserverDesign, errors: ErrorSystem, tracking: FloatArray, factor: FloatArray, lag: int
 ) -> Iterator[Check]:
-    plant, claims = design.plant, design.certificate.claims
+    (plant, observer), claims = design.linear, design.certificate.claims
     gamma = claimed(claims, "gamma")
-    proof = prove_bounded_real(plant, design.observer, tracking, factor, gamma if plant.nd else 1.0, lag=lag)
+    proof = prove_bounded_real(plant, observer, tracking, factor, gamma if plant.nd else 1.0, lag=lag)
     what = f"stable, and l2 gain d -> fault error < {gamma:.6g}" if plant.nd else "stable (Lyapunov)"
     yield Check(
         "LMI",

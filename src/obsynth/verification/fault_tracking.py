@@ -60,8 +60,8 @@ def fault_response(design: ObserverDesign, frequencies: ArrayLike) -> ComplexArr
     """
     if "tracking" not in design.certificate.matrices:
         raise SpecError("The design holds no tracking map: fhat/f cannot be computed.", path="certificate")
-    points = boundary_points(np.atleast_1d(np.asarray(frequencies, dtype=np.float64)), design.plant.dt)
-    return _transfer(design.plant, design.observer, design.certificate.matrices["tracking"], points)
+    points = boundary_points(np.atleast_1d(np.asarray(frequencies, dtype=np.float64)), design.linear[0].dt)
+    return _transfer(*design.linear, design.certificate.matrices["tracking"], points)
 
 
 def _system(

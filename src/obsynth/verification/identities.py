@@ -117,6 +117,13 @@ class Identity:
         return np.asarray(np.where(rows > 0.0, rows, 1.0) / columns)
 
 
+def residual(
+    *terms: FloatArray, factors: tuple[tuple[FloatArray, ...], ...] = (), units: FloatArray | None = None
+) -> Residual:
+    """Return the residual of ``terms[0] + terms[1] + ... = 0``; see `Identity`."""
+    return Identity(terms, factors, units).residual()
+
+
 def worst(found: list[Residual]) -> Residual:
     """Return the residual that misses most of what it is allowed; one that is no number outdoes them all."""
     for item in found:

@@ -18,7 +18,7 @@ LARGE_GAIN = 1e2
 
 def norm_rows(design: ObserverDesign, errors: PdErrorSystem) -> Iterator[Check]:
     """Yield norms and gains: checks where a bound is claimed, else information."""
-    plant, claims = design.plant, design.certificate.claims
+    plant, claims = design.linear[0], design.certificate.claims
     noisy = with_sensor_noise(plant)
     unit = "" if plant.nw else "unit noise on every output, as the plant states none"
     yield _norm_row(
@@ -66,7 +66,7 @@ def _gain_rows(design: ObserverDesign, errors: PdErrorSystem) -> Iterator[Check]
             "gain bound", "norm of [J L], with the rows of M and N: at most as claimed", gain, claims["gain_bound"],
             source="ours",
         )  # fmt: skip
-    own = max(_size(design.plant.A), 1.0)
+    own = max(_size(design.linear[0].A), 1.0)
     warning = (
         "WARNING: out of proportion to the plant: any error of the model or the sensors is multiplied by it. Ask for a "
         "slower decay."

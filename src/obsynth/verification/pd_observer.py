@@ -22,7 +22,7 @@ from obsynth.numerics.scaling import balance_by_least_squares
 from obsynth.observers.linear import LinearObserver
 from obsynth.results.design import ObserverDesign
 from obsynth.results.report import Check, information, lower_bound_check, upper_bound_check
-from obsynth.verification.error_system import Residual, residual, tracking_residuals
+from obsynth.verification.identities import Residual, residual, tracking_identities
 from obsynth.verification.pd_error_system import PdErrorSystem
 from obsynth.verification.pd_norms import norm_rows
 from obsynth.verification.pd_proofs import fitting_claims, proof_rows, stacked_gains
@@ -43,7 +43,7 @@ _IDENTITIES = {
 
 def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
     """Yield every check of ``design``; see `obsynth.verification.verify`."""
-    plant, observer = design.plant, design.observer
+    plant, observer = design.linear
     yield from plant_information(plant)
     yield from condition_rows(pd_observer_conditions(plant))
     fitting = _fits(plant, observer) and fitting_claims(design)
@@ -62,7 +62,8 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     whole = replace(
         observer, state_names=augmented.state_names, fault_names=(), state_delays=(0,) * augmented.nx, fault_delays=()
     )
-    for key, found in tracking_residuals(augmented, whole, np.eye(augmented.nx), 0).items():
+    for key, identity in tracking_identities(augmented, whole, np.eye(augmented.nx), 0).items():
+        found = identity.residual()
         if key in _IDENTITIES:
             name, claim, source = _IDENTITIES[key]
             yield _equality(name, claim, found, tolerance, source)
@@ -103,7 +104,7 @@ def _negative(name: str, claim: str, value: float, *, source: str, detail: str) 
 
 def _gains_row(design: ObserverDesign, augmented: DescriptorSystem, tolerance: float) -> Check:
     """Check that the listed gains are those of the realisation: ``S L = T`` and ``By = J + Az L``."""
-    observer, (gain_j, gain_l) = design.observer, stacked_gains(design)
+    observer, (gain_j, gain_l) = design.linear[1], stacked_gains(design)
     estimate, direct = observer.Cz[: observer.order], observer.Dy[: observer.order]
     # A gain on an output in small units must not hide behind one on an output in large units.
     units = 1.0 / balance_by_least_squares(augmented.E, augmented.A, outputs=[augmented.C]).outputs
@@ -126,7 +127,7 @@ def _gains_row(design: ObserverDesign, augmented: DescriptorSystem, tolerance: f
 
 
 def _spectra(design: ObserverDesign, errors: PdErrorSystem) -> Iterator[Check]:
-    plant, claims = design.plant, design.certificate.claims
+    plant, claims = design.linear[0], design.certificate.claims
     # The matrix maps states to states: in units that balance it, the condition number is that of the observer.
     singular_values = np.linalg.svd(_balanced(errors.estimate), compute_uv=False)
     largest, smallest = float(singular_values[0]), float(singular_values[-1])

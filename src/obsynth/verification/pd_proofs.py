@@ -21,13 +21,13 @@ POSITIVE_CLAIMS = ("delta", "gain_bound", "fault_rate_gain", "noise_gain", "disk
 def stacked_gains(design: ObserverDesign) -> tuple[FloatArray, FloatArray]:
     """Return the gains in the loop, ``[J; G M]`` and ``[L; G N]``."""
     gains = design.gains
-    g = gains.get("G", np.eye(design.plant.nf))
+    g = gains.get("G", np.eye(design.linear[0].nf))
     return np.vstack([gains["J"], g @ gains["M"]]), np.vstack([gains["L"], g @ gains["N"]])
 
 
 def fitting_claims(design: ObserverDesign) -> bool:
     """Whether gains, matrices and claims are there, finite and of the right shapes."""
-    plant, claims = design.plant, design.certificate.claims
+    plant, claims = design.linear[0], design.certificate.claims
     n = plant.nx + plant.nf
     gains = {"J": (plant.nx, plant.ny), "L": (plant.nx, plant.ny), "M": (plant.nf, plant.ny), "N": (plant.nf, plant.ny)}
     if "G" in design.gains:
@@ -63,7 +63,7 @@ def proof_rows(design: ObserverDesign) -> Iterator[Check]:
     yield _proof("P1", "P1 is symmetric and positive definite", prove_symmetric_positive(p1), labels[0])
     if theorem == 2:
         yield _proof("Q", "Q = P3 is symmetric and positive definite", prove_symmetric_positive(p3), labels[0])
-    found = prove_shipped_stability(design.observer, p1, p3, delta=delta, decay=decay)
+    found = prove_shipped_stability(design.linear[1], p1, p3, delta=delta, decay=decay)
     rate = f"errors decay faster than exp(-{decay:.6g} t)" if decay > 0.0 else "the observer is stable"
     yield _proof(
         "LMI", f"Theorem {theorem} holds for the shipped realisation (delta = {delta:.6g} s): {rate}", found, labels[1]
@@ -81,7 +81,7 @@ def _proof(name: str, claim: str, found: DefinitenessProof, label: str) -> Check
 
 def _range_row(design: ObserverDesign) -> Check:
     """Prove the inequality at both ends of the range of g in G = g I; between them it is an average of the two."""
-    plant, matrices, claims = design.plant, design.certificate.matrices, design.certificate.claims
+    plant, matrices, claims = design.linear[0], design.certificate.matrices, design.certificate.claims
     gains = design.gains
     gain_j, gain_l = np.vstack([gains["J"], gains["M"]]), np.vstack([gains["L"], gains["N"]])
     loop = np.eye(plant.nx + plant.nf)

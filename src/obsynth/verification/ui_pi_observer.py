@@ -22,8 +22,8 @@ from obsynth.observers.linear import LinearObserver
 from obsynth.results.design import ObserverDesign
 from obsynth.results.report import Check, information, lower_bound_check, upper_bound_check
 from obsynth.verification.decoupling import decoupling_norm
-from obsynth.verification.error_system import Residual, residual
 from obsynth.verification.fault_tracking import tracking_rows
+from obsynth.verification.identities import Residual, residual
 from obsynth.verification.lyapunov import prove_stable
 from obsynth.verification.plant import condition_rows, plant_information
 
@@ -42,7 +42,7 @@ _MATRICES = ("tracking", "Phi", "Cw", "poles", "stability")
 
 def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
     """Yield every check of ``design``; see `obsynth.verification.verify`."""
-    plant, observer, certificate = design.plant, design.observer, design.certificate
+    (plant, observer), certificate = design.linear, design.certificate
     yield from plant_information(plant)
     fitting = _fits(design)
     yield upper_bound_check(
@@ -87,7 +87,7 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
 
 
 def _fits(design: ObserverDesign) -> bool:
-    plant, observer, matrices = design.plant, design.observer, design.certificate.matrices
+    (plant, observer), matrices = design.linear, design.certificate.matrices
     if any(name not in matrices for name in _MATRICES):
         return False
     order = matrices["Phi"].shape[0]
@@ -177,7 +177,8 @@ def _identities(
 
 
 def _stability_rows(design: ObserverDesign, poles: FloatArray, factor: FloatArray) -> Iterator[Check]:
-    observer, dt, claims = design.observer, design.plant.dt, design.certificate.claims
+    (plant, observer), claims = design.linear, design.certificate.claims
+    dt = plant.dt
     proof = prove_stable(observer.Az, factor, dt)
     yield Check(
         "stability",
@@ -258,7 +259,7 @@ def _least_digits(matrix: FloatArray, dt: float) -> int:
 
 
 def _noise_rows(design: ObserverDesign) -> Iterator[Check]:
-    plant, observer, claims = design.plant, design.observer, design.certificate.claims
+    (plant, observer), claims = design.linear, design.certificate.claims
     rows = observer.Cz[observer.fault_rows]
     direct = observer.Dy[observer.fault_rows]
     discrete = float(plant.dt > 0.0)

@@ -10,7 +10,11 @@ REGISTRY = {
     "fault-estimation-filter": "obsynth.synthesis.methods.fault_estimation_filter",
     "pd-observer": "obsynth.synthesis.methods.pd_observer",
     "ui-pi-observer": "obsynth.synthesis.methods.ui_pi_observer",
+    "descriptor-kalman": "obsynth.synthesis.methods.descriptor_kalman",
+    "adaptive-observer": "obsynth.synthesis.methods.adaptive_observer",
 }
+#: Methods that take plants whose matrices change with k.
+TIME_VARYING = ("descriptor-kalman", "adaptive-observer")
 
 
 def method_module(method: str) -> Any:

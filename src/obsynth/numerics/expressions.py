@@ -1,0 +1,198 @@
+"""A small arithmetic language for data: parsed into a tree of known operations, never executed as code.
+
+Numbers, names, ``+ - * / **``, parentheses and a fixed list of functions.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from obsynth.errors import SpecError
+
+#: Longer texts and deeper nestings are refused: nobody writes them by hand.
+MAXIMUM_LENGTH = 2000
+MAXIMUM_DEPTH = 50
+
+Evaluator: TypeAlias = Callable[[Mapping[str, Any]], Any]
+
+_TOKEN = re.compile(r"\s*(?:((?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)|([A-Za-z_]\w*)|(\*\*|[-+*/(),]))", re.ASCII)
+
+
+def _step(value: Any) -> Any:
+    return np.where(np.asarray(value) >= 0.0, 1.0, 0.0)
+
+
+#: Functions of one argument; ``step(x)`` is 1 where ``x >= 0`` and 0 elsewhere.
+FUNCTIONS: Mapping[str, Callable[[Any], Any]] = {
+    "sin": np.sin, "cos": np.cos, "tan": np.tan, "asin": np.arcsin, "acos": np.arccos, "atan": np.arctan,
+    "sinh": np.sinh, "cosh": np.cosh, "tanh": np.tanh, "exp": np.exp, "log": np.log, "log10": np.log10,
+    "sqrt": np.sqrt, "abs": np.abs, "sign": np.sign, "floor": np.floor, "ceil": np.ceil, "step": _step,
+}  # fmt: skip
+#: Functions of two arguments.
+FUNCTIONS_OF_TWO: Mapping[str, Callable[[Any, Any], Any]] = {"min": np.minimum, "max": np.maximum}
+CONSTANTS: Mapping[str, float] = {"pi": float(np.pi)}
+
+
+@dataclass(frozen=True)
+class Expression:
+    """An expression that was parsed and can be evaluated.
+
+    Parameters
+    ----------
+    text : str
+        As written.
+    names : frozenset of str
+        The names whose values are needed.
+    """
+
+    text: str
+    names: frozenset[str]
+    _evaluator: Evaluator = field(repr=False, compare=False)
+
+    def __call__(self, values: Mapping[str, Any]) -> Any:
+        """Return the value, NaN or infinite where there is none; ``values`` are numbers or arrays by name."""
+        # What is not finite is found by the caller, who knows where it came from.
+        with np.errstate(all="ignore"):
+            return self._evaluator(values)
+
+
+def parse_expression(text: str) -> Expression:
+    """Parse a text into an expression.
+
+    Parameters
+    ----------
+    text : str
+        For example ``"(k + 1) / (k + 0.5)"``.
+
+    Returns
+    -------
+    Expression
+        Ready to be evaluated for values of its names, numbers or arrays.
+
+    Raises
+    ------
+    SpecError
+        The text does not belong to the language; the message says where.
+    """
+    if len(text) > MAXIMUM_LENGTH:
+        raise SpecError(f"An expression has {len(text)} characters: at most {MAXIMUM_LENGTH} are read.")
+    parser = _Parser(text)
+    evaluator = parser.whole()
+    return Expression(text, frozenset(parser.names), evaluator)
+
+
+class _Parser:
+    """Recursive descent: sum, term, sign, power, atom."""
+
+    def __init__(self, text: str) -> None:
+        self.text, self.tokens, self.names = text, _tokens(text), set[str]()
+        self.position = self.depth = 0
+
+    def whole(self) -> Evaluator:
+        found = self.sum()
+        if self.peek():
+            raise self.error(f"{self.peek()!r} is not expected here")
+        return found
+
+    def peek(self) -> str:
+        return self.tokens[self.position] if self.position < len(self.tokens) else ""
+
+    def take(self, *wanted: str) -> str:
+        token = self.peek()
+        if token and token in wanted:
+            self.position += 1
+            return token
+        return ""
+
+    def error(self, reason: str) -> SpecError:
+        return SpecError(
+            f"{self.text!r} is no valid expression: {reason}. Allowed are numbers, names, + - * / **, parentheses "
+            f"and the functions {', '.join([*FUNCTIONS, *FUNCTIONS_OF_TWO])}."
+        )
+
+    def sum(self) -> Evaluator:
+        left = self.term()
+        while operator := self.take("+", "-"):
+            left = _binary(np.add if operator == "+" else np.subtract, left, self.term())
+        return left
+
+    def term(self) -> Evaluator:
+        left = self.signed()
+        while operator := self.take("*", "/"):
+            left = _binary(np.multiply if operator == "*" else np.divide, left, self.signed())
+        return left
+
+    def signed(self) -> Evaluator:
+        self.depth += 1
+        if self.depth > MAXIMUM_DEPTH:
+            raise self.error(f"it is nested more than {MAXIMUM_DEPTH} times")
+        sign = self.take("+", "-")
+        found = self.signed() if sign else self.power()
+        self.depth -= 1
+        return _unary(np.negative, found) if sign == "-" else found
+
+    def power(self) -> Evaluator:
+        base = self.atom()
+        return _binary(np.power, base, self.signed()) if self.take("**") else base
+
+    def atom(self) -> Evaluator:
+        if self.take("("):
+            inner = self.sum()
+            self.close()
+            return inner
+        token = self.peek()
+        if not token or token in "**/+-(),":
+            raise self.error(f"{token!r} is not expected here" if token else "it ends too early")
+        self.position += 1
+        if token[0].isdigit() or token[0] == ".":
+            number = np.float64(token)
+            return lambda values: number
+        if self.take("("):
+            return self.function(token)
+        if token in CONSTANTS:
+            constant = CONSTANTS[token]
+            return lambda values: constant
+        self.names.add(token)
+        return lambda values: values[token]
+
+    def function(self, name: str) -> Evaluator:
+        first = self.sum()
+        if name in FUNCTIONS:
+            self.close()
+            return _unary(FUNCTIONS[name], first)
+        if name not in FUNCTIONS_OF_TWO:
+            raise self.error(f"there is no function {name!r}")
+        if not self.take(","):
+            raise self.error(f"{name} needs two arguments")
+        second = self.sum()
+        self.close()
+        return _binary(FUNCTIONS_OF_TWO[name], first, second)
+
+    def close(self) -> None:
+        if not self.take(")"):
+            raise self.error("a parenthesis is not closed")
+
+
+def _tokens(text: str) -> list[str]:
+    tokens, position = [], 0
+    stripped = text.rstrip()
+    while position < len(stripped):
+        match = _TOKEN.match(stripped, position)
+        if match is None:
+            raise SpecError(f"{text!r} is no valid expression: {stripped[position:].strip()[0]!r} is not allowed.")
+        tokens.append(match.group(match.lastindex or 0))
+        position = match.end()
+    return tokens
+
+
+def _unary(operation: Callable[[Any], Any], inner: Evaluator) -> Evaluator:
+    return lambda values: operation(inner(values))
+
+
+def _binary(operation: Callable[[Any, Any], Any], left: Evaluator, right: Evaluator) -> Evaluator:
+    return lambda values: operation(left(values), right(values))

@@ -1,0 +1,236 @@
+"""One step of the descriptor Kalman filter in square-root covariance form (generalised least squares after Paige).
+
+From ``Y = H x + S e`` with ``e ~ N(0, I)``: the estimate of x, a square root of its covariance, and the whitened parity
+innovation, all from two orthogonal factorisations.  No covariance is ever formed or inverted.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from obsynth.errors import PreconditionError
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.ranks import RANK_TOLERANCE
+
+#: A column of H that keeps less than this of its length beside the others goes to the rank-revealing step: far below
+#: what a condition number of 1e12 does, far above rounding.
+DEPENDENT_COLUMN = 1e-14
+#: The same for a row of the parity covariance, relative to the whole noise: the rank-revealing step then decides.
+SUSPECT_PARITY = 1e-15
+#: Parity directions whose noise is below this share of the terms it is made of are free of noise: a few roundings.
+PERFECT_PARITY = 1e-14
+#: Noise-free parity directions must vanish to this share of their terms; rounding of data in double precision.
+CONSISTENCY = 1e-9
+
+
+class LeastSquaresStep(NamedTuple):
+    """What one step gives.
+
+    Parameters
+    ----------
+    estimate : FloatArray
+        ``(n, columns of Y)``: the linear map applied to each column of Y.
+    factor : FloatArray
+        ``(n, n)`` with ``P = factor factor'``.
+    innovation : FloatArray
+        ``(m, columns of Y)``, the whitened parity: for the column that holds the data it is N(0, I).
+    diffuse : FloatArray
+        ``(n, r)``: directions of x about which nothing is known; r = 0 unless samples are missing.
+    """
+
+    estimate: FloatArray
+    factor: FloatArray
+    innovation: FloatArray
+    diffuse: FloatArray
+
+
+class Projection(NamedTuple):
+    """The orthogonal factorisation of H, which may serve many steps.
+
+    Parameters
+    ----------
+    rotation : FloatArray
+        ``(rows, rows)``: ``[Q_2'; Q_1']``, parity first.
+    head : FloatArray
+        ``(n, n)``: R_H, upper triangular.
+    lower : FloatArray
+        ``(n, n)``: ones on and below the diagonal.
+    """
+
+    rotation: FloatArray
+    head: FloatArray
+    lower: FloatArray
+
+
+def projection_of(H: FloatArray) -> Projection | None:
+    """Return the factorisation of H, or ``None`` where its rank has to be decided.
+
+    Parameters
+    ----------
+    H : FloatArray
+        ``(rows, n)``.
+    """
+    from scipy.linalg.lapack import dgeqrf, dormqr
+
+    rows, n = H.shape
+    if rows < n:
+        return None
+    packed, tau, _, _ = dgeqrf(H)
+    diagonal = np.abs(packed.diagonal())
+    if (diagonal <= DEPENDENT_COLUMN * np.sqrt(np.einsum("ij,ij->j", H, H))).any():
+        return None
+    transposed = dormqr("L", "T", packed, tau, np.eye(rows), 64 * rows)[0]
+    rotation = np.concatenate((transposed[n:], transposed[:n]))
+    return Projection(rotation, np.asfortranarray(packed[:n]), np.tri(n))
+
+
+def projected_step(projection: Projection, noise: FloatArray, data: FloatArray) -> LeastSquaresStep | None:
+    """Solve one step from rotated noise and data, or return ``None`` where the rank of the noise has to be decided.
+
+    Parameters
+    ----------
+    projection : Projection
+        Of H.
+    noise : FloatArray
+        ``(s, rows)``, in Fortran order, overwritten: the transpose of ``rotation S``.
+    data : FloatArray
+        ``(rows, columns)``: ``rotation Y``.
+    """
+    from scipy.linalg.lapack import dgeqrf, dtrtrs
+
+    n = len(projection.head)
+    rows, columns = data.shape
+    m = rows - n
+    suspect = SUSPECT_PARITY * math.sqrt(np.vdot(noise, noise)) if m else 0.0
+    triangle = dgeqrf(noise, overwrite_a=1)[0]
+    right = np.empty((n, columns + n), order="F")
+    innovation = data[:m]
+    if m:
+        if abs(triangle.diagonal()[:m]).min() <= suspect:
+            return None
+        innovation = dtrtrs(triangle[:m, :m], innovation, trans=1)[0]
+        right[:, :columns] = data[m:] - triangle[:m, m:rows].T @ innovation
+    else:
+        right[:, :columns] = data
+    np.multiply(triangle[m:rows, m:rows].T, projection.lower, out=right[:, columns:])
+    solved = dtrtrs(projection.head, right, overwrite_b=1)[0]
+    return LeastSquaresStep(solved[:, :columns], solved[:, columns:], innovation, np.empty((n, 0)))
+
+
+def least_squares_step(H: FloatArray, S: FloatArray, Y: FloatArray) -> LeastSquaresStep | None:
+    r"""Solve one step by LAPACK alone, or return ``None`` where a rank has to be decided.
+
+    .. math::
+        H = [Q_1\ Q_2]\begin{bmatrix} R_H \\ 0 \end{bmatrix}, \quad
+        \begin{bmatrix} Q_2^T S \\ Q_1^T S \end{bmatrix} = \begin{bmatrix} L & 0 \\ X & T \end{bmatrix} Z^T, \quad
+        v = L^{-1} Q_2^T Y, \quad x = R_H^{-1} (Q_1^T Y - X v), \quad P = R_H^{-1} T T^T R_H^{-T}
+
+    Parameters
+    ----------
+    H : FloatArray
+        ``(rows, n)``, of full column rank.
+    S : FloatArray
+        ``(rows, s)`` with ``s >= rows``: square root of the covariance of ``Y - H x``.
+    Y : FloatArray
+        ``(rows, columns)``: data, regressors, or the identity.
+    """
+    projection = projection_of(H)
+    if projection is None:
+        return None
+    return projected_step(projection, (projection.rotation @ S).T, projection.rotation @ Y)
+
+
+def rank_revealing_step(H: FloatArray, S: FloatArray, Y: FloatArray, unknown: FloatArray) -> LeastSquaresStep:
+    """Solve one step in which x may be undetermined, noise may be missing, and earlier directions are unknown.
+
+    Parameters
+    ----------
+    H, S, Y : FloatArray
+        As for `least_squares_step`; here H may have any rank.
+    unknown : FloatArray
+        ``(rows, r)``: columns of further unknowns without prior, eliminated together with x.
+
+    Returns
+    -------
+    LeastSquaresStep
+        Undetermined directions are in ``diffuse``, where the estimate is the one of least norm; perfect and redundant
+        rows of the innovation are left out.
+
+    Raises
+    ------
+    PreconditionError
+        Constraints without noise contradict each other, or determine what only noise may: the regressors.
+    """
+    from scipy.linalg import qr, solve_triangular
+
+    n = H.shape[1]
+    whole = np.hstack([H, -unknown])
+    lengths = np.sqrt(np.einsum("ij,ij->j", whole, whole))
+    lengths[lengths == 0.0] = 1.0
+    q, r, order = qr(whole / lengths, pivoting=True)
+    sizes = np.abs(np.diagonal(r))
+    rank = int(np.sum(sizes > RANK_TOLERANCE * max(float(sizes[0]), 0.0))) if sizes.size else 0
+    q1, q2, head = q[:, :rank], q[:, rank:], r[:rank, :rank]
+    innovation, carried, rest = _whitened(q1, q2, S, Y)
+    noise = qr(rest.T, mode="economic")[1].T if rest.size else np.zeros((rank, 0))
+    solved = solve_triangular(head, np.hstack([q1.T @ Y - carried, noise])) if rank else np.zeros((0, Y.shape[1]))
+    back = np.zeros((whole.shape[1], solved.shape[1]))
+    back[order[:rank]] = solved
+    null = np.zeros((whole.shape[1], whole.shape[1] - rank))
+    if rank and null.shape[1]:
+        null[order[:rank]] = -solve_triangular(head, r[:rank, rank:])
+    null[order[rank:]] = np.eye(null.shape[1])
+    back, null = back / lengths[:, None], null / lengths[:, None]
+    found, factor = back[:n, Y.shape[1] :], np.zeros((n, n))
+    compact = qr(found.T, mode="r")[0][:n].T if found.size else found
+    factor[:, : compact.shape[1]] = compact
+    return LeastSquaresStep(back[:n, : Y.shape[1]], factor, innovation, _basis(null[:n]))
+
+
+def _basis(null: FloatArray) -> FloatArray:
+    """Return an orthonormal basis of what the null space leaves open in x."""
+    if not null.shape[1]:
+        return null
+    left, values, _ = np.linalg.svd(null, full_matrices=False)
+    return np.asarray(left[:, values > RANK_TOLERANCE * max(float(values[0]), np.finfo(np.float64).tiny)])
+
+
+def _whitened(
+    q1: FloatArray, q2: FloatArray, S: FloatArray, Y: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the whitened parity of Y, what it tells about the rest, and the noise that is left in the rest."""
+    from scipy.linalg import qr, solve_triangular
+
+    parity, data = q2.T @ S, q2.T @ Y
+    if not q2.shape[1]:
+        return data, np.zeros((q1.shape[1], Y.shape[1])), q1.T @ S
+    sizes = np.abs(q2.T) @ np.linalg.norm(S, axis=1)
+    sizes[sizes == 0.0] = 1.0
+    z, t, order = qr((parity / sizes[:, None]).T, pivoting=True)
+    rank = int(np.sum(np.abs(np.diagonal(t)) > PERFECT_PARITY))
+    scaled = (data / sizes[:, None])[order]
+    lower = t[:rank, :rank].T
+    innovation = solve_triangular(lower, scaled[:rank], lower=True) if rank else np.zeros((0, Y.shape[1]))
+    # What is left is free of noise: it must vanish, or the constraints contradict each other.
+    left = scaled[rank:] - (t[:rank, rank:].T @ innovation if rank else 0.0)
+    terms = ((np.abs(q2.T) @ np.abs(Y)) / sizes[:, None])[order][rank:]
+    _require_consistent(left, terms)
+    rotated = q1.T @ S @ z
+    return innovation, rotated[:, :rank] @ innovation, rotated[:, rank:]
+
+
+def _require_consistent(left: FloatArray, terms: FloatArray) -> None:
+    bad = np.abs(left) > CONSISTENCY * terms
+    if np.any(bad[:, :1]):
+        raise PreconditionError(
+            "Equations or outputs without noise contradict each other: no state fits them. Give the ones that are only "
+            "nearly true a variance in Q or R.", condition="consistent perfect constraints",
+        )  # fmt: skip
+    if np.any(bad):
+        raise PreconditionError(
+            "Equations or outputs without noise determine the parameters exactly, which a filter cannot weigh against "
+            "noisy data. Give them a variance in Q or R.", condition="parity covariance nonsingular",
+        )  # fmt: skip

@@ -1,0 +1,112 @@
+"""A recursive observer from a plant and plain options: used to design one, and to check the one that was shipped."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.models.sequences import MatrixSequence
+from obsynth.models.time_varying import TimeVaryingDescriptorSystem
+from obsynth.numerics.arrays import FloatArray, as_matrix
+from obsynth.observers.recursive import Adaptation, RecursiveObserver
+
+#: Options of the filter, and of the parameters besides.
+FILTER_OPTIONS = ("Q", "R", "initial_state", "initial_covariance", "early_constraints")
+PARAMETER_OPTIONS = (
+    "form", "forgetting", "guard", "initial_parameters", "initial_parameter_covariance", "random_walk", "window",
+)  # fmt: skip
+
+
+def observer_from_options(plant: TimeVaryingDescriptorSystem, options: Mapping[str, Any]) -> RecursiveObserver:
+    """Return the observer that options stand for.
+
+    Parameters
+    ----------
+    plant : TimeVaryingDescriptorSystem
+        The plant.
+    options : mapping
+        All of `FILTER_OPTIONS`; all of `PARAMETER_OPTIONS` too where parameters are estimated.  ``None`` stands for the
+        identity, or for zeros in means and in the walk.
+
+    Raises
+    ------
+    SpecError
+        An option is out of range or has the wrong shape.
+    """
+    adaptation = None
+    if "form" in options:
+        nq = plant.nq
+        adaptation = Adaptation(
+            form=options["form"],
+            forgetting=float(options["forgetting"]),
+            guard=options["guard"],
+            initial_parameters=_vector(options["initial_parameters"], nq, "initial_parameters"),
+            initial_covariance=_square(
+                options["initial_parameter_covariance"], nq, 1.0, "initial_parameter_covariance"
+            ),
+            walk=_square(options["random_walk"], nq, 0.0, "random_walk"),
+            window=options["window"],
+        )
+    return RecursiveObserver(
+        plant, _sequence(options["Q"], plant.ne, "Q", plant), _sequence(options["R"], plant.ny, "R", plant),
+        _vector(options["initial_state"], plant.nx, "initial_state"),
+        _square(options["initial_covariance"], plant.nx, 1.0, "initial_covariance"), adaptation,
+        bool(options["early_constraints"]),
+    )  # fmt: skip
+
+
+def plain_options(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return options as they are kept with a design: arrays and sequences as data, callables as they are.
+
+    Parameters
+    ----------
+    options : mapping
+        As for `observer_from_options`.
+    """
+    plain: dict[str, Any] = {}
+    for name, value in options.items():
+        if isinstance(value, MatrixSequence):
+            plain[name] = value.as_data() if value.is_data else value.function
+        elif value is None or callable(value) or isinstance(value, (bool, int, float, str)) or _has_text(value):
+            plain[name] = value
+        else:
+            plain[name] = np.array(value, dtype=np.float64)
+    return plain
+
+
+def _has_text(value: Any) -> bool:
+    return isinstance(value, (list, tuple)) and any(isinstance(item, str) or _has_text(item) for item in value)
+
+
+def _sequence(value: Any, size: int, name: str, plant: TimeVaryingDescriptorSystem) -> MatrixSequence:
+    if value is None:
+        return MatrixSequence.of(np.eye(size), name)
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        value = float(value) * np.eye(size)
+    found = MatrixSequence.of(value, name, constants=plant.constants)
+    if found.length is not None and (plant.horizon is None or found.length < plant.horizon):
+        raise SpecError(f"{name} is a stack for {found.length} steps: it must reach as far as the plant's horizon "
+                        f"({plant.horizon or 'without end'}).", path=name)  # fmt: skip
+    return found
+
+
+def _vector(value: Any, size: int, name: str) -> FloatArray:
+    if value is None:
+        return np.zeros(size)
+    try:
+        vector = np.atleast_1d(np.asarray(value, dtype=np.float64))
+    except (TypeError, ValueError):
+        raise SpecError(f"{name} must be {size} finite number(s).", path=name) from None
+    if vector.shape != (size,) or not np.isfinite(vector).all():
+        raise SpecError(f"{name} must be {size} finite number(s).", path=name)
+    return vector
+
+
+def _square(value: Any, size: int, default: float, name: str) -> FloatArray:
+    if value is None:
+        return default * np.eye(size)
+    matrix = as_matrix(value, name)
+    return float(matrix[0, 0]) * np.eye(size) if np.ndim(value) == 0 else matrix

@@ -1,0 +1,122 @@
+"""Numbers about a recursive observer that do not depend on data: contraction of the errors, excitation, last gains."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from obsynth.analysis.time_varying import STEPS_WITHOUT_HORIZON
+from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.gain_schedule import GainStep, gain_steps
+from obsynth.observers.recursive import RecursiveObserver
+from obsynth.observers.recursive_estimates import excitation_levels
+
+#: Errors that shrank below this are gone; the product starts anew from there, so that it does not underflow.
+UNDERFLOW = 1e-200
+
+
+@dataclass(frozen=True, eq=False)
+class ScheduleFacts:
+    """What the gains along the horizon say.
+
+    Parameters
+    ----------
+    steps : int
+        How many steps were looked at.
+    contraction : float
+        ``norm(product of L_k A_k)^(1 / steps)``: the mean factor by which an error shrinks in a step.
+    growth : float
+        The largest norm of the product on the way: how much an error may grow before it dies out.
+    excitation : float
+        The least eigenvalue of the information on the parameters in any window, (26); NaN without parameters.
+    excitation_k : int
+        The sample that ends that window.
+    L, K : FloatArray
+        The gains (11) of the last step.
+    deviations : FloatArray
+        ``(nq,)``: standard deviations of the parameters after the last step.
+    state_deviations : FloatArray
+        ``(nx,)``: standard deviations of the states after the last step, the parameters being known.
+    """
+
+    steps: int
+    contraction: float
+    growth: float
+    excitation: float
+    excitation_k: int
+    L: FloatArray
+    K: FloatArray
+    deviations: FloatArray
+    state_deviations: FloatArray
+
+
+def looked_at(observer: RecursiveObserver) -> int:
+    """Return how many steps of an observer's model are looked at.
+
+    Parameters
+    ----------
+    observer : RecursiveObserver
+        At rest.
+    """
+    steps = observer.plant.horizon or STEPS_WITHOUT_HORIZON
+    return max(steps - 1, 1) if observer.early_constraints else steps
+
+
+def schedule_facts(observer: RecursiveObserver) -> ScheduleFacts:
+    """Return what the gains along the horizon say.
+
+    Parameters
+    ----------
+    observer : RecursiveObserver
+        At rest.
+    """
+    steps = looked_at(observer)
+    learning = observer.adaptation is not None
+    walking = observer.adaptation is not None and observer.adaptation.form == "random-walk"
+    # Of a walk, the state filter and the regressors are those of the model without the walk.
+    plain = observer
+    if observer.adaptation is not None and walking:
+        plain = replace(observer, adaptation=replace(observer.adaptation, form="innovation", forgetting=1.0))
+    schedule = list(gain_steps(plain, steps))
+    last = schedule[-1]
+    ne = len(last.step.A)
+    contraction, growth = _contraction(schedule, observer.plant.nx)
+    window = observer.adaptation.window if observer.adaptation is not None else 1
+    levels = excitation_levels([found.G for found in schedule], window)[window - 1 :]
+    deviations, state_deviations = _lengths(last.spread), _lengths(last.factor)
+    if walking:
+        *_, end = gain_steps(observer, steps)
+        lengths = _lengths(end.factor)
+        state_deviations, deviations = lengths[: observer.plant.nx], lengths[observer.plant.nx :]
+    return ScheduleFacts(
+        steps=len(schedule),
+        contraction=contraction,
+        growth=growth,
+        excitation=float(levels.min()) if learning and levels.size else float("nan"),
+        excitation_k=int(levels.argmin()) + window if learning and levels.size else 0,
+        L=last.gain[:, :ne],
+        K=last.gain[:, ne:],
+        deviations=deviations,
+        state_deviations=state_deviations,
+    )
+
+
+def _lengths(factor: FloatArray) -> FloatArray:
+    return np.asarray(np.sqrt(np.einsum("ij,ij->i", factor, factor)))
+
+
+def _contraction(schedule: Sequence[GainStep], nx: int) -> tuple[float, float]:
+    product, logarithm, growth = np.eye(nx), 0.0, 1.0
+    for found in schedule:
+        product = found.gain[:, : len(found.step.A)] @ found.step.A @ product
+        size = float(np.linalg.norm(product, 2))
+        growth = max(growth, size * float(np.exp(min(logarithm, 0.0))))
+        if not size < 1.0 / UNDERFLOW:
+            return float("inf"), float("inf")
+        if size == 0.0:
+            return 0.0, growth
+        if size < UNDERFLOW:
+            product, logarithm = product / size, logarithm + float(np.log(size))
+    return float(np.exp((logarithm + np.log(np.linalg.norm(product, 2))) / len(schedule))), growth

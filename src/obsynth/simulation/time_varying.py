@@ -1,0 +1,113 @@
+"""Consistent simulation of time-varying descriptor plants of index one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from obsynth.analysis.time_varying import algebraic_rows
+from obsynth.errors import PreconditionError, SpecError
+from obsynth.models.time_varying import TimeVaryingDescriptorSystem
+from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
+from obsynth.numerics.ranks import decide_rank
+
+
+@dataclass(frozen=True, eq=False)
+class VaryingTrajectory:
+    """A simulated record.
+
+    Parameters
+    ----------
+    states : FloatArray
+        ``(samples, nx)``.
+    outputs : FloatArray
+        ``(samples, ny)``; the first row is NaN: the model begins with y(1).
+    """
+
+    states: FloatArray
+    outputs: FloatArray
+
+
+def simulate_time_varying(
+    plant: TimeVaryingDescriptorSystem,
+    *,
+    samples: int,
+    parameters: ArrayLike | None = None,
+    u: ArrayLike | None = None,
+    initial_state: ArrayLike | None = None,
+    equation_noise: ArrayLike | None = None,
+    output_noise: ArrayLike | None = None,
+) -> VaryingTrajectory:
+    """Simulate a plant whose algebraic equations (rows of E that are zero for every k) determine the rest of the state.
+
+    Parameters
+    ----------
+    plant : TimeVaryingDescriptorSystem
+        As many equations as states; its horizon must reach ``samples`` steps, one more than the record, where it has
+        algebraic equations (that of the last sample holds too).
+    samples : int
+        Length of the record, the start included.
+    parameters : array_like, optional
+        ``(samples, nq)``, or ``(nq,)`` for constant ones; zero by default.
+    u : array_like, optional
+        Known inputs ``(samples, nu)``.
+    initial_state : array_like, optional
+        ``(nx,)``: taken to the nearest state that satisfies the algebraic equations of k = 0.
+    equation_noise, output_noise : array_like, optional
+        mu ``(samples, ne)`` and nu ``(samples - 1, ny)``.  In an algebraic equation mu(k) acts on x(k) itself.
+
+    Returns
+    -------
+    VaryingTrajectory
+        States and outputs.
+
+    Raises
+    ------
+    SpecError
+        A record has the wrong shape.
+    PreconditionError
+        The state is not determined at some k: the index is higher than one there.
+    """
+    if plant.ne != plant.nx:
+        raise SpecError(f"{plant.ne} equations do not determine {plant.nx} states.", path="E")
+    nq = plant.nq
+    given = np.zeros(nq) if parameters is None else np.asarray(parameters, dtype=np.float64)
+    theta = _record(np.broadcast_to(given, (samples, nq)) if given.ndim == 1 else given, (samples, nq), "parameters")
+    inputs, mu = _record(u, (samples, plant.nu), "u"), _record(equation_noise, (samples, plant.ne), "equation_noise")
+    nu = _record(output_noise, (samples - 1, plant.ny), "output_noise")
+    late = algebraic_rows(plant, plant.horizon or samples)
+    others = np.setdiff1d(np.arange(plant.ne), late)
+
+    def drive(k: int) -> FloatArray:
+        return np.asarray(plant.B.at(k) @ inputs[k] + plant.Phi.at(k) @ theta[k] + mu[k])
+
+    x = np.zeros(plant.nx) if initial_state is None else np.asarray(initial_state, dtype=np.float64)
+    if late.size:
+        constraint = plant.A.at(0)[late]
+        x = x - np.linalg.pinv(constraint) @ (constraint @ x + drive(0)[late])
+    states, outputs = np.empty((samples, plant.nx)), np.full((samples, plant.ny), np.nan)
+    states[0] = x
+    for k in range(samples - 1):
+        matrix, value = plant.E.at(k + 1)[others], (plant.A.at(k) @ x + drive(k))[others]
+        if late.size:
+            matrix = np.vstack([matrix, plant.A.at(k + 1)[late]])
+            value = np.concatenate([value, -drive(k + 1)[late]])
+        decision = decide_rank(matrix)
+        if not decision.full:
+            raise PreconditionError(
+                f"The plant cannot be simulated step by step: at k = {k + 1} its equations do not determine the state "
+                f"({decision.describe()}), so its index is higher than one there.", condition="index one",
+            )  # fmt: skip
+        x = np.asarray(np.linalg.solve(matrix, value), dtype=np.float64)
+        states[k + 1] = x
+        outputs[k + 1] = plant.C.at(k + 1) @ x + plant.Psi.at(k) @ theta[k] + nu[k]
+    return VaryingTrajectory(read_only(states), read_only(outputs))
+
+
+def _record(value: ArrayLike | None, shape: tuple[int, int], name: str) -> FloatArray:
+    array = np.zeros(shape) if value is None or 0 in shape else as_matrix(value, name)
+    if array.shape != shape:
+        raise SpecError(f"{name} has shape {array.shape}, but {shape} is needed.", path=name)
+    return array

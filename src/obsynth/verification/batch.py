@@ -1,0 +1,89 @@
+"""A second route to the recursive estimates: one least-squares problem over the first steps as a whole."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.least_squares_step import LeastSquaresStep, least_squares_step, rank_revealing_step
+from obsynth.observers.recursive import RecursiveObserver
+from obsynth.observers.recursive_running import RunningRecursiveObserver, step_model_of
+from obsynth.observers.schedule_facts import looked_at
+from obsynth.observers.step_model import EarlySteps, StepMatrices
+
+#: Steps in the batch: enough for every matrix to matter, few enough for one dense problem.
+BATCH_STEPS = 6
+#: Seed of the record that both are given; the estimators are linear, so any record will do.
+SEED = 2013
+
+
+def batch_residuals(stated: RecursiveObserver, shipped: RecursiveObserver) -> dict[str, float]:
+    """Return how far the shipped recursion is from the batch solution of the stated problem.
+
+    Parameters
+    ----------
+    stated : RecursiveObserver
+        Built from plant and options: its matrices make the batch.
+    shipped : RecursiveObserver
+        Which is run.
+
+    Returns
+    -------
+    dict
+        The largest gaps of ``state``, ``covariance`` and ``regressor`` after the last step, relative to standard
+        deviations of the state (and of the record, which has size one).
+    """
+    steps = min(BATCH_STEPS, looked_at(stated))
+    plant, rng = stated.plant, np.random.default_rng(SEED)
+    y, u = rng.standard_normal((steps + 1, plant.ny)), rng.standard_normal((steps + 1, plant.nu))
+    running = RunningRecursiveObserver(shipped)
+    for k in range(steps + 1):
+        running.raw_step(y[k], u[k])
+    exact = _batch(stated, y, u)
+    covariance = exact.factor @ exact.factor.T
+    deviations = np.sqrt(np.diag(covariance))
+    size = deviations + np.abs(exact.estimate[:, 0]) + np.finfo(np.float64).tiny
+    found = running.factor @ running.factor.T
+    gaps = {
+        "state": np.abs(running.x - exact.estimate[:, 0]) / size,
+        "covariance": np.abs(found - covariance) / np.maximum(np.outer(size, size), np.finfo(np.float64).tiny),
+    }
+    if running.Upsilon.shape[1]:
+        regressor = exact.estimate[:, 1:]
+        sizes = np.linalg.norm(regressor, axis=0) + np.finfo(np.float64).tiny
+        gaps["regressor"] = np.abs(running.Upsilon - regressor) / sizes
+    return {name: float(np.max(gap)) for name, gap in gaps.items()}
+
+
+def _batch(observer: RecursiveObserver, y: FloatArray, u: FloatArray) -> LeastSquaresStep:
+    """Return the last state of the solution over all states at once; further columns belong to the parameters."""
+    start = RunningRecursiveObserver(observer)
+    model, steps = step_model_of(observer), len(y) - 1
+    n, nq = len(start.x), start.Upsilon.shape[1]
+    listed: list[tuple[StepMatrices, FloatArray]] = [
+        (model.at(k), np.concatenate([model.at(k).B @ u[k], y[k + 1], model.at(k).Dn @ u[k + 1]])) for k in range(steps)
+    ]
+    rows = n + sum(len(step.H) for step, _ in listed)
+    H, data = np.zeros((rows, n * (steps + 1))), np.zeros((rows, 1 + nq))
+    roots = [start.factor, *(step.noise for step, _ in listed)]
+    H[:n, :n], data[:n, 0] = np.eye(n), start.x
+    top = n
+    for k, (step, values) in enumerate(listed):
+        here, ne = slice(top, top + len(step.H)), len(step.A)
+        H[here, (k + 1) * n : (k + 2) * n] = step.H
+        H[top : top + ne, k * n : (k + 1) * n] = -step.A
+        data[here, 0] = values
+        data[here, 1:] = np.vstack([step.Phi, -step.Psi])[:, :nq] if nq else 0.0
+        top += len(step.H)
+    if isinstance(model, EarlySteps):
+        first, late = model.first(), len(model.late)
+        H = np.vstack([H, np.hstack([first.H[n:], np.zeros((late, n * steps))])])
+        data = np.vstack([data, np.hstack([(first.Dn @ u[0])[:, None], -first.Psi[:, :nq]])])
+        roots.append(first.noise[n:])
+    S = np.zeros((len(H), max(sum(root.shape[1] for root in roots), len(H))))
+    top = left = 0
+    for root in roots:
+        S[top : top + len(root), left : left + root.shape[1]] = root
+        top, left = top + len(root), left + root.shape[1]
+    found = least_squares_step(H, S, data) or rank_revealing_step(H, S, data, np.zeros((len(H), 0)))
+    return LeastSquaresStep(found.estimate[-n:], found.factor[-n:], found.innovation, found.diffuse[-n:])

@@ -1,0 +1,186 @@
+"""Decisions on parameters, the steady state, and consistent simulation."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+from time_varying_plants import observer_for, printed, textbook, varying
+
+from obsynth import DescriptorSystem, PreconditionError, SpecError, TimeVaryingDescriptorSystem
+from obsynth.observers.decisions import STATISTICS, decide
+from obsynth.simulation.time_varying import simulate_time_varying
+from obsynth.synthesis.steady_filter import steady_state_filter
+
+SAMPLES, CHANGE = 160, 90
+PLANT = varying(horizon=SAMPLES)
+
+
+def run(seed: int, *, jump: float = 0.0, adapt: dict | None = None, missing: bool = False):
+    return cached(seed, jump, missing) if adapt is None else fresh(seed, jump, missing, adapt)
+
+
+@cache
+def cached(seed: int, jump: float, missing: bool):
+    return fresh(seed, jump, missing, {})
+
+
+def fresh(seed: int, jump: float, missing: bool, adapt: dict):
+    rng = np.random.default_rng(seed)
+    theta = np.zeros((SAMPLES, 2))
+    theta[CHANGE:, 1] = jump
+    mu = rng.standard_normal((SAMPLES, 3)) * np.sqrt([0.1, 0.2, 0.3])
+    nu = rng.standard_normal((SAMPLES - 1, 2)) * np.sqrt([0.2, 0.4])
+    u = rng.standard_normal((SAMPLES, 1))
+    record = simulate_time_varying(PLANT, samples=SAMPLES, parameters=theta, u=u, equation_noise=mu, output_noise=nu)
+    y = record.outputs.copy()
+    if missing:
+        y[20, 0] = np.nan
+    observer = observer_for(PLANT, adapt={"forgetting": 0.95, "initial_covariance": 0.01 * np.eye(2), **adapt})
+    return observer, observer.run(y, u)
+
+
+@pytest.mark.parametrize("statistic", STATISTICS)
+def test_false_alarms_are_as_rare_as_asked(statistic: str) -> None:
+    """Forty runs without a change, at 5 % each: two alarms are expected, and more than seven have probability 0.003."""
+    alarms = 0
+    for seed in range(40):
+        decision = decide(*run(seed), statistic=statistic, false_alarms=0.05)
+        alarms += decision.alarm is not None
+        assert (decision.alarm is None) == (decision.values <= decision.thresholds).all()
+    assert alarms <= 7
+
+
+@pytest.mark.parametrize("statistic", STATISTICS)
+def test_a_change_is_found_and_named(statistic: str) -> None:
+    delays, onsets, named = [], [], []
+    for seed in range(10):
+        alarm = decide(*run(seed, jump=3.0), statistic=statistic, change=1.0).alarm
+        assert alarm is not None
+        assert 0.99 <= alarm.confidence <= 1.0
+        delays.append(alarm.k - CHANGE)
+        onsets.append(alarm.onset - CHANGE)
+        named.append(alarm.parameter)
+    assert min(delays) >= 0
+    assert np.median(delays) <= 8
+    assert abs(np.median(onsets)) <= 3
+    # The CUSUM alarms earliest in terms of evidence, and its signature is that of a running regressor: it names worst.
+    assert named.count("" if statistic == "nis" else "theta2") >= (4 if statistic == "cusum" else 8)
+
+
+def test_the_glr_knows_the_onset_of_an_abrupt_change() -> None:
+    """theta(k) acts on x(k) by the algebraic equation, and on x(k + 1) by the others: either is the onset."""
+    onsets = [decide(*run(seed, jump=6.0), statistic="glr").alarm.onset for seed in range(8)]
+    assert sum(onset in (CHANGE, CHANGE + 1) for onset in onsets) >= 7
+
+
+def test_a_parameter_that_is_not_nominal_from_the_start() -> None:
+    observer, found = run(0)
+    for statistic in ("chi-square", "cusum", "glr", "nis"):
+        assert decide(observer, found, statistic=statistic, nominal=[0.0, 4.0], change=1.0).alarm is not None
+
+
+def test_missing_samples_and_the_random_walk() -> None:
+    observer, found = run(3, missing=True)
+    for statistic in ("chi-square", "cusum", "nis"):
+        assert decide(observer, found, statistic=statistic).alarm is None
+    with pytest.raises(SpecError, match="complete record"):
+        decide(observer, found, statistic="glr")
+    walking, walked = run(3, jump=4.0, adapt={"form": "random-walk", "walk": 1e-4 * np.eye(2)})
+    alarm = decide(walking, walked).alarm
+    assert alarm is not None
+    assert alarm.parameter == "theta2"
+    with pytest.raises(SpecError, match="needs regressors"):
+        decide(walking, walked, statistic="cusum")
+
+
+def test_bad_options() -> None:
+    observer, found = run(0)
+    for options, part in (
+        ({"statistic": "t-test"}, "statistic is 't-test'"),
+        ({"false_alarms": 0.0}, "false_alarms is 0"),
+        ({"nominal": [1.0]}, "nominal must be 2"),
+        ({"change": -1.0}, "change must be"),
+        ({"change": [1.0]}, "change must be"),
+    ):
+        with pytest.raises(SpecError, match=part):
+            decide(observer, found, **options)
+    with pytest.raises(SpecError, match="needs an observer that estimates"):
+        decide(observer_for(PLANT), found)
+
+
+class TestSteadyState:
+    PLANT = TimeVaryingDescriptorSystem(
+        np.diag([1.0, 1, 0]), [[0.9, 0.1, 0.3], [0.0, 0.7, 0.2], [1.0, 0.4, -1.0]], C=[[1, 0, 0.3], [0, 1, 1]], dt=1.0
+    )
+    Q, R = np.diag([0.1, 0.2, 0.3]), np.array([[20.0, 5.0], [5.0, 40.0]])
+
+    def covariances(self, steps: int) -> list[np.ndarray]:
+        running = observer_for(self.PLANT, Q=self.Q, R=self.R).start()
+        rows = [running.raw_step(np.zeros(2), np.zeros(0)) for _ in range(steps)]
+        return [row.factor @ row.factor.T for row in rows]
+
+    def test_the_recursion_converges_to_it_at_its_rate(self) -> None:
+        steady = steady_state_filter(self.PLANT, Q=self.Q, R=self.R)
+        found = self.covariances(200)
+        np.testing.assert_allclose(found[-1], steady.P, rtol=0, atol=1e-13)
+        np.testing.assert_allclose(steady.L @ self.PLANT.E.at(1) + steady.K @ self.PLANT.C.at(1), np.eye(3), atol=1e-12)
+        A = self.PLANT.A.at(0)
+        np.testing.assert_allclose(steady.P_predicted, A @ steady.P @ A.T + self.Q, atol=1e-15)
+        gaps = [np.linalg.norm(P - steady.P) for P in found]
+        assert (gaps[30] / gaps[20]) ** (1 / 10) == pytest.approx(steady.rate, rel=0.01)
+        assert 0.05 < steady.rate < 0.9
+
+    def test_the_printed_equation_has_it_for_a_solution(self) -> None:
+        """(16), with E and A as printed."""
+        steady = steady_state_filter(self.PLANT, Q=self.Q, R=self.R)
+        E, A, C, P = self.PLANT.E.at(1), self.PLANT.A.at(0), self.PLANT.C.at(1), steady.P_predicted
+        inner = E.T @ np.linalg.inv(P) @ E + C.T @ np.linalg.inv(self.R) @ C
+        np.testing.assert_allclose(A @ np.linalg.inv(inner) @ A.T + self.Q, P, atol=1e-12)
+
+    def test_refusals(self) -> None:
+        with pytest.raises(SpecError, match="changes with k"):
+            steady_state_filter(varying(), Q=np.eye(3), R=np.eye(2))
+        with pytest.raises(SpecError, match="Q is singular"):
+            steady_state_filter(self.PLANT, Q=np.diag([1.0, 1, 0]), R=self.R)
+        with pytest.raises(SpecError, match=r"R is \(1, 1\)"):
+            steady_state_filter(self.PLANT, Q=self.Q, R=[[1.0]])
+        with pytest.raises(PreconditionError, match="rank"):
+            steady_state_filter(self.PLANT.replace(C=[[1, 0, 0], [0, 1, 0]]), Q=self.Q, R=self.R)
+        discrete = DescriptorSystem(np.eye(2), 0.5 * np.eye(2), C=np.eye(2), dt=1.0)
+        assert steady_state_filter(discrete, Q=np.eye(2), R=np.eye(2)).rate < 0.25
+
+
+class TestSimulation:
+    def test_every_equation_holds(self) -> None:
+        rng = np.random.default_rng(4)
+        theta, u, mu, nu = (rng.standard_normal(shape) for shape in ((20, 1), (20, 2), (20, 2), (19, 1)))
+        plant = printed(horizon=20)
+        found = simulate_time_varying(
+            plant, samples=20, parameters=theta, u=u, equation_noise=mu, output_noise=nu, initial_state=[1.0, 2.0]
+        )
+        x = found.states
+        for k in range(19):
+            right = plant.A.at(k) @ x[k] + plant.B.at(k) @ u[k] + plant.Phi.at(k) @ theta[k] + mu[k]
+            np.testing.assert_allclose(plant.E.at(k + 1) @ x[k + 1], right, rtol=0, atol=1e-12)
+            np.testing.assert_allclose(found.outputs[k + 1], plant.C.at(k + 1) @ x[k + 1] + nu[k], atol=1e-13)
+        assert np.isnan(found.outputs[0]).all()
+
+    def test_the_printed_example_as_the_audit_has_it(self) -> None:
+        """theta = 1 and the paper's inputs: max|x1| = 15.57, max|x2| = 14.16, x(1000) = (-2, 7e-6)."""
+        k = np.arange(1001)
+        u = np.column_stack([1 - np.exp(-0.018 * k) / 0.8 * np.sin(0.03 * k), 1 + np.exp(-0.03 * k) * np.sin(0.1 * k)])
+        found = simulate_time_varying(printed(), samples=1001, parameters=[1.0], u=u, initial_state=[-2.0, 0.0])
+        assert np.abs(found.states).max(axis=0) == pytest.approx([15.57, 14.16], abs=5e-3)
+        assert found.states[-1] == pytest.approx([-2.0, 7e-6], abs=1e-5)
+
+    def test_refusals(self) -> None:
+        with pytest.raises(PreconditionError, match="index is higher than one"):
+            simulate_time_varying(textbook(E=np.diag([1.0, 0]), A=[[1, 1], [1, 0]]), samples=5)
+        with pytest.raises(SpecError, match="2 equations do not determine 3"):
+            simulate_time_varying(
+                TimeVaryingDescriptorSystem([[1, 0, 0], [0, 1, 0]], np.ones((2, 3)), C=np.eye(3), dt=1.0), samples=3
+            )
+        with pytest.raises(SpecError, match="parameters has shape"):
+            simulate_time_varying(printed(), samples=5, parameters=np.zeros((4, 1)))

@@ -1,0 +1,77 @@
+"""The arithmetic language of specs: right values, and nothing but arithmetic."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from obsynth.errors import SpecError
+from obsynth.numerics.expressions import MAXIMUM_DEPTH, parse_expression
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("1 + 2 * 3", 7.0),
+        ("(1 + 2) * 3", 9.0),
+        ("2 ** 3 ** 2", 512.0),
+        ("-2 ** 2", -4.0),
+        ("2 ** -1", 0.5),
+        ("8 / 4 / 2", 1.0),
+        ("5 - 3 - 1", 1.0),
+        ("--3", 3.0),
+        (".5e1 + 1.", 6.0),
+        ("1e-3", 1e-3),
+        ("k / (k + 1)", 0.8),
+        ("exp(-k / 30) * sin(0.1 * k)", math.exp(-4 / 30) * math.sin(0.4)),
+        ("min(k, 2) + max(k, 9)", 11.0),
+        ("step(k - 4) + step(k - 5)", 1.0),
+        ("sqrt(abs(-k)) + pi", 2.0 + math.pi),
+        ("floor(2.7) + ceil(2.2) + sign(-3)", 4.0),
+    ],
+)
+def test_values(text: str, value: float) -> None:
+    assert float(parse_expression(text)({"k": 4.0})) == pytest.approx(value, rel=1e-15)
+
+
+def test_arrays_and_names() -> None:
+    expression = parse_expression("a * k ** 2 + step(k - 2)")
+    assert expression.names == {"a", "k"}
+    np.testing.assert_array_equal(expression({"a": 2.0, "k": np.arange(4.0)}), [0.0, 2.0, 9.0, 19.0])
+
+
+@pytest.mark.parametrize(
+    ("text", "part"),
+    [
+        ("", "ends too early"),
+        ("1 +", "ends too early"),
+        ("(1", "not closed"),
+        ("1 2", "not expected"),
+        ("1)", "not expected"),
+        ("sin 1", "not expected"),
+        ("min(1)", "two arguments"),
+        ("sin(1, 2)", "not closed"),
+        ("eval(1)", "no function 'eval'"),
+        ("__import__('os')", "not allowed"),
+        ("k.real", "not allowed"),
+        ("k[0]", "not allowed"),
+        ("k if k else 1", "not expected"),
+        ("lambda: 1", "not allowed"),
+        ("k == 1", "not allowed"),
+        ("1 // 2", "not expected"),
+        ("²", "not allowed"),
+        ("(" * 60 + "1" + ")" * 60, f"more than {MAXIMUM_DEPTH}"),
+        ("-" * 60 + "1", f"more than {MAXIMUM_DEPTH}"),
+        ("1" * 3000, "3000 characters"),
+    ],
+)
+def test_what_is_no_arithmetic_is_refused(text: str, part: str) -> None:
+    with pytest.raises(SpecError, match=part.replace("(", r"\(")):
+        parse_expression(text)
+
+
+def test_what_is_not_finite_is_left_to_the_caller_without_a_warning() -> None:
+    assert np.isnan(parse_expression("0 / (k - k)")({"k": np.float64(1.0)}))
+    assert np.isinf(parse_expression("9 ** 9 ** 9")({}))
