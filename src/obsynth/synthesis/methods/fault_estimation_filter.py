@@ -42,6 +42,7 @@ from obsynth.synthesis.gain_design import null_basis
 from obsynth.synthesis.gain_problem import GainProblem, Injection, WeightLimit
 from obsynth.synthesis.lmi import SOLVER_SETTINGS
 from obsynth.synthesis.result import Synthesis
+from obsynth.synthesis.small_gains import small_gain_design
 
 #: Fictitious noise on the measurements, relative to the given one, so that no direction of the gains is free of cost.
 BACKGROUND_NOISE = 1e-3
@@ -122,7 +123,7 @@ def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **op
     gamma = _gain_to_ship(asked, problem, least, noisy=plant.nw > 0)
     progress("choosing small gains")
     inner = gamma - min(CERTIFICATE_SHARE * (gamma - least.gain), CERTIFICATE_MARGIN * gamma)
-    chosen, records = gain_search.small_gain_design(problem, least, inner, solver=asked.solver)
+    chosen, records = small_gain_design(problem, least, inner, solver=asked.solver)
     gains = _gains(prepared, parts, chosen)
     progress("building the realisation and its certificate")
     observer, tracking, lag = realise_filter(plant, prepared.plant, gains, prepared.detectability)
