@@ -24,7 +24,9 @@ from obsynth.synthesis.riccati import doubled_riccati_solution
 NOISE_LADDER = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
 #: Relative width of the bracket at which the bisection of one rung ends.
 LEVEL_TOLERANCE = 1e-8
-MOST_LEVELS = 40
+MOST_LEVELS = 60
+#: How much longer each stride downwards is than the one before.
+STRIDE_GROWTH = 8.0
 #: A level this far above anything a disturbance could do is no limit.
 WITHOUT_LIMIT = 1e4
 #: A level counts as reached when the true gain is below it up to the tolerance of the norm.
@@ -90,7 +92,9 @@ def with_least_weight(problem: GainProblem) -> GainProblem:
 
 
 def search_central_filter(problem: GainProblem, start: Injection) -> tuple[Injection, float]:
-    """Return the best central filter found by bisection, one rung of noise after the other, and its true gain.
+    """Return the best central filter found, one rung of noise after the other, and its true gain.
+
+    Each rung starts from the best gain so far, steps down from it in strides that grow, and bisects the last stride.
 
     Parameters
     ----------
@@ -101,16 +105,19 @@ def search_central_filter(problem: GainProblem, start: Injection) -> tuple[Injec
     """
     best, gain = start, problem.achieved_gain(start)
     for noise in NOISE_LADDER:
-        low, high = 0.0, gain
+        low, high, stride = 0.0, gain, LEVEL_TOLERANCE
         for _ in range(MOST_LEVELS):
             if high - low <= LEVEL_TOLERANCE * high:
                 break
-            level = 0.5 * (low + high)
+            level = max(0.5 * (low + high), high * (1.0 - stride))
             found = central_injection(problem, level, noise=noise)
             reached = np.inf if found is None else problem.achieved_gain(found)
             if found is not None and reached < gain:
                 best, gain = found, reached
-            low, high = (low, min(level, reached)) if reached <= level * (1.0 + NORM_ALLOWANCE) else (level, high)
+            if reached <= level * (1.0 + NORM_ALLOWANCE):
+                high, stride = min(level, reached), min(STRIDE_GROWTH * stride, 1.0)
+            else:
+                low = level
             high = min(high, gain) if gain > low else high
     return best, gain
 
