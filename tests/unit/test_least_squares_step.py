@@ -109,7 +109,7 @@ INDEX_ONE = {"E": np.diag([1.0, 1, 0]), "A": [[0.9, 0.1, 0.3], [0.0, 0.7, 0.2], 
 TWICE = [[1.0, 0.2, 0.5], [1.0, 0.2, 0.5 + 1e-7]]
 PLAIN_Q = np.diag([0.1, 0.2, 0.1])
 
-#: Case -> tolerance (for a nearly singular H of the order of eps cond^2, or below), and whether the printed form must be
+#: Case -> tolerance (for a nearly singular H about eps cond^2, or below), and whether the printed form must be
 #: worse than 1e-4 (or throw).
 HARD = {
     "an easy one": (Case(**INDEX_ONE, C=[[1, 0, 0.3], [0, 1, 1]], Q=PLAIN_Q, R=np.eye(2), P0=np.eye(3)), 1e-14, False),
