@@ -72,7 +72,7 @@ def observer_of(problem: Problem, *, adaptive: bool, varying: bool = False) -> o
     if adaptive:
         options |= {
             "form": "innovation", "forgetting": 0.98, "guard": "regularise", "initial_parameters": None,
-            "initial_parameter_covariance": None, "random_walk": None, "window": 50,
+            "initial_parameter_covariance": None, "random_walk": None, "window": 50, "reset": 0.0,
         }  # fmt: skip
     return observer_from_options(plant_of(problem, varying=varying), options)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from time_varying_plants import maximum_likelihood, observer_for, printed, record, textbook, varying
 
-from obsynth import PreconditionError
+from obsynth import PreconditionError, SpecError, run_batch, simulate_time_varying
 from obsynth.analysis.time_varying import horizon_ranks, residual_condition
 from obsynth.numerics.paper_filter import PaperState, paper_step
 from obsynth.numerics.recursive_least_squares import ParameterState, start_of, update
@@ -272,3 +272,46 @@ def test_a_scalar_parameter_takes_the_same_way_as_several() -> None:
             assert first.theta[0] == pytest.approx(second.theta[0], abs=1e-14)
             assert abs(first.triangle[0, 0]) == pytest.approx(abs(second.triangle[0, 0]), abs=1e-14)
             assert abs(first.spread[0, 0]) == pytest.approx(np.linalg.norm(second.spread[0]), abs=1e-14)
+
+
+class TestReset:
+    """Detect and reset: a jump is followed at once, and nothing happens without one."""
+
+    SAMPLES, CHANGE = 300, 150
+
+    def errors(self, seed: int, *, jump: float, **adapt: float) -> tuple[np.ndarray, int]:
+        plant = varying(horizon=self.SAMPLES)
+        rng = np.random.default_rng(seed)
+        theta = np.zeros((self.SAMPLES, 2))
+        theta[self.CHANGE :, 1] = jump
+        y = simulate_time_varying(
+            plant, samples=self.SAMPLES, parameters=theta,
+            equation_noise=rng.standard_normal((self.SAMPLES, 3)) * np.sqrt([0.1, 0.2, 0.3]),
+            output_noise=rng.standard_normal((self.SAMPLES - 1, 2)) * np.sqrt([0.2, 0.4]),
+        ).outputs  # fmt: skip
+        running = observer_for(plant, adapt={"forgetting": 0.995, "guard": "regularise", **adapt}).start()
+        found = np.array([running.raw_step(row, np.zeros(1)).parameters.theta for row in y])
+        return found - theta, 0 if running.alarm is None else running.alarm.resets
+
+    def test_a_jump_is_followed_at_once(self) -> None:
+        after = slice(self.CHANGE + 15, self.CHANGE + 60)
+        for seed in range(4):
+            plain, none = self.errors(seed, jump=4.0)
+            reset, count = self.errors(seed, jump=4.0, reset=1e-6)
+            assert (none, count) == (0, 1)
+            assert np.sqrt(np.mean(reset[after] ** 2)) < 0.3 * np.sqrt(np.mean(plain[after] ** 2))
+
+    def test_nothing_happens_without_a_jump(self) -> None:
+        for seed in range(10):
+            plain, _ = self.errors(seed, jump=0.0)
+            reset, count = self.errors(seed, jump=0.0, reset=1e-6)
+            assert count == 0
+            np.testing.assert_array_equal(plain, reset)
+
+    def test_refusals(self) -> None:
+        with pytest.raises(SpecError, match="reset is 1"):
+            observer_for(varying(), adapt={"reset": 1.0})
+        with pytest.raises(SpecError, match="reset belongs to the forms that forget"):
+            observer_for(varying(), adapt={"form": "random-walk", "reset": 0.01})
+        with pytest.raises(SpecError, match="run them one by one"):
+            run_batch(observer_for(varying(), adapt={"reset": 0.01}), np.zeros((2, 5, 2)), np.zeros((5, 1)))

@@ -101,6 +101,7 @@ TABLE: dict[str, tuple[str, Corruption, set[str]]] = {
     "another S0": ("innovation", with_adaptation(initial_covariance=4.0 * np.eye(2)), {FITS}),
     "another theta0": ("innovation", with_adaptation(initial_parameters=np.ones(2)), {FITS}),
     "another guard": ("innovation", with_adaptation(guard="none"), {FITS}),
+    "a reset": ("innovation", with_adaptation(reset=1e-6), {FITS}),
     "another window": ("innovation", with_adaptation(window=20), {FITS, CLAIMS}),
     "another walk": ("walk", with_adaptation(walk=np.eye(2)), {FITS, STATE, COVARIANCE}),
     "no adaptation": ("innovation", with_observer(adaptation=None), {FITS}),

@@ -41,6 +41,10 @@ class MatrixSequence:
         Rows of expressions.
     constants : mapping
         Values of the names in the expressions.
+    still : FloatArray or None
+        Of expressions, the entries that do not depend on k.
+    moving : tuple
+        Row and column of those that do.
     """
 
     name: str
@@ -50,6 +54,8 @@ class MatrixSequence:
     function: Callable[[int], ArrayLike] | None = None
     entries: tuple[tuple[Expression, ...], ...] | None = None
     constants: Mapping[str, float] | None = None
+    still: FloatArray | None = None
+    moving: tuple[tuple[int, int], ...] = ()
 
     @classmethod
     def of(
@@ -80,7 +86,10 @@ class MatrixSequence:
             return cls(name, (int(shape[0]), int(shape[1])), None, function=value)
         if _has_text(value):
             entries = _parsed(value, name, constants or {})
-            return cls(name, (len(entries), len(entries[0])), None, entries=entries, constants=dict(constants or {}))
+            known = dict(constants or {})
+            still, moving = _split(entries, known)
+            shape = (len(entries), len(entries[0]))
+            return cls(name, shape, None, entries=entries, constants=known, still=still, moving=moving)
         array = _array(value, name)
         if array.ndim != 3:
             matrix = as_matrix(value, name)
@@ -136,8 +145,10 @@ class MatrixSequence:
         if self.function is not None:
             return as_matrix(self.function(k), f"{self.name}({k})")
         values = {**(self.constants or {}), INDEX_NAME: np.float64(k)}
-        rows = [[float(entry(values)) for entry in row] for row in self.entries or ()]
-        return as_matrix(rows, f"{self.name}({k})")
+        matrix = np.array(self.still)
+        for i, j in self.moving:
+            matrix[i, j] = (self.entries or ())[i][j](values)
+        return as_matrix(matrix, f"{self.name}({k})")
 
     def as_data(self) -> Any:
         """Return an array or rows of texts.
@@ -211,3 +222,17 @@ def _parsed(value: Any, name: str, constants: Mapping[str, float]) -> tuple[tupl
             expressions.append(expression)
         parsed.append(tuple(expressions))
     return tuple(parsed)
+
+
+def _split(
+    entries: tuple[tuple[Expression, ...], ...], constants: Mapping[str, float]
+) -> tuple[FloatArray, tuple[tuple[int, int], ...]]:
+    """Evaluate once what does not depend on k; return it with the places of what does."""
+    still, moving = np.zeros((len(entries), len(entries[0]))), []
+    for i, row in enumerate(entries):
+        for j, entry in enumerate(row):
+            if INDEX_NAME in entry.names:
+                moving.append((i, j))
+            else:
+                still[i, j] = entry(constants)
+    return still, tuple(moving)

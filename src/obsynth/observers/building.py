@@ -17,6 +17,7 @@ from obsynth.observers.recursive import Adaptation, RecursiveObserver
 FILTER_OPTIONS = ("Q", "R", "initial_state", "initial_covariance", "early_constraints")
 PARAMETER_OPTIONS = (
     "form", "forgetting", "guard", "initial_parameters", "initial_parameter_covariance", "random_walk", "window",
+    "reset",
 )  # fmt: skip
 
 
@@ -49,6 +50,7 @@ def observer_from_options(plant: TimeVaryingDescriptorSystem, options: Mapping[s
             ),
             walk=_square(options["random_walk"], nq, 0.0, "random_walk"),
             window=options["window"],
+            reset=float(options["reset"]),
         )
     return RecursiveObserver(
         plant, _sequence(options["Q"], plant.ne, "Q", plant), _sequence(options["R"], plant.ny, "R", plant),

@@ -133,8 +133,10 @@ def run_batch(observer: RecursiveObserver, y: ArrayLike, u: ArrayLike | None = N
     Raises
     ------
     SpecError
-        Shapes do not fit, something is not finite, or the record is longer than the horizon.
+        Shapes do not fit, something is not finite, the record is longer than the horizon, or the observer resets.
     """
+    if observer.adaptation is not None and observer.adaptation.reset:
+        raise SpecError("Resets depend on the data of each trial: run them one by one, or without reset.", path="reset")
     outputs = np.asarray(y, dtype=np.float64)
     if outputs.ndim != 3 or outputs.shape[2] != observer.plant.ny:
         raise SpecError(f"y has shape {outputs.shape}, but (trials, samples, {observer.plant.ny}) is needed.", path="y")

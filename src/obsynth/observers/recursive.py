@@ -44,6 +44,9 @@ class Adaptation:
         ``(nq, nq)``: covariance of one step of the random walk.
     window : int
         Samples over which excitation is watched.
+    reset : float
+        Detect and reset: probability, per sample, that innovations which no change has made larger pass the threshold
+        above which S and the covariance start again from S_0.  Zero never resets.
 
     Raises
     ------
@@ -58,6 +61,7 @@ class Adaptation:
     initial_covariance: FloatArray
     walk: FloatArray
     window: int
+    reset: float = 0.0
 
     def __post_init__(self) -> None:
         if self.form not in FORMS:
@@ -71,6 +75,11 @@ class Adaptation:
             )
         if self.window < 1:
             raise SpecError(f"window is {self.window}: give a number of samples, at least 1.", path="window")
+        if not 0.0 <= self.reset < 1.0:
+            raise SpecError(f"reset is {self.reset}: give a probability per sample, such as 1e-6; 0 never resets.",
+                            path="reset")  # fmt: skip
+        if self.reset and self.form == "random-walk":
+            raise SpecError("reset belongs to the forms that forget: the random walk follows by itself.", path="reset")
         q = len(self.initial_parameters)
         object.__setattr__(self, "initial_parameters", read_only(self.initial_parameters))
         for name in ("initial_covariance", "walk"):

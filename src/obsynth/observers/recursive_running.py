@@ -25,6 +25,7 @@ from obsynth.observers.literal_form import posterior_residual
 from obsynth.observers.records import measured_record, require_horizon
 from obsynth.observers.recursive import RecursiveObserver
 from obsynth.observers.recursive_estimates import RecursiveEstimates
+from obsynth.observers.reset_alarm import ResetAlarm
 from obsynth.observers.step_model import (
     EarlySteps,
     PlantSteps,
@@ -108,6 +109,7 @@ class RunningRecursiveObserver:
         self.directional = adaptation is not None and adaptation.guard == "directional"
         self.window: deque[FloatArray] = deque(maxlen=1 if adaptation is None else adaptation.window)
         self.u = np.zeros(observer.plant.nu)
+        self.alarm: ResetAlarm | None = None
         # What the literal form learns from where it is used, and the factorisation of a step that stays the same.
         self.lesson: tuple[FloatArray, FloatArray, FloatArray] | None = None
         self.prepared_for: StepMatrices | None = None
@@ -122,6 +124,7 @@ class RunningRecursiveObserver:
             self.factor, self.Upsilon, self.diffuse = joint, np.zeros((nx + nq, 0)), np.zeros((nx + nq, 0))
             return
         self.parameters = start_of(adaptation.initial_parameters, spread)
+        self.alarm = ResetAlarm(adaptation.reset, self.parameters) if adaptation.reset else None
         self.regular = self.parameters.triangle if adaptation.guard == "regularise" else None
 
     def step(self, y: ArrayLike, u: ArrayLike = ()) -> RecursiveEstimates:
@@ -191,6 +194,8 @@ class RunningRecursiveObserver:
         self.factor, self.diffuse = found.factor, found.diffuse
         v, G = found.innovation[:, 0], -found.innovation[:, 1:]
         if nq and self.observer.adaptation is not None:
+            if self.alarm is not None:
+                self.parameters = self.alarm.watched(self.parameters, v, G)
             seen, regressor, noise = self.lesson or (v, G, None)
             self.parameters, _ = update(
                 self.parameters, seen, regressor, forgetting=self.observer.adaptation.forgetting, regular=self.regular,

@@ -26,6 +26,7 @@ def adaptive_observer(
     initial_covariance: ArrayLike | None = None,
     early_constraints: bool = False,
     window: int = 50,
+    reset: float = 0.0,
     name: str = "design",
 ) -> ObserverDesign:
     r"""Design an observer of states and parameters of a descriptor plant, time-varying or not.
@@ -58,6 +59,9 @@ def adaptive_observer(
         As for `descriptor_kalman`.
     window : int, optional
         Samples over which excitation is watched.
+    reset : float, optional, dimensionless
+        Detect and reset: when the innovations of 20 samples pass a threshold (with this probability per sample where
+        nothing has changed, such as 1e-6), S and the covariance of theta start again from S_0.  0, the default, never.
     name : str, optional
         Name of the design.
 
@@ -90,5 +94,5 @@ def adaptive_observer(
         plant, "adaptive-observer", name=name, Q=Q, R=R, forgetting=forgetting, form=form, guard=guard,
         random_walk=random_walk, initial_parameters=initial_parameters,
         initial_parameter_covariance=initial_parameter_covariance, initial_state=initial_state,
-        initial_covariance=initial_covariance, early_constraints=early_constraints, window=window,
+        initial_covariance=initial_covariance, early_constraints=early_constraints, window=window, reset=reset,
     )  # fmt: skip

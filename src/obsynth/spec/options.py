@@ -96,6 +96,7 @@ class AdaptiveObserverOptions(DescriptorKalmanOptions):
     initial_parameters: list[float] | None = None
     initial_parameter_covariance: Matrix | None = None
     window: Annotated[int, Field(ge=1)] = 50
+    reset: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0
 
 
 #: Options of every method, by its identifier.

@@ -145,7 +145,16 @@ def misfit(design: ObserverDesign) -> str:
     if (ours is None) != (theirs is None):
         return "adaptation"
     if ours is not None and theirs is not None:
-        for field in ("form", "forgetting", "guard", "window", "initial_parameters", "initial_covariance", "walk"):
+        for field in (
+            "form",
+            "forgetting",
+            "guard",
+            "window",
+            "reset",
+            "initial_parameters",
+            "initial_covariance",
+            "walk",
+        ):
             if not np.array_equal(getattr(ours, field), getattr(theirs, field)):
                 return field
     for field in ("initial_state", "initial_covariance"):

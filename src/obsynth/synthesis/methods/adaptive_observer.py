@@ -50,6 +50,7 @@ def synthesise(
     initial_covariance: Any = None,
     early_constraints: bool = False,
     window: int = 50,
+    reset: float = 0.0,
 ) -> Synthesis:
     """Put the observer together; see `obsynth.adaptive_observer` for the options, results and errors."""
     if form == "random-walk" and random_walk is None:
@@ -65,7 +66,7 @@ def synthesise(
         "early_constraints": early_constraints, "form": form, "forgetting": forgetting,
         "guard": guard or ("none" if form == "literal" else "regularise"),
         "initial_parameters": initial_parameters, "initial_parameter_covariance": initial_parameter_covariance,
-        "random_walk": random_walk, "window": window,
+        "random_walk": random_walk, "window": window, "reset": reset,
     })  # fmt: skip
     progress("computing the gains")
     return recursive_synthesis(as_time_varying(plant), options)

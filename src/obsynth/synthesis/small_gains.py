@@ -1,0 +1,175 @@
+"""The second stage: of all filters that reach a gain, one with small gains or little noise.
+
+No number of a solver is believed: the true gain, the true variance and the spectral radius of the closed loop decide.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from obsynth.errors import SolverError
+from obsynth.numerics.norms import spectral_radius
+from obsynth.synthesis import gain_design
+from obsynth.synthesis.central_filter import least_noise_filter
+from obsynth.synthesis.gain_problem import GainProblem, Injection, NormalisedProblem
+from obsynth.synthesis.gain_search import LeastGain, coordinates
+
+#: Descent in steps: ratios of successive levels, tried in turn, and how many steps at most.
+STEP_RATIOS = (0.6, 0.9)
+MOST_STEPS = 24
+#: The error shall be forgotten at least this fast (spectral radius), or half as fast as the starting filter does: the
+#: smallest gains alone would leave an observable mode at the very edge of stability.
+SLOWEST_DECAY = 0.999
+#: Halvings of the step towards the filter of least noise.
+LINE_STEPS = 20
+#: A step counts when its level is met to this relative accuracy.
+LEVEL_ACCURACY = 1e-6
+
+
+def small_gain_design(
+    problem: GainProblem, least: LeastGain, gain: float, *, solver: str
+) -> tuple[Injection, list[dict[str, Any]]]:
+    """Return gains of least size or least noise whose true norm is at most ``gain``.
+
+    Falls back on the centre of the inequality, and then on the filter of the search, when the solver fails; the
+    records say so.
+
+    Parameters
+    ----------
+    problem : GainProblem
+        In the original coordinates.
+    least : LeastGain
+        Where the search ended.
+    gain : float
+        Level asked for.
+    solver : str
+        Name of the solver.
+
+    Raises
+    ------
+    SolverError
+        Nothing reached ``gain``.
+    """
+    records: list[dict[str, Any]] = []
+    if problem.measured == 0:
+        return least.injection, records
+    nothing = Injection(np.zeros_like(least.injection.R), np.zeros_like(least.injection.V))
+    fresh = coordinates(problem, solver=solver)
+    slowest = max(SLOWEST_DECAY, 0.5 + 0.5 * _radius(problem, fresh.start))
+    noisy = np.any(problem.Bn) or np.any(problem.Zn)
+    if not noisy and _radius(problem, nothing) <= slowest and _reaches(problem, nothing, gain):
+        # Without a noise model the objective is the size of the gains themselves, and zero is least.
+        return nothing, records
+    candidates: list[Injection] = []
+    attempts = ((least.normalised, 1.0), (fresh, 1.0), (None, 1.0), (least.normalised, slowest), (fresh, slowest))
+    for normalised, decay in attempts:
+        if normalised is None:
+            injection = _small_gains_step_by_step(problem, gain, records, solver=solver)
+        else:
+            injection = _small_gains_in(problem, normalised, gain, records, solver=solver, decay=decay)
+        if injection is not None and _reaches(problem, injection, gain):
+            candidates.append(injection)
+            if records[-1]["status"] == "optimal" and _radius(problem, injection) <= slowest:
+                break
+    if not candidates and problem.disturbances:
+        centre = gain_design.feasible_point(least.normalised.problem, gain / least.normalised.gain, solver=solver)
+        centred = [] if centre is None else [least.normalised.restore(centre.injection)]
+        candidates = [injection for injection in [*centred, least.injection] if _reaches(problem, injection, gain)]
+    if candidates:
+        # An inaccurate solution may be far from the least noise: the true variance decides, not the solver.
+        fast = [injection for injection in candidates if _radius(problem, injection) <= slowest]
+        found = min(fast or candidates, key=problem.noise_variance)
+        return (_quieter(problem, found, gain) if noisy else found), records
+    if _reaches(problem, least.injection, gain):
+        return least.injection, records
+    raise SolverError(f"No filter with gain {gain:.6g} was found: nothing is known.", record=records[-1])
+
+
+def _quieter(problem: GainProblem, injection: Injection, gain: float) -> Injection:
+    """Go towards the filter of least noise as far as the true gain allows: one P for gain and noise leaves room."""
+    quietest = least_noise_filter(problem)
+    if quietest is None:
+        return injection
+    best, share, step = injection, 0.0, 1.0
+    for _ in range(LINE_STEPS):
+        tried = share + step
+        mixed = Injection(
+            (1.0 - tried) * injection.R + tried * quietest.R, (1.0 - tried) * injection.V + tried * quietest.V
+        )
+        if (
+            tried <= 1.0
+            and _reaches(problem, mixed, gain)
+            and problem.noise_variance(mixed) <= problem.noise_variance(best)
+        ):
+            best, share = mixed, tried
+        step *= 0.5
+    return best
+
+
+def _radius(problem: GainProblem, injection: Injection) -> float:
+    return spectral_radius(problem.closed_loop(injection)[0])
+
+
+def _small_gains_in(
+    problem: GainProblem,
+    normalised: NormalisedProblem,
+    gain: float,
+    records: list[dict[str, Any]],
+    *,
+    solver: str,
+    decay: float = 1.0,
+) -> Injection | None:
+    try:
+        work, level = _with_scaled_noise(normalised), gain / normalised.gain
+        found = gain_design.small_gains(work, level, solver=solver, decay=decay)
+    except (SolverError, np.linalg.LinAlgError) as error:
+        records.append(dict(getattr(error, "record", {})) | {"outcome": str(error)})
+        return None
+    records.append(found.record)
+    return normalised.restore(found.injection)
+
+
+def _small_gains_step_by_step(
+    problem: GainProblem, gain: float, records: list[dict[str, Any]], *, solver: str
+) -> Injection | None:
+    """Walk from the starting filter down to ``gain``, each filter giving the coordinates for the next level.
+
+    Far below the starting filter's gain its coordinates are too bad for one jump, and those of the least gain can
+    be extreme (a decoupled disturbance).
+    """
+    normalised = coordinates(problem, solver=solver)
+    reached = problem.achieved_gain(normalised.start)
+    for _ in range(MOST_STEPS):
+        for ratio in STEP_RATIOS:
+            level = max(gain, ratio * reached)
+            injection = _small_gains_in(problem, normalised, level, records, solver=solver)
+            if injection is not None and _reaches(problem, injection, level * (1.0 + LEVEL_ACCURACY)):
+                break
+        else:
+            return None
+        if _reaches(problem, injection, gain):
+            return injection
+        reached = problem.achieved_gain(injection)
+        normalised = coordinates(problem, solver=solver, start=injection)
+    return None
+
+
+def _reaches(problem: GainProblem, injection: Injection, gain: float) -> bool:
+    limit = problem.weight_limit
+    if limit is not None and float(np.linalg.norm(limit.fixed + injection.V @ limit.free, 2)) > limit.bound:
+        return False
+    if problem.disturbances == 0:
+        return spectral_radius(problem.closed_loop(injection)[0]) < 1.0
+    return problem.achieved_gain(injection) <= gain
+
+
+def _with_scaled_noise(normalised: NormalisedProblem) -> GainProblem:
+    """Return the problem with its noise scaled so that the objective is of size one."""
+    work = normalised.problem
+    r = normalised.contracted(normalised.start).R
+    size = float(np.linalg.norm(np.vstack([work.Bn - r @ work.Dn, work.Zn])))
+    size = size if size > 0.0 else max(float(np.linalg.norm(work.Dn)), 1.0)
+    return replace(work, Bn=work.Bn / size, Dn=work.Dn / size, Zn=work.Zn / size)
