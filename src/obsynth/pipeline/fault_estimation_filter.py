@@ -20,6 +20,7 @@ def fault_estimation_filter(
     free_residual_weight: bool | None = None,
     residual_weight_limit: float | None = None,
     S: ArrayLike | None = None,
+    engine: str = "auto",
     solver: str = "CLARABEL",
     tolerance: float = 1e-6,
     name: str = "design",
@@ -48,8 +49,12 @@ def fault_estimation_filter(
         Bound on the spectral norm of W (implies a free W).
     S : array_like, optional
         The paper's free matrix ``(nx, nx + ny)`` in (17); by default T is nonsingular by construction.
+    engine : {"auto", "riccati", "lmi"}, optional
+        Who finds the gains: Riccati equations alone, which serve hundreds of states; or the matrix inequality, started
+        from them; or, up to 20 states, both, and the better one is shipped.  The result's ``solver["engine"]`` says
+        which ran.  The inequality is what is verified in each case.
     solver : {"CLARABEL", "SCS"}, optional
-        Semidefinite solver.
+        Semidefinite solver, for the inequality and for proofs that a gamma cannot be reached.
     tolerance : float, optional
         Relative width of the bracket at which bisection ends.
     name : str, optional
@@ -97,6 +102,7 @@ def fault_estimation_filter(
         free_residual_weight=free_residual_weight,
         residual_weight_limit=residual_weight_limit,
         S=S,
+        engine=engine,
         solver=solver,
         tolerance=tolerance,
     )

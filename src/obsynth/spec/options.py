@@ -21,6 +21,7 @@ class FaultEstimationFilterOptions(Section):
     free_residual_weight: bool | None = None
     residual_weight_limit: Positive | None = None
     S: Matrix | None = None
+    engine: Literal["auto", "riccati", "lmi"] = "auto"
     solver: Literal["CLARABEL", "SCS"] = "CLARABEL"
     tolerance: Annotated[float, Field(gt=0.0, lt=1.0)] = 1e-6
 

@@ -12,6 +12,7 @@ gain of the true problem decides whether a level counts as reached.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -27,6 +28,10 @@ LEVEL_TOLERANCE = 1e-8
 MOST_LEVELS = 60
 #: How much longer each stride downwards is than the one before.
 STRIDE_GROWTH = 8.0
+#: Weights of the noise beside the disturbance, relative to their sizes, and levels of both together, relative to the
+#: gain of the disturbance alone.
+NOISE_WEIGHTS = np.logspace(-6.0, 3.0, 55)
+LEVEL_FACTORS = (1.0, 1.2, 1.5, 2.5, 5.0)
 #: A level this far above anything a disturbance could do is no limit.
 WITHOUT_LIMIT = 1e4
 #: A level counts as reached when the true gain is below it up to the tolerance of the norm.
@@ -129,3 +134,46 @@ def least_noise_filter(problem: GainProblem) -> Injection | None:
         return None
     found = central_injection(noise, WITHOUT_LIMIT * max(noise.disturbance_size, 1.0), noise=NOISE_LADDER[-1])
     return found if found is not None and np.isfinite(problem.noise_variance(found)) else None
+
+
+def noise_weighted_filters(problem: GainProblem, gain: float) -> Iterator[Injection]:
+    """Yield central filters of true gain at most ``gain`` for which the noise counts as much as it can.
+
+    The noise of the problem, times a weight, is one more disturbance.  For some levels of both together the largest
+    weight is searched with which the gain from the true disturbance alone stays within ``gain``.
+
+    Parameters
+    ----------
+    problem : GainProblem
+        With measurements; without a noise model its noise is a unit one on the free measurements, so that little
+        noise means small gains.
+    gain : float
+        Bound on the true gain of the disturbance.
+    """
+    work = with_least_weight(problem)
+    sizes = [float(np.linalg.norm(np.vstack(pair))) for pair in ((work.B, work.D), (work.Bn, work.Dn))]
+    if work.order == 0 or work.measured == 0 or not min(sizes) > 0.0:
+        return
+    for factor in LEVEL_FACTORS:
+        low, high = 0, len(NOISE_WEIGHTS)
+        best = None
+        while low < high:
+            middle = (low + high) // 2
+            both = _with_noise(work, NOISE_WEIGHTS[middle] * sizes[0] / sizes[1])
+            found = central_injection(both, factor * gain, noise=NOISE_LADDER[-1])
+            if found is not None and problem.achieved_gain(found) <= gain:
+                best, low = found, middle + 1
+            else:
+                high = middle
+        if best is not None:
+            yield best
+
+
+def _with_noise(problem: GainProblem, weight: float) -> GainProblem:
+    """Return the problem with its noise, times a weight, as further disturbances."""
+    return replace(
+        problem,
+        B=np.hstack([problem.B, weight * problem.Bn]),
+        D=np.hstack([problem.D, weight * problem.Dn]),
+        Zd=np.hstack([problem.Zd, weight * problem.Zn]),
+    )

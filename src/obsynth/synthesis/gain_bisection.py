@@ -11,7 +11,7 @@ from obsynth.synthesis.gain_search import LeastGain, coordinates
 
 
 def bisected_gain(
-    problem: GainProblem, start: Injection, *, tolerance: float, solver: str
+    problem: GainProblem, start: Injection, *, tolerance: float, solver: str, polish: bool
 ) -> tuple[float, float, Injection, list[dict[str, Any]]]:
     """Return ``(high, low, gains, records)``: the final bracket of a bisection on the gain, and the best filter.
 
@@ -28,13 +28,15 @@ def bisected_gain(
         Relative width of the bracket at which to stop.
     solver : str
         Name of the solver.
+    polish : bool
+        Whether the matrix inequality is asked where the central filter does not reach a level.
     """
     best, high, low = start, problem.achieved_gain(start), 0.0
     records = []
     while high - low > tolerance * high:
         middle = 0.5 * (low + high)
         better = central_filter_at(problem, middle)
-        if better is None:
+        if better is None and polish:
             found = gain_design.feasible_point(problem, middle, solver=solver)
             better = None if found is None else found.injection
             records += [] if found is None else [found.record]
@@ -45,14 +47,16 @@ def bisected_gain(
     return high, low, best, records
 
 
-def search_by_bisection(problem: GainProblem, *, tolerance: float, solver: str) -> LeastGain:
+def search_by_bisection(problem: GainProblem, *, tolerance: float, solver: str, polish: bool = True) -> LeastGain:
     """Minimise the gain by bisection (the paper's Algorithm 1, made to end)."""
     normalised = coordinates(problem, solver=solver)
     gain = problem.achieved_gain(normalised.start)
     if problem.measured == 0 or gain == 0.0:
         return LeastGain(gain, normalised, normalised.start, gain, (gain, gain))
     start = normalised.contracted(normalised.start)
-    high, low, found, records = bisected_gain(normalised.problem, start, tolerance=tolerance, solver=solver)
+    high, low, found, records = bisected_gain(
+        normalised.problem, start, tolerance=tolerance, solver=solver, polish=polish
+    )
     injection = normalised.restore(found)
     better = coordinates(problem, solver=solver, start=injection)
     return LeastGain(

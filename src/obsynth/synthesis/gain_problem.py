@@ -135,6 +135,11 @@ class Injection:
     R: FloatArray
     V: FloatArray
 
+    @property
+    def parts(self) -> tuple[FloatArray, FloatArray]:
+        """R and V."""
+        return self.R, self.V
+
 
 @dataclass(frozen=True, eq=False)
 class NormalisedProblem:

@@ -60,8 +60,17 @@ def coordinates(problem: GainProblem, *, solver: str, start: Injection | None = 
     return normalise(problem, start=start, rotate=solver not in lmi.FIRST_ORDER_SOLVERS)
 
 
-def search_least_gain(problem: GainProblem, *, solver: str) -> LeastGain:
+def search_least_gain(problem: GainProblem, *, solver: str, polish: bool = True) -> LeastGain:
     """Minimise the gain directly, improving the coordinates between passes.
+
+    Parameters
+    ----------
+    problem : GainProblem
+        In the original coordinates.
+    solver : str
+        Name of the solver.
+    polish : bool, optional
+        Whether the matrix inequality has the last word, or the Riccati equations are left alone.
 
     Raises
     ------
@@ -76,7 +85,7 @@ def search_least_gain(problem: GainProblem, *, solver: str) -> LeastGain:
         return LeastGain(gain, normalised, best, starting, (gain, gain))
     for _ in range(MOST_PASSES):
         before = gain
-        for improve in (_central_filter, _polished):
+        for improve in (_central_filter, _polished) if polish else (_central_filter,):
             better = improve(normalised, best, records, solver=solver)
             reached = np.inf if better is None else problem.achieved_gain(better)
             if better is not None and reached < gain:

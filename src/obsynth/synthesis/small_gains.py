@@ -5,7 +5,7 @@ No number of a solver is believed: the true gain, the true variance and the spec
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ import numpy as np
 from obsynth.errors import SolverError
 from obsynth.numerics.norms import spectral_radius
 from obsynth.synthesis import gain_design
-from obsynth.synthesis.central_filter import least_noise_filter
+from obsynth.synthesis.central_filter import least_noise_filter, noise_weighted_filters
 from obsynth.synthesis.gain_problem import GainProblem, Injection, NormalisedProblem
 from obsynth.synthesis.gain_search import LeastGain, coordinates
 
@@ -30,12 +30,12 @@ LEVEL_ACCURACY = 1e-6
 
 
 def small_gain_design(
-    problem: GainProblem, least: LeastGain, gain: float, *, solver: str
+    problem: GainProblem, least: LeastGain, gain: float, *, solver: str, engine: str
 ) -> tuple[Injection, list[dict[str, Any]]]:
     """Return gains of least size or least noise whose true norm is at most ``gain``.
 
-    Falls back on the centre of the inequality, and then on the filter of the search, when the solver fails; the
-    records say so.
+    Central filters that weigh the noise, and solutions of the inequality, compete; where both fail, the filter of the
+    search is left.  The records say what was tried.
 
     Parameters
     ----------
@@ -47,6 +47,8 @@ def small_gain_design(
         Level asked for.
     solver : str
         Name of the solver.
+    engine : {"riccati", "lmi", "both"}
+        Who competes.
 
     Raises
     ------
@@ -58,52 +60,87 @@ def small_gain_design(
         return least.injection, records
     nothing = Injection(np.zeros_like(least.injection.R), np.zeros_like(least.injection.V))
     fresh = coordinates(problem, solver=solver)
-    slowest = max(SLOWEST_DECAY, 0.5 + 0.5 * _radius(problem, fresh.start))
-    noisy = np.any(problem.Bn) or np.any(problem.Zn)
-    if not noisy and _radius(problem, nothing) <= slowest and _reaches(problem, nothing, gain):
+    goal = _Goal(problem, gain, max(SLOWEST_DECAY, 0.5 + 0.5 * _radius(problem, fresh.start)))
+    if not goal.noisy and goal.met_fast(nothing):
         # Without a noise model the objective is the size of the gains themselves, and zero is least.
         return nothing, records
     candidates: list[Injection] = []
-    attempts = ((least.normalised, 1.0), (fresh, 1.0), (None, 1.0), (least.normalised, slowest), (fresh, slowest))
+    if engine != "lmi":
+        target = least_noise_filter(problem) if goal.noisy else nothing
+        central = [item for item in (*noise_weighted_filters(problem, gain), fresh.start) if goal.met(item)]
+        candidates += [_towards(goal, item, target) for item in central]
+        records.append({"what": "small gains", "solver": "central filter", "status": f"{len(central)} filters"})
+    if engine != "riccati":
+        candidates += _by_inequality(goal, least, fresh, records, solver=solver)
+    if not candidates and goal.met(least.injection):
+        candidates.append(least.injection)
+    if not candidates:
+        raise SolverError(f"No filter with gain {gain:.6g} was found: nothing is known.", record=records[-1])
+    # An inaccurate solution may be far from the least noise: the true cost decides, not the solver.
+    fast = [item for item in candidates if goal.met_fast(item)]
+    found = min(fast or candidates, key=goal.cost)
+    return (_towards(goal, found, least_noise_filter(problem)) if goal.noisy else found), records
+
+
+@dataclass(frozen=True, eq=False)
+class _Goal:
+    """What a filter must meet, and what it shall cost little of."""
+
+    problem: GainProblem
+    gain: float
+    slowest: float
+
+    @property
+    def noisy(self) -> bool:
+        """Whether there is a noise model; without one the size of the gains is the cost."""
+        return bool(np.any(self.problem.Bn) or np.any(self.problem.Zn))
+
+    def met(self, injection: Injection) -> bool:
+        return _reaches(self.problem, injection, self.gain)
+
+    def met_fast(self, injection: Injection) -> bool:
+        return _radius(self.problem, injection) <= self.slowest and self.met(injection)
+
+    def cost(self, injection: Injection) -> float:
+        if self.noisy:
+            return self.problem.noise_variance(injection)
+        return float(np.linalg.norm(np.vstack([injection.R, injection.V])))
+
+
+def _by_inequality(
+    goal: _Goal, least: LeastGain, fresh: NormalisedProblem, records: list[dict[str, Any]], *, solver: str
+) -> list[Injection]:
+    """Return what the inequality gives, in different coordinates until one run is optimal and fast enough."""
+    problem, gain = goal.problem, goal.gain
+    candidates: list[Injection] = []
+    attempts = (
+        (least.normalised, 1.0), (fresh, 1.0), (None, 1.0), (least.normalised, goal.slowest), (fresh, goal.slowest),
+    )  # fmt: skip
     for normalised, decay in attempts:
         if normalised is None:
             injection = _small_gains_step_by_step(problem, gain, records, solver=solver)
         else:
             injection = _small_gains_in(problem, normalised, gain, records, solver=solver, decay=decay)
-        if injection is not None and _reaches(problem, injection, gain):
+        if injection is not None and goal.met(injection):
             candidates.append(injection)
-            if records[-1]["status"] == "optimal" and _radius(problem, injection) <= slowest:
+            if records[-1]["status"] == "optimal" and goal.met_fast(injection):
                 break
     if not candidates and problem.disturbances:
         centre = gain_design.feasible_point(least.normalised.problem, gain / least.normalised.gain, solver=solver)
-        centred = [] if centre is None else [least.normalised.restore(centre.injection)]
-        candidates = [injection for injection in [*centred, least.injection] if _reaches(problem, injection, gain)]
-    if candidates:
-        # An inaccurate solution may be far from the least noise: the true variance decides, not the solver.
-        fast = [injection for injection in candidates if _radius(problem, injection) <= slowest]
-        found = min(fast or candidates, key=problem.noise_variance)
-        return (_quieter(problem, found, gain) if noisy else found), records
-    if _reaches(problem, least.injection, gain):
-        return least.injection, records
-    raise SolverError(f"No filter with gain {gain:.6g} was found: nothing is known.", record=records[-1])
+        candidates = [] if centre is None else [least.normalised.restore(centre.injection)]
+    return [item for item in candidates if goal.met(item)]
 
 
-def _quieter(problem: GainProblem, injection: Injection, gain: float) -> Injection:
-    """Go towards the filter of least noise as far as the true gain allows: one P for gain and noise leaves room."""
-    quietest = least_noise_filter(problem)
-    if quietest is None:
+def _towards(goal: _Goal, injection: Injection, target: Injection | None) -> Injection:
+    """Go towards a cheaper filter as far as the true gain allows: one P for gain and noise leaves room."""
+    if target is None:
         return injection
     best, share, step = injection, 0.0, 1.0
+    judge = goal.met_fast if goal.met_fast(injection) else goal.met
     for _ in range(LINE_STEPS):
         tried = share + step
-        mixed = Injection(
-            (1.0 - tried) * injection.R + tried * quietest.R, (1.0 - tried) * injection.V + tried * quietest.V
-        )
-        if (
-            tried <= 1.0
-            and _reaches(problem, mixed, gain)
-            and problem.noise_variance(mixed) <= problem.noise_variance(best)
-        ):
+        mixed = Injection(*((1.0 - tried) * a + tried * b for a, b in zip(injection.parts, target.parts, strict=True)))
+        if tried <= 1.0 and judge(mixed) and goal.cost(mixed) <= goal.cost(best):
             best, share = mixed, tried
         step *= 0.5
     return best

@@ -44,6 +44,9 @@ from obsynth.synthesis.lmi import SOLVER_SETTINGS
 from obsynth.synthesis.result import Synthesis
 from obsynth.synthesis.small_gains import small_gain_design
 
+#: Who finds the gains: Riccati equations, the matrix inequality started from them, or both up to so many states.
+ENGINES = ("auto", "riccati", "lmi")
+MOST_STATES_FOR_BOTH = 20
 #: Fictitious noise on the measurements, relative to the given one, so that no direction of the gains is free of cost.
 BACKGROUND_NOISE = 1e-3
 #: Asking for a gain above this multiple of the starting filter's adds nothing but bad scaling.
@@ -74,6 +77,7 @@ class FilterOptions:
     free_residual_weight: bool | None = None
     residual_weight_limit: float | None = None
     S: Any = None
+    engine: str = "auto"
     solver: str = "CLARABEL"
     tolerance: float = 1e-6
 
@@ -88,6 +92,8 @@ class FilterOptions:
                 f"gamma_margin is {self.gamma_margin}: give {LEAST_MARGIN} or more, such as 0.05; less leaves no room "
                 "for a proof."
             )
+        if self.engine not in ENGINES:
+            problems.append(f"engine is {self.engine!r}: use one of {', '.join(ENGINES)}.")
         if self.solver not in SOLVER_SETTINGS:
             problems.append(f"solver is {self.solver!r}: use one of {', '.join(SOLVER_SETTINGS)}.")
         if not 0.0 < self.tolerance < 1.0:
@@ -114,16 +120,19 @@ def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **op
     if limit is not None:
         problem = _with_weight_limit(problem, prepared, parts, limit)
     size = max(problem.disturbance_size, NOMINAL_GAIN)
+    engine = asked.engine
+    if engine == "auto":
+        engine = "both" if problem.order <= MOST_STATES_FOR_BOTH else "riccati"
     progress("searching the least gain")
-    least = _least_gain(problem, asked)
+    least = _least_gain(problem, asked, engine)
     if problem.disturbances and least.starting_gain <= ROUNDING_GAIN * problem.disturbance_size:
         # What is left of the disturbance in the estimates is rounding: nothing to minimise.
         problem = problem.without_disturbance()
-        least = replace(_least_gain(problem, asked), gain=least.starting_gain)
+        least = replace(_least_gain(problem, asked, engine), gain=least.starting_gain)
     gamma = _gain_to_ship(asked, problem, least, noisy=plant.nw > 0)
     progress("choosing small gains")
     inner = gamma - min(CERTIFICATE_SHARE * (gamma - least.gain), CERTIFICATE_MARGIN * gamma)
-    chosen, records = small_gain_design(problem, least, inner, solver=asked.solver)
+    chosen, records = small_gain_design(problem, least, inner, solver=asked.solver, engine=engine)
     gains = _gains(prepared, parts, chosen)
     progress("building the realisation and its certificate")
     observer, tracking, lag = realise_filter(plant, prepared.plant, gains, prepared.detectability)
@@ -141,6 +150,7 @@ def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **op
         "free_residual_weight": free,
         "residual_weight_limit": limit,
         "S": None if s is None else s.tolist(),
+        "engine": asked.engine,
         "solver": asked.solver,
         "tolerance": asked.tolerance,
     }
@@ -149,7 +159,7 @@ def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **op
         gains,
         observer,
         Certificate({"P_factor": factor, "tracking": tracking}, claims),
-        {"runs": [*least.records, *records]},
+        {"engine": engine, "runs": [*least.records, *records]},
         notes(plant, prepared.detectability, observer),
     )
 
@@ -223,10 +233,11 @@ def gain_problem(prepared: PreparedPlant, *, free_weight: bool) -> tuple[GainPro
     return problem, _Parts(l0, w0, v)
 
 
-def _least_gain(problem: GainProblem, asked: FilterOptions) -> gain_search.LeastGain:
+def _least_gain(problem: GainProblem, asked: FilterOptions, engine: str) -> gain_search.LeastGain:
+    polish = engine != "riccati"
     if asked.gamma_search == "direct":
-        return gain_search.search_least_gain(problem, solver=asked.solver)
-    return search_by_bisection(problem, tolerance=asked.tolerance, solver=asked.solver)
+        return gain_search.search_least_gain(problem, solver=asked.solver, polish=polish)
+    return search_by_bisection(problem, tolerance=asked.tolerance, solver=asked.solver, polish=polish)
 
 
 def _gain_to_ship(asked: FilterOptions, problem: GainProblem, least: gain_search.LeastGain, *, noisy: bool) -> float:
