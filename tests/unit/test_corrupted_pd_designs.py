@@ -29,7 +29,7 @@ RESIDUAL, FEEDTHROUGH = "unbiased: residual", "unbiased: feedthrough"
 GAINS, DET, ERRORS, DECAY, DISK, PAIR = (
     "gains", "det(I + L C)", "error system", "decay rate", "disk", "descriptor pair",
 )  # fmt: skip
-P1, Q, LMI, RANGE = "P1", "Q", "LMI", "adaptation range"
+P1, Q, LMI, RANGE, LMI_RATE, LMI_NOISE = "P1", "Q", "LMI", "adaptation range", "LMI, rate", "LMI, noise"
 RATE, NOISE, BOUND = (
     "fault rate in the fault estimate", "noise and its derivative in the fault estimate", "gain bound",
 )  # fmt: skip
@@ -252,7 +252,8 @@ TABLE: dict[str, tuple[str, Corruption, tuple[str, ...]]] = {
     "infinite gains": ("paper", singular_estimate, (GAINS, DET, LMI)),
     "unstable gains": ("paper", unstable, (ERRORS, PAIR, LMI)),
     "unstable gains, one state": ("single", unstable, (ERRORS, PAIR, LMI)),
-    "unstable gains, all bounds": ("bounds", unstable, (ERRORS, DECAY, DISK, PAIR, LMI, RATE, NOISE)),
+    "unstable gains, all bounds": (
+        "bounds", unstable, (ERRORS, DECAY, DISK, PAIR, LMI, RATE, NOISE, LMI_RATE, LMI_NOISE)),
     "unstable gains, range": ("range", unstable, (ERRORS, PAIR, LMI, RANGE)),
     # The listed gains.
     "J": ("paper", gain_entry("J", 1, 1), (GAINS,)),
@@ -316,9 +317,14 @@ TABLE: dict[str, tuple[str, Corruption, tuple[str, ...]]] = {
     "disk of negative radius": ("bounds", claim("disk_radius", -1.0), (FITS,)),
     "gain bound too small": ("bounds", claim_beside("gain_bound", BOUND, 1.0 - 1e-9), (BOUND,)),
     "gain bound zero": ("bounds", claim("gain_bound", 0.0), (FITS,)),
-    "rate gain too small": ("bounds", claim_beside("fault_rate_gain", RATE, 1.0 - 1e-6), (RATE,)),
-    "rate gain hardly too small": ("bounds", claim_beside("fault_rate_gain", RATE, 1.0 - 0.5e-9), (RATE,)),
-    "noise gain too small": ("bounds", claim_beside("noise_gain", NOISE, 1.0 - 1e-6), (NOISE,)),
+    "rate gain too small": ("bounds", claim_beside("fault_rate_gain", RATE, 1.0 - 1e-6), (RATE, LMI_RATE)),
+    "rate gain hardly too small": ("bounds", claim_beside("fault_rate_gain", RATE, 1.0 - 0.5e-9), (RATE, LMI_RATE)),
+    "noise gain too small": ("bounds", claim_beside("noise_gain", NOISE, 1.0 - 1e-6), (NOISE, LMI_NOISE)),
+    "P_rate wrong": ("bounds", certificate_times("P_rate", 100.0), (LMI_RATE,)),
+    "P_rate not symmetric": ("bounds", certificate_nudge("P_rate", 0, 1), (LMI_RATE,)),
+    "P_rate without a row": ("bounds", certificate_cut("P_rate", slice(1, None)), (FITS,)),
+    "P_noise negative": ("bounds", certificate_times("P_noise", -1.0), (LMI_NOISE,)),
+    "P_noise NaN": ("bounds", certificate_entry("P_noise", 0, 0, np.nan), (FITS,)),
     "noise gain NaN": ("bounds", claim("noise_gain", np.nan), (FITS,)),
     "range too wide": ("range", claim("adaptation_high", 1e3), (RANGE,)),
     "range without an end": ("range", without_claim("adaptation_high"), (FITS,)),
@@ -326,7 +332,7 @@ TABLE: dict[str, tuple[str, Corruption, tuple[str, ...]]] = {
     # Numbers that overflow.
     "Az huge": ("paper", entry("Az", 0, 0, 1e300), (DYNAMICS, GAINS, ERRORS, LMI)),
     "By huge": ("bounds", entry("By", 0, 0, 1e300), (DYNAMICS, GAINS, BOUND, NOISE)),
-    "Cz huge": ("bounds", entry("Cz", 4, 0, 1e300), (ESTIMATES, GAINS, LMI, RATE, NOISE, BOUND)),
+    "Cz huge": ("bounds", entry("Cz", 4, 0, 1e300), (ESTIMATES, GAINS, LMI, RATE, NOISE, BOUND, LMI_RATE, LMI_NOISE)),
     # The plant is another one.
     "A": ("paper", plant_entry("A", 3, 2), (DYNAMICS,)),
     "B": ("paper", plant_entry("B", 1, 1), (INPUTS,)),
@@ -335,7 +341,8 @@ TABLE: dict[str, tuple[str, Corruption, tuple[str, ...]]] = {
     "fault direction": ("paper", plant_entry("Bf", 0, 0), (DYNAMICS,)),
     "direction of a sensor fault": ("direct", plant_entry("Df", 1, 0), (DYNAMICS, ESTIMATES, RESIDUAL)),
     "more noise than the bound allows": (
-        "bounds", lambda d: with_plant(d, Bw=np.zeros((4, 2)), Dw=100.0 * np.eye(2), noise_names=None), (NOISE,)),
+        "bounds", lambda d: with_plant(d, Bw=np.zeros((4, 2)), Dw=100.0 * np.eye(2), noise_names=None),
+        (NOISE, LMI_NOISE)),
     "names of the plant": ("paper", plant_field(state_names=["a", "b", "c", "d"]), (FITS,)),
     "a factor in E": ("paper", plant_field(E=2.0 * np.eye(4)), (FITS,)),
     # Existence conditions.

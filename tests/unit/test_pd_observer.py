@@ -9,15 +9,21 @@ import numpy as np
 import pytest
 
 import obsynth
-from obsynth.analysis.pd_augmentation import with_faults_as_states
+from obsynth.analysis.pd_augmentation import with_faults_as_states, with_sensor_noise
 from obsynth.analysis.pd_conditions import pd_observer_conditions
 from obsynth.numerics.continuous import continuous_hinf_norm
 from obsynth.simulation import simulate_plant
 from obsynth.spec import load_spec
 from obsynth.synthesis import lmi, pd_design
-from obsynth.synthesis.pd_certificate import explicit_certificate, symmetric_certificate
+from obsynth.synthesis.pd_certificate import explicit_certificate, gain_certificate, symmetric_certificate
 from obsynth.synthesis.pd_options import least_noise_gain
-from obsynth.verification.pd_inequality import prove_gains, prove_shipped_stability, prove_symmetric_positive
+from obsynth.verification.pd_inequality import (
+    error_inputs,
+    prove_gain,
+    prove_gains,
+    prove_shipped_stability,
+    prove_symmetric_positive,
+)
 
 FOLDER = Path(__file__).parents[2] / "designs" / "filasova"
 PLANT = load_spec(FOLDER / "spec.yaml").plant
@@ -337,6 +343,25 @@ class TestCertificates:
         for delta, proved in ((0.9 * limit, True), (1.1 * limit, False)):
             assert prove_gains(a, none.T, none, none, q, q, delta=delta, decay=0.0).proved is proved
         assert symmetric_certificate(-a, decay=0.0) is None
+
+    def test_an_l2_gain_is_proved_down_to_the_norm_and_not_below(self) -> None:
+        for plant in (PLANT, rich()):
+            design = obsynth.pd_observer(plant)
+            observer, gains = design.observer, design.gains
+            noisy = with_sensor_noise(plant)
+            stacked = np.vstack([gains["J"], gains["M"]]), np.vstack([gains["L"], gains["N"]])
+            shown = observer.Cz[observer.fault_rows]
+            rows = {"rate": "fault rate in", "noise": "noise and its derivative in"}
+            for kind, row in rows.items():
+                entering = error_inputs(noisy, *stacked, kind)
+                norm = design.report[f"{row} the fault estimate"].value
+                for factor in (10.0, 1.1, 1.001):
+                    found = gain_certificate(observer.Az, entering, shown, factor * norm)
+                    assert found is not None
+                    assert prove_gain(observer.Az, entering, shown, found, factor * norm).proved
+                    assert not prove_gain(observer.Az, entering, shown, found, (1.0 - 1e-6) * norm).proved
+                assert gain_certificate(observer.Az, entering, shown, (1.0 - 1e-6) * norm) is None
+                assert not prove_gain(-observer.Az, entering, shown, found, 10.0 * norm).proved
 
     def test_both_forms_of_the_inequality_agree(self) -> None:
         design = obsynth.pd_observer(rich(), decay=0.3)

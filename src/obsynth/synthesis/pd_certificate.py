@@ -12,7 +12,9 @@ import warnings
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.balls import Ball
 from obsynth.numerics.continuous import spectral_abscissa
+from obsynth.verification.pd_inequality import prove_gain
 
 #: delta is moved by this factor when -1/delta is close to an eigenvalue, where the construction breaks down.
 DELTA_STEP = 1.7
@@ -20,6 +22,8 @@ DELTA_STEP = 1.7
 GOOD_CONDITION = 1e3
 #: As many values of delta are tried.
 DELTA_TRIES = 12
+#: Slack of the Riccati equation relative to the output weight, largest first: the first that proves is taken.
+SLACKS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)
 
 
 def explicit_certificate(
@@ -76,6 +80,42 @@ def symmetric_certificate(Az: FloatArray, *, decay: float) -> tuple[FloatArray, 
         return None
     largest = float(eigvalsh(balanced.T @ q @ balanced)[-1]) / float(np.linalg.norm(balanced))
     return q / units[:, None] / units, 2.0 / largest
+
+
+def gain_certificate(a: FloatArray, b: Ball, c: FloatArray, gain: float) -> FloatArray | None:
+    """Return P ``(n, n)`` that proves the l2 gain of ``x' = a x + b v``, ``z = c x`` below ``gain``, or ``None``.
+
+    The Riccati solution with the largest slack that gives a proof.
+
+    Parameters
+    ----------
+    a, c : FloatArray
+        ``(n, n)``, ``(p, n)``.
+    b : Ball
+        ``(n, m)``.
+    gain : float
+        Level.
+    """
+    from scipy.linalg import matrix_balance, solve_continuous_are
+
+    balanced, (units, _) = matrix_balance(a, permute=False, separate=True)
+    entering, shown = b.midpoint / units[:, None], c * units
+    weight = max(float(np.linalg.norm(shown, 2)) ** 2, np.finfo(np.float64).tiny)
+    for slack in SLACKS:
+        try:
+            p = np.asarray(
+                solve_continuous_are(
+                    balanced, entering, shown.T @ shown + slack * weight * np.eye(len(a)),
+                    -(gain**2) * np.eye(entering.shape[1]),
+                )
+            )  # fmt: skip
+        except (np.linalg.LinAlgError, ValueError):
+            continue
+        found = 0.5 * (p + p.T) / units[:, None] / units
+        found = np.asarray(0.5 * (found + found.T))
+        if np.all(np.isfinite(found)) and prove_gain(a, b, c, found, gain).proved:
+            return found
+    return None
 
 
 def _gram(a: FloatArray) -> FloatArray:

@@ -8,16 +8,22 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.analysis.pd_augmentation import with_faults_as_states
+from obsynth.analysis.pd_augmentation import with_faults_as_states, with_sensor_noise
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import spectral_abscissa
 from obsynth.observers.linear import LinearObserver
-from obsynth.synthesis.pd_certificate import explicit_certificate
+from obsynth.synthesis.pd_certificate import explicit_certificate, gain_certificate
 from obsynth.synthesis.pd_options import PdOptions
 from obsynth.synthesis.pd_problem import PdSolution
 from obsynth.synthesis.pd_realisation import realise_pd_observer
-from obsynth.verification.pd_inequality import prove_gains, prove_shipped_stability, prove_symmetric_positive
+from obsynth.verification.pd_inequality import (
+    error_inputs,
+    prove_gains,
+    prove_shipped_stability,
+    prove_symmetric_positive,
+)
+from obsynth.verification.pd_proofs import GAIN_CLAIMS
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +38,8 @@ class PdGains:
         Certificate ``(nx + nf, nx + nf)`` for the state ``[x; f]``.
     ends : tuple of FloatArray
         P1 at the ends of the range of adaptation gains, empty without one.
+    gain_certificates : mapping of str to FloatArray
+        ``P_rate`` and ``P_noise`` ``(nx + nf, nx + nf)``, for the bounds on l2 gains that were asked for.
     theorem : int
         The theorem that the certificate belongs to.
     asked_delta, delta, decay : float
@@ -49,6 +57,7 @@ class PdGains:
     P1: FloatArray
     P3: FloatArray
     ends: tuple[FloatArray, ...]
+    gain_certificates: Mapping[str, FloatArray]
     theorem: int
     asked_delta: float
     delta: float
@@ -83,10 +92,26 @@ def certified(
     ends = asked.range_numbers
     p1, p3 = _symmetric(found.P1[0]), _symmetric(found.P3) if asked.theorem == 2 else found.P3
     gains = PdGains(
-        found.J, found.L, p1, p3, (), asked.theorem, delta, delta, decay, observer, proved=False, record=found.record
+        found.J,
+        found.L,
+        p1,
+        p3,
+        (),
+        {},
+        asked.theorem,
+        delta,
+        delta,
+        decay,
+        observer,
+        proved=False,
+        record=found.record,
     )
     if ends is not None:
         return _certified_range(plant, replace(gains, ends=found.P1), ends)
+    certificates = _gain_certificates(plant, asked, gains)
+    if certificates is None:
+        return gains
+    gains = replace(gains, gain_certificates=certificates)
     if _is_proved(gains):
         return replace(gains, proved=True)
     own = explicit_certificate(observer.Az, observer.Cz[: observer.order], decay=decay) if asked.theorem == 1 else None
@@ -94,6 +119,21 @@ def certified(
         return gains
     gains = replace(gains, P1=own[0], P3=own[1], delta=own[2])
     return replace(gains, proved=_is_proved(gains))
+
+
+def _gain_certificates(plant: DescriptorSystem, asked: PdOptions, gains: PdGains) -> dict[str, FloatArray] | None:
+    """Return the certificates of the bounds on l2 gains that are asked for; ``None`` when one is not found."""
+    observer, found = gains.observer, {}
+    for option, kind in GAIN_CLAIMS.items():
+        bound = getattr(asked, option)
+        if bound is None:
+            continue
+        entering = error_inputs(with_sensor_noise(plant), gains.J, gains.L, kind)
+        certificate = gain_certificate(observer.Az, entering, observer.Cz[observer.fault_rows], float(bound))
+        if certificate is None:
+            return None
+        found[f"P_{kind}"] = certificate
+    return found
 
 
 def _symmetric(matrix: FloatArray) -> FloatArray:

@@ -17,8 +17,11 @@ that S is nonsingular, so that the congruence is one.
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 
+from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.balls import Ball, block
 from obsynth.numerics.definiteness import DefinitenessProof, prove_positive_definite
@@ -76,6 +79,60 @@ def prove_symmetric_positive(matrix: FloatArray) -> DefinitenessProof:
     if not np.array_equal(matrix, matrix.T):
         return DefinitenessProof(False, -np.inf, 0.0)
     return prove_positive_definite(matrix)
+
+
+def error_inputs(
+    plant: DescriptorSystem, J: FloatArray, L: FloatArray, kind: Literal["rate", "noise"]
+) -> Ball:  # fmt: skip
+    """Return where the rate of the faults, or ``[w; w']``, enters ``eps' = Az eps + B v``, with rounding bounds.
+
+    Parameters
+    ----------
+    plant : DescriptorSystem
+        Continuous time, ``E = I``, with noise stated (see `obsynth.analysis.pd_augmentation.with_sensor_noise`).
+    J, L : FloatArray
+        Gains in the loop ``(nx + nf, ny)``.
+    kind : {"rate", "noise"}
+        Which.
+    """
+    if kind == "rate":
+        return Ball.exact(np.vstack([np.zeros((plant.nx, plant.nf)), np.eye(plant.nf)]))
+    process = Ball.exact(np.vstack([plant.Bw, np.zeros((plant.nf, plant.nw))]))
+    sensor = Ball.exact(plant.Dw)
+    return block([[process - Ball.exact(J) @ sensor, -(Ball.exact(L) @ sensor)]])
+
+
+def prove_gain(a: FloatArray, b: Ball, c: FloatArray, P: FloatArray, gain: float) -> DefinitenessProof:
+    """Try to prove that ``x' = a x + b v``, ``z = c x`` is stable with an l2 gain below ``gain``.
+
+    The bounded real inequality ``a' P + P a + c' c + P b b' P / gain^2 < 0`` before its Schur complements; that P is
+    positive definite is a proof of its own.
+
+    Parameters
+    ----------
+    a, c : FloatArray
+        ``(n, n)``, ``(p, n)``.
+    b : Ball
+        ``(n, m)``.
+    P : FloatArray
+        Certificate ``(n, n)``.
+    gain : float
+        Level.
+    """
+    if not prove_symmetric_positive(P).proved:
+        return DefinitenessProof(False, -np.inf, 0.0)
+    inputs, outputs = b.shape[1], c.shape[0]
+    through = Ball.exact(P) @ Ball.exact(a)
+    entering, shown = Ball.exact(P) @ b, Ball.exact(c)
+    level = Ball.exact(gain * np.eye(inputs)) @ Ball.exact(gain * np.eye(inputs))
+    none = Ball.exact(np.zeros((inputs, outputs)))
+    return prove_positive_definite(
+        block([
+            [-(through + through.T), -entering, shown.T],
+            [-entering.T, level, none],
+            [shown, none.T, Ball.exact(np.eye(outputs))],
+        ])
+    )  # fmt: skip
 
 
 def _prove(moving: Ball, still: Ball, x: Ball, p: Ball, delta: float) -> DefinitenessProof:

@@ -3,18 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Literal
 
 import numpy as np
 
-from obsynth.analysis.pd_augmentation import with_faults_as_states
+from obsynth.analysis.pd_augmentation import with_faults_as_states, with_sensor_noise
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.definiteness import DefinitenessProof
 from obsynth.results.design import ObserverDesign
 from obsynth.results.report import Check
-from obsynth.verification.pd_inequality import prove_gains, prove_shipped_stability, prove_symmetric_positive
+from obsynth.verification.pd_inequality import (
+    error_inputs,
+    prove_gain,
+    prove_gains,
+    prove_shipped_stability,
+    prove_symmetric_positive,
+)
 
-#: Claims that a certificate always makes, and those it may make.
+#: Claims that a certificate always makes, those on l2 gains with the names of their certificates, and those that are
+#: positive.
 NEEDED_CLAIMS = ("theorem", "delta", "decay")
+GAIN_CLAIMS: dict[str, Literal["rate", "noise"]] = {"fault_rate_gain": "rate", "noise_gain": "noise"}
 POSITIVE_CLAIMS = ("delta", "gain_bound", "fault_rate_gain", "noise_gain", "disk_radius", "adaptation_low")
 
 
@@ -33,6 +42,7 @@ def fitting_claims(design: ObserverDesign) -> bool:
     if "G" in design.gains:
         gains["G"] = (plant.nf, plant.nf)
     matrices = {"P1": (n, n), "P3": (n, n)}
+    matrices |= {f"P_{kind}": (n, n) for claim, kind in GAIN_CLAIMS.items() if claim in claims}
     if "adaptation_low" in claims:
         matrices |= {"P1_low": (n, n), "P1_high": (n, n)}
     numbers = all(np.isfinite(value) for value in claims.values())
@@ -68,8 +78,25 @@ def proof_rows(design: ObserverDesign) -> Iterator[Check]:
     yield _proof(
         "LMI", f"Theorem {theorem} holds for the shipped realisation (delta = {delta:.6g} s): {rate}", found, labels[1]
     )
+    for claim, kind in GAIN_CLAIMS.items():
+        if claim in claims:
+            yield _gain_row(design, kind, claims[claim])
     if "adaptation_low" in claims:
         yield _range_row(design)
+
+
+def _gain_row(design: ObserverDesign, kind: Literal["rate", "noise"], gain: float) -> Check:
+    observer = design.observer
+    entering = error_inputs(with_sensor_noise(design.plant), *stacked_gains(design), kind)
+    found = prove_gain(
+        observer.Az, entering, observer.Cz[observer.fault_rows], design.certificate.matrices[f"P_{kind}"], gain
+    )
+    source = {"rate": "the rate of the faults", "noise": "noise and its derivative, as free inputs,"}[kind]
+    claim = f"l2 gain from {source} to the fault error < {gain:.6g}"
+    return Check(
+        f"LMI, {kind}", claim, found.lower_bound, 0.0, found.lower_bound, found.proved, "ours: bounded real lemma",
+        "proved", f"Cholesky with rounding bound {found.error_bound:.1e}, on a unit diagonal",
+    )  # fmt: skip
 
 
 def _proof(name: str, claim: str, found: DefinitenessProof, label: str) -> Check:

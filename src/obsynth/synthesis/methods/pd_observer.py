@@ -108,7 +108,7 @@ def _certificate(asked: PdOptions, gains: PdGains) -> Certificate:
         "gain_bound": asked.gain_bound, "fault_rate_gain": asked.fault_rate_gain, "noise_gain": asked.noise_gain,
     }  # fmt: skip
     claims |= {name: float(bound) for name, bound in bounds.items() if bound is not None}
-    matrices = {"P1": gains.P1, "P3": gains.P3}
+    matrices = {"P1": gains.P1, "P3": gains.P3, **gains.gain_certificates}
     if asked.disk_numbers is not None:
         claims |= {"disk_centre": asked.disk_numbers[0], "disk_radius": asked.disk_numbers[1]}
     if asked.range_numbers is not None:
