@@ -115,12 +115,14 @@ def _identities(
     units = scaling.states
     own_u = np.outer(units, scaling.equations)
     own_dy = np.outer(np.max(np.abs(cz) * units, axis=1, initial=0.0), scaling.outputs)
+    # Bhat = Ahat D + K may cancel: what it is formed of says how well it can be known.
+    formed = (az[:, : plant.nx], dy[observer.state_rows], augmented.C)
     yield (
         "Sylvester",
         "Ahat U_a E_a + Bhat C_a = U_a A_a",
         residual(
             az @ ve, by @ augmented.C, -tracking @ augmented.A,
-            factors=((az, tracking, augmented.E), (by, augmented.C), (tracking, augmented.A)), units=units,
+            factors=((az, tracking, augmented.E), (by, augmented.C), (tracking, augmented.A), formed), units=units,
         ),
         _PAPER,
     )  # fmt: skip
