@@ -103,7 +103,15 @@ def test_functions_say_what_they_return_and_raise(name, item):
     assert all(hasattr(obsynth, error) for error in raises), f"{name} raises undocumented types: {raises}"
 
 
-@pytest.mark.parametrize("name", ["fault_estimation_filter", "fault_estimation_filter_from_gains"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "fault_estimation_filter",
+        "fault_estimation_filter_from_gains",
+        "ui_pi_observer",
+        "ui_pi_observer_from_gains",
+    ],
+)
 def test_methods_give_shapes_units_and_source(name):
     text = inspect.getdoc(getattr(obsynth, name)) or ""
     assert re.search(r"\(nx, n[xyf]\)", text), "shapes are missing"
