@@ -95,7 +95,7 @@ def test_without_noise_the_torque_comes_back_one_sample_late(design: obsynth.Obs
     torque = rng.standard_normal((400, 1))
     run = simulate_plant(PLANT, steps=400, f=torque)
     estimates = design.observer.run(run.outputs, np.zeros((400, 0)))
-    # Outputs of size one are multiplied by 289: rounding is 1e-13 of that.
+    # Outputs of size one are multiplied by 290: rounding is 1e-13 of that.
     np.testing.assert_allclose(estimates.faults[1:, 0], torque[:-1, 0], rtol=0, atol=1e-9)
     np.testing.assert_allclose(estimates.states, run.states, rtol=0, atol=1e-9)
 
@@ -109,7 +109,7 @@ def test_a_disturbance_stays_below_the_gain_at_every_horizon(design: obsynth.Obs
         "step": np.where(k >= 100, 0.5, 0.0),
         "pulse": np.where((k >= 100) & (k < 110), 1.0, 0.0),
         # The peak of the norm, as the report says it in hertz.
-        "resonance": np.sin(2.0 * np.pi * 2.520 * PLANT.dt * k),
+        "resonance": np.sin(2.0 * np.pi * 2.071 * PLANT.dt * k),
         "random": np.random.default_rng(3).standard_normal(steps),
     }[kind]
     run = simulate_plant(PLANT, steps=steps, d=power)

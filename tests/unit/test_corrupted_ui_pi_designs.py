@@ -273,7 +273,7 @@ TABLE: dict[str, tuple[str, Callable[[ObserverDesign], ObserverDesign], tuple[st
     "noise claimed too small": ("paper", claim_times("noise_amplification", 0.99), (NOISE,)),
     "noise NaN": ("direct", claim_times("noise_amplification", np.nan), (NOISE,)),
     # Numbers that overflow.
-    "Az huge": ("paper", entry("Az", 0, 0, 1e300), (STABILITY, POLES, DECAY, DIGITS, DECOUPLING, NOISE)),
+    "Az huge": ("paper", entry("Az", 0, 0, 1e300), (STABILITY, POLES, DECAY, DIGITS, NOISE)),
     "By huge": ("direct", entry("By", 0, 0, 1e300), (SYLVESTER, INPUTS, IN_ERROR, DECOUPLING, NOISE)),
     # The plant is another one.
     "E": ("paper", plant_entry("E", 0, 0), (SYLVESTER, STATE, RESIDUAL, DECOUPLING)),

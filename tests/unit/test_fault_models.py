@@ -8,7 +8,8 @@ import scipy.linalg
 
 from obsynth import FaultModel, SpecError, fault_model
 from obsynth.models.exosystems import exosystem
-from obsynth.models.fault_models import stated_eigenvalues, summed
+from obsynth.models.fault_model_spectra import stated_eigenvalues
+from obsynth.models.fault_models import summed
 
 
 def course(data: object, start: list[float], times: np.ndarray) -> np.ndarray:

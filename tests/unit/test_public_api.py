@@ -106,10 +106,17 @@ def test_functions_say_what_they_return_and_raise(name, item):
 @pytest.mark.parametrize(
     "name",
     [
-        "fault_estimation_filter", "fault_estimation_filter_from_gains", "pd_observer", "pd_observer_from_gains",
-        "pd_delta_scan", "descriptor_kalman", "adaptive_observer",
+        "fault_estimation_filter",
+        "fault_estimation_filter_from_gains",
+        "pd_observer",
+        "pd_observer_from_gains",
+        "pd_delta_scan",
+        "ui_pi_observer",
+        "ui_pi_observer_from_gains",
+        "descriptor_kalman",
+        "adaptive_observer",
     ],
-)  # fmt: skip
+)
 def test_methods_give_shapes_units_and_source(name):
     text = inspect.getdoc(getattr(obsynth, name)) or ""
     assert re.search(r"\(nx, n[xyf]\)", text), "shapes are missing"

@@ -16,24 +16,22 @@ regularity nor index 1 is needed.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from obsynth.analysis.conditions import Condition
+from obsynth.analysis.fault_model_conditions import model_conditions, order_conditions
 from obsynth.analysis.transformations import Transformation, eliminate_algebraic_states
 from obsynth.analysis.unknown_input_pencils import (
-    equilibrated,
+    MOST_NAMES,
     in_disturbances,
     independent_disturbances,
     instability,
-    kernel,
     number,
     system_pencil,
 )
 from obsynth.analysis.unknown_inputs import AugmentedPlant, balancing
-from obsynth.analysis.zeros import Zero, are_outside, invariant_zeros, is_outside, leading_names
+from obsynth.analysis.zeros import Zero, are_outside, invariant_zeros, leading_names
 from obsynth.errors import PreconditionError
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.models.exosystems import Exosystem
@@ -45,8 +43,6 @@ from obsynth.numerics.scaling import equilibrate_pencil
 #: A direct effect on an output, relative to the effect on the states (both in balanced units), that elimination may
 #: leave by rounding.
 ELIMINATION_ROUNDING = 1e-13
-#: At most this many signals of a kind are named in a failed condition.
-MOST_NAMES = 4
 _SOURCE = "Share Pasand, Lemma 4 (9.1), in a form without E#"
 
 
@@ -90,10 +86,10 @@ def existence(plant: DescriptorSystem, model: Exosystem) -> Existence:
     # (D1) and the others fail independently: a user wants to know both.
     found = [enough, solvable, _zero_condition(working)]
     if found[-1].holds:
-        found += _model_conditions(working, model)
+        found += model_conditions(working, model)
     if not all(condition.holds for condition in found):
         return Existence(tuple(found), working, transformation, nothing)
-    found += _order_conditions(working, model)
+    found += order_conditions(working, model)
     if not found[-1].holds:
         return Existence(tuple(found), working, transformation, nothing)
     fixed, condition = _fixed_modes(working, model)
@@ -243,105 +239,6 @@ def _zero_failure(
         "(D2) zeros", claim, False, zero.value.real if plant.dt == 0.0 else abs(zero.value), 0.0, source, detail,
         mode=zero.value, signals=(*states, *disturbances),
     )  # fmt: skip
-
-
-def _model_conditions(plant: DescriptorSystem, model: Exosystem) -> list[Condition]:
-    """Test (D3) at each unstable eigenvalue of the fault model, upper half plane only."""
-    unstable = [complex(value) for value in model.eigenvalues if value.imag >= 0.0 and is_outside(value, plant.dt)]
-    found = []
-    for value in sorted(unstable, key=lambda value: (value.real, value.imag)):
-        found.append(_model_condition(plant, model, value))
-        if not found[-1].holds:
-            break
-    return found
-
-
-def _model_condition(plant: DescriptorSystem, model: Exosystem, value: complex) -> Condition:
-    inputs, direct = independent_disturbances(plant)
-    courses = model.Cw @ kernel(model.Phi - value * np.eye(model.order))
-    width = courses.shape[1]
-    matrix = np.block([
-        [value * plant.E - plant.A, -plant.Bf @ courses, -inputs],
-        [plant.C.astype(complex), plant.Df @ courses, direct],
-    ])  # fmt: skip
-    scaled, columns = equilibrated(matrix)
-    decision = decide_rank(scaled, expected=matrix.shape[1], equilibrated=False)
-    where = f"{'s' if plant.dt == 0.0 else 'z'} = {number(value)}"
-    signals: tuple[str, ...] = ()
-    detail = decision.describe()
-    if not decision.full:
-        direction = columns * np.linalg.svd(scaled)[2][-1].conj()
-        faults = leading_names(np.abs(courses @ direction[plant.nx : plant.nx + width]), plant.fault_names)
-        shares = in_disturbances(plant, inputs, direct, direction[plant.nx + width :])
-        disturbances = _masking(scaled, plant, width, shares)
-        signals = (*faults, *disturbances)
-        masked = f" is masked by the unknown input {', '.join(map(repr, disturbances))}" if disturbances else ""
-        detail += (
-            f": at {where} the fault {', '.join(map(repr, faults))}{masked or ' can persist'} without showing in any "
-            "output, so no observer can estimate it. Measure another signal, or leave one of them out."
-        )
-    return Condition(
-        f"(D3) fault model at {number(value)}",
-        f"rank [lambda E - A, -Bf Cw V, -Bd; C, Df Cw V, Dd] full at {where}, an eigenvalue of Phi",
-        decision.full,
-        float(decision.rank),
-        float(decision.expected),
-        "in place of Share Pasand, Theorems 1 and 2, which are false",
-        detail,
-        mode=None if decision.full else value,
-        signals=signals,
-    )
-
-
-def _order_conditions(plant: DescriptorSystem, model: Exosystem) -> list[Condition]:
-    """Test that the fault model is not lost in rounding, at the zeros where faults can hide longest.
-
-    At a zero z0 of (f, d) -> y outside the region of stability, a polynomial model of order n is seen with a strength
-    of about abs(z0)^(n + 1) only: a high order is observable on paper and lost in double precision.
-    """
-    inputs, direct = np.hstack([plant.Bf, plant.Bd]), np.hstack([plant.Df, plant.Dd])
-    wide_e, wide_a = system_pencil(plant.E, plant.A, inputs, plant.C, direct)
-    zeros = finite_zeros(wide_e, wide_a)
-    if zeros.normal_rank < wide_e.shape[1]:
-        return []
-    points = [complex(value) for value in zeros.values if value.imag >= 0.0 and is_outside(value, plant.dt)]
-    augmented = AugmentedPlant.of(plant, model)
-    own, shown = independent_disturbances(plant)
-    below = np.vstack([own, np.zeros((model.order, own.shape[1]))])
-    worst: tuple[RankDecision, complex] | None = None
-    for point in points:
-        matrix = np.block([[point * augmented.E - augmented.A, -below], [augmented.C.astype(complex), shown]])
-        scaled, _ = equilibrated(matrix)
-        decision = decide_rank(scaled, expected=matrix.shape[1], equilibrated=False)
-        if worst is None or (decision.rank, decision.smallest_kept) < (worst[0].rank, worst[0].smallest_kept):
-            worst = (decision, point)
-    if worst is None:
-        return []
-    decision, point = worst
-    lost = (
-        f": at the zero {number(point)} of (f, d) -> y the fault model (order {model.order}) cannot be told from "
-        "nothing in double precision. Lower its order."
-    )
-    return [
-        Condition(
-            "order of the fault model",
-            "the augmented plant is observable in double precision where faults can hide longest",
-            decision.full,
-            float(decision.rank),
-            float(decision.expected),
-            "ours: observable on paper is not enough",
-            f"{decision.describe()} at {number(point)}" + ("" if decision.full else lost),
-            mode=None if decision.full else point,
-            signals=() if decision.full else plant.fault_names,
-        )
-    ]
-
-
-def _masking(scaled: NDArray[Any], plant: DescriptorSystem, width: int, shares: FloatArray) -> tuple[str, ...]:
-    """Return the disturbances of a null vector; none where states alone already hide the fault."""
-    without = scaled[:, : plant.nx + width]
-    alone = decide_rank(without, expected=plant.nx + width, equilibrated=False)
-    return leading_names(shares, plant.disturbance_names, most=MOST_NAMES) if alone.full else ()
 
 
 def _fixed_modes(plant: DescriptorSystem, model: Exosystem) -> tuple[ComplexArray, Condition]:

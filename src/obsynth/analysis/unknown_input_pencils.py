@@ -12,6 +12,9 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import RANK_TOLERANCE, decide_rank
 from obsynth.numerics.scaling import equilibrate_pencil
 
+#: At most this many signals of a kind are named in a failed condition.
+MOST_NAMES = 4
+
 
 def number(value: complex) -> str:
     """Return a real or complex eigenvalue as text, a pair by its upper half."""

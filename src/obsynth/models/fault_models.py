@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
+from obsynth.models.fault_model_spectra import MULTIPLE_EIGENVALUE, SAME_EIGENVALUE, distinct_eigenvalues
 from obsynth.numerics.arrays import ComplexArray, FloatArray, as_matrix, read_only
 from obsynth.numerics.ranks import decide_rank
 
@@ -21,11 +22,6 @@ from obsynth.numerics.ranks import decide_rank
 POLYNOMIAL_WORDS = {"step": 0, "ramp": 1, "parabola": 2}
 #: Keys of a model given as data; the last two come together.
 MODEL_KEYS = ("polynomial", "sinusoid", "exponential", "sum", "Phi", "Cw")
-#: Distance, relative to the norm of a given matrix, below which computed eigenvalues count as one multiple eigenvalue:
-#: a triple one scatters by the cube root of the unit roundoff.
-MULTIPLE_EIGENVALUE = 1e-4
-#: The same for built-in models, whose matrices are triangular or diagonalisable: only rounding separates copies.
-SAME_EIGENVALUE = 1e-9
 #: A polynomial of higher order has no meaning in data of double precision.
 HIGHEST_ORDER = 60
 
@@ -83,7 +79,7 @@ class FaultModel:
         dt : float, seconds
             As for `transition`.
         """
-        return _distinct(self.transition(dt), MULTIPLE_EIGENVALUE if self.sampled else SAME_EIGENVALUE)
+        return distinct_eigenvalues(self.transition(dt), MULTIPLE_EIGENVALUE if self.sampled else SAME_EIGENVALUE)
 
 
 def polynomial(order: int) -> FaultModel:
@@ -248,39 +244,6 @@ def _observable(model: FaultModel) -> FaultModel:
                 path="fault_model",
             )
     return model
-
-
-def stated_eigenvalues(phi: FloatArray) -> ComplexArray:
-    """Return the distinct eigenvalues of a stacked transition ``(nw, nw)``, block by block where it falls apart.
-
-    Parameters
-    ----------
-    phi : FloatArray
-        Block-diagonal; multiple eigenvalues, which rounding scatters, count once for each block.
-    """
-    linked = (phi != 0.0) | (phi.T != 0.0) | np.eye(len(phi), dtype=bool)
-    for _ in range(len(phi)):
-        linked = (linked.astype(float) @ linked.astype(float)) > 0.0
-    values: list[complex] = []
-    for members in sorted({tuple(np.flatnonzero(row).tolist()) for row in linked}):
-        block = phi[np.ix_(members, members)]
-        triangular = not np.any(np.tril(block, -1))
-        found = np.unique(np.diag(block)) if triangular else _distinct(block, MULTIPLE_EIGENVALUE)
-        values += [complex(value) for value in found if complex(value) not in values]
-    return np.array(values, dtype=np.complex128)
-
-
-def _distinct(matrix: FloatArray, tolerance: float) -> ComplexArray:
-    reach = tolerance * float(np.linalg.norm(matrix, 2))
-    found: list[complex] = []
-    waiting = [complex(value) for value in np.linalg.eigvals(matrix)]
-    while waiting:
-        near = [value for value in waiting if abs(value - waiting[0]) <= reach]
-        waiting = [value for value in waiting if abs(value - waiting[0]) > reach]
-        mean = sum(near) / len(near)
-        # A cluster that scatters around the real axis is a real eigenvalue.
-        found.append(complex(mean.real, 0.0) if abs(mean.imag) <= reach else mean)
-    return np.array(found, dtype=np.complex128)
 
 
 def _number(value: Any, what: str) -> float:

@@ -20,6 +20,8 @@ from obsynth.observers.linear import LinearObserver
 #: Frequencies of the grid, and how far it reaches beyond the slowest and the fastest pole of the observer.
 GRID_POINTS = 61
 GRID_REACH = 30.0
+#: A signal below this share of what a trajectory of unit size could make of it is held not to be moved.
+UNMOVED = 1e-4
 
 
 @dataclass(frozen=True)
@@ -71,6 +73,8 @@ def decoupling_norm(plant: DescriptorSystem, observer: LinearObserver) -> Decoup
         return DecouplingNorm(float("nan"), float("nan"), float("nan"))
     # Outputs of the balanced plant are those of the plant times powers of two.
     by, dy = observer.By / scaling.outputs, observer.Dy / scaling.outputs
+    # Bhat = Ahat D + K may cancel: what it is formed of says how well it can be known.
+    formed = np.abs(by) + np.abs(observer.Az[:, : plant.nx]) @ np.abs(dy[: plant.nx])
     for frequency, point in zip(frequencies, boundary_points(frequencies, plant.dt), strict=True):
         _, values, right = np.linalg.svd(np.hstack([point * scaled.E - scaled.A, -scaled.Bd]))
         rank = int(np.sum(values > RANK_TOLERANCE * values[0]))
@@ -86,9 +90,13 @@ def decoupling_norm(plant: DescriptorSystem, observer: LinearObserver) -> Decoup
         error = observer.Cz @ (resolvent @ (by @ y)) + dy @ y
         error[: plant.nx] -= scaling.states[:, None] * x
         terms = np.abs(scaled.C) @ np.abs(x) + np.abs(scaled.Dd) @ np.abs(d)
-        size = np.abs(observer.Cz) @ (np.abs(resolvent) @ (np.abs(by) @ terms)) + np.abs(dy) @ terms
+        size = np.abs(observer.Cz) @ (np.abs(resolvent) @ (formed @ terms)) + np.abs(dy) @ terms
         size[: plant.nx] += scaling.states[:, None] * np.abs(x)
-        rows = np.max(size, axis=1)
+        # A signal that a trajectory does not move is rounding: it is judged by what trajectories of its size could do.
+        unit = np.sum(np.abs(scaled.C), axis=1) + np.sum(np.abs(scaled.Dd), axis=1)
+        possible = np.abs(observer.Cz) @ (np.abs(resolvent) @ (formed @ unit)) + np.abs(dy) @ unit
+        possible[: plant.nx] += scaling.states
+        rows = np.maximum(np.max(size, axis=1), UNMOVED * possible)
         relative = float(np.max(np.max(np.abs(error), axis=1) / np.where(rows > 0.0, rows, 1.0), initial=0.0))
         fault = float(np.max(np.linalg.norm(error[observer.fault_rows], axis=1), initial=0.0))
         if not relative <= worst.relative:

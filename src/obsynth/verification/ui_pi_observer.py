@@ -10,32 +10,25 @@ from collections.abc import Iterator
 import numpy as np
 
 from obsynth.analysis.unknown_input_conditions import existence
-from obsynth.analysis.unknown_input_pencils import number
 from obsynth.analysis.unknown_inputs import AugmentedPlant
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.models.exosystems import Exosystem
-from obsynth.models.fault_models import stated_eigenvalues
+from obsynth.models.fault_model_spectra import stated_eigenvalues
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.scaling import balance_by_least_squares
-from obsynth.numerics.spectra import abscissa, decay_rates, eigenvalues, noise_covariance, spectrum_error
 from obsynth.observers.linear import LinearObserver
 from obsynth.results.design import ObserverDesign
-from obsynth.results.report import Check, information, lower_bound_check, upper_bound_check
+from obsynth.results.report import Check, information, upper_bound_check
 from obsynth.verification.decoupling import decoupling_norm
 from obsynth.verification.fault_tracking import tracking_rows
 from obsynth.verification.identities import Residual, residual
-from obsynth.verification.lyapunov import prove_stable
 from obsynth.verification.plant import condition_rows, plant_information
+from obsynth.verification.ui_pi_numbers import noise_rows, stability_rows
 
 #: Equalities may miss by this much, relative to the terms they are made of.
 EQUALITY_TOLERANCE = 1e-9
 #: The same for estimates at a frequency, whose terms pass through the inverse of ``sI - Az``.
 DECOUPLING_TOLERANCE = 1e-8
-#: Recomputed poles may miss the claimed ones by this, relative to their size; claimed rates and norms likewise.
-SPECTRUM_TOLERANCE = 1e-4
-CLAIM_TOLERANCE = 1e-4
-#: Significant digits with which gains are commonly printed in full: the observer must stay stable with them.
-PRINTED_DIGITS = 9
 _PAPER = "Share Pasand, eq. (19)"
 _MATRICES = ("tracking", "Phi", "Cw", "poles", "stability")
 
@@ -71,7 +64,7 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
             name, claim, found.relative, tolerance, source=source, kind="equality",
             detail=f"largest miss {found.error:.1e} among terms of size {found.scale:.1e}",
         )  # fmt: skip
-    yield from _stability_rows(design, poles, factor)
+    yield from stability_rows(design, poles, factor)
     norm = decoupling_norm(plant, observer)
     yield upper_bound_check(
         "decoupling",
@@ -82,7 +75,7 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
         detail=f"relative to the terms; absolute gain to a fault estimate up to {norm.fault_gain:.1e}; "
         f"worst at {norm.frequency:.3g} rad/s",
     )
-    yield from _noise_rows(design)
+    yield from noise_rows(design)
     yield from tracking_rows(plant, observer, tracking, phi, cw)
 
 
@@ -122,12 +115,14 @@ def _identities(
     units = scaling.states
     own_u = np.outer(units, scaling.equations)
     own_dy = np.outer(np.max(np.abs(cz) * units, axis=1, initial=0.0), scaling.outputs)
+    # Bhat = Ahat D + K may cancel: what it is formed of says how well it can be known.
+    formed = (az[:, : plant.nx], dy[observer.state_rows], augmented.C)
     yield (
         "Sylvester",
         "Ahat U_a E_a + Bhat C_a = U_a A_a",
         residual(
             az @ ve, by @ augmented.C, -tracking @ augmented.A,
-            factors=((az, tracking, augmented.E), (by, augmented.C), (tracking, augmented.A)), units=units,
+            factors=((az, tracking, augmented.E), (by, augmented.C), (tracking, augmented.A), formed), units=units,
         ),
         _PAPER,
     )  # fmt: skip
@@ -137,21 +132,7 @@ def _identities(
         residual(bu, by @ plant.D, -tracking @ augmented.B, factors=((by, plant.D), (tracking, augmented.B))),
         _PAPER,
     )
-    yield (
-        "disturbance in the error",
-        "U_a Bd_a = 0 (Bhat Dd, where d reaches y)",
-        residual(
-            tracking @ augmented.Bd, -by @ plant.Dd,
-            factors=((tracking, augmented.Bd), (by, plant.Dd), (own_u, augmented.Bd)),
-        ),
-        _PAPER,
-    )  # fmt: skip
-    yield (
-        "disturbance in the estimates",
-        "D_a Dd = 0: no estimate sees d directly",
-        residual(dy @ plant.Dd, factors=((dy, plant.Dd), (own_dy, plant.Dd))),
-        "our extension",
-    )
+    yield from _disturbance_identities(plant, observer, augmented, tracking, own_u, own_dy)
     wanted = {
         "state": (observer.state_rows, np.eye(plant.nx, augmented.order), "U_a E_a + D_a C_a = I, rows of the state"),
         "fault": (
@@ -176,116 +157,27 @@ def _identities(
     )
 
 
-def _stability_rows(design: ObserverDesign, poles: FloatArray, factor: FloatArray) -> Iterator[Check]:
-    (plant, observer), claims = design.linear, design.certificate.claims
-    dt = plant.dt
-    proof = prove_stable(observer.Az, factor, dt)
-    yield Check(
-        "stability",
-        "every error dies out: the Lyapunov inequality is positive definite",
-        proof.lower_bound,
-        0.0,
-        proof.lower_bound,
-        proof.proved,
-        "Share Pasand, eq. (7)",
-        "proved",
-        f"Cholesky with rounding bound {proof.error_bound:.1e}, on a unit diagonal",
+def _disturbance_identities(
+    plant: DescriptorSystem,
+    observer: LinearObserver,
+    augmented: AugmentedPlant,
+    tracking: FloatArray,
+    own_u: FloatArray,
+    own_dy: FloatArray,
+) -> Iterator[tuple[str, str, Residual, str]]:
+    by, dy = observer.By, observer.Dy
+    yield (
+        "disturbance in the error",
+        "U_a Bd_a = 0 (Bhat Dd, where d reaches y)",
+        residual(
+            tracking @ augmented.Bd, -by @ plant.Dd,
+            factors=((tracking, augmented.Bd), (by, plant.Dd), (own_u, augmented.Bd)),
+        ),
+        _PAPER,
+    )  # fmt: skip
+    yield (
+        "disturbance in the estimates",
+        "D_a Dd = 0: no estimate sees d directly",
+        residual(dy @ plant.Dd, factors=((dy, plant.Dd), (own_dy, plant.Dd))),
+        "our extension",
     )
-    claimed = [complex(*row) for row in poles]
-    yield upper_bound_check(
-        "poles",
-        "the eigenvalues of Ahat are the claimed ones",
-        spectrum_error(observer.Az, claimed, dt),
-        SPECTRUM_TOLERANCE,
-        source="Share Pasand, procedure 1, step 7",
-        detail="means are compared for multiple poles; " + _some(claimed),
-    )
-    rates = decay_rates(eigenvalues(observer.Az), dt)
-    slowest = float(np.min(rates, initial=np.inf))
-    if "decay" in claims:
-        yield lower_bound_check(
-            "decay",
-            "every mode decays at the claimed rate (1/s) or faster",
-            slowest,
-            claims["decay"] - CLAIM_TOLERANCE * abs(claims["decay"]) - _scatter(claimed, claims["decay"]),
-            source="recomputed eigenvalues",
-            detail=f"slowest time constant {1.0 / slowest:.3g} s" if slowest > 0.0 else "",
-        )
-    rounded = _rounded(observer.Az, PRINTED_DIGITS)
-    bound = 1.0 if dt > 0.0 else 0.0
-    found = abscissa(rounded, dt)
-    yield Check(
-        f"stable with {PRINTED_DIGITS} digits",
-        f"Ahat rounded to {PRINTED_DIGITS} significant digits is still stable (strictly below the bound)",
-        found,
-        bound,
-        bound - found,
-        bool(found < bound),
-        "ours: gains of high-order placements do not survive short printing",
-    )
-    yield information(
-        "digits needed",
-        "significant digits of Ahat with which every mode stays stable",
-        float(_least_digits(observer.Az, dt)),
-        source="recomputed eigenvalues",
-        detail=f"with {PRINTED_DIGITS} digits poles move by {spectrum_error(rounded, claimed, dt):.1e} of their size",
-    )
-
-
-def _scatter(claimed: list[complex], decay: float) -> float:
-    """Return how far rounding may scatter the slowest pole when it is a multiple one: a root of the unit roundoff."""
-    rates = [abs(pole) for pole in claimed if abs(abs(pole.real) - decay) <= CLAIM_TOLERANCE * max(decay, 1e-300)]
-    multiplicity = max((sum(abs(p - q) <= CLAIM_TOLERANCE * abs(p) for q in claimed) for p in claimed), default=1)
-    if multiplicity <= 1 or not rates:
-        return 0.0
-    return float(abs(decay) * (1e4 * np.finfo(np.float64).eps) ** (1.0 / multiplicity))
-
-
-def _some(poles: list[complex], most: int = 8) -> str:
-    shown = [number(pole) for pole in sorted(poles, key=lambda pole: -pole.real) if pole.imag >= 0.0]
-    return "slowest " + ", ".join(shown[:most]) if shown else "none"
-
-
-def _rounded(matrix: FloatArray, digits: int) -> FloatArray:
-    sizes = np.where(matrix != 0.0, np.abs(matrix), 1.0)
-    places = 10.0 ** (digits - 1 - np.floor(np.log10(sizes)))
-    return np.asarray(np.round(matrix * places) / places)
-
-
-def _least_digits(matrix: FloatArray, dt: float) -> int:
-    bound = 1.0 if dt > 0.0 else 0.0
-    stable = [abscissa(_rounded(matrix, digits), dt) < bound for digits in range(1, 17)]
-    return next((digits for digits in range(1, 17) if all(stable[digits - 1 :])), 17)
-
-
-def _noise_rows(design: ObserverDesign) -> Iterator[Check]:
-    (plant, observer), claims = design.linear, design.certificate.claims
-    rows = observer.Cz[observer.fault_rows]
-    direct = observer.Dy[observer.fault_rows]
-    discrete = float(plant.dt > 0.0)
-    unit = noise_covariance(observer.Az, observer.By, rows, discrete * direct, plant.dt)
-    if "noise_amplification" in claims:
-        largest = float(np.sqrt(np.max(np.maximum(np.diag(unit), 0.0), initial=0.0)))
-        yield upper_bound_check(
-            "noise amplification",
-            "H2 norm from white noise on every output to a fault estimate is at most the claimed one",
-            largest,
-            claims["noise_amplification"] * (1.0 + CLAIM_TOLERANCE),
-            source="recomputed, Lyapunov equation",
-            detail="outputs in their own units" + ("" if plant.dt else "; times the root of the sample time in s")
-            + (f"; besides, y enters fhat directly by {float(np.linalg.norm(direct, 2)):.3g}" if direct.any() else ""),
-        )  # fmt: skip
-    if not plant.nw:
-        return
-    tracking = design.certificate.matrices["tracking"][:, : plant.nx]
-    entering = tracking @ plant.Bw - observer.By @ plant.Dw
-    stated = noise_covariance(observer.Az, entering, rows, discrete * (direct @ plant.Dw), plant.dt)
-    for name, variance in zip(plant.fault_names, np.diag(stated), strict=True):
-        yield information(
-            f"noise in fhat[{name}]",
-            "standard deviation of the fault estimate under the stated noise"
-            + ("" if plant.dt else ", for a sample time of 1 s (times its root for others)"),
-            float(np.sqrt(max(variance, 0.0))),
-            source="recomputed, Lyapunov equation",
-            detail=plant.units.get(name, ""),
-        )

@@ -119,10 +119,9 @@ def region_gain(problem: KalmanProblem, region: Region, *, solver: str) -> tuple
     inverse = np.linalg.inv(change)
     f, c = inverse @ problem.F @ change, problem.C @ change
     estimates = problem.estimates @ change
-    entering = inverse @ np.hstack([problem.B, problem.drive, np.zeros((n, problem.background.shape[1]))])
-    direct = np.hstack([
-        problem.D, np.zeros((len(c), problem.drive.shape[1])), problem.background,
-    ])  # fmt: skip
+    # The drive is left out: the region says how fast the poles must be, and less noise is what is left to ask for.
+    entering = inverse @ np.hstack([problem.B, np.zeros((n, problem.background.shape[1]))])
+    direct = np.hstack([problem.D, problem.background])
     size = max(float(np.linalg.norm(estimates, 2)), 1e-300)
     weight = estimates.T @ estimates / size**2 + STATE_WEIGHT * np.eye(n)
     p, y = lmi.symmetric_variable(n), lmi.matrix_variable(n, c.shape[0])

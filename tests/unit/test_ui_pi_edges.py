@@ -1,0 +1,35 @@
+"""Plants at the edge: no faults, no disturbances, repeated disturbances, sensor faults, strange units."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from obsynth import DescriptorSystem, ui_pi_observer
+
+TWO = [[-1.0, 1.0], [0.0, -2.0]]
+PLANTS = {
+    "no fault, no disturbance": (DescriptorSystem(None, [[0, 1], [0, 0]], C=[[1, 0]]), "step"),
+    "double integrator": (DescriptorSystem(None, [[0, 1], [0, 0]], C=[[1, 0]], Bf=[[0], [1]]), "ramp"),
+    "disturbance alone": (DescriptorSystem(None, TWO, C=np.eye(2), Bd=[[1], [0]]), "step"),
+    "repeated disturbance": (DescriptorSystem(None, TWO, C=np.eye(2), Bf=[[0], [1]], Bd=[[1, 2], [0, 0]]), "step"),
+    "disturbance that acts nowhere": (DescriptorSystem(None, TWO, C=np.eye(2), Bf=[[0], [1]], Bd=[[0], [0]]), "step"),
+    "sensor fault": (DescriptorSystem(None, TWO, C=np.eye(2), Df=[[1], [0]]), "step"),
+    "sensor fault and disturbed sensor": (
+        DescriptorSystem(None, TWO, C=[[1, 0], [0, 1], [1, 1]], Df=[[1], [0], [0]], Dd=[[0], [1], [0]]), "ramp"),
+    "algebraic alone": (DescriptorSystem([[0]], [[1]], C=[[1]], Bf=[[1]]), "step"),
+    "feedthrough": (DescriptorSystem(None, [[1.0]], B=[[1]], C=[[1]], D=[[2]], Bf=[[1]], dt=0.1), "step"),
+    "index 2": (DescriptorSystem([[0, 1], [0, 0]], np.eye(2), C=np.eye(2), Bf=[[0], [1]]), "step"),
+    "units that differ by 1e11": (
+        DescriptorSystem(
+            None, [[-1e6, 1], [0, -2e-3]], C=[[1, 0], [0, 1e5]], Bf=[[1e6], [0]], Bd=[[0], [1e-3]]), "step"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_it_is_designed_and_passes(name: str) -> None:
+    plant, model = PLANTS[name]
+    design = ui_pi_observer(plant, fault_model=model)
+    assert design.report.passed
+    assert design.report["decoupling"].value < 1e-8
+    assert design.certificate.claims["decay"] > 0.0
