@@ -86,8 +86,8 @@ def proof_rows(design: ObserverDesign) -> Iterator[Check]:
 
 
 def _gain_row(design: ObserverDesign, kind: Literal["rate", "noise"], gain: float) -> Check:
-    observer = design.observer
-    entering = error_inputs(with_sensor_noise(design.plant), *stacked_gains(design), kind)
+    plant, observer = design.linear
+    entering = error_inputs(with_sensor_noise(plant), *stacked_gains(design), kind)
     found = prove_gain(
         observer.Az, entering, observer.Cz[observer.fault_rows], design.certificate.matrices[f"P_{kind}"], gain
     )
