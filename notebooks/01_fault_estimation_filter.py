@@ -28,7 +28,7 @@ from obsynth.numerics.norms import hinf_norm, spectral_radius
 from obsynth.plotting import plot_faults, plot_poles, plot_residuals
 from obsynth.simulation import simulate_plant
 from obsynth.spec import load_spec
-from obsynth.synthesis import gain_search, small_gains, lmi
+from obsynth.synthesis import gain_search, lmi, small_gains
 from obsynth.synthesis.methods.fault_estimation_filter import gain_problem
 
 np.set_printoptions(precision=4, suppress=True)
