@@ -7,7 +7,7 @@ from scipy.linalg import solve_discrete_are
 from obsynth.numerics.norms import hinf_norm, spectral_radius
 from obsynth.synthesis.central_filter import central_filter_at, central_injection, search_central_filter
 from obsynth.synthesis.gain_problem import GainProblem, Injection
-from obsynth.synthesis.riccati import doubled_riccati_solution
+from obsynth.synthesis.riccati import doubled_riccati_solution, gain_is_below
 
 
 def random_problem(rng, n=5, m=2, q=1, nd=3, free_weight=False):
@@ -68,3 +68,25 @@ def test_a_fixed_weight_is_left_alone():
     found = central_injection(problem, 1e3, noise=1e-2)
     assert isinstance(found, Injection)
     assert not np.any(found.V)
+
+
+@pytest.mark.parametrize("n", [1, 4, 30])
+def test_the_equation_tells_levels_above_the_norm_from_levels_below(n):
+    rng = np.random.default_rng(n)
+    for _ in range(20):
+        a = rng.normal(size=(n, n))
+        a *= rng.uniform(0.3, 0.99) / spectral_radius(a)
+        b, c, d = rng.normal(size=(n, 3)), rng.normal(size=(2, n)), rng.normal(size=(2, 3))
+        norm = hinf_norm(a, b, c, d).value
+        assert gain_is_below(a, b, c, d, 1.00001 * norm)
+        assert not gain_is_below(a, b, c, d, 0.9999 * norm)
+
+
+def test_many_states_are_judged_as_few_are():
+    problem = random_problem(np.random.default_rng(5), n=45, m=8, nd=6)
+    start = central_injection(problem, 1e6, noise=1e-1)
+    best, bound = search_central_filter(problem, start)
+    gain = problem.achieved_gain(best)
+    assert gain <= bound * (1.0 + 1e-6)
+    assert problem.reaches(best, 1.00001 * gain)
+    assert not problem.reaches(best, 0.9999 * gain)

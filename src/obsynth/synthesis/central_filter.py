@@ -18,7 +18,7 @@ from dataclasses import replace
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
-from obsynth.synthesis.gain_problem import GainProblem, Injection
+from obsynth.synthesis.gain_problem import MOST_STATES_FOR_NORMS, GainProblem, Injection
 from obsynth.synthesis.riccati import doubled_riccati_solution
 
 #: Artificial noise relative to the disturbance, in turn: the more of it, the better the equation is conditioned.
@@ -86,7 +86,7 @@ def central_filter_at(problem: GainProblem, level: float) -> Injection | None:
     work = with_least_weight(problem)
     for noise in NOISE_LADDER:
         found = central_injection(work, level, noise=noise)
-        if found is not None and problem.achieved_gain(found) < level:
+        if found is not None and problem.reaches(found, level):
             return found
     return None
 
@@ -97,7 +97,7 @@ def with_least_weight(problem: GainProblem) -> GainProblem:
 
 
 def search_central_filter(problem: GainProblem, start: Injection) -> tuple[Injection, float]:
-    """Return the best central filter found, one rung of noise after the other, and its true gain.
+    """Return the best central filter found, one rung of noise after the other, and (a bound on) its true gain.
 
     Each rung starts from the best gain so far, steps down from it in strides that grow, and bisects the last stride.
 
@@ -116,7 +116,7 @@ def search_central_filter(problem: GainProblem, start: Injection) -> tuple[Injec
                 break
             level = max(0.5 * (low + high), high * (1.0 - stride))
             found = central_injection(problem, level, noise=noise)
-            reached = np.inf if found is None else problem.achieved_gain(found)
+            reached = np.inf if found is None else _gain_of(problem, found, level)
             if found is not None and reached < gain:
                 best, gain = found, reached
             if reached <= level * (1.0 + NORM_ALLOWANCE):
@@ -125,6 +125,13 @@ def search_central_filter(problem: GainProblem, start: Injection) -> tuple[Injec
                 low = level
             high = min(high, gain) if gain > low else high
     return best, gain
+
+
+def _gain_of(problem: GainProblem, found: Injection, level: float) -> float:
+    """Return the true gain, or for many states just the level when it is reached."""
+    if problem.order <= MOST_STATES_FOR_NORMS:
+        return problem.achieved_gain(found)
+    return level if problem.reaches(found, level * (1.0 + NORM_ALLOWANCE)) else np.inf
 
 
 def least_noise_filter(problem: GainProblem) -> Injection | None:
@@ -161,7 +168,7 @@ def noise_weighted_filters(problem: GainProblem, gain: float) -> Iterator[Inject
             middle = (low + high) // 2
             both = _with_noise(work, NOISE_WEIGHTS[middle] * sizes[0] / sizes[1])
             found = central_injection(both, factor * gain, noise=NOISE_LADDER[-1])
-            if found is not None and problem.achieved_gain(found) <= gain:
+            if found is not None and problem.reaches(found, gain):
                 best, low = found, middle + 1
             else:
                 high = middle

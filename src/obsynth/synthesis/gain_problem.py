@@ -17,11 +17,13 @@ import numpy as np
 
 from obsynth.errors import SolverError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.norms import hinf_norm, output_covariance
-from obsynth.synthesis.riccati import bounded_real_matrix, normalising_change, stabilising_gain
+from obsynth.numerics.norms import hinf_norm, output_covariance, spectral_radius
+from obsynth.synthesis.riccati import bounded_real_matrix, gain_is_below, normalising_change, stabilising_gain
 
 #: The normalising Riccati solution is taken at this multiple of the starting filter's norm.
 NORMALISING_LEVEL = 1.3
+#: Up to so many states a gain is judged by its exact norm.
+MOST_STATES_FOR_NORMS = 40
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,6 +116,18 @@ class GainProblem:
     def noise_variance(self, solution: Injection) -> float:
         """Return the true total variance of xi under the noise of the problem, with the given gains."""
         return float(np.trace(output_covariance(*self.noise_loop(solution))))
+
+    def reaches(self, solution: Injection, level: float) -> bool:
+        """Return whether the true norm d -> xi is at most ``level``.
+
+        By the norm itself, or for many states by the solution of a Riccati equation, which takes products alone.
+        """
+        if self.order <= MOST_STATES_FOR_NORMS:
+            return self.achieved_gain(solution) <= level
+        a, b, z, zd = self.closed_loop(solution)
+        if not np.all(np.isfinite(a)) or spectral_radius(a) >= 1.0:
+            return False
+        return gain_is_below(a, b, z, zd, level)
 
     def achieved_gain(self, solution: Injection) -> float:
         """Return the true H-infinity norm d -> xi with the given gains."""

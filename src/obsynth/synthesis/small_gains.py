@@ -200,7 +200,7 @@ def _reaches(problem: GainProblem, injection: Injection, gain: float) -> bool:
         return False
     if problem.disturbances == 0:
         return spectral_radius(problem.closed_loop(injection)[0]) < 1.0
-    return problem.achieved_gain(injection) <= gain
+    return problem.reaches(injection, gain)
 
 
 def _with_scaled_noise(normalised: NormalisedProblem) -> GainProblem:
