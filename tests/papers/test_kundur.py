@@ -137,3 +137,18 @@ def test_other_unknown_inputs_are_refused(state: str) -> None:
     assert ("tm GENROU 1" in error.signals) == masked
     assert error.mode == (0.0 if masked else None)
     assert ("masked by the unknown input 'pref TGOV1 1'" in str(error)) == masked
+
+
+def test_the_fault_estimation_filter_of_the_same_network() -> None:
+    spec, expected = load_spec(FOLDER / "spec_fault_filter.yaml"), EXPECTED["fault_filter"]
+    assert spec.plant.nx == 52
+    filtered = obsynth.design(spec.plant, spec.method, name=spec.name, **spec.options)
+    assert filtered.report.passed
+    assert filtered.solver["engine"] == "riccati"
+    assert filtered.observer.fault_delays == (expected["fault_delay"],) * 4
+    assert filtered.certificate.claims["gamma"] == pytest.approx(expected["gamma"], rel=1e-3)
+    assert filtered.certificate.claims["gamma_min"] < 1e-4
+    found = [filtered.report[f"noise in fhat[{name}]"].value for name in spec.plant.fault_names]
+    assert found == pytest.approx(expected["deviations"], abs=1.5e-3)
+    radius = np.max(np.abs(np.linalg.eigvals(filtered.observer.Az)))
+    assert radius == pytest.approx(expected["spectral_radius"], abs=2e-5)

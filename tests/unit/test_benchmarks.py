@@ -1,0 +1,17 @@
+"""A small instance of each benchmark runs, so that none can rot; what it measures is no business of a test."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_the_fault_filter_benchmark_runs():
+    script = ROOT / "benchmarks" / "fault_estimation_filter.py"
+    done = subprocess.run([sys.executable, script, "--small"], capture_output=True, text=True, check=True)
+    rows = [line.strip("| ").split(" | ") for line in done.stdout.splitlines()[2:]]
+    assert [row[0] for row in rows] == ["6"]
+    gains = [float(cell.split(", ")[1]) for cell in rows[0][1:]]
+    # The bisection ends within 1e-4 of the least gain, the others much closer.
+    assert max(gains) <= min(gains) * (1.0 + 2e-4)
