@@ -16,6 +16,7 @@ if TYPE_CHECKING:
         SpecError,
         VerificationError,
     )
+    from obsynth.evaluation.simulating import Simulation, simulate
     from obsynth.models.descriptor import DescriptorSystem
     from obsynth.models.fault_models import FaultModel, fault_model
     from obsynth.models.time_varying import TimeVaryingDescriptorSystem
@@ -41,6 +42,9 @@ if TYPE_CHECKING:
     from obsynth.results.design import Certificate, ObserverDesign
     from obsynth.results.report import Check, VerificationReport
     from obsynth.results.serialise import load
+    from obsynth.simulation.failures import Gaussian, LostEffectiveness, Stuck, Uniform
+    from obsynth.simulation.profiles import Drift, Intermittent, Ramp, Sine, Step
+    from obsynth.simulation.scenario import Scenario
     from obsynth.simulation.time_varying import simulate_time_varying
     from obsynth.synthesis.steady_filter import SteadyState, steady_state_filter
     from obsynth.verification import verify
@@ -58,21 +62,32 @@ _HOMES = {
     "Decision": "obsynth.observers.decisions",
     "DeltaScan": "obsynth.results.delta_scan",
     "DescriptorSystem": "obsynth.models.descriptor",
+    "Drift": "obsynth.simulation.profiles",
     "Estimates": "obsynth.observers.linear",
     "FaultModel": "obsynth.models.fault_models",
+    "Gaussian": "obsynth.simulation.failures",
     "InfeasibleError": "obsynth.errors",
+    "Intermittent": "obsynth.simulation.profiles",
     "LinearObserver": "obsynth.observers.linear",
+    "LostEffectiveness": "obsynth.simulation.failures",
     "ObserverDesign": "obsynth.results.design",
     "ObsynthError": "obsynth.errors",
     "PreconditionError": "obsynth.errors",
+    "Ramp": "obsynth.simulation.profiles",
     "RecursiveEstimates": "obsynth.observers.recursive_estimates",
     "RecursiveObserver": "obsynth.observers.recursive",
     "RunningObserver": "obsynth.observers.linear",
     "RunningRecursiveObserver": "obsynth.observers.recursive_running",
+    "Scenario": "obsynth.simulation.scenario",
+    "Simulation": "obsynth.evaluation.simulating",
+    "Sine": "obsynth.simulation.profiles",
     "SolverError": "obsynth.errors",
     "SpecError": "obsynth.errors",
     "SteadyState": "obsynth.synthesis.steady_filter",
+    "Step": "obsynth.simulation.profiles",
+    "Stuck": "obsynth.simulation.failures",
     "TimeVaryingDescriptorSystem": "obsynth.models.time_varying",
+    "Uniform": "obsynth.simulation.failures",
     "VerificationError": "obsynth.errors",
     "VerificationReport": "obsynth.results.report",
     "adaptive_observer": "obsynth.pipeline.adaptive_observer",
@@ -93,6 +108,7 @@ _HOMES = {
     "pd_observer_from_gains": "obsynth.pipeline.pd_observer",
     "run_batch": "obsynth.observers.gain_schedule",
     "sample_observer": "obsynth.observers.sampling",
+    "simulate": "obsynth.evaluation.simulating",
     "simulate_time_varying": "obsynth.simulation.time_varying",
     "steady_state_filter": "obsynth.synthesis.steady_filter",
     "ui_pi_observer": "obsynth.pipeline.ui_pi_observer",
@@ -109,21 +125,32 @@ __all__ = [
     "Decision",
     "DeltaScan",
     "DescriptorSystem",
+    "Drift",
     "Estimates",
     "FaultModel",
+    "Gaussian",
     "InfeasibleError",
+    "Intermittent",
     "LinearObserver",
+    "LostEffectiveness",
     "ObserverDesign",
     "ObsynthError",
     "PreconditionError",
+    "Ramp",
     "RecursiveEstimates",
     "RecursiveObserver",
     "RunningObserver",
     "RunningRecursiveObserver",
+    "Scenario",
+    "Simulation",
+    "Sine",
     "SolverError",
     "SpecError",
     "SteadyState",
+    "Step",
+    "Stuck",
     "TimeVaryingDescriptorSystem",
+    "Uniform",
     "VerificationError",
     "VerificationReport",
     "adaptive_observer",
@@ -144,6 +171,7 @@ __all__ = [
     "pd_observer_from_gains",
     "run_batch",
     "sample_observer",
+    "simulate",
     "simulate_time_varying",
     "steady_state_filter",
     "ui_pi_observer",
