@@ -33,7 +33,27 @@ def test_every_linked_file_exists():
     assert [link for link in links if not (ROOT / link).exists()] == []
 
 
-@pytest.mark.parametrize("code", blocks("python"))
+SCENARIO = re.search(r"<!-- scenario -->\n```python\n(.*?)```", README, re.DOTALL).group(1)
+
+
+def test_the_scenario_does_what_its_comments_say(monkeypatch, capsys):
+    monkeypatch.chdir(ROOT)
+    namespace = {}
+    exec(SCENARIO, namespace)
+    assert capsys.readouterr().out.splitlines() == ["actuator 1", "0.0 1.0"]
+    assert namespace["watched"].watch(namespace["simulation"].estimates).time == 81.0
+    assert next(iter(namespace["spec"].scenario.faults["actuator 1"])).start == 80
+
+
+@pytest.mark.parametrize("command", re.findall(r"^obsynth (simulate --system .*)$", README, re.MULTILINE))
+def test_every_simulation_of_the_readme_runs(command, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    verb, flag, spec, *rest = command.split()
+    assert main([verb, flag, str(ROOT / spec), *rest, "--quiet"]) == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["run.csv"]
+
+
+@pytest.mark.parametrize("code", [code for code in blocks("python") if code != SCENARIO])
 def test_python_examples_run(code, tmp_path):
     result = subprocess.run(
         [sys.executable, "-W", "error", "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False

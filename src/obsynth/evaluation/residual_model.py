@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from obsynth.numerics.norms import output_covariance
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.drive import resolve
 from obsynth.simulation.failures import Random, Uniform
-from obsynth.simulation.profiles import sampled
+from obsynth.simulation.profiles import Additive, sampled
 from obsynth.simulation.scenario import Scenario
 from obsynth.verification.error_system import ErrorSystem
 
@@ -147,7 +148,7 @@ def _disturbances(
                 )
                 variances[i] += spread
             else:
-                fixed, calm = fixed + sampled(profile, steps, dt)[0], False
+                fixed, calm = fixed + sampled(cast(Additive, profile), steps, dt)[0], False
         bounds[i] += np.max(np.abs(fixed))
         steady.append(calm)
     return bounds, means, np.sqrt(variances), tuple(steady)

@@ -22,6 +22,13 @@ _LABELS = {
     "chi-square": "chi-square",
     "cusum": "CUSUM",
 }
+_THRESHOLDS = {
+    "paper": "(66): not a pointwise bound",
+    "pointwise": "pointwise bound",
+    "window": "bound over the window",
+    "chi-square": "threshold for Gaussian noise",
+    "cusum": "threshold for Gaussian noise",
+}
 #: Decades that a logarithmic axis shows below the lowest threshold.
 DECADES_BELOW = 3
 
@@ -88,7 +95,7 @@ def plot_detection(detection: Detection, *, dt: float, axes: Axes | None = None)
     deciding = np.isfinite(detection.threshold) & (detection.threshold > 0.0)
     shown = np.where(detection.values > 0.0, detection.values, np.nan)
     panel.plot(time, shown, label="residual" if "norm" in _LABELS[detection.kind] else "statistic", **RESIDUAL_STYLE)
-    panel.plot(time, np.where(deciding, detection.threshold, np.nan), label=f"threshold: {detection.kind}",
+    panel.plot(time, np.where(deciding, detection.threshold, np.nan), label=_THRESHOLDS[detection.kind],
                **THRESHOLD_STYLES[0])  # fmt: skip
     if np.any(~np.isnan(shown)):
         panel.set_yscale("log")
