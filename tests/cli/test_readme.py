@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from obsynth.cli.main import main
+from obsynth.simulation.failures import KINDS
 from obsynth.synthesis.methods import REGISTRY
 
 ROOT = Path(__file__).parents[2]
@@ -98,4 +99,6 @@ def test_the_example_spec_has_only_keys_that_exist(tmp_path):
     (tmp_path / "names.json").write_text('["omega 1", "tm 1", "v 3"]', encoding="utf-8")
     spec = load_spec(tmp_path / "spec.yaml")
     assert spec.plant.dt == 0.02
+    assert spec.scenario is not None
+    assert set(re.findall(r"`([a-z-]+)`", README[README.index("Kinds: `step`") :].split("\n\n")[0])) == set(KINDS)
     assert spec.plant.output_names == ("omega 1", "v 3")

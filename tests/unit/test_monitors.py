@@ -90,6 +90,46 @@ def test_the_papers_and_the_pointwise_threshold_have_their_formulas(wang) -> Non
     np.testing.assert_allclose(obsynth.monitor(design, scenario, **BOUNDS).threshold, exact, rtol=1e-9)
 
 
+def sampled_unknown_input_observer() -> obsynth.ObserverDesign:
+    plant = load_spec(DESIGNS / "sharepasand" / "spec.yaml").plant.replace(
+        Dw=0.1 * np.eye(2), Bw=np.zeros((3, 2)), noise_names=None
+    )
+    return obsynth.ui_pi_observer(obsynth.discretise(plant, 0.05).plant, fault_model="step")
+
+
+def lagging_filter() -> obsynth.ObserverDesign:
+    """Return a filter whose state estimate needs the fault of an older sample: its fault shows after two."""
+    plant = obsynth.DescriptorSystem(
+        None, [[0.5, 1.0, 0.0], [0.0, 0.4, 0.2], [0.1, 0.0, 0.3]], None, [[1.0, 0, 0], [0, 0, 1.0]],
+        Bf=[[0.0], [1.0], [0.0]], Bd=[[0.3], [0.1], [1.0]], Dw=0.1 * np.eye(2), Bw=np.zeros((3, 2)), dt=1.0,
+    )  # fmt: skip
+    design = obsynth.fault_estimation_filter(plant)
+    assert max(design.observer.fault_delays) == 2
+    return design
+
+
+@pytest.mark.parametrize("make", [sampled_unknown_input_observer, lagging_filter], ids=["ui-pi", "delay two"])
+def test_the_residual_model_says_what_the_observer_does(make) -> None:
+    """Plant and observer together against the error system, from rest, with disturbance and noise."""
+    design = make()
+    plant = design.plant
+    name = plant.disturbance_names[0]
+    scenario = obsynth.Scenario(
+        horizon=40 * plant.dt, noise=1, disturbances={name: obsynth.Uniform(low=-1, high=1)}, seed=3
+    )
+    simulation, model = obsynth.simulate(design, scenario), residual_model(design, scenario)
+    rng = np.random.default_rng(3)
+    disturbance = rng.uniform(-1, 1, 41)
+    noise = np.hstack([rng.standard_normal((41, plant.nw)), np.zeros((41, plant.ny))])
+    error = np.zeros(len(model.A))
+    for k in range(41):
+        expected = model.C @ error + model.Dd[:, 0] * disturbance[k] + model.Dw @ noise[k]
+        np.testing.assert_allclose(simulation.estimates.residuals[k], expected, rtol=0, atol=1e-10)
+        error = model.A @ error + model.Bd[:, 0] * disturbance[k] + model.Bw @ noise[k]
+    watched = obsynth.monitor(design, scenario, noise_bound=5.0)
+    assert watched.watch(simulation.estimates).k is None
+
+
 def test_a_bounded_disturbance_can_pass_the_papers_threshold_but_not_the_pointwise_one(wang) -> None:
     design, scenario = wang
     paper = obsynth.monitor(design, scenario, "paper", **BOUNDS).threshold[30]
@@ -282,6 +322,12 @@ def test_runs_do_not_depend_on_where_they_are_made(wang) -> None:
         with make(2) as executor:
             there = obsynth.evaluate(design, scenario, runs=700, monitor=watched, executor=executor)
         assert there.as_dict() == here.as_dict()
+
+
+def test_a_record_of_one_sample_has_no_errors(wang) -> None:
+    found = obsynth.evaluate(wang[0], wang[1].replace(horizon=0.5), runs=3)
+    assert found.fault_rmse["actuator 1"].count == 0
+    assert found.state_rmse["x2"].count == 3
 
 
 def test_a_run_can_be_replayed_by_its_seed(wang) -> None:

@@ -264,6 +264,32 @@ def test_feedback_makes_an_unstable_plant_last() -> None:
         obsynth.simulate(design, scenario.replace(stabilise=False, horizon=1000, sample_time=0.1))
 
 
+def test_feedback_of_a_discrete_plant_is_the_linear_quadratic_one() -> None:
+    a, b = np.array([[1.2, 0.3], [0.0, 0.7]]), np.array([[0.0], [1.0]])
+    plant = obsynth.DescriptorSystem(None, a, b, np.eye(2), dt=0.5)
+    scenario = obsynth.Scenario(horizon=10, initial_state={"x1": 1.0}, stabilise=True)
+    states, _, _ = moved(plant, scenario)
+    gain = np.asarray(control.dlqr(a, b, np.eye(2), np.eye(1))[0])
+    np.testing.assert_allclose(states[1:], states[:-1] @ (a - b @ gain).T, rtol=0, atol=1e-12)
+
+
+def test_process_noise_of_a_continuous_plant_has_its_stationary_variance() -> None:
+    """x' = -a x + s w has variance s^2 / (2 a), whatever the sampling."""
+    plant = obsynth.DescriptorSystem(None, [[-2.0]], None, [[1.0]], Bw=[[3.0]])
+    states, _, _ = moved(plant, obsynth.Scenario(horizon=5000, sample_time=0.5, noise=1))
+    # Samples a time constant apart: the standard deviation of the variance's estimate is about 2 %.
+    assert np.var(states[20:]) == pytest.approx(9.0 / 4.0, rel=0.08)
+
+
+def test_the_horizon_is_not_passed_and_has_a_limit() -> None:
+    plant = obsynth.DescriptorSystem(None, [[0.5]], None, [[1.0]], dt=0.1)
+    assert resolve(plant, obsynth.Scenario(horizon=0.3)).steps == 4
+    assert resolve(plant, obsynth.Scenario(horizon=0.39)).steps == 4
+    assert resolve(plant, obsynth.Scenario(horizon=0.05)).steps == 1
+    with pytest.raises(SpecError, match="shorten the horizon"):
+        resolve(plant, obsynth.Scenario(horizon=1e9))
+
+
 def test_what_no_feedback_can_stabilise_is_refused() -> None:
     plant = obsynth.DescriptorSystem(None, [[1.0, 0], [0, -1]], [[0.0], [1.0]], np.eye(2))
     with pytest.raises(PreconditionError) as caught:

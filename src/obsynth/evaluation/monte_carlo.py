@@ -162,7 +162,8 @@ def _trial(task: _Task) -> dict[str, FloatArray]:
         ("faults", observer.fault_rows, runs.faults, observer.fault_delays, task.warm_ups[1]),
     ):
         errors = aligned_errors(runs.rows[:, :, rows], truth, delays)[max(warm_up, *delays, 0) :]
-        found[name] = np.sqrt(np.mean(errors**2, axis=0))
+        # A record no longer than the delays has no error to speak of.
+        found[name] = np.sqrt(np.mean(errors**2, axis=0)) if len(errors) else np.full(errors.shape[1:], np.nan)
     count = len(task.seeds)
     false, found_at, wrong = np.full(count, np.nan), np.full(count, np.nan), np.full(count, np.nan)
     if task.watched is not None:

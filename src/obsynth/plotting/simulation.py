@@ -29,6 +29,11 @@ _THRESHOLDS = {
     "chi-square": "threshold for Gaussian noise",
     "cusum": "threshold for Gaussian noise",
 }
+#: An estimate whose typical step from sample to sample is this share of its range is a band, not a line.
+NOISY_SHARE = 0.05
+#: Such a band lies under the truth.
+_BAND = {"color": "0.7", "linewidth": 0.6, "linestyle": "-", "zorder": 1.8}
+_TRUTH_ON_BAND = {"color": "black", "linewidth": 1.8, "zorder": 2.5}
 #: Decades that a logarithmic axis shows below the lowest threshold.
 DECADES_BELOW = 3
 
@@ -61,6 +66,12 @@ def plot_simulation(
     panels = new_panels(None, count + len(detections))
     dt = float(simulation.time[1]) if len(simulation.time) > 1 else 1.0
     plot_faults(simulation.estimates, faults=simulation.faults, dt=dt, units=units, axes=panels[:count])
+    for panel, estimate in zip(panels[:count], simulation.estimates.faults.T, strict=True):
+        if np.median(np.abs(np.diff(estimate))) > NOISY_SHARE * np.ptp(estimate):
+            truth, band = panel.get_lines()
+            truth.set(**_TRUTH_ON_BAND)
+            band.set(**_BAND)
+            panel.legend(loc="best")
     for panel, detection in zip(panels[count:], detections, strict=True):
         plot_detection(detection, dt=dt, axes=panel)
     for panel in panels[:-1]:

@@ -12,8 +12,11 @@ from obsynth.models.descriptor import DescriptorSystem
 from obsynth.models.names import index_of
 from obsynth.numerics.arrays import FloatArray
 from obsynth.simulation.failures import LostEffectiveness, Random, Stuck
-from obsynth.simulation.profiles import Profile, sampled
+from obsynth.simulation.profiles import SAMPLE_SLACK, Profile, sampled
 from obsynth.simulation.scenario import Scenario
+
+#: A simulation holds every sample in memory: a typing error in a horizon must not fill it.
+MAXIMUM_SAMPLES = 5_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +114,12 @@ def resolve(plant: DescriptorSystem, scenario: Scenario) -> Drive:
     """
     scenario.check_names(plant)
     dt = scenario.step_of(plant)
-    steps = round(scenario.horizon / dt) + 1
+    if scenario.horizon / dt > MAXIMUM_SAMPLES:
+        raise SpecError(
+            f"{scenario.horizon:g} s are {scenario.horizon / dt:.3g} samples of {dt:g} s, more than "
+            f"{MAXIMUM_SAMPLES:,}: shorten the horizon.", path="horizon",
+        )  # fmt: skip
+    steps = int(scenario.horizon / dt + SAMPLE_SLACK) + 1
     names = (*plant.input_names, *plant.fault_names, *plant.disturbance_names)
     left, right = np.zeros((steps, len(names))), np.zeros((steps, len(names)))
     offsets = {"inputs": 0, "faults": plant.nu, "disturbances": plant.nu + plant.nf}
