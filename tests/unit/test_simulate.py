@@ -327,3 +327,15 @@ def test_the_file_holds_every_signal_to_the_last_bit(wang, tmp_path: Path) -> No
     np.testing.assert_array_equal([float(row["u2"]) for row in rows], found.inputs[:, 1])
     np.testing.assert_array_equal([float(row["fhat[actuator 1]"]) for row in rows], found.estimates.faults[:, 0])
     assert [item.name for item in tmp_path.iterdir()] == ["run.csv"]
+
+
+def test_an_output_may_have_the_name_of_an_input() -> None:
+    plant = obsynth.DescriptorSystem(
+        None, [[0.5]], [[1.0]], [[1.0]], Bf=[[1.0]], dt=1.0, input_names=["level"], output_names=["level"]
+    )
+    design = obsynth.fault_estimation_filter(plant)
+    found = obsynth.simulate(design, obsynth.Scenario(horizon=3, inputs={"level": obsynth.Step(size=2)}))
+    table = found.columns()
+    assert list(table)[:4] == ["time", "level", "y[level]", "x[x1]"]
+    np.testing.assert_array_equal(table["level"], 2.0)
+    np.testing.assert_allclose(table["y[level]"], [0.0, 2.0, 3.0, 3.5])

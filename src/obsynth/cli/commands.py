@@ -43,8 +43,8 @@ def run_design(options: argparse.Namespace) -> int:
         from obsynth.spec import load_spec
 
         spec = load_spec(options.system)
-        target = output_file(options.output, spec)
-        design = designed_from(spec, report_stage)
+        target = _output_file(options.output, spec)
+        design = _designed(spec, report_stage)
         file = design.save(target)
     if options.json:
         print_json({
@@ -58,7 +58,7 @@ def run_design(options: argparse.Namespace) -> int:
     return 0
 
 
-def designed_from(spec: Spec, report_stage: Any) -> ObserverDesign:
+def _designed(spec: Spec, report_stage: Any) -> ObserverDesign:
     """Return the design that a spec asks for, proved; stages go to ``report_stage``."""
     from obsynth.pipeline.designing import design
 
@@ -68,7 +68,7 @@ def designed_from(spec: Spec, report_stage: Any) -> ObserverDesign:
     )
 
 
-def output_file(wanted: Path | None, spec: Spec, *, option: str = "--output") -> Path:
+def _output_file(wanted: Path | None, spec: Spec, *, option: str = "--output") -> Path:
     """Return where to write; refuse a hopeless place before any work is done."""
     target = wanted if wanted is not None else Path(f"{spec.name}.gains.json")
     if target.is_dir():

@@ -93,11 +93,12 @@ class Simulation:
     def columns(self) -> dict[str, FloatArray]:
         """Return every column by name: ``time``, inputs and outputs, ``x[..]``, ``f[..]``, ``d[..]``, and estimates.
 
-        Estimates ``xhat[..]``, ``fhat[..]`` and residuals ``r[..]`` stand where the observer gave them.
+        An output with the name of an input is ``y[..]``.  Estimates ``xhat[..]``, ``fhat[..]`` and residuals ``r[..]``
+        stand where the observer gave them.
         """
         shown = self.estimates
         groups = (
-            ("{}", self.input_names, self.inputs), ("{}", self.output_names, self.outputs),
+            ("u[{}]", self.input_names, self.inputs), ("y[{}]", self.output_names, self.outputs),
             ("x[{}]", shown.state_names, self.states), ("f[{}]", shown.fault_names, self.faults),
             ("d[{}]", self.disturbance_names, self.disturbances), ("xhat[{}]", shown.state_names, shown.states),
             ("fhat[{}]", shown.fault_names, shown.faults), ("r[{}]", shown.residual_names, shown.residuals),
@@ -105,9 +106,9 @@ class Simulation:
         found = {"time": self.time}
         for form, names, values in groups:
             for i, name in enumerate(names):
-                key = form.format(name)
-                # An input may be named as an output is: both columns stay.
-                found[key if key not in found else f"y[{name}]"] = values[:, i]
+                # Inputs and outputs go by their own names, unless those are taken.
+                plain = form[0] in "uy" and name not in found
+                found[name if plain else form.format(name)] = values[:, i]
         return found
 
     def write_csv(self, path: str | Path) -> Path:
