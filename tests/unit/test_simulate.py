@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import pickle
 from pathlib import Path
 
 import control
@@ -99,6 +100,15 @@ def test_bad_profiles_and_scenarios_say_where(make, path: str) -> None:
     with pytest.raises(SpecError) as caught:
         make()
     assert caught.value.path == path
+
+
+def test_a_scenario_cannot_be_changed_and_travels(wang) -> None:
+    scenario = wang[1]
+    with pytest.raises(TypeError):
+        scenario.faults["actuator 1"] = ()
+    assert pickle.loads(pickle.dumps(scenario)) == scenario
+    assert scenario.replace(seed=7).replace(seed=2015) == scenario
+    assert scenario.replace(seed=7) != scenario
 
 
 # Discrete plants

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
+from types import MappingProxyType
 from typing import Any
 
 from obsynth.errors import SpecError
@@ -81,15 +82,20 @@ class Scenario:
         if isinstance(self.seed, bool) or not isinstance(self.seed, int) or self.seed < 0:
             raise SpecError(f"seed is {self.seed!r}: give a whole number, 0 or more.", path="seed")
         for group, (kinds, _) in _ALLOWED.items():
-            object.__setattr__(self, group, _checked_profiles(getattr(self, group), group, kinds))
+            object.__setattr__(self, group, MappingProxyType(_checked_profiles(getattr(self, group), group, kinds)))
         for name in ("sensor_noise", "initial_state"):
-            object.__setattr__(self, name, _checked_numbers(getattr(self, name), name))
+            object.__setattr__(self, name, MappingProxyType(_checked_numbers(getattr(self, name), name)))
         if any(value < 0.0 for value in self.sensor_noise.values()):
             raise SpecError("A standard deviation is negative.", path="sensor_noise")
         if self.observer_state is not None:
             if not all(map(_is_finite, self.observer_state)):
                 raise SpecError("observer_state must be finite numbers.", path="observer_state")
             object.__setattr__(self, "observer_state", tuple(map(float, self.observer_state)))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return what makes it again in another process: read-only mappings do not travel."""
+        given = {item.name: getattr(self, item.name) for item in fields(self)}
+        return _made, ({name: dict(value) if isinstance(value, Mapping) else value for name, value in given.items()},)
 
     def replace(self, **changes: Any) -> Scenario:
         """Return the scenario with some fields changed, such as its seed.
@@ -145,6 +151,10 @@ class Scenario:
                     index_of(name, getattr(plant, names), what="The plant")
                 except SpecError as error:
                     raise SpecError(str(error), path=f"{group}.{name}") from None
+
+
+def _made(given: dict[str, Any]) -> Scenario:
+    return Scenario(**given)
 
 
 def _is_finite(value: Any) -> bool:
