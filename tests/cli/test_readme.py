@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from obsynth.cli.main import main
+from obsynth.simulation.failures import KINDS
 from obsynth.synthesis.methods import REGISTRY
 
 ROOT = Path(__file__).parents[2]
@@ -33,7 +34,27 @@ def test_every_linked_file_exists():
     assert [link for link in links if not (ROOT / link).exists()] == []
 
 
-@pytest.mark.parametrize("code", blocks("python"))
+SCENARIO = re.search(r"<!-- scenario -->\n```python\n(.*?)```", README, re.DOTALL).group(1)
+
+
+def test_the_scenario_does_what_its_comments_say(monkeypatch, capsys):
+    monkeypatch.chdir(ROOT)
+    namespace = {}
+    exec(SCENARIO, namespace)
+    assert capsys.readouterr().out.splitlines() == ["actuator 1", "0.0 1.0"]
+    assert namespace["watched"].watch(namespace["simulation"].estimates).time == 81.0
+    assert next(iter(namespace["spec"].scenario.faults["actuator 1"])).start == 80
+
+
+@pytest.mark.parametrize("command", re.findall(r"^obsynth (simulate --system .*)$", README, re.MULTILINE))
+def test_every_simulation_of_the_readme_runs(command, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    verb, flag, spec, *rest = command.split()
+    assert main([verb, flag, str(ROOT / spec), *rest, "--quiet"]) == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["run.csv"]
+
+
+@pytest.mark.parametrize("code", [code for code in blocks("python") if code != SCENARIO])
 def test_python_examples_run(code, tmp_path):
     result = subprocess.run(
         [sys.executable, "-W", "error", "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
@@ -78,4 +99,6 @@ def test_the_example_spec_has_only_keys_that_exist(tmp_path):
     (tmp_path / "names.json").write_text('["omega 1", "tm 1", "v 3"]', encoding="utf-8")
     spec = load_spec(tmp_path / "spec.yaml")
     assert spec.plant.dt == 0.02
+    assert spec.scenario is not None
+    assert set(re.findall(r"`([a-z-]+)`", README[README.index("Kinds: `step`") :].split("\n\n")[0])) == set(KINDS)
     assert spec.plant.output_names == ("omega 1", "v 3")

@@ -16,6 +16,7 @@ IMPORT = "import obsynth"
 DESIGN_HELP = "from obsynth.cli.main import design_command as run; arguments = ['--help']"
 OBSYNTH_HELP = "from obsynth.cli.main import main as run; arguments = ['--help']"
 CHECK_HELP = "from obsynth.cli.main import main as run; arguments = ['check', '--help']"
+SIMULATE_HELP = "from obsynth.cli.main import main as run; arguments = ['simulate', '--help']"
 VERSION = "from obsynth.cli.main import main as run; arguments = ['--version']"
 RUN = """
 try:
@@ -43,8 +44,15 @@ def loaded_modules(program: str, names: tuple[str, ...]) -> str:
 
 @pytest.mark.parametrize(
     "program",
-    [IMPORT, DESIGN_HELP + RUN, OBSYNTH_HELP + RUN, CHECK_HELP + RUN, VERSION + RUN],
-    ids=["import obsynth", "design --help", "obsynth --help", "obsynth check --help", "obsynth --version"],
+    [IMPORT, DESIGN_HELP + RUN, OBSYNTH_HELP + RUN, CHECK_HELP + RUN, SIMULATE_HELP + RUN, VERSION + RUN],
+    ids=[
+        "import obsynth",
+        "design --help",
+        "obsynth --help",
+        "obsynth check --help",
+        "obsynth simulate --help",
+        "obsynth --version",
+    ],
 )
 def test_nothing_heavy_is_loaded(program: str) -> None:
     assert loaded_modules(program, HEAVY) == "LOADED []"

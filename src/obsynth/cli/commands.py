@@ -59,6 +59,7 @@ def run_design(options: argparse.Namespace) -> int:
 
 
 def _designed(spec: Spec, report_stage: Any) -> ObserverDesign:
+    """Return the design that a spec asks for, proved; stages go to ``report_stage``."""
     from obsynth.pipeline.designing import design
 
     recovery = None if spec.transformation is None else spec.transformation.recovery
@@ -67,15 +68,15 @@ def _designed(spec: Spec, report_stage: Any) -> ObserverDesign:
     )
 
 
-def _output_file(wanted: Path | None, spec: Spec) -> Path:
+def _output_file(wanted: Path | None, spec: Spec, *, option: str = "--output") -> Path:
     """Return where to write; refuse a hopeless place before any work is done."""
     target = wanted if wanted is not None else Path(f"{spec.name}.gains.json")
     if target.is_dir():
-        raise SpecError(f"{target} is a folder: give the name of a file to --output.", path=str(target))
+        raise SpecError(f"{target} is a folder: give the name of a file to {option}.", path=str(target))
     if not target.parent.is_dir():
         raise SpecError(f"The folder {target.parent} does not exist: {target} cannot be written.", path=str(target))
     if target.exists() and target.samefile(spec.path):
-        raise SpecError(f"{target} is the spec itself: give another file to --output.", path=str(target))
+        raise SpecError(f"{target} is the spec itself: give another file to {option}.", path=str(target))
     return target
 
 

@@ -66,6 +66,7 @@ def design_command(arguments: Sequence[str] | None = None) -> int:
 _DESIGN = "Design an observer from a spec, prove it, print a report and write the gain set."
 _CHECK = "Analyse the plant of a spec, and check for every method whether a design can exist."
 _VERIFY = "Verify a saved gain set again, from the plant and the shipped realisation alone."
+_SIMULATE = "Design an observer from a spec, and simulate it on the spec's scenario."
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -90,6 +91,13 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     _add_json(verify)
     verify.set_defaults(verb="verify")
+
+    simulate = verbs.add_parser("simulate", help=_SIMULATE, description=_SIMULATE)
+    _add_system(simulate)
+    simulate.add_argument("--out", type=Path, metavar="FILE", help="write every signal to this file (CSV)")
+    _add_json(simulate)
+    simulate.add_argument("--quiet", action="store_true", help="print no progress")
+    simulate.set_defaults(verb="simulate")
     return parser
 
 
@@ -124,9 +132,14 @@ def _digits(text: str) -> int:
 
 
 def _verb(name: str) -> Callable[[argparse.Namespace], int]:
-    from obsynth.cli import commands
+    from obsynth.cli import commands, simulating
 
-    return {"design": commands.run_design, "check": commands.run_check, "verify": commands.run_verify}[name]
+    return {
+        "design": commands.run_design,
+        "check": commands.run_check,
+        "verify": commands.run_verify,
+        "simulate": simulating.run_simulate,
+    }[name]
 
 
 def _run(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> int:

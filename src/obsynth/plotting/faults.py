@@ -71,7 +71,7 @@ def plot_faults(
     """
     steps, count = estimates.faults.shape
     truth = None if faults is None else _matching(faults, "faults", (steps, count))
-    panels = _panels(axes, count)
+    panels = new_panels(axes, count)
     time = dt * np.arange(steps)
     for i, (panel, name, delay) in enumerate(zip(panels, estimates.fault_names, estimates.fault_delays, strict=True)):
         if truth is not None:
@@ -81,7 +81,7 @@ def plot_faults(
         unit = (units or {}).get(name)
         panel.set_ylabel(f"{name} ({unit})" if unit else name)
         panel.legend(loc="best")
-        _tidy(panel)
+        tidy(panel)
     if panels:
         panels[-1].set_xlabel("time (s)")
     return panels
@@ -125,7 +125,7 @@ def plot_residuals(
         curves = {name: _curve(value, name, steps) for name, value in named.items()}
     if len(curves) > len(THRESHOLD_STYLES):
         raise SpecError(f"{len(curves)} thresholds are too many for one picture: give at most 3.", path="threshold")
-    (panel,) = _panels(None if axes is None else [axes], 1)
+    (panel,) = new_panels(None if axes is None else [axes], 1)
     time, size = dt * np.arange(steps), np.linalg.norm(estimates.residuals, axis=1)
     if np.any(size > 0.0):
         panel.set_yscale("log")
@@ -144,7 +144,7 @@ def plot_residuals(
     panel.set_ylabel("norm of the residual")
     panel.set_xlabel("time (s)")
     panel.legend(loc="best")
-    _tidy(panel)
+    tidy(panel)
     return panel
 
 
@@ -164,7 +164,7 @@ def plot_poles(design: ObserverDesign, *, axes: Axes | None = None) -> Axes:
         The complex plane.
     """
     if axes is None:
-        (axes,) = _panels(None, 1, size=(5.0, 5.4))
+        (axes,) = new_panels(None, 1, size=(5.0, 5.4))
     plant, observer = design.linear
     poles = np.linalg.eigvals(observer.Az)
     zeros = np.array([zero.value for zero in fault_zeros(plant).zeros], dtype=complex)
@@ -186,7 +186,7 @@ def plot_poles(design: ObserverDesign, *, axes: Axes | None = None) -> Axes:
     return axes
 
 
-def _panels(axes: Iterable[Axes] | None, count: int, *, size: tuple[float, float] | None = None) -> list[Axes]:
+def new_panels(axes: Iterable[Axes] | None, count: int, *, size: tuple[float, float] | None = None) -> list[Axes]:
     """Return ``count`` axes: the given ones, or new ones one above the other."""
     if axes is not None:
         given = list(np.ravel(np.asarray(axes, dtype=object)))
@@ -224,7 +224,8 @@ def _samples(count: int) -> str:
     return f"{count} sample" if count == 1 else f"{count} samples"
 
 
-def _tidy(panel: Axes) -> None:
+def tidy(panel: Axes) -> None:
+    """Give a panel a faint grid and no box."""
     panel.grid(True, color="0.9", linewidth=0.6)
     panel.set_axisbelow(True)
     for side in ("top", "right"):

@@ -103,7 +103,7 @@ def simulate_plant(
     elimination = eliminate_algebraic_states(plant)
     reduced, recovery = elimination.plant, elimination.recovery
     drive = _sum_of(signals, {"u": reduced.B, "f": reduced.Bf, "d": reduced.Bd, "w": reduced.Bw})
-    dynamic = _recursion(reduced.A, _dynamic_part(plant, recovery, start), drive)
+    dynamic = _recursion(reduced.A, dynamic_part(plant, recovery, start), drive)
     states = dynamic @ recovery.from_state.T + _sum_of(
         signals,
         {
@@ -148,7 +148,7 @@ def _sum_of(signals: dict[str, FloatArray], matrices: dict[str, FloatArray]) -> 
     return sum(others, start=first)
 
 
-def _dynamic_part(plant: DescriptorSystem, recovery: StateRecovery, state: FloatArray) -> FloatArray:
+def dynamic_part(plant: DescriptorSystem, recovery: StateRecovery, state: FloatArray) -> FloatArray:
     """Return the coordinates of the dynamic states with the same ``E x``; the rest of x adds nothing to it."""
     moving = plant.E @ recovery.from_state
     sizes = np.max(np.abs(moving), axis=1)

@@ -229,10 +229,17 @@ def _known_keys(location: Sequence[str | int]) -> list[str]:
         "<file>": schema.MatrixFile,
         "<inline>": schema.PlantSection,
         "<varying>": schema.TimeVaryingSection,
+        "<one>": schema.ProfileSection,
     }
-    by_name: dict[str, type[BaseModel]] = {"method": schema.MethodSection, "transform": schema.TransformSection}
+    by_name: dict[str, type[BaseModel]] = {
+        "method": schema.MethodSection,
+        "transform": schema.TransformSection,
+        "scenario": schema.ScenarioSection,
+    }
     if "<pick>" in location:
         return ["outputs" if "C" in location else "states", "file"]
+    if "<list>" in location and location[0] == "scenario":
+        return list(schema.ProfileSection.model_fields)
     around = location[-2]
     section: type[BaseModel] | None = by_tag.get(str(around)) or by_name.get(str(around))
     return list(section.model_fields) if section is not None else []

@@ -16,9 +16,11 @@ from obsynth.models.time_varying import TimeVaryingDescriptorSystem
 from obsynth.spec.checking import DocumentProblems, checked_plant, checked_spec
 from obsynth.spec.documents import read_names, read_yaml
 from obsynth.spec.matrices import read_matrix
+from obsynth.spec.scenarios import built_scenario
 
 if TYPE_CHECKING:
     from obsynth.analysis.transformations import Transformation
+    from obsynth.simulation.scenario import Scenario
     from obsynth.spec.schema import PlantSection, TimeVaryingSection, TransformSection
 
 _MATRICES = ("E", "A", "B", "C", "D", "Bf", "Df", "Bd", "Dd", "Bw", "Dw")
@@ -47,6 +49,8 @@ class Spec:
         Identifier of the method.
     options : mapping
         The options of the method that the spec gives, checked.
+    scenario : Scenario, optional
+        What `obsynth.simulate` is asked to let happen.
     """
 
     name: str
@@ -56,6 +60,7 @@ class Spec:
     transformation: Transformation | None
     method: str
     options: Mapping[str, Any]
+    scenario: Scenario | None = None
 
 
 def load_spec(path: str | Path) -> Spec:
@@ -94,6 +99,7 @@ def load_spec(path: str | Path) -> Spec:
     problems.raise_if_any()
     if hasattr(section, "kind"):
         varying = _varying_plant(section, plant_source, prefix)
+        built_scenario(checked.scenario, varying, source)
         return Spec(
             name=checked.name, description=checked.description or "", path=source, plant=varying, transformation=None,
             method=checked.method.id, options=options,
@@ -104,10 +110,11 @@ def load_spec(path: str | Path) -> Spec:
         transformation = _transformed(reference.transform, as_written, source, "plant")
     else:
         transformation = _transformed(section.transform, as_written, plant_source, prefix)
+    plant = as_written if transformation is None else transformation.plant
     return Spec(
-        name=checked.name, description=checked.description or "", path=source,
-        plant=as_written if transformation is None else transformation.plant, transformation=transformation,
-        method=checked.method.id, options=options,
+        name=checked.name, description=checked.description or "", path=source, plant=plant,
+        transformation=transformation, method=checked.method.id, options=options,
+        scenario=built_scenario(checked.scenario, plant, source),
     )  # fmt: skip
 
 

@@ -25,6 +25,7 @@ SCHEMA_VERSION = 1
 
 # Tags of unions appear in the locations of pydantic's errors; the bracket marks them for removal.
 _ROWS, _FILE, _PICK, _LIST, _INLINE, _VARYING = "<rows>", "<file>", "<pick>", "<list>", "<inline>", "<varying>"
+_ONE = "<one>"
 
 
 def _rectangular(rows: Any, check_entries: ValidatorFunctionWrapHandler) -> Any:
@@ -212,6 +213,55 @@ class MethodSection(Section):
     options: dict[str, Any] = Field(default_factory=dict)
 
 
+def _kind_of_profiles(value: Any) -> str:
+    return _LIST if isinstance(value, list) else _ONE
+
+
+class ProfileSection(Section):
+    """How a signal goes with time; which keys belong to which kind is checked when it is built."""
+
+    kind: Literal["step", "ramp", "sine", "drift", "intermittent", "stuck", "lost-effectiveness", "uniform", "gaussian"]
+    start: float | None = None
+    end: float | None = None
+    size: float | None = None
+    rate: float | None = None
+    amplitude: float | None = None
+    frequency: float | None = None
+    phase: float | None = None
+    time_constant: float | None = None
+    period: float | None = None
+    duty: float | None = None
+    value: float | None = None
+    share: float | None = None
+    low: float | None = None
+    high: float | None = None
+    deviation: float | None = None
+    mean: float | None = None
+
+
+Profiles = Annotated[
+    Annotated[ProfileSection, Tag(_ONE)] | Annotated[Annotated[list[ProfileSection], Field(min_length=1)], Tag(_LIST)],
+    Discriminator(_kind_of_profiles),
+]
+
+
+class ScenarioSection(Section):
+    """What happens in a simulation of the design."""
+
+    horizon: Positive
+    sample_time: Positive | None = None
+    inputs: dict[Text, Profiles] = Field(default_factory=dict)
+    faults: dict[Text, Profiles] = Field(default_factory=dict)
+    disturbances: dict[Text, Profiles] = Field(default_factory=dict)
+    sensors: dict[Text, Profiles] = Field(default_factory=dict)
+    noise: Annotated[float, Field(ge=0.0)] = 0.0
+    sensor_noise: dict[Text, Annotated[float, Field(ge=0.0)]] = Field(default_factory=dict)
+    seed: Annotated[int, Field(ge=0)] = 0
+    initial_state: dict[Text, float] = Field(default_factory=dict)
+    observer_state: Annotated[list[float], Field(min_length=1)] | None = None
+    stabilise: bool = False
+
+
 class SpecDocument(Section):
     """A whole spec."""
 
@@ -225,3 +275,4 @@ class SpecDocument(Section):
         Discriminator(_kind_of_plant),
     ]
     method: MethodSection
+    scenario: ScenarioSection | None = None

@@ -1,0 +1,51 @@
+"""The verb ``simulate``: a spec's design on the spec's scenario."""
+
+from __future__ import annotations
+
+import argparse
+
+from obsynth.cli.output import print_json, progress, stdout_console
+from obsynth.errors import SpecError
+
+
+def run_simulate(options: argparse.Namespace) -> int:
+    """Run ``simulate``: spec in, table of errors out, and every signal in a file if asked.
+
+    Parameters
+    ----------
+    options : argparse.Namespace
+        ``system``, ``out``, ``json``, ``quiet``.
+
+    Returns
+    -------
+    int
+        0; every failure is an error.
+
+    Raises
+    ------
+    ObsynthError
+        As its exit code says; nothing is written then.
+    """
+    from obsynth.cli.commands import _designed, _output_file
+    from obsynth.spec import load_spec
+
+    with progress(quiet=options.quiet) as report_stage:
+        report_stage(f"reading {options.system}")
+        spec = load_spec(options.system)
+        if spec.scenario is None:
+            raise SpecError(f"{spec.path} has no scenario: add one, for example scenario: {{horizon: 100}}.",
+                            path="scenario")  # fmt: skip
+        target = None if options.out is None else _output_file(options.out, spec, option="--out")
+        design = _designed(spec, report_stage)
+        report_stage("simulating")
+        from obsynth.evaluation.simulating import simulate
+
+        found = simulate(design, spec.scenario)
+        written = None if target is None else str(found.write_csv(target))
+    if options.json:
+        print_json({"command": "simulate", "spec": str(spec.path), "file": written, **found.summary()})
+        return 0
+    from obsynth.report.simulation import simulation_report
+
+    simulation_report(design.name, found, console=stdout_console(), units=design.linear[0].units, file=written)
+    return 0

@@ -1,0 +1,131 @@
+"""Thresholds for the norm of a residual: the paper's, one that is never passed without a fault, one for a window."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.evaluation.residual_model import ResidualModel
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.norms import hinf_norm
+
+
+def scaled_inputs(model: ResidualModel, bounds: FloatArray, noise_bound: float | None) -> tuple[FloatArray, FloatArray]:
+    """Return B and D with every input scaled to at most one in absolute value.
+
+    Parameters
+    ----------
+    model : ResidualModel
+        The residual's.
+    bounds : FloatArray
+        ``(nd,)``, of the disturbances.
+    noise_bound : float or None
+        What the noise never exceeds, in its standard deviations.
+
+    Raises
+    ------
+    SpecError
+        An input that reaches the residual has no bound.
+    """
+    reached = np.any(model.Bd != 0.0, axis=0) | np.any(model.Dd != 0.0, axis=0)
+    if np.any(reached & ~np.isfinite(bounds)):
+        raise SpecError(
+            "A disturbance has no bound (a Gaussian one has none): give disturbance_bounds, or use a statistical "
+            "threshold.", path="disturbance_bounds",
+        )  # fmt: skip
+    if model.noisy and noise_bound is None:
+        raise SpecError(
+            "Gaussian noise has no pointwise bound: say with noise_bound how many standard deviations yours never "
+            "exceeds, or use a statistical threshold.", path="noise_bound",
+        )  # fmt: skip
+    sizes = np.where(reached, bounds, 0.0)
+    factor = 0.0 if noise_bound is None else noise_bound
+    return np.hstack([model.Bd * sizes, factor * model.Bw]), np.hstack([model.Dd * sizes, factor * model.Dw])
+
+
+def paper_threshold(model: ResidualModel, bounds: FloatArray, initial_error: float, gamma: float | None) -> FloatArray:
+    """Return (66) of Wang et al. 2015 with the norm of the power where the paper has the power of the norm.
+
+    Parameters
+    ----------
+    model : ResidualModel
+        The residual's.
+    bounds : FloatArray
+        ``(nd,)``, of the disturbances.
+    initial_error : float
+        Norm of the error at the start.
+    gamma : float or None
+        l2 gain from the disturbances to the residual; computed by default.
+
+    Raises
+    ------
+    SpecError
+        A disturbance has no bound.
+    """
+    if not np.isfinite(bounds).all():
+        raise SpecError("The paper's threshold needs a bound of each disturbance.", path="disturbance_bounds")
+    gain = hinf_norm(model.A, model.Bd, model.C, model.Dd).upper if gamma is None else gamma
+    decay = np.array([np.linalg.norm(power, 2) for power in model.powers()])
+    return np.hypot(gain * float(np.linalg.norm(bounds)), float(np.linalg.norm(model.C, 2)) * decay * initial_error)
+
+
+def pointwise_threshold(model: ResidualModel, B: FloatArray, D: FloatArray, initial_error: float) -> FloatArray:
+    """Return what the norm of the residual never passes: exact initial-error term and l1 (peak) gains of each input.
+
+    Parameters
+    ----------
+    model : ResidualModel
+        The residual's.
+    B, D : FloatArray
+        Inputs of at most one in absolute value, see `scaled_inputs`.
+    initial_error : float
+        Norm of the error at the start, at most.
+    """
+    powers = model.powers()
+    start = np.array([np.linalg.norm(model.C @ power, 2) for power in powers]) * initial_error
+    gathered = np.array([np.sum(np.linalg.norm(model.C @ power @ B, axis=0)) for power in powers])
+    earlier = np.concatenate([[0.0], np.cumsum(gathered)[:-1]])
+    return np.asarray(start + earlier + np.sum(np.linalg.norm(D, axis=0)))
+
+
+def window_threshold(
+    model: ResidualModel, B: FloatArray, D: FloatArray, initial_error: float, window: int
+) -> FloatArray:
+    """Return what the l2 norm of the residual over the last ``window`` samples never passes.
+
+    The inputs give at most their l2 gain times ``sqrt(window m)``; the error at the window's start gives the square
+    root of its energy, bounded as the pointwise bound is.
+
+    Parameters
+    ----------
+    model : ResidualModel
+        The residual's.
+    B, D : FloatArray
+        m inputs of at most one in absolute value.
+    initial_error : float
+        Norm of the error at the start, at most.
+    window : int
+        Samples.
+    """
+    powers = model.powers()
+    inputs = int(np.sum(np.any(B != 0.0, axis=0) | np.any(D != 0.0, axis=0)))
+    gain = hinf_norm(model.A, B, model.C, D).upper if inputs else 0.0
+    bound = np.empty(model.steps)
+    energy = np.zeros_like(model.A)
+    roots = []
+    for power in powers[:window]:
+        shown = model.C @ power
+        energy = energy + shown.T @ shown
+        values, vectors = np.linalg.eigh((energy + energy.T) / 2.0)
+        roots.append(np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T)
+    for k in range(model.steps):
+        length = min(window, k + 1)
+        bound[k] = gain * np.sqrt(length * inputs) + (
+            0.0 if k + 1 > window else float(np.linalg.norm(roots[length - 1], 2)) * initial_error
+        )
+    full = roots[-1]
+    gathered = np.cumsum([0.0, *(np.sum(np.linalg.norm(full @ power @ B, axis=0)) for power in powers)])
+    for k in range(window, model.steps):
+        begin = k - window + 1
+        bound[k] += float(np.linalg.norm(full @ powers[begin], 2)) * initial_error + gathered[begin]
+    return bound

@@ -1,0 +1,158 @@
+"""From a design and a scenario to a monitor of the residual."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.evaluation.bench import Bench, make_bench
+from obsynth.evaluation.monitors import KINDS, STATEMENTS, Monitor
+from obsynth.evaluation.residual_model import ResidualModel, residual_model
+from obsynth.evaluation.thresholds import paper_threshold, pointwise_threshold, scaled_inputs, window_threshold
+from obsynth.evaluation.whitening import innovation_whitener, settled, steady_mean, whitener_of, window_covariance
+from obsynth.models.names import index_of
+from obsynth.numerics.arrays import FloatArray
+from obsynth.results.design import ObserverDesign
+from obsynth.simulation.scenario import Scenario
+
+#: What rounding may add to a residual, relative to the terms it is made of.
+ROUNDING_SHARE = 1e-10
+
+
+def monitor(
+    design: ObserverDesign,
+    scenario: Scenario,
+    kind: str = "pointwise",
+    *,
+    disturbance_bounds: Mapping[str, float] | None = None,
+    noise_bound: float | None = None,
+    initial_error: float | None = None,
+    gamma: float | None = None,
+    window: int = 20,
+    false_alarms: float = 0.01,
+    change: float = 1.0,
+    isolation_delay: int = 0,
+) -> Monitor:
+    """Return a threshold for the residual of a discrete design, and the statistic it belongs to.
+
+    Parameters
+    ----------
+    design : ObserverDesign
+        Of a linear method, discrete time, with residuals.
+    scenario : Scenario
+        Its length, start, disturbances and noise count; its faults do not.
+    kind : {"pointwise", "paper", "window", "chi-square", "cusum"}, optional
+        ``pointwise``: norm of the residual against its l1 (peak) bound, never passed without a fault.  ``paper``: the
+        same norm against (66) with the norm of the power, which is not a pointwise bound.  ``window``: l2 norm over a
+        window against the l2 gain and the energy of the error at its start.  ``chi-square``: a window of residuals in
+        the metric of its covariance.  ``cusum``: cumulative sums of the whitened residual, for small changes.
+    disturbance_bounds : mapping, optional
+        Largest absolute value of disturbances by name; those of the scenario by default.
+    noise_bound : float, optional
+        Standard deviations that no component of the noise exceeds; needed by ``pointwise`` and ``window`` where the
+        scenario has noise.
+    initial_error : float, optional
+        Bound on the norm of the observer's error at the start (``V E x - z``, with the tracking map V of the
+        certificate); that of the scenario by default.
+    gamma : float, optional
+        For ``paper``: l2 gain from the disturbances to the residual; computed by default.
+    window : int, optional
+        Samples that ``window``, ``chi-square`` and ``cusum`` look back.
+    false_alarms : float, optional
+        For ``chi-square`` and ``cusum``: probability of a false alarm in a whole run, at most.
+    change : float, optional
+        For ``cusum``: shift it is tuned for, in standard deviations of the whitened residual.
+    isolation_delay : int, optional
+        Samples from an alarm to the comparison of the fault estimates, where these answer later than the residual.
+
+    Returns
+    -------
+    Monitor
+        With a sentence that says what its threshold means.
+
+    Raises
+    ------
+    SpecError
+        A continuous or recursive design, an option out of range, a signal without a bound (or without a covariance),
+        or a record that is too short.
+    """
+    if kind not in KINDS:
+        raise SpecError(f"kind is {kind!r}: use one of {', '.join(KINDS)}.", path="kind")
+    _require_options(noise_bound, initial_error, gamma, window, false_alarms, change, isolation_delay)
+    model = residual_model(design, scenario)
+    start = model.initial_error if initial_error is None else float(initial_error)
+    bounds = _bounds(design, model, disturbance_bounds)
+    whitener, mean = np.zeros((0, 0)), np.zeros(len(model.C))
+    if kind == "paper":
+        threshold = paper_threshold(model, bounds, start, gamma)
+    elif kind in ("pointwise", "window"):
+        inputs = scaled_inputs(model, bounds, noise_bound)
+        threshold = (
+            pointwise_threshold(model, *inputs, start)
+            if kind == "pointwise"
+            else window_threshold(model, *inputs, start, window)
+        )
+    else:
+        covariance = window_covariance(model, window)
+        whitener = whitener_of(covariance) if kind == "chi-square" else innovation_whitener(covariance, len(model.C))
+        mean, threshold = steady_mean(model), _statistical(kind, model, len(whitener), start, window, false_alarms)
+    return Monitor(
+        kind, STATEMENTS[kind], threshold, _floor(make_bench(design, scenario), scenario), design.linear[0].dt, window,
+        mean, whitener, float(change), model.fault_scales(), design.linear[1].fault_names, isolation_delay,
+    )  # fmt: skip
+
+
+def _require_options(
+    noise_bound: float | None, initial_error: float | None, gamma: float | None, window: int, false_alarms: float,
+    change: float, isolation_delay: int,
+) -> None:  # fmt: skip
+    for name, value in (("noise_bound", noise_bound), ("initial_error", initial_error), ("gamma", gamma)):
+        if value is not None and not (math.isfinite(value) and value >= 0.0):
+            raise SpecError(f"{name} is {value}: give a number, 0 or more.", path=name)
+    for name, count, least in (("window", window, 1), ("isolation_delay", isolation_delay, 0)):
+        if isinstance(count, bool) or not isinstance(count, int) or count < least:
+            raise SpecError(f"{name} is {count!r}: give a whole number of samples, {least} or more.", path=name)
+    if not 0.0 < false_alarms < 1.0:
+        raise SpecError(f"false_alarms is {false_alarms}: give a probability between 0 and 1.", path="false_alarms")
+    if not (math.isfinite(change) and change > 0.0):
+        raise SpecError(f"change is {change}: give a positive number of deviations.", path="change")
+
+
+def _bounds(design: ObserverDesign, model: ResidualModel, given: Mapping[str, float] | None) -> FloatArray:
+    bounds = model.bounds.copy()
+    for name, value in (given or {}).items():
+        place = index_of(name, design.linear[0].disturbance_names, what="disturbance_bounds")
+        if not (math.isfinite(value) and value >= 0.0):
+            raise SpecError(f"The bound of {name!r} is {value}: give a number, 0 or more.", path="disturbance_bounds")
+        bounds[place] = float(value)
+    return bounds
+
+
+def _statistical(
+    kind: str, model: ResidualModel, degrees: int, start: float, window: int, false_alarms: float
+) -> FloatArray:
+    """Return thresholds by Bonferroni's inequality over all looks (chi-square), or Ville's over all sums (cusum)."""
+    from scipy.special import chdtri
+
+    threshold = np.full(model.steps, np.inf)
+    first = settled(model, start, window)
+    looks = model.steps - first
+    if kind == "chi-square":
+        threshold[first:] = float(chdtri(degrees, false_alarms / looks))
+    else:
+        # Two signs for each component; a sum may start at every look.
+        threshold[first:] = math.log(2 * degrees * looks / false_alarms)
+    return threshold
+
+
+def _floor(bench: Bench, scenario: Scenario) -> float:
+    """Return what rounding may add to the norm of the residual, from the size of what it is made of."""
+    runs, rows = bench.run([scenario.seed]), bench.observer.residual_rows
+    size = (
+        np.abs(runs.outputs) @ np.abs(bench.observer.Dy[rows]).T
+        + np.abs(runs.inputs) @ np.abs(bench.observer.Du[rows]).T
+    )
+    return ROUNDING_SHARE * float(np.max(np.linalg.norm(size, axis=2)))

@@ -1,0 +1,39 @@
+"""Exact steps of ``x' = A x + B s`` for signals that are linear between samples."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.scaling import power_of_two_below
+
+
+def first_order_hold(
+    a: FloatArray, inputs: FloatArray, step: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:  # fmt: skip
+    """Return Phi, Gamma0 and Gamma1 of ``x(h) = Phi x(0) + Gamma0 s(0) + Gamma1 (s(h) - s(0))``.
+
+    Parameters
+    ----------
+    a, inputs : FloatArray
+        ``(n, n)`` and ``(n, m)``.
+    step : float, seconds
+        ``h``.
+
+    Returns
+    -------
+    tuple of FloatArray
+        ``(n, n)``, ``(n, m)``, ``(n, m)``, from one balanced block exponential.
+    """
+    from scipy.linalg import expm, matrix_balance
+
+    n, m = inputs.shape
+    balanced, (scale, _) = matrix_balance(a, permute=False, separate=True)
+    scaled = inputs / scale[:, None]
+    # Large inputs would make the exponential square more often than the dynamics need.
+    sizes = power_of_two_below(np.max(np.abs(scaled), axis=0, initial=0.0))
+    chain = np.zeros((n + 2 * m, n + 2 * m))
+    chain[:n, :n], chain[:n, n : n + m], chain[n : n + m, n + m :] = balanced * step, scaled / sizes * step, np.eye(m)
+    row = expm(chain)[:n]
+    held, ramped = (scale[:, None] * block * sizes for block in (row[:, n : n + m], row[:, n + m :]))
+    return scale[:, None] * row[:, :n] / scale, held, ramped

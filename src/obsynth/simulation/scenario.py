@@ -1,0 +1,191 @@
+"""What happens to a plant in a simulation: inputs, faults, disturbances, sensors, noise, start and length."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from types import MappingProxyType
+from typing import Any
+
+from obsynth.errors import SpecError
+from obsynth.models.descriptor import DescriptorSystem
+from obsynth.models.names import index_of
+from obsynth.simulation.failures import RANDOM, LostEffectiveness, Stuck
+from obsynth.simulation.profiles import ADDITIVE, Profile
+
+#: What each group of signals may do, and the names of the plant's signals it speaks of.
+_ALLOWED: dict[str, tuple[tuple[type[Profile], ...], str]] = {
+    "inputs": (ADDITIVE, "input_names"),
+    "faults": ((*ADDITIVE, Stuck, LostEffectiveness), "fault_names"),
+    "disturbances": ((*ADDITIVE, *RANDOM), "disturbance_names"),
+    "sensors": ((*ADDITIVE, Stuck, LostEffectiveness), "output_names"),
+}
+Profiles = Mapping[str, Profile | Sequence[Profile]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scenario:
+    """What happens to a plant, signal by signal; profiles of one signal add up.
+
+    Parameters
+    ----------
+    horizon : float, seconds
+        Length; samples are at 0, dt, 2 dt, ... up to it.
+    sample_time : float, optional, seconds
+        Between samples; needed for a continuous plant, and a discrete one has its own.
+    inputs, faults, disturbances : mapping, optional
+        Profile, or list of them, by name of the signal; zero by default.  `Uniform` and `Gaussian` are for
+        disturbances.  `Stuck` and `LostEffectiveness` are for faults that enter where an input does.
+    sensors : mapping, optional
+        What is wrong with a sensor, by name of the output: a bias (`Step`), a `Ramp`, ..., `Stuck`,
+        `LostEffectiveness`.  The plant's model does not know of it.
+    noise : float, optional
+        The plant's own noise (``Bw, Dw``), as a multiple of what it states; 0 for none.
+    sensor_noise : mapping, optional
+        Standard deviation of more white noise by output, per sample.
+    seed : int, optional
+        Of `numpy.random.default_rng`.
+    initial_state : mapping, optional
+        Values at the start by name of the state; the others are zero.
+    observer_state : sequence of float, optional
+        ``z(0)`` of the observer; zero by default.
+    stabilise : bool, optional
+        Add a state feedback that stabilises the plant, for the simulation only (linear-quadratic, unit weights).
+
+    Raises
+    ------
+    SpecError
+        A number is out of range, or a profile stands where it cannot be.
+    """
+
+    horizon: float
+    sample_time: float | None = None
+    inputs: Profiles = field(default_factory=dict)
+    faults: Profiles = field(default_factory=dict)
+    disturbances: Profiles = field(default_factory=dict)
+    sensors: Profiles = field(default_factory=dict)
+    noise: float = 0.0
+    sensor_noise: Mapping[str, float] = field(default_factory=dict)
+    seed: int = 0
+    initial_state: Mapping[str, float] = field(default_factory=dict)
+    observer_state: Sequence[float] | None = None
+    stabilise: bool = False
+
+    def __post_init__(self) -> None:
+        for name in ("horizon", "sample_time"):
+            value = getattr(self, name)
+            if not (value is None and name == "sample_time") and not (_is_finite(value) and value > 0.0):
+                raise SpecError(f"{name} is {value!r}: give seconds, a positive number.", path=name)
+        if not (_is_finite(self.noise) and self.noise >= 0.0):
+            raise SpecError(f"noise is {self.noise!r}: give a factor, 0 or more.", path="noise")
+        if isinstance(self.seed, bool) or not isinstance(self.seed, int) or self.seed < 0:
+            raise SpecError(f"seed is {self.seed!r}: give a whole number, 0 or more.", path="seed")
+        for group, (kinds, _) in _ALLOWED.items():
+            object.__setattr__(self, group, MappingProxyType(_checked_profiles(getattr(self, group), group, kinds)))
+        for name in ("sensor_noise", "initial_state"):
+            object.__setattr__(self, name, MappingProxyType(_checked_numbers(getattr(self, name), name)))
+        if any(value < 0.0 for value in self.sensor_noise.values()):
+            raise SpecError("A standard deviation is negative.", path="sensor_noise")
+        if self.observer_state is not None:
+            if not all(map(_is_finite, self.observer_state)):
+                raise SpecError("observer_state must be finite numbers.", path="observer_state")
+            object.__setattr__(self, "observer_state", tuple(map(float, self.observer_state)))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return what makes it again in another process: read-only mappings do not travel."""
+        given = {item.name: getattr(self, item.name) for item in fields(self)}
+        return _made, ({name: dict(value) if isinstance(value, Mapping) else value for name, value in given.items()},)
+
+    def replace(self, **changes: Any) -> Scenario:
+        """Return the scenario with some fields changed, such as its seed.
+
+        Parameters
+        ----------
+        **changes
+            Any argument of the constructor.
+        """
+        return replace(self, **changes)
+
+    def step_of(self, plant: DescriptorSystem) -> float:
+        """Return the seconds between samples.
+
+        Parameters
+        ----------
+        plant : DescriptorSystem
+            Whose ``dt`` counts, where it has one.
+
+        Raises
+        ------
+        SpecError
+            The plant is continuous and the scenario has no sample time, or both have different ones.
+        """
+        if plant.is_discrete:
+            if self.sample_time is not None and self.sample_time != plant.dt:
+                raise SpecError(
+                    f"sample_time is {self.sample_time:g} s, but the plant has {plant.dt:g} s: leave it out.",
+                    path="sample_time",
+                )
+            return plant.dt
+        if self.sample_time is None:
+            raise SpecError("The plant is continuous: the scenario needs a sample_time.", path="sample_time")
+        return float(self.sample_time)
+
+    def check_names(self, plant: DescriptorSystem) -> None:
+        """Raise where a name is no signal of ``plant``.
+
+        Parameters
+        ----------
+        plant : DescriptorSystem
+            The plant that is to be simulated.
+
+        Raises
+        ------
+        SpecError
+            An unknown name, with the closest ones; ``path`` says where.
+        """
+        groups = {group: names for group, (_, names) in _ALLOWED.items()}
+        for group, names in {**groups, "sensor_noise": "output_names", "initial_state": "state_names"}.items():
+            for name in getattr(self, group):
+                try:
+                    index_of(name, getattr(plant, names), what="The plant")
+                except SpecError as error:
+                    raise SpecError(str(error), path=f"{group}.{name}") from None
+
+
+def _made(given: dict[str, Any]) -> Scenario:
+    return Scenario(**given)
+
+
+def _is_finite(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _checked_profiles(given: Any, group: str, kinds: tuple[type[Profile], ...]) -> dict[str, tuple[Profile, ...]]:
+    if not isinstance(given, Mapping):
+        raise SpecError(f"{group} must map names of signals to profiles.", path=group)
+    found = {}
+    for name, value in given.items():
+        profiles = (value,) if isinstance(value, Profile) else tuple(value) if isinstance(value, (list, tuple)) else ()
+        where = f"{group}.{name}"
+        if not profiles or not all(isinstance(profile, Profile) for profile in profiles):
+            raise SpecError(f"{name!r} needs a profile, or a list of them.", path=where)
+        for profile in profiles:
+            if not isinstance(profile, kinds):
+                raise SpecError(
+                    f"{type(profile).__name__} has no meaning among the {group}: use "
+                    f"{', '.join(kind.__name__ for kind in kinds)}.", path=where,
+                )  # fmt: skip
+        if len(profiles) > 1 and any(isinstance(profile, (Stuck, LostEffectiveness)) for profile in profiles):
+            raise SpecError("Stuck and LostEffectiveness must be a signal's only profile.", path=where)
+        found[str(name)] = profiles
+    return found
+
+
+def _checked_numbers(given: Any, name: str) -> dict[str, float]:
+    if not isinstance(given, Mapping):
+        raise SpecError(f"{name} must map names of signals to numbers.", path=name)
+    for key, value in given.items():
+        if not _is_finite(value):
+            raise SpecError(f"{key!r} is {value!r}: give a finite number.", path=f"{name}.{key}")
+    return {str(key): float(value) for key, value in given.items()}

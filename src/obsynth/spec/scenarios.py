@@ -1,0 +1,86 @@
+"""From the scenario of a document to one that can be simulated."""
+
+from __future__ import annotations
+
+from dataclasses import MISSING, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from obsynth.errors import SpecError
+from obsynth.models.descriptor import DescriptorSystem
+from obsynth.models.time_varying import TimeVaryingDescriptorSystem
+from obsynth.simulation.failures import KINDS
+from obsynth.simulation.profiles import Profile
+from obsynth.simulation.scenario import Scenario
+from obsynth.spec.checking import DocumentProblems
+
+if TYPE_CHECKING:
+    from obsynth.spec.schema import ProfileSection, ScenarioSection
+
+_GROUPS = ("inputs", "faults", "disturbances", "sensors")
+
+
+def built_scenario(
+    section: ScenarioSection | None, plant: DescriptorSystem | TimeVaryingDescriptorSystem, source: Path
+) -> Scenario | None:
+    """Return the scenario of a spec; `None` if it has none.
+
+    Parameters
+    ----------
+    section : ScenarioSection or None
+        As checked by the schema.
+    plant : DescriptorSystem or TimeVaryingDescriptorSystem
+        Whose signals it names, after the transformation.
+    source : Path
+        The spec, for messages.
+
+    Raises
+    ------
+    SpecError
+        A profile lacks a key or has one of another kind, a number is out of range, or a name is unknown.
+    """
+    if section is None:
+        return None
+    problems = DocumentProblems(source, what="spec")
+    if not isinstance(plant, DescriptorSystem):
+        problems.add("scenario", "scenarios are for linear time-invariant plants, and this one changes with k.")
+        problems.raise_if_any()
+        return None
+    given: dict[str, Any] = {name: getattr(section, name) for name in section.model_fields_set}
+    for group in _GROUPS:
+        given[group] = {
+            name: [_profile(item, f"scenario.{group}.{name}", problems) for item in _listed(value)]
+            for name, value in getattr(section, group).items()
+        }
+    problems.raise_if_any()
+    try:
+        scenario = Scenario(**given)
+        scenario.check_names(plant)
+        scenario.step_of(plant)
+    except SpecError as error:
+        problems.add(f"scenario.{error.path}", str(error))
+        problems.raise_if_any()
+    return scenario
+
+
+def _listed(value: Any) -> list[ProfileSection]:
+    return value if isinstance(value, list) else [value]
+
+
+def _profile(section: ProfileSection, where: str, problems: DocumentProblems) -> Profile | None:
+    """Return the profile; note what is wrong with it."""
+    kind = KINDS[section.kind]
+    given = {name: getattr(section, name) for name in section.model_fields_set - {"kind"}}
+    known = {field.name: field.default is MISSING for field in fields(kind)}
+    for name in given.keys() - known.keys():
+        problems.add(f"{where}.{name}", f"a {section.kind} has no {name}: it takes {', '.join(known)}.")
+    missing = [name for name, needed in known.items() if needed and name not in given]
+    for name in missing:
+        problems.add(f"{where}.{name}", f"a {section.kind} needs this key.")
+    if missing or given.keys() - known.keys():
+        return None
+    try:
+        return kind(**given)
+    except SpecError as error:
+        problems.add(f"{where}.{error.path}", str(error))
+        return None
