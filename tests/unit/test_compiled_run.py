@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from time_varying_plants import maximum_likelihood, observer_for, printed, record, textbook, varying
 
-from obsynth import PreconditionError, RecursiveObserver, SpecError, TimeVaryingDescriptorSystem
+from obsynth import PreconditionError, SpecError, TimeVaryingDescriptorSystem
 from obsynth.observers import compiled_run
 from obsynth.observers.recursive_running import RunningRecursiveObserver
 
