@@ -16,13 +16,12 @@ import numba
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.least_squares_step import SUSPECT_PARITY
 
 Function = TypeVar("Function", bound=Callable[..., object])
 
 #: Types of `square_root_steps`, so that it is compiled once for all sizes.
 VECTOR, MATRIX, STACK = "float64[::1]", "float64[:, ::1]", "float64[:, :, ::1]"
-SIGNATURE = f"int64({', '.join([VECTOR, MATRIX, *[STACK] * 3, *[MATRIX] * 4, STACK])})"
+SIGNATURE = f"int64({', '.join([VECTOR, MATRIX, *[STACK] * 3, *[MATRIX] * 4, STACK, 'float64'])})"
 
 
 def compiled(function: Function, signature: str | None = None) -> Function:
@@ -144,7 +143,7 @@ def _note_spreads(factor: FloatArray, deviations: FloatArray, covariance: FloatA
 
 def _steps(
     x: FloatArray, factor: FloatArray, moved: FloatArray, known: FloatArray, head: FloatArray, data: FloatArray,
-    states: FloatArray, innovations: FloatArray, deviations: FloatArray, covariances: FloatArray,
+    states: FloatArray, innovations: FloatArray, deviations: FloatArray, covariances: FloatArray, share: float,
 ) -> int:  # fmt: skip
     """See `square_root_steps`."""
     n, rows = moved.shape[1], moved.shape[2]
@@ -153,7 +152,7 @@ def _steps(
     sums, right = np.zeros(rows), np.zeros(rows)
     for k in range(len(data)):
         move, noise, top = moved[k % len(moved)], known[k % len(known)], head[k % len(head)]
-        suspect = SUSPECT_PARITY * math.sqrt(_fill(work, factor, move, noise))
+        suspect = share * math.sqrt(_fill(work, factor, move, noise))
         _triangularise(work, sums)
         for i in range(m):
             if not abs(work[i, i]) > suspect:
@@ -174,7 +173,7 @@ _compiled_steps = compiled(_steps, SIGNATURE)
 
 def square_root_steps(
     x: FloatArray, factor: FloatArray, moved: FloatArray, known: FloatArray, head: FloatArray, data: FloatArray,
-    states: FloatArray, innovations: FloatArray, deviations: FloatArray, covariances: FloatArray,
+    states: FloatArray, innovations: FloatArray, deviations: FloatArray, covariances: FloatArray, share: float,
 ) -> int:  # fmt: skip
     """Take steps of the square-root recursion until one needs a decision about a rank; return how many were taken.
 
@@ -199,5 +198,7 @@ def square_root_steps(
         ``(steps, nx)``: filled; standard deviations of the first nx entries of the state.
     covariances : FloatArray
         ``(steps, n - nx, n - nx)``: filled; of the others.
+    share : float
+        `SUSPECT_PARITY`, an argument because numba's cache does not see it change.
     """
-    return _compiled_steps(x, factor, moved, known, head, data, states, innovations, deviations, covariances)
+    return _compiled_steps(x, factor, moved, known, head, data, states, innovations, deviations, covariances, share)

@@ -17,6 +17,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.least_squares_step import SUSPECT_PARITY
 from obsynth.observers.recursive import RecursiveObserver
 from obsynth.observers.recursive_estimates import RecursiveEstimates, deviations_of
 from obsynth.observers.recursive_running import RawEstimate, RunningRecursiveObserver
@@ -185,7 +186,7 @@ def _kernel_steps(running: RunningRecursiveObserver, record: _Record, y: FloatAr
     x, factor = np.array(running.x), np.array(running.factor, order="C")
     states, innovations = np.empty((count, n)), np.empty((count, rows - n))
     deviations, covariances = np.empty((count, nx)), np.empty((count, n - nx, n - nx))
-    taken = square_root_steps(x, factor, *stack, states, innovations, deviations, covariances)
+    taken = square_root_steps(x, factor, *stack, states, innovations, deviations, covariances, SUSPECT_PARITY)
     kept = slice(first, first + taken)
     record.states[kept], record.parameters[kept] = states[:taken, :nx], states[:taken, nx:]
     record.deviations[kept], record.covariances[kept] = deviations[:taken], covariances[:taken]
