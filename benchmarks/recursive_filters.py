@@ -1,7 +1,8 @@
 """Steps per second of recursive filters on the same problem with E = I, in one run: ours and other packages.
 
 Usage: ``python benchmarks/recursive_filters.py``; packages that are not installed are left out.  One thread, processor
-time, best of several; all filters are compared first, so that nothing is timed that computes something else.
+time, best of several; all filters are compared first, so that nothing is timed that computes something else.  The time
+that the compiled kernel takes to load (or, the first time, to compile) is printed and not part of its rate.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+import importlib
 import importlib.util
 import platform
 import time
@@ -83,6 +85,12 @@ def ours(problem: Problem, *, adaptive: bool = False, varying: bool = False) -> 
     for k in range(STEPS):
         row = running.raw_step(problem.y[k], problem.u[k])
     return row.x
+
+
+def ours_compiled(problem: Problem, *, varying: bool = False) -> FloatArray:
+    """Run our observer over the record in the compiled kernel, estimates of every sample included."""
+    observer = observer_of(problem, adaptive=False, varying=varying)
+    return observer.run(problem.y, problem.u, compiled=True).states[-1]
 
 
 def by_filterpy(problem: Problem) -> FloatArray:
@@ -164,6 +172,8 @@ def rate(run: Callable[[], object], steps: int) -> float:
 CONTESTANTS: dict[str, tuple[str | None, Callable[[Problem], FloatArray]]] = {
     "obsynth, filter": (None, ours),
     "obsynth, filter, A as a stack": (None, lambda problem: ours(problem, varying=True)),
+    "obsynth, filter, compiled": ("numba", ours_compiled),
+    "obsynth, filter, compiled, A as a stack": ("numba", lambda problem: ours_compiled(problem, varying=True)),
     "filterpy": ("filterpy", by_filterpy),
     "filterpy, square root": ("filterpy", by_filterpy_square_root),
     "pykalman": ("pykalman", by_pykalman),
@@ -174,6 +184,10 @@ CONTESTANTS: dict[str, tuple[str | None, Callable[[Problem], FloatArray]]] = {
 def main() -> None:
     """Print the table."""
     print(f"Python {platform.python_version()}, numpy {np.__version__}, {platform.machine()}")
+    if importlib.util.find_spec("numba") is not None:
+        begin = time.perf_counter()
+        importlib.import_module("obsynth.numerics.compiled_steps")
+        print(f"The kernel was there after {time.perf_counter() - begin:.1f} s.")
     print("| steps per second | " + " | ".join(f"nx, ny, nq = {size}" for size in SIZES) + " |")
     print("| --- |" + " --- |" * len(SIZES))
     problems = [Problem.of(*size) for size in SIZES]

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-HEAVY = ("cvxpy", "control", "slycot", "matplotlib", "pydantic", "scipy.linalg")
+HEAVY = ("cvxpy", "control", "slycot", "matplotlib", "pydantic", "numba", "scipy.linalg")
 SOURCE = Path(__file__).parents[2] / "src"
 
 IMPORT = "import obsynth"
@@ -56,6 +56,16 @@ def loaded_modules(program: str, names: tuple[str, ...]) -> str:
 )
 def test_nothing_heavy_is_loaded(program: str) -> None:
     assert loaded_modules(program, HEAVY) == "LOADED []"
+
+
+def test_a_short_record_is_run_without_numba() -> None:
+    run = (
+        "import numpy as np, obsynth; from obsynth.observers.recursive import RecursiveObserver; "
+        "from obsynth.models.sequences import MatrixSequence as M; one = np.eye(1); "
+        "plant = obsynth.TimeVaryingDescriptorSystem(None, one, one, one, dt=1.0); "
+        "RecursiveObserver(plant, M.of(one, 'Q'), M.of(one, 'R'), [0.0], one, None).run(np.ones(9), np.ones(9))"
+    )
+    assert loaded_modules(run, ("numba", "scipy.linalg")) == "LOADED ['scipy.linalg']"
 
 
 def test_the_help_was_really_run() -> None:

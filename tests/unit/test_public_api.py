@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import inspect
 import pkgutil
 import re
@@ -13,6 +14,9 @@ import obsynth
 
 SECTION = re.compile(r"^(\w[\w ]*)\n-{3,}$", re.MULTILINE)
 
+#: Modules that cannot be imported without an optional package.
+OPTIONAL = {"obsynth.numerics.compiled_steps": "numba"}
+
 
 def public_modules():
     found = [
@@ -20,7 +24,8 @@ def public_modules():
         for module in pkgutil.walk_packages(obsynth.__path__, "obsynth.")
         if not any(part.startswith("_") for part in module.name.split("."))
     ]
-    return [importlib.import_module(name) for name in found]
+    there = [name for name in found if name not in OPTIONAL or importlib.util.find_spec(OPTIONAL[name]) is not None]
+    return [importlib.import_module(name) for name in there]
 
 
 def public_callables():

@@ -104,7 +104,8 @@ def projected_step(projection: Projection, noise: FloatArray, data: FloatArray) 
     n = len(projection.head)
     rows, columns = data.shape
     m = rows - n
-    suspect = SUSPECT_PARITY * math.sqrt(np.vdot(noise, noise)) if m else 0.0
+    flat = noise.ravel(order="K")
+    suspect = SUSPECT_PARITY * math.sqrt(flat.dot(flat)) if m else 0.0
     triangle = dgeqrf(noise, overwrite_a=1)[0]
     right = np.empty((n, columns + n), order="F")
     innovation = data[:m]

@@ -51,3 +51,12 @@ def checked_record(value: Any, columns: int, name: str) -> FloatArray:
     if array.shape[1] != columns:
         raise SpecError(f"{name} has shape {array.shape}, but the observer needs (samples, {columns}).", path=name)
     return array
+
+
+def whole_record(y: ArrayLike, u: ArrayLike | None, ny: int, nu: int) -> tuple[FloatArray, FloatArray]:
+    """Return outputs ``(samples, ny)`` and known inputs ``(samples, nu)``, optional when there are none."""
+    outputs = measured_record(y, ny)
+    inputs = checked_record(np.zeros((len(outputs), 0)) if u is None and not nu else u, nu, "u")
+    if len(inputs) != len(outputs):
+        raise SpecError(f"u has {len(inputs)} samples and y has {len(outputs)}: give the same number.", path="u")
+    return outputs, inputs

@@ -14,7 +14,7 @@ from obsynth.models.sequences import MatrixSequence
 from obsynth.models.time_varying import TimeVaryingDescriptorSystem
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.covariances import covariance_factor
-from obsynth.observers.records import checked_record, measured_record, require_horizon
+from obsynth.observers.records import require_horizon, whole_record
 
 if TYPE_CHECKING:
     from obsynth.observers.recursive_estimates import RecursiveEstimates
@@ -210,7 +210,7 @@ class RecursiveObserver:
 
         return RunningRecursiveObserver(self)
 
-    def run(self, y: ArrayLike, u: ArrayLike | None = None) -> RecursiveEstimates:
+    def run(self, y: ArrayLike, u: ArrayLike | None = None, *, compiled: bool | None = None) -> RecursiveEstimates:
         """Run over a whole record.
 
         Parameters
@@ -220,6 +220,9 @@ class RecursiveObserver:
             begins with y(1).
         u : array_like, optional
             Known inputs ``(samples, nu)``; may be left out when there are none.
+        compiled : bool, optional
+            Whether a kernel compiled by numba (`obsynth[fast]`) runs the same square-root recursion: always, never, or,
+            by default, for long records of small observers.  `obsynth.observers.compiled_run` says what it covers.
 
         Returns
         -------
@@ -229,18 +232,13 @@ class RecursiveObserver:
         Raises
         ------
         SpecError
-            Shapes do not fit, an input is not finite, or the record is longer than the plant's horizon.
+            Shapes do not fit, an input is not finite, or the record is longer than the plant's horizon; the kernel is
+            asked for, but numba is missing or parameters are estimated by least squares.
         PreconditionError
             Rank H_k is lost at some k (named) although no sample is missing.
         """
-        from obsynth.observers.recursive_estimates import RecursiveEstimates
+        from obsynth.observers.compiled_run import run_record
 
-        outputs = measured_record(y, self.plant.ny)
-        known = np.zeros((len(outputs), 0)) if u is None and not self.plant.nu else u
-        inputs = checked_record(known, self.plant.nu, "u")
-        if len(inputs) != len(outputs):
-            raise SpecError(f"u has {len(inputs)} samples and y has {len(outputs)}: give the same number.", path="u")
+        outputs, inputs = whole_record(y, u, self.plant.ny, self.plant.nu)
         require_horizon(self.plant.horizon, len(outputs), early=self.early_constraints)
-        running = self.start()
-        rows = [running.raw_step(outputs[k], inputs[k]) for k in range(len(outputs))]
-        return RecursiveEstimates.of(self, rows)
+        return run_record(self, outputs, inputs, compiled)

@@ -97,7 +97,7 @@ class RecursiveEstimates:
         parameters = np.array([row.parameters.theta for row in rows]).reshape(len(rows), nq)
         return cls(
             states=read_only(np.array([row.x for row in rows])),
-            state_deviations=read_only(np.array([_deviations(row) for row in rows])),
+            state_deviations=read_only(np.array([deviations_of(row) for row in rows])),
             parameters=read_only(parameters),
             parameter_covariances=read_only(spreads),
             innovations=read_only(innovations),
@@ -110,7 +110,14 @@ class RecursiveEstimates:
         )
 
 
-def _deviations(row: RawEstimate) -> FloatArray:
+def deviations_of(row: RawEstimate) -> FloatArray:
+    """Return standard deviations ``(nx,)`` of the states; infinite where one is undetermined.
+
+    Parameters
+    ----------
+    row : RawEstimate
+        Of an observer in motion.
+    """
     deviations = np.sqrt(np.einsum("ij,ij->i", row.factor, row.factor))
     open_states = (np.abs(row.diffuse) > UNDETERMINED_SHARE).any(axis=1)
     return np.where(open_states, np.inf, deviations)

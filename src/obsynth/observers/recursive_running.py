@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from typing import NamedTuple
 
@@ -14,14 +15,12 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.covariances import covariance_factor
 from obsynth.numerics.least_squares_step import (
     LeastSquaresStep,
-    Projection,
     least_squares_step,
-    projected_step,
-    projection_of,
     rank_revealing_step,
 )
 from obsynth.numerics.recursive_least_squares import ParameterState, start_of, update
 from obsynth.observers.literal_form import posterior_residual
+from obsynth.observers.prepared_step import PreparedStep
 from obsynth.observers.records import measured_record, require_horizon
 from obsynth.observers.recursive import RecursiveObserver
 from obsynth.observers.recursive_estimates import RecursiveEstimates
@@ -112,8 +111,7 @@ class RunningRecursiveObserver:
         self.alarm: ResetAlarm | None = None
         # What the literal form learns from where it is used, and the factorisation of a step that stays the same.
         self.lesson: tuple[FloatArray, FloatArray, FloatArray] | None = None
-        self.prepared_for: StepMatrices | None = None
-        self.prepared: tuple[Projection, FloatArray, FloatArray] | None = None
+        self.prepared: PreparedStep | None = None
         if adaptation is None:
             return
         spread = covariance_factor(adaptation.initial_covariance, "initial_covariance")
@@ -186,7 +184,8 @@ class RunningRecursiveObserver:
             right[:ne, 1:] = step.A @ self.Upsilon + step.Phi
             right[ne:, 1:] = -step.Psi
         found = None
-        if not (self.literal or self.diffuse.shape[1] or np.isnan(y).any()):
+        # The product is NaN exactly if a sample is.
+        if not (self.literal or self.diffuse.shape[1] or math.isnan(y.dot(y))):
             found = self._fast(step, right)
         if found is None:
             found = self._careful(step, right)
@@ -205,22 +204,9 @@ class RunningRecursiveObserver:
 
     def _fast(self, step: StepMatrices, right: FloatArray) -> LeastSquaresStep | None:
         """Take a step that is complete; what depends on the matrices alone is kept while they stay the same."""
-        if step is not self.prepared_for:
-            same = self.prepared_for is not None and self.prepared is not None and step.H is self.prepared_for.H
-            projection = self.prepared[0] if same and self.prepared is not None else projection_of(step.H)
-            self.prepared_for, self.prepared = step, None
-            if projection is not None:
-                rotation = projection.rotation
-                self.prepared = projection, rotation[:, : len(step.A)] @ step.A, (rotation @ step.noise).T
-        if self.prepared is None:
-            return None
-        projection, moved, known = self.prepared
-        width = self.factor.shape[1]
-        # As many rows as the projection has at least: what is missing (rectangular roots) are rows of zeros.
-        noise = np.zeros((max(width + len(known), len(right)), len(right)), order="F")
-        noise[:width] = (moved @ self.factor).T
-        noise[width : width + len(known)] = known
-        return projected_step(projection, noise, projection.rotation @ right)
+        if self.prepared is None or step is not self.prepared.step:
+            self.prepared = PreparedStep.of(step, self.prepared)
+        return self.prepared.taken(self.factor, right)
 
     def _careful(self, step: StepMatrices, right: FloatArray) -> LeastSquaresStep:
         """Take a step with missing samples, with undetermined directions, with perfect rows, or of the literal form."""

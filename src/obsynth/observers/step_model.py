@@ -80,8 +80,10 @@ class PlantSteps:
         self._constant: StepMatrices | None = None
         self._noise: FloatArray | None = None
         self._H: FloatArray | None = None
+        self._Dn = np.zeros((0, self.plant.nu))
         self._noise_is_constant = self.Q.is_constant and self.R.is_constant
         self._H_is_constant = self.plant.E.is_constant and self.plant.C.is_constant
+        self._is_constant = self._noise_is_constant and self._H_is_constant and self.plant.is_time_invariant
 
     def at(self, k: int) -> StepMatrices:
         """Return the matrices of the step from k to k + 1.
@@ -103,11 +105,8 @@ class PlantSteps:
         if H is None:
             H = np.asfortranarray(np.vstack([plant.E.at(k + 1), plant.C.at(k + 1)]))
             self._H = H if self._H_is_constant else None
-        found = StepMatrices(
-            H, plant.A.at(k), plant.B.at(k), plant.Phi.at(k), plant.Psi.at(k), np.zeros((0, plant.nu)), noise
-        )
-        constant = self._noise_is_constant and self._H_is_constant and plant.is_time_invariant
-        self._constant = found if constant else None
+        found = StepMatrices(H, plant.A.at(k), plant.B.at(k), plant.Phi.at(k), plant.Psi.at(k), self._Dn, noise)
+        self._constant = found if self._is_constant else None
         return found
 
 
