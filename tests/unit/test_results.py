@@ -444,3 +444,23 @@ class TestReport:
             with pytest.raises(SpecError) as caught:
                 verify(design, printed_digits=digits)
             assert caught.value.path == "printed_digits"
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"gamma": "a"}, {"gamma": [1.0]}, {"gamma": True}, {"tolerance": "x"}, {"gamma_margin": None},
+        {"residual_weight_limit": "2"}, {"free_residual_weight": "no"}, {"engine": "fast"},
+    ],
+    ids=str,
+)  # fmt: skip
+def test_options_of_a_wrong_type_are_named(options):
+    plant = obsynth.DescriptorSystem(None, [[0.5]], None, [[1.0]], Bf=[[1.0]], dt=0.1)
+    with pytest.raises(obsynth.SpecError, match=next(iter(options))):
+        obsynth.fault_estimation_filter(plant, **options)
+
+
+@pytest.mark.parametrize("plant", [None, {}, 3.0])
+def test_what_is_no_plant_is_refused(plant):
+    with pytest.raises(obsynth.SpecError, match="DescriptorSystem"):
+        obsynth.fault_estimation_filter(plant)

@@ -47,8 +47,8 @@ class Condition:
         """Raise `PreconditionError` when the condition fails."""
         if not self.holds:
             raise PreconditionError(
-                f"No such observer exists: the condition {self.name!r} fails ({self.source}). Needed: {self.claim}. "
-                f"Found: {self.detail}{_involved(self.signals, self.detail)}",
+                f"No observer of this kind exists: the condition {self.name!r} fails ({self.source}). "
+                f"Needed: {self.claim}. Found: {self.detail}{_involved(self.signals, self.detail)}",
                 condition=self.name,
                 mode=self.mode,
                 signals=self.signals,

@@ -103,6 +103,12 @@ def check(plant: Plant, options: Mapping[str, Mapping[str, Any]] | None = None) 
 
 def _kind_conditions(plant: Plant, method: str) -> tuple[Condition, ...]:
     """Return the failing condition where a method does not take plants that change with k, else nothing."""
+    if not isinstance(plant, (DescriptorSystem, TimeVaryingDescriptorSystem)):
+        raise SpecError(
+            f"The plant is a {type(plant).__name__}: give an obsynth.DescriptorSystem (or a "
+            "TimeVaryingDescriptorSystem).",
+            path="plant",
+        )
     if isinstance(plant, DescriptorSystem) or method in TIME_VARYING:
         return ()
     return (
@@ -196,7 +202,7 @@ def verified(
         failed = "; ".join(f"{row.name} ({row.value:.3g} against {row.bound:.3g})" for row in report.failures)
         raise VerificationError(
             f"Gains were found, but the shipped realisation fails: {failed}. Nothing was shipped; "
-            "rescale the plant, or ask for less (a larger gamma, a slower decay).",
+            "the plant may be badly scaled, or what was asked may be at the edge of what can be had: ask for less.",
             report=report,
         )
     return draft.replace(report=report)

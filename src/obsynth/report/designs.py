@@ -131,10 +131,13 @@ def _fault_estimates(design: ObserverDesign) -> Table:
         for name in observer.fault_names:
             table.add_row(Text(name), f"{number(deviations[f'noise in fhat[{name}]'])} {units.get(name, '')}".strip())
         return table
-    table = headed_table("fault", "delay in samples", "delay in s", "std under the stated noise")
+    sampled = observer.dt > 0.0
+    delays = ("delay in samples", "delay in s") if sampled else ()
+    noise = "std under the stated noise" + ("" if sampled else ", 1 s between samples")
+    table = headed_table("fault", *delays, noise)
     for name, delay in zip(observer.fault_names, observer.fault_delays, strict=True):
         deviation = deviations.get(f"noise in fhat[{name}]")
-        missing = "-" if design.linear[0].nw else "no noise stated"
+        missing = "depends on the sampling" if design.linear[0].nw else "no noise stated"
         shown = missing if deviation is None else f"{number(deviation)} {units.get(name, '')}".strip()
-        table.add_row(Text(name), str(delay), number(delay * observer.dt), Text(shown))
+        table.add_row(Text(name), *((str(delay), number(delay * observer.dt)) if sampled else ()), Text(shown))
     return table

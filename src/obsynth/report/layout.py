@@ -18,8 +18,8 @@ from obsynth.results.report import Check
 
 
 def number(value: float, *, digits: int = 4) -> str:
-    """Return ``value`` with a few significant digits; a dash for "not a number"."""
-    if math.isnan(value):
+    """Return ``value`` with a few significant digits; a dash for "not a number", whatever a changed file may hold."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or math.isnan(value):
         return "-"
     if math.isinf(value):
         return "inf" if value > 0 else "-inf"

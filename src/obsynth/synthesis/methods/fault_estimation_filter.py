@@ -82,7 +82,9 @@ class FilterOptions:
     tolerance: float = 1e-6
 
     def __post_init__(self) -> None:
-        problems = []
+        problems = self._wrong_types()
+        if problems:
+            raise SpecError("Options of fault-estimation-filter:", path="method.options", problems=problems)
         if self.gamma is not None and not (np.isfinite(self.gamma) and self.gamma > 0.0):
             problems.append(f"gamma is {self.gamma}: give a positive number, or none for the least.")
         if self.gamma_search not in ("direct", "bisection"):
@@ -105,6 +107,19 @@ class FilterOptions:
             problems.append("residual_weight_limit needs free_residual_weight: the weight is fixed otherwise.")
         if problems:
             raise SpecError("Options of fault-estimation-filter:", path="method.options", problems=problems)
+
+    def _wrong_types(self) -> list[str]:
+        optional = {"gamma": self.gamma, "residual_weight_limit": self.residual_weight_limit}
+        numbers: dict[str, object] = {name: value for name, value in optional.items() if value is not None}
+        numbers |= {"gamma_margin": self.gamma_margin, "tolerance": self.tolerance}
+        wrong = [
+            f"{name} is {value!r}: give a number."
+            for name, value in numbers.items()
+            if isinstance(value, bool) or not isinstance(value, (int, float))
+        ]
+        if self.free_residual_weight not in (None, True, False):
+            wrong.append(f"free_residual_weight is {self.free_residual_weight!r}: use True, False or None.")
+        return wrong
 
 
 def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **options: Any) -> Synthesis:
