@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from obsynth.analysis.structure import analyse_structure
     from obsynth.analysis.transformations import discretise, eliminate_algebraic_states
+    from obsynth.data.run import DataRun, run_on_data
     from obsynth.errors import (
         InfeasibleError,
         ObsynthError,
@@ -55,6 +56,7 @@ _HOMES = {
     "BatchEstimates": "obsynth.observers.gain_schedule",
     "Certificate": "obsynth.results.design",
     "Check": "obsynth.results.report",
+    "DataRun": "obsynth.data.run",
     "Decision": "obsynth.observers.decisions",
     "DeltaScan": "obsynth.results.delta_scan",
     "DescriptorSystem": "obsynth.models.descriptor",
@@ -92,6 +94,7 @@ _HOMES = {
     "pd_observer": "obsynth.pipeline.pd_observer",
     "pd_observer_from_gains": "obsynth.pipeline.pd_observer",
     "run_batch": "obsynth.observers.gain_schedule",
+    "run_on_data": "obsynth.data.run",
     "sample_observer": "obsynth.observers.sampling",
     "simulate_time_varying": "obsynth.simulation.time_varying",
     "steady_state_filter": "obsynth.synthesis.steady_filter",
@@ -106,6 +109,7 @@ __all__ = [
     "BatchEstimates",
     "Certificate",
     "Check",
+    "DataRun",
     "Decision",
     "DeltaScan",
     "DescriptorSystem",
@@ -143,6 +147,7 @@ __all__ = [
     "pd_observer",
     "pd_observer_from_gains",
     "run_batch",
+    "run_on_data",
     "sample_observer",
     "simulate_time_varying",
     "steady_state_filter",

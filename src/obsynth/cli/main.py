@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from obsynth import __version__
+from obsynth.cli.data_arguments import add_data_verbs
 from obsynth.cli.output import print_error, print_json
 from obsynth.errors import ObsynthError
 
@@ -90,6 +91,7 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     _add_json(verify)
     verify.set_defaults(verb="verify")
+    add_data_verbs(verbs)
     return parser
 
 
@@ -124,9 +126,12 @@ def _digits(text: str) -> int:
 
 
 def _verb(name: str) -> Callable[[argparse.Namespace], int]:
-    from obsynth.cli import commands
+    from obsynth.cli import commands, data_commands
 
-    return {"design": commands.run_design, "check": commands.run_check, "verify": commands.run_verify}[name]
+    return {
+        "design": commands.run_design, "check": commands.run_check, "verify": commands.run_verify,
+        "run": data_commands.run_run,
+    }[name]  # fmt: skip
 
 
 def _run(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> int:
