@@ -17,6 +17,7 @@ if TYPE_CHECKING:
         SpecError,
         VerificationError,
     )
+    from obsynth.exporting.files import export
     from obsynth.models.descriptor import DescriptorSystem
     from obsynth.models.fault_models import FaultModel, fault_model
     from obsynth.models.time_varying import TimeVaryingDescriptorSystem
@@ -85,6 +86,7 @@ _HOMES = {
     "design": "obsynth.pipeline.designing",
     "discretise": "obsynth.analysis.transformations",
     "eliminate_algebraic_states": "obsynth.analysis.transformations",
+    "export": "obsynth.exporting.files",
     "fault_estimation_filter": "obsynth.pipeline.fault_estimation_filter",
     "fault_estimation_filter_from_gains": "obsynth.pipeline.fault_estimation_filter",
     "fault_model": "obsynth.models.fault_models",
@@ -138,6 +140,7 @@ __all__ = [
     "design",
     "discretise",
     "eliminate_algebraic_states",
+    "export",
     "fault_estimation_filter",
     "fault_estimation_filter_from_gains",
     "fault_model",

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 _RUN = "Run a linear design on measured data: a log, or a stream on standard input, a row in, a row out."
+_EXPORT = "Write a linear gain set for Simulink (.mat), numpy (.npz) or C99 (.c and .h)."
 _RUN_DETAILS = """\
 The data have a column 'time' in seconds and one for each known input and output, by name.
 Each row of estimates has a status:
@@ -54,6 +55,15 @@ def add_data_verbs(verbs: Any) -> None:
     _add_json(run)
     run.add_argument("--quiet", action="store_true", help="print no progress and no summary")
     run.set_defaults(verb="run")
+
+    export = verbs.add_parser("export", help=_EXPORT, description=_EXPORT)
+    _add_gains(export)
+    export.add_argument("--to", type=Path, required=True, metavar="FILE", help=".mat, .npz, or .c (with a header)")
+    export.add_argument(
+        "--sample-time", type=float, metavar="SECONDS", help="sample a continuous-time observer (needed for C)"
+    )
+    _add_json(export)
+    export.set_defaults(verb="export")
 
 
 def _add_gains(parser: argparse.ArgumentParser) -> None:

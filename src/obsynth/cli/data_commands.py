@@ -61,6 +61,36 @@ def run_run(options: argparse.Namespace) -> int:
     return 0
 
 
+def run_export(options: argparse.Namespace) -> int:
+    """Run ``export``: gain set in, file for another program out.
+
+    Parameters
+    ----------
+    options : argparse.Namespace
+        ``gains``, ``to``, ``sample_time``, ``json``.
+
+    Returns
+    -------
+    int
+        0; every failure is an error.
+
+    Raises
+    ------
+    SpecError
+        The gain set is malformed or recursive, or the file cannot be written.
+    """
+    from obsynth.exporting.files import export
+    from obsynth.results.serialise import load
+
+    design = load(options.gains)
+    files = export(design, options.to, sample_time=options.sample_time)
+    if options.json:
+        print_json({"command": "export", "gains": str(options.gains), "files": [str(file) for file in files]})
+    else:
+        print(f"Written: {', '.join(map(str, files))}")
+    return 0
+
+
 def _target(options: argparse.Namespace) -> Path | TextIO:
     wanted: str = options.out
     if wanted == STREAM:

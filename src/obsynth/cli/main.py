@@ -130,7 +130,7 @@ def _verb(name: str) -> Callable[[argparse.Namespace], int]:
 
     return {
         "design": commands.run_design, "check": commands.run_check, "verify": commands.run_verify,
-        "run": data_commands.run_run,
+        "run": data_commands.run_run, "export": data_commands.run_export,
     }[name]  # fmt: skip
 
 
