@@ -39,6 +39,7 @@ if TYPE_CHECKING:
         pd_observer_from_gains,
     )
     from obsynth.pipeline.ui_pi_observer import ui_pi_observer, ui_pi_observer_from_gains
+    from obsynth.report.page import html_report
     from obsynth.results.delta_scan import DeltaScan
     from obsynth.results.design import Certificate, ObserverDesign
     from obsynth.results.report import Check, VerificationReport
@@ -91,6 +92,7 @@ _HOMES = {
     "fault_estimation_filter_from_gains": "obsynth.pipeline.fault_estimation_filter",
     "fault_model": "obsynth.models.fault_models",
     "fault_response": "obsynth.verification.fault_tracking",
+    "html_report": "obsynth.report.page",
     "load": "obsynth.results.serialise",
     "pd_delta_scan": "obsynth.pipeline.pd_observer",
     "pd_observer": "obsynth.pipeline.pd_observer",
@@ -145,6 +147,7 @@ __all__ = [
     "fault_estimation_filter_from_gains",
     "fault_model",
     "fault_response",
+    "html_report",
     "load",
     "pd_delta_scan",
     "pd_observer",

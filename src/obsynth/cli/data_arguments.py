@@ -8,6 +8,7 @@ from typing import Any
 
 _RUN = "Run a linear design on measured data: a log, or a stream on standard input, a row in, a row out."
 _EXPORT = "Write a linear gain set for Simulink (.mat), numpy (.npz) or C99 (.c and .h)."
+_REPORT = "Verify a gain set again and write one self-contained HTML page about it."
 _RUN_DETAILS = """\
 The data have a column 'time' in seconds and one for each known input and output, by name.
 Each row of estimates has a status:
@@ -64,6 +65,12 @@ def add_data_verbs(verbs: Any) -> None:
     )
     _add_json(export)
     export.set_defaults(verb="export")
+
+    report = verbs.add_parser("report", help=_REPORT, description=_REPORT)
+    _add_gains(report)
+    report.add_argument("--out", type=Path, required=True, metavar="FILE", help="the page (HTML)")
+    _add_json(report)
+    report.set_defaults(verb="report")
 
 
 def _add_gains(parser: argparse.ArgumentParser) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
 from obsynth.cli.output import print_json
-from obsynth.errors import SpecError
+from obsynth.errors import SpecError, VerificationError
 
 if TYPE_CHECKING:
     from obsynth.data.run import DataRun
@@ -89,6 +89,41 @@ def run_export(options: argparse.Namespace) -> int:
     else:
         print(f"Written: {', '.join(map(str, files))}")
     return 0
+
+
+def run_report(options: argparse.Namespace) -> int:
+    """Run ``report``: gain set in, verified again, one HTML page out.
+
+    Parameters
+    ----------
+    options : argparse.Namespace
+        ``gains``, ``out``, ``json``.
+
+    Returns
+    -------
+    int
+        0 if every check holds, else 6; the page is written in either case, and says so.
+
+    Raises
+    ------
+    SpecError
+        The gain set is malformed, or the page cannot be written.
+    """
+    from obsynth.results.serialise import load
+    from obsynth.verification import verify
+
+    if options.out.resolve() == options.gains.resolve():
+        raise SpecError(f"--out and --gains are the same file {options.out}: give another one.", path=str(options.out))
+    design = load(options.gains)
+    report = verify(design)
+    from obsynth.report.page import html_report
+
+    file = html_report(design, options.out, report=report, gains_file=options.gains.name)
+    if options.json:
+        print_json({"command": "report", "gains": str(options.gains), "file": str(file), "passed": report.passed})
+    else:
+        print(f"Written: {file}")
+    return 0 if report.passed else VerificationError.exit_code
 
 
 def _target(options: argparse.Namespace) -> Path | TextIO:

@@ -131,6 +131,7 @@ def _verb(name: str) -> Callable[[argparse.Namespace], int]:
     return {
         "design": commands.run_design, "check": commands.run_check, "verify": commands.run_verify,
         "run": data_commands.run_run, "export": data_commands.run_export,
+        "report": data_commands.run_report,
     }[name]  # fmt: skip
 
 
