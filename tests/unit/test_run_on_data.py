@@ -196,6 +196,19 @@ def test_a_bad_row_never_poisons_the_state(sampled, bad):
     assert np.abs(estimates(found, "xhat")[75:] - states[75:]).max() < 0.05 * np.abs(states).max()
 
 
+def test_a_model_that_has_lost_the_plant_is_dropped(continuous):
+    """The plant is unstable, 2/3 per second: after 100 s without sensors its model is off by e^66 times any error."""
+    times = 0.05 * np.arange(2600)
+    table = random_log(continuous, times)
+    table.iloc[300:2300, 1:] = np.nan
+    found = run_on_data(continuous, table).table
+    assert np.abs(estimates(found, "xhat")[2299]).max() > 1e20
+    assert found["status"][2300] == "warm-up"
+    before, after = (np.abs(estimates(found, "xhat")[rows]).max() for rows in (slice(100, 300), slice(2300, 2600)))
+    assert after < 3.0 * before
+    assert found["status"].iloc[-1] == "ok"
+
+
 def test_nothing_is_known_before_the_first_good_row(sampled):
     table, _ = log_of(sampled)
     table.iloc[:3, 1:] = np.nan

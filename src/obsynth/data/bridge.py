@@ -67,3 +67,20 @@ class Bridge:
     def outputs(self, state: FloatArray, u: FloatArray, fault: FloatArray) -> FloatArray:
         """Return the outputs ``(ny,)`` of a state."""
         return np.asarray(self.plant.C @ state + self.plant.D @ u + self.plant.Df @ fault)
+
+    def miss(self, v: FloatArray, state: FloatArray | None = None, fault: FloatArray | None = None) -> float:
+        """Return the distance between measured outputs and those of a state; of rest and no fault by default.
+
+        Parameters
+        ----------
+        v : FloatArray
+            ``[u, y]``.
+        state : FloatArray, optional
+            ``(nx,)``.
+        fault : FloatArray, optional
+            ``(nf,)``.
+        """
+        plant = self.plant
+        at = np.zeros(plant.nx) if state is None else state
+        f = np.zeros(plant.nf) if fault is None else fault
+        return float(np.linalg.norm(v[plant.nu :] - self.outputs(at, v[: plant.nu], f)))

@@ -128,8 +128,10 @@ def run_on_data(
     signals that are linear between rows.  In a row with a missing sample, and in a gap, the outputs of the plant model
     (faults held at their last estimate, unknown inputs zero, started from the last state estimate) stand in for the
     measured ones, so that the observer's state follows the model's; fault estimates are held, residuals are empty and
-    the status is ``gap``.  Plants of index 2 or more, whose model cannot be propagated, and gaps of more than 10,000
-    samples: the observer starts again after them.  Intervals are rounded to the resolution of the time stamps.
+    the status is ``gap``.  The observer starts again after a gap of more than 10,000 samples, where the model has lost
+    the plant (it misses the outputs by more than their size before and after the gap, as an unstable one will in the
+    end), and after every gap of a plant of index 2 or more, whose model cannot be propagated.  Intervals are rounded to
+    the resolution of the time stamps.
     """
     plant, observer = design.linear
     if isinstance(chunk_rows, bool) or not isinstance(chunk_rows, int) or chunk_rows < 1:

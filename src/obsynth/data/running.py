@@ -83,6 +83,7 @@ class DataObserver:
         self.row = np.full(len(self.observer.Cz), np.nan)
         self.model: FloatArray | None = None
         self.fault = np.zeros(len(self.observer.fault_names))
+        self.size = 0.0
         self.settled_at, self.phase = math.inf, WARM_UP
         self.inputs: deque[FloatArray] = deque(maxlen=max(lags) + 1)
 
@@ -116,12 +117,13 @@ class DataObserver:
         with np.errstate(over="ignore", invalid="ignore"):
             if missing:
                 self._bridge_interval(seconds, missing, u)
+                seconds = 0.0 if self.observer.dt == 0.0 else seconds
+            if good and self.model is not None and self._lost(seconds, values):
+                self._restart()
             if good and self.z is None:
                 self.z, self.settled_at, self.phase = np.zeros(self.observer.order), time + self.warm_up, WARM_UP
                 self.inputs.clear()
                 seconds = 0.0
-            elif missing:
-                seconds = 0.0 if self.observer.dt == 0.0 else seconds
             if good:
                 found = self._measured(seconds, values)
                 if self.model is not None:
@@ -142,8 +144,17 @@ class DataObserver:
         if self.observer.dt == 0.0:
             self._flow(seconds, v)
         self.row = np.asarray(self.observer.Cz @ self.z + self.d @ v)
+        if self.bridge is not None:
+            self.size = self.bridge.miss(v)
         self._taken(v)
         return self.row
+
+    def _lost(self, seconds: float, v: FloatArray) -> bool:
+        """Whether the model, after a gap, misses the outputs by more than their whole size before and after it."""
+        assert self.bridge is not None
+        self._propagate(seconds, v[: self.nu])
+        # The outputs and the model may both be huge; a miss that is not finite is lost as well.
+        return not self.bridge.miss(v, self.model, self.fault) <= self.size + self.bridge.miss(v)
 
     def _taken(self, v: FloatArray) -> None:
         assert self.z is not None
@@ -229,7 +240,8 @@ class DataObserver:
         return {
             "last": self.clock.last, "longest": self.clock.longest, "z": self.z, "v": self.v, "row": self.row,
             "model": self.model, "fault": self.fault, "settled_at": self.settled_at, "phase": self.phase,
-            "inputs": np.array(list(self.inputs)).reshape(-1, self.nu), "warm_up": self.warm_up, "gap": self.clock.gap,
+            "inputs": np.array(list(self.inputs)).reshape(-1, self.nu), "size": self.size,
+            "warm_up": self.warm_up, "gap": self.clock.gap,
         }  # fmt: skip
 
     def resume(self, data: dict[str, Any]) -> None:
@@ -252,5 +264,6 @@ class DataObserver:
         self.clock.last, self.clock.longest = data["last"], data["longest"]
         self.z, self.v, self.row, self.model = data["z"], data["v"], data["row"], data["model"]
         self.fault, self.settled_at, self.phase = data["fault"], data["settled_at"], data["phase"]
+        self.size = data["size"]
         self.inputs.clear()
         self.inputs.extend(data["inputs"])
