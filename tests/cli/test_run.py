@@ -194,3 +194,19 @@ def test_a_recursive_design_is_refused(capsys):
     assert run(Path("recursive.json")) == 2
     assert "no linear time-invariant observer" in capsys.readouterr().err
     assert not Path("estimates.csv").exists()
+
+
+def test_a_stream_that_breaks_off_saves_the_state_of_the_rows_that_were_answered(gains, monkeypatch, capsys):
+    """What has left on a stream cannot be taken back: the run goes on after the last good row."""
+    import io
+
+    log(*ROWS)
+    assert run(gains, "--quiet") == 0
+    whole = Path("estimates.csv").read_text().splitlines()
+    answers = []
+    for rows, code in ((["high,0,0,0,0,0"], 2), ([*ROWS[:4], ROWS[3]], 2), (ROWS[4:], 0)):
+        monkeypatch.setattr("sys.stdin", io.StringIO("\n".join([HEADER, *rows])))
+        assert run(gains, "--quiet", "--state", "state.json", data="-", out="-") == code
+        answers += capsys.readouterr().out.splitlines()[1:]
+        assert Path("state.json").exists() == (len(answers) > 0)
+    assert answers == whole[1:]

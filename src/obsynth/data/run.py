@@ -144,7 +144,7 @@ def run_on_data(
     with _sink(out, header) as sink:
         try:
             for chunk in chunks(data, job.signals, chunk_rows):
-                sink.write([job.take(row) for row in chunk])
+                sink.write(job.take(chunk))
                 if progress is not None:
                     progress(job.rows)
         finally:
@@ -190,17 +190,24 @@ class _Job:
         self.first, self.rows = FirstSecond(signals), 0
         self.statuses, self.alarms = Counter[str](), dict[str, float]()
 
-    def take(self, cells: FloatArray) -> list[Any]:
-        """Take ``[time, u, y]`` as read; return one row of output."""
-        time = float(cells[0])
-        deviations = self.signals.scale * cells[1:] - self.signals.offset
-        found = self.observer.step(time, deviations, self.rows + 1)
-        self.first.take(time, deviations)
-        self.rows += 1
-        self.statuses[found.status] += 1
-        values: list[float] = (found.values + self._point).tolist()
-        row: list[Any] = [time, found.status, *(time - lag for lag in self._lags), *values]
-        return [*row, self._alarm(time, found)] if self._levels else row
+    def take(self, chunk: FloatArray) -> list[list[Any]]:
+        """Take rows ``[time, u, y]`` as read; return rows of output."""
+        times: list[float] = chunk[:, 0].tolist()
+        found = []
+        for time, deviations in zip(times, self.signals.scale * chunk[:, 1:] - self.signals.offset, strict=True):
+            found.append(self.observer.step(time, deviations, self.rows + 1))
+            self.rows += 1
+            self.first.take(time, deviations)
+        values: list[list[float]] = (np.array([row.values for row in found]) + self._point).tolist()
+        self.statuses.update(row.status for row in found)
+        rows: list[list[Any]] = [
+            [time, row.status, *(time - lag for lag in self._lags), *estimates]
+            for time, row, estimates in zip(times, found, values, strict=True)
+        ]
+        if self._levels:
+            for time, row, cells in zip(times, found, rows, strict=True):
+                cells.append(self._alarm(time, row))
+        return rows
 
     def _alarm(self, time: float, found: Row) -> str:
         above = [

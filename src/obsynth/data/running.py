@@ -83,7 +83,7 @@ class DataObserver:
         self.row = np.full(len(self.observer.Cz), np.nan)
         self.model: FloatArray | None = None
         self.fault = np.zeros(len(self.observer.fault_names))
-        self.size = 0.0
+        self.measured = self.v
         self.settled_at, self.phase = math.inf, WARM_UP
         self.inputs: deque[FloatArray] = deque(maxlen=max(lags) + 1)
 
@@ -144,8 +144,7 @@ class DataObserver:
         if self.observer.dt == 0.0:
             self._flow(seconds, v)
         self.row = np.asarray(self.observer.Cz @ self.z + self.d @ v)
-        if self.bridge is not None:
-            self.size = self.bridge.miss(v)
+        self.measured = v
         self._taken(v)
         return self.row
 
@@ -154,13 +153,13 @@ class DataObserver:
         assert self.bridge is not None
         self._propagate(seconds, v[: self.nu])
         # The outputs and the model may both be huge; a miss that is not finite is lost as well.
-        return not self.bridge.miss(v, self.model, self.fault) <= self.size + self.bridge.miss(v)
+        return not self.bridge.miss(v, self.model, self.fault) <= self.bridge.miss(self.measured) + self.bridge.miss(v)
 
     def _taken(self, v: FloatArray) -> None:
         assert self.z is not None
         if self.observer.dt > 0.0:
             self.z = np.asarray(self.observer.Az @ self.z + self.b @ v)
-        self.v = v.copy()
+        self.v = v
         self.inputs.append(self.v[: self.nu])
 
     def _flow(self, seconds: float, v: FloatArray) -> None:
@@ -240,7 +239,7 @@ class DataObserver:
         return {
             "last": self.clock.last, "longest": self.clock.longest, "z": self.z, "v": self.v, "row": self.row,
             "model": self.model, "fault": self.fault, "settled_at": self.settled_at, "phase": self.phase,
-            "inputs": np.array(list(self.inputs)).reshape(-1, self.nu), "size": self.size,
+            "inputs": np.array(list(self.inputs)).reshape(-1, self.nu), "measured": self.measured,
             "warm_up": self.warm_up, "gap": self.clock.gap,
         }  # fmt: skip
 
@@ -264,6 +263,6 @@ class DataObserver:
         self.clock.last, self.clock.longest = data["last"], data["longest"]
         self.z, self.v, self.row, self.model = data["z"], data["v"], data["row"], data["model"]
         self.fault, self.settled_at, self.phase = data["fault"], data["settled_at"], data["phase"]
-        self.size = data["size"]
+        self.measured = data["measured"]
         self.inputs.clear()
         self.inputs.extend(data["inputs"])
