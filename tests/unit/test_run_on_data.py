@@ -406,6 +406,8 @@ def test_options_are_checked(sampled, continuous):
         run_on_data(continuous, table, chunk_rows=0)
     with pytest.raises(SpecError, match="no signal that this observer reads"):
         run_on_data(continuous, table, columns={"speed": "y1"})
+    with pytest.raises(SpecError, match="'time' is no signal"):
+        run_on_data(continuous, table, columns={"time": "time"}, scales={"time": 1e-3})
     with pytest.raises(SpecError, match="scale of 'y1'"):
         run_on_data(continuous, table, scales={"y1": 0.0})
     with pytest.raises(SpecError, match="no column 'fhat' to watch"):

@@ -67,7 +67,8 @@ class Signals:
         """
         names = observer.input_names + observer.output_names
         renamed, factors = dict(columns or {}), dict(scales or {})
-        unknown = [name for name in (*renamed, *factors) if name not in names and not (name == TIME in renamed)]
+        unknown = [name for name in renamed if name not in (TIME, *names)]
+        unknown += [name for name in factors if name not in names]
         if unknown:
             raise SpecError(
                 f"{unknown[0]!r} is no signal that this observer reads: it reads {', '.join(names)}.", path="columns"
