@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from obsynth.analysis.structure import analyse_structure
     from obsynth.analysis.transformations import discretise, eliminate_algebraic_states
+    from obsynth.data.run import DataRun, run_on_data
     from obsynth.errors import (
         InfeasibleError,
         ObsynthError,
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from obsynth.evaluation.monte_carlo import Evaluation, evaluate
     from obsynth.evaluation.simulating import Simulation, simulate
     from obsynth.evaluation.watching import monitor
+    from obsynth.exporting.files import export
     from obsynth.models.descriptor import DescriptorSystem
     from obsynth.models.fault_models import FaultModel, fault_model
     from obsynth.models.time_varying import TimeVaryingDescriptorSystem
@@ -42,6 +44,7 @@ if TYPE_CHECKING:
         pd_observer_from_gains,
     )
     from obsynth.pipeline.ui_pi_observer import ui_pi_observer, ui_pi_observer_from_gains
+    from obsynth.report.page import html_report
     from obsynth.results.delta_scan import DeltaScan
     from obsynth.results.design import Certificate, ObserverDesign
     from obsynth.results.report import Check, VerificationReport
@@ -63,6 +66,7 @@ _HOMES = {
     "BatchEstimates": "obsynth.observers.gain_schedule",
     "Certificate": "obsynth.results.design",
     "Check": "obsynth.results.report",
+    "DataRun": "obsynth.data.run",
     "Decision": "obsynth.observers.decisions",
     "DeltaScan": "obsynth.results.delta_scan",
     "DescriptorSystem": "obsynth.models.descriptor",
@@ -107,16 +111,19 @@ _HOMES = {
     "discretise": "obsynth.analysis.transformations",
     "eliminate_algebraic_states": "obsynth.analysis.transformations",
     "evaluate": "obsynth.evaluation.monte_carlo",
+    "export": "obsynth.exporting.files",
     "fault_estimation_filter": "obsynth.pipeline.fault_estimation_filter",
     "fault_estimation_filter_from_gains": "obsynth.pipeline.fault_estimation_filter",
     "fault_model": "obsynth.models.fault_models",
     "fault_response": "obsynth.verification.fault_tracking",
+    "html_report": "obsynth.report.page",
     "load": "obsynth.results.serialise",
     "monitor": "obsynth.evaluation.watching",
     "pd_delta_scan": "obsynth.pipeline.pd_observer",
     "pd_observer": "obsynth.pipeline.pd_observer",
     "pd_observer_from_gains": "obsynth.pipeline.pd_observer",
     "run_batch": "obsynth.observers.gain_schedule",
+    "run_on_data": "obsynth.data.run",
     "sample_observer": "obsynth.observers.sampling",
     "simulate": "obsynth.evaluation.simulating",
     "simulate_time_varying": "obsynth.simulation.time_varying",
@@ -132,6 +139,7 @@ __all__ = [
     "BatchEstimates",
     "Certificate",
     "Check",
+    "DataRun",
     "Decision",
     "DeltaScan",
     "DescriptorSystem",
@@ -176,16 +184,19 @@ __all__ = [
     "discretise",
     "eliminate_algebraic_states",
     "evaluate",
+    "export",
     "fault_estimation_filter",
     "fault_estimation_filter_from_gains",
     "fault_model",
     "fault_response",
+    "html_report",
     "load",
     "monitor",
     "pd_delta_scan",
     "pd_observer",
     "pd_observer_from_gains",
     "run_batch",
+    "run_on_data",
     "sample_observer",
     "simulate",
     "simulate_time_varying",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import subprocess
 import sys
@@ -79,6 +80,28 @@ def test_first_command_writes_the_file_it_names(tmp_path, monkeypatch, capsys):
     main(["design", "--system", str(ROOT / "designs/wang2015/spec.yaml"), "--quiet"])
     assert [path.name for path in tmp_path.iterdir()] == ["wang2015.gains.json"]
     assert "`wang2015.gains.json`" in README
+
+
+def test_the_tour_runs_on_a_log(tmp_path, monkeypatch, capsys):
+    """The three commands as printed, after the first one of the page, on a log with a gap."""
+    monkeypatch.chdir(tmp_path)
+    assert main(["design", "--system", str(ROOT / "designs/wang2015/spec.yaml"), "--quiet"]) == 0
+    rows = [f"{k},0.1,0,{0.2 * k},{-0.1 * k},{0.05 * k}" for k in range(30) if not 12 <= k < 15]
+    Path("log.csv").write_text("\n".join(["time,u1,u2,x2,x3,x4", *rows]) + "\n", encoding="utf-8")
+    commands = re.search(r"<!-- tour -->\n```sh\n(.*?)```\n<!-- end -->", README, re.DOTALL).group(1).splitlines()
+    assert len(commands) == 3
+    for command in commands:
+        program, *arguments = command.split()
+        assert program == "obsynth"
+        assert main(arguments) == 0
+    header, *estimates = Path("estimates.csv").read_text(encoding="utf-8").splitlines()
+    assert len(estimates) == len(rows)
+    assert header.split(",")[:4] == ["time", "status", "time of fhat[actuator 1]", "time of fhat[actuator 2]"]
+    assert {line.split(",")[1] for line in estimates} == {"warm-up", "ok", "recovering"}
+    assert "Verified: all" in Path("report.html").read_text(encoding="utf-8")
+    digest = json.loads(Path("wang2015.gains.json").read_text(encoding="utf-8"))["sha256"]
+    assert digest in Path("observer.h").read_text(encoding="utf-8")
+    assert digest in Path("report.html").read_text(encoding="utf-8")
 
 
 def test_every_method_is_in_the_table():

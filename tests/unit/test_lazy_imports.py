@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-HEAVY = ("cvxpy", "control", "slycot", "matplotlib", "pydantic", "numba", "scipy.linalg")
+HEAVY = ("cvxpy", "control", "slycot", "matplotlib", "pydantic", "numba", "scipy.linalg", "pandas", "pyarrow")
 SOURCE = Path(__file__).parents[2] / "src"
 
 IMPORT = "import obsynth"

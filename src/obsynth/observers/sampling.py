@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from obsynth.errors import SpecError
+from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear import LinearObserver
 
 
@@ -38,21 +39,40 @@ def sample_observer(observer: LinearObserver, dt: float) -> LinearObserver:
     SpecError
         The observer is discrete in time already, or ``dt`` is not positive and finite.
     """
-    from scipy.linalg import expm
-
     if observer.dt > 0.0:
         raise SpecError(f"The observer is discrete in time already (dt = {observer.dt:g} s).", path="dt")
     if not (math.isfinite(dt) and dt > 0.0):
         raise SpecError(f"dt is {dt}: give the seconds between two samples, a positive number.", path="dt")
-    n, inputs = observer.order, len(observer.input_names)
+    inputs = len(observer.input_names)
     b, d = np.hstack([observer.Bu, observer.By]), np.hstack([observer.Du, observer.Dy])
-    m = b.shape[1]
-    chain = np.zeros((n + 2 * m, n + 2 * m))
-    chain[:n, :n], chain[:n, n : n + m], chain[n : n + m, n + m :] = observer.Az * dt, b * dt, np.eye(m)
-    row = expm(chain)[:n]
-    transition, constant, ramp = row[:, :n], row[:, n : n + m], row[:, n + m :]
+    transition, constant, ramp = first_order_hold(observer.Az, b, dt)
     into, through = transition @ ramp + constant - ramp, d + observer.Cz @ ramp
     return replace(
         observer, Az=transition, Bu=into[:, :inputs], By=into[:, inputs:], Du=through[:, :inputs],
         Dy=through[:, inputs:], dt=dt,
     )  # fmt: skip
+
+
+def first_order_hold(a: FloatArray, b: FloatArray, dt: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    r"""Return the matrices of ``x' = a x + b v`` over an interval in which v is linear.
+
+    Parameters
+    ----------
+    a, b : FloatArray
+        ``(n, n)``, ``(n, m)``.
+    dt : float
+        Seconds, positive.
+
+    Returns
+    -------
+    tuple of FloatArray
+        ``Phi (n, n)``, ``Gamma_0 (n, m)``, ``Gamma_1 (n, m)`` of
+        ``x(t + dt) = Phi x(t) + Gamma_0 v(t) + Gamma_1 (v(t + dt) - v(t))``.
+    """
+    from scipy.linalg import expm
+
+    n, m = b.shape
+    chain = np.zeros((n + 2 * m, n + 2 * m))
+    chain[:n, :n], chain[:n, n : n + m], chain[n : n + m, n + m :] = a * dt, b * dt, np.eye(m)
+    row = expm(chain)[:n]
+    return row[:, :n], row[:, n : n + m], row[:, n + m :]

@@ -72,7 +72,7 @@ def design_report(design: ObserverDesign, *, console: Console, file: Path | None
         Where the gain set was written, or read from.
     """
     print_section(console, f"Design '{design.name}' by {design.method}", facts_table(plant_facts(design.plant)))
-    print_section(console, "What is promised", facts_table(_promises(design)))
+    print_section(console, "What is promised", facts_table(promises(design)))
     if design.observer.fault_names:
         heading = "Fault estimates" if isinstance(design.observer, LinearObserver) else "Parameter estimates"
         print_section(console, heading, _fault_estimates(design))
@@ -114,7 +114,19 @@ def _recovered_states(recovery: StateRecovery) -> Iterator[tuple[str, str]]:
         yield flag, f"{len(names_by_flag[flag])}: {name_list(names_by_flag[flag])}"
 
 
-def _promises(design: ObserverDesign) -> Iterator[tuple[str, str, str]]:
+def promises(design: ObserverDesign) -> Iterator[tuple[str, str, str]]:
+    """Yield name, value and meaning of what a design claims.
+
+    Parameters
+    ----------
+    design : ObserverDesign
+        A finished design.
+
+    Yields
+    ------
+    tuple of str
+        Name, value, meaning.
+    """
     for name, value in design.certificate.claims.items():
         yield name, number(value, digits=7), meaning_of(design.method, name)
     for check in design.report.checks:

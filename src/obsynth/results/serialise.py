@@ -93,8 +93,8 @@ def design_as_dict(design: ObserverDesign) -> dict[str, Any]:
     return {"kind": _KIND, "schema_version": SCHEMA_VERSION, "sha256": digest_of(body), "design": body}
 
 
-def write_atomically(path: str | Path, text: str) -> Path:
-    """Write ``text`` to ``path`` so that the file is there whole or not at all.
+def write_atomically(path: str | Path, content: str | bytes) -> Path:
+    """Write ``content`` (text as UTF-8) to ``path`` so that the file is there whole or not at all.
 
     Raises
     ------
@@ -107,8 +107,8 @@ def write_atomically(path: str | Path, text: str) -> Path:
     temporary = None
     try:
         handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=".part")
-        with os.fdopen(handle, "w", encoding="utf-8") as stream:
-            stream.write(text)
+        with os.fdopen(handle, "wb") as stream:
+            stream.write(content.encode() if isinstance(content, str) else content)
         # mkstemp makes private files; a result should have the permissions of any new file.
         mask = os.umask(0)
         os.umask(mask)

@@ -1,0 +1,1 @@
+"""Measured data: logs and streams in, estimates out."""

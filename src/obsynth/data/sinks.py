@@ -1,0 +1,145 @@
+"""Where estimates go: CSV and Parquet files that appear whole or not at all, data frames, and streams."""
+
+from __future__ import annotations
+
+import csv
+import os
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Protocol, TextIO
+
+from obsynth.data.sources import check_suffix
+from obsynth.errors import SpecError
+
+
+class Sink(Protocol):
+    """Takes rows of cells."""
+
+    def write(self, rows: Sequence[Sequence[Any]]) -> None:
+        """Take rows: texts, and numbers of which NaN is an empty cell."""
+        ...
+
+
+class TextSink:
+    """CSV to a text stream, flushed after each call.
+
+    Parameters
+    ----------
+    stream : TextIO
+        Where to.
+    header : sequence of str
+        Names of the columns.
+    """
+
+    def __init__(self, stream: TextIO, header: Sequence[str]) -> None:
+        self._stream = stream
+        self._writer = csv.writer(stream, lineterminator="\n")
+        self._writer.writerow(header)
+
+    def write(self, rows: Sequence[Sequence[Any]]) -> None:
+        """Write rows; floats so that they are read back bit for bit."""
+        self._writer.writerows([["" if cell != cell else cell for cell in row] for row in rows])
+        self._stream.flush()
+
+
+class FrameSink:
+    """Rows to a data frame.
+
+    Parameters
+    ----------
+    header : sequence of str
+        Names of the columns.
+    """
+
+    def __init__(self, header: Sequence[str]) -> None:
+        self._header, self._rows = list(header), list[Sequence[Any]]()
+
+    def write(self, rows: Sequence[Sequence[Any]]) -> None:
+        """Keep rows."""
+        self._rows.extend(rows)
+
+    def frame(self) -> Any:
+        """Return the data frame."""
+        import pandas as pd
+
+        return pd.DataFrame(self._rows, columns=self._header)
+
+
+class ParquetSink:
+    """Rows to a Parquet file, one row group for each call.
+
+    Parameters
+    ----------
+    path : str
+        The file.
+    header : sequence of str
+        Names of the columns.
+    texts : set of str
+        The columns that hold text.
+    """
+
+    def __init__(self, path: str, header: Sequence[str], texts: set[str]) -> None:
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        self._schema = pa.schema([(name, pa.string() if name in texts else pa.float64()) for name in header])
+        self._writer = pq.ParquetWriter(path, self._schema)
+
+    def write(self, rows: Sequence[Sequence[Any]]) -> None:
+        """Write one row group."""
+        import pyarrow as pa
+
+        columns = [pa.array(list(cells), field.type) for cells, field in zip(zip(*rows, strict=True), self._schema,
+                                                                             strict=True)]  # fmt: skip
+        self._writer.write_table(pa.Table.from_arrays(columns, schema=self._schema))
+
+    def close(self) -> None:
+        """Finish the file."""
+        self._writer.close()
+
+
+@contextmanager
+def file_sink(path: Path, header: Sequence[str], texts: set[str]) -> Iterator[Sink]:
+    """Give a sink for a file that replaces ``path`` when all went well, and leaves nothing behind otherwise.
+
+    Parameters
+    ----------
+    path : Path
+        ``.csv`` or ``.parquet``.
+    header : sequence of str
+        Names of the columns.
+    texts : set of str
+        The columns that hold text.
+
+    Raises
+    ------
+    SpecError
+        The suffix is unknown, the folder does not exist, the path is a folder, or the system refuses.
+    """
+    check_suffix(path)
+    if path.is_dir():
+        raise SpecError(f"{path} is a folder: give the name of a file.", path=str(path))
+    temporary = None
+    try:
+        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
+        if path.suffix.lower() == ".parquet":
+            os.close(handle)
+            sink = ParquetSink(temporary, header, texts)
+            try:
+                yield sink
+            finally:
+                sink.close()
+        else:
+            with os.fdopen(handle, "w", encoding="utf-8", newline="") as stream:
+                yield TextSink(stream, header)
+        mask = os.umask(0)
+        os.umask(mask)
+        os.chmod(temporary, 0o666 & ~mask)
+        os.replace(temporary, path)
+    except OSError as error:
+        raise SpecError(f"{path} cannot be written: {error.strerror}.", path=str(path)) from error
+    finally:
+        if temporary is not None and os.path.exists(temporary):
+            os.unlink(temporary)

@@ -1,0 +1,1 @@
+"""Gain sets for other programs: MATLAB, numpy, C."""

@@ -1,0 +1,175 @@
+"""A sampled observer as C99: one header, one source, no allocation, no library."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator, Sequence
+
+from obsynth.exporting.realisation import Realisation
+from obsynth.numerics.arrays import FloatArray
+
+_KEYWORDS = frozenset(
+    {
+        "auto", "break", "case", "char", "const", "continue", "default", "do", "double", "else", "enum", "extern",
+        "float", "for", "goto", "if", "inline", "int", "long", "register", "restrict", "return", "short", "signed",
+        "sizeof", "static", "struct", "switch", "typedef", "union", "unsigned", "void", "volatile", "while",
+    }
+)  # fmt: skip
+_NUMBERS_PER_LINE = 4
+
+
+def c_identifier(text: str) -> str:
+    """Return a C identifier made of ``text``; one that C reserves, or that begins with a digit, gets a prefix.
+
+    Parameters
+    ----------
+    text : str
+        Such as the stem of a file.
+    """
+    name = re.sub(r"\W", "_", text, flags=re.ASCII)
+    return name if re.match(r"[A-Za-z]", name) and name not in _KEYWORDS else f"obs_{name}"
+
+
+def header_text(found: Realisation, prefix: str) -> str:
+    """Return the header.
+
+    Parameters
+    ----------
+    found : Realisation
+        Sampled.
+    prefix : str
+        Of every name.
+    """
+    observer = found.observer
+    guard = f"{prefix.upper()}_H"
+    before, after = found.operating_point
+    lines = [
+        _comment(f"Observer {_quoted(found.design.name)} by {_quoted(found.design.method)}, written by obsynth."),
+        f"#ifndef {guard}", f"#define {guard}", "",
+        _comment("sha256 of the gain set"), f'#define {prefix.upper()}_SHA256 "{found.digest}"',
+        _comment("seconds between samples"), f"#define {prefix.upper()}_DT {observer.dt!r}",
+        "", "typedef struct {", f"    double z[{max(observer.order, 1)}];", f"}} {prefix}_state;", "",
+        _comment("Start at rest."), f"void {prefix}_reset({prefix}_state *state);", "",
+        _comment("Take one sample of each signal, write the estimates at that sample, and advance."),
+        _comment("Signals are deviations from the operating point. Returns 0; or 1 if a sample is not finite:"),
+        _comment("the state and the estimates are left as they were then."),
+        *_signal_comments("u", found.inputs[: len(observer.input_names)], before),
+        *_signal_comments("y", observer.output_names, before[len(observer.input_names) :]),
+        *_signal_comments("states", observer.state_names, after, observer.state_delays),
+        *_signal_comments("faults", observer.fault_names, after[len(observer.state_names) :], observer.fault_delays),
+        *_signal_comments("residuals", observer.residual_names, None),
+        f"{_step_signature(found, prefix)};", "", "#endif",
+    ]  # fmt: skip
+    return "\n".join(lines) + "\n"
+
+
+def source_text(found: Realisation, prefix: str, header: str) -> str:
+    """Return the source.
+
+    Parameters
+    ----------
+    found : Realisation
+        Sampled.
+    prefix : str
+        Of every name.
+    header : str
+        Name of the header's file.
+    """
+    observer = found.observer
+    sizes = {"z": observer.order, "u": len(observer.input_names), "y": len(observer.output_names)}
+    groups = (
+        ("states", observer.state_rows), ("faults", observer.fault_rows), ("residuals", observer.residual_rows),
+    )  # fmt: skip
+    blocks: list[tuple[str, str, dict[str, FloatArray]]] = [
+        (target, f"{target}[i]", {"z": observer.Cz[rows], "u": observer.Du[rows], "y": observer.Dy[rows]})
+        for target, rows in groups
+        if rows.stop > rows.start
+    ]
+    blocks.append(("next", "next[i]", {"z": observer.Az, "u": observer.Bu, "y": observer.By}))
+    tables = [
+        line for target, _, parts in blocks for signal, matrix in parts.items() if matrix.size
+        for line in _table(f"{target}_{signal}", matrix)
+    ]  # fmt: skip
+    body = [line for target, _, parts in blocks for line in _product(target, parts)]
+    copy = [f"    for (i = 0; i < {sizes['z']}; i++) {{", "        state->z[i] = next[i];", "    }"]
+    return "\n".join([
+        _comment(f"sha256 of the gain set: {found.digest}"), f'#include "{_include(header)}"', "", "#include <math.h>",
+        "", *tables, f"void {prefix}_reset({prefix}_state *state)", "{", "    int i;",
+        f"    for (i = 0; i < {max(sizes['z'], 1)}; i++) {{", "        state->z[i] = 0.0;", "    }", "}", "",
+        _step_signature(found, prefix), "{", "    int i;", *(["    int j;"] if any(sizes.values()) else []),
+        *([f"    double next[{sizes['z']}];"] if sizes["z"] else []),
+        *([] if sizes["z"] else ["    (void)state;"]),
+        *_guards(sizes), *body, *(copy if sizes["z"] else []), "    return 0;", "}",
+    ]) + "\n"  # fmt: skip
+
+
+def _guards(sizes: dict[str, int]) -> Iterator[str]:
+    for signal in "uy":
+        if sizes[signal]:
+            yield f"    for (i = 0; i < {sizes[signal]}; i++) {{"
+            yield f"        if (!isfinite({signal}[i])) {{"
+            yield "            return 1;"
+            yield "        }"
+            yield "    }"
+
+
+def _product(target: str, parts: dict[str, FloatArray]) -> Iterator[str]:
+    rows = next(iter(parts.values())).shape[0]
+    if not rows:
+        return
+    yield f"    for (i = 0; i < {rows}; i++) {{"
+    yield "        double sum = 0.0;"
+    for signal, matrix in parts.items():
+        if matrix.size:
+            vector = "state->z" if signal == "z" else signal
+            yield f"        for (j = 0; j < {matrix.shape[1]}; j++) {{"
+            yield f"            sum += {target}_{signal}[i][j] * {vector}[j];"
+            yield "        }"
+    yield f"        {target}[i] = sum;"
+    yield "    }"
+
+
+def _table(name: str, matrix: FloatArray) -> Iterator[str]:
+    yield f"static const double {name}[{matrix.shape[0]}][{matrix.shape[1]}] = {{"
+    for row in matrix.tolist():
+        # repr gives the shortest text that is read back bit for bit.
+        texts = [repr(value) for value in row]
+        lines = [", ".join(texts[i : i + _NUMBERS_PER_LINE]) for i in range(0, len(texts), _NUMBERS_PER_LINE)]
+        yield "    {" + ",\n     ".join(lines) + "},"
+    yield "};"
+    yield ""
+
+
+def _step_signature(found: Realisation, prefix: str) -> str:
+    observer = found.observer
+    inputs = {"u": observer.input_names, "y": observer.output_names}
+    outputs = {"states": observer.state_names, "faults": observer.fault_names, "residuals": observer.residual_names}
+    arguments = [
+        f"{prefix}_state *state",
+        *(f"const double {name}[{len(names)}]" for name, names in inputs.items() if names),
+        *(f"double {name}[{len(names)}]" for name, names in outputs.items() if names),
+    ]
+    return f"int {prefix}_step({', '.join(arguments)})"
+
+
+def _signal_comments(
+    array: str, names: Sequence[str], point: FloatArray | None, delays: Sequence[int] = ()
+) -> Iterator[str]:
+    for i, name in enumerate(names):
+        at = f", operating point {float(point[i])!r}" if point is not None and point[i] else ""
+        late = f", {delays[i]} sample(s) late" if delays and delays[i] else ""
+        yield _comment(f"{array}[{i}]: {_quoted(name)}{at}{late}")
+
+
+def _quoted(name: str) -> str:
+    """Return a name in quotes, in ASCII, that cannot end or begin a comment or form a trigraph."""
+    return json.dumps(name).replace("*/", "* /").replace("/*", "/ *").replace("??", "? ?").replace("??", "? ?")
+
+
+def _include(name: str) -> str:
+    return name.replace("\\", "/")
+
+
+def _comment(text: str) -> str:
+    return f"/* {text} */"

@@ -1,0 +1,81 @@
+"""Writing a gain set for other programs."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.exporting.c_source import c_identifier, header_text, source_text
+from obsynth.exporting.realisation import Realisation
+from obsynth.results.design import ObserverDesign
+from obsynth.results.serialise import write_atomically
+
+SUFFIXES = (".mat", ".npz", ".c")
+
+
+def export(design: ObserverDesign, path: str | Path, *, sample_time: float | None = None) -> tuple[Path, ...]:
+    """Write the observer of a linear design for MATLAB and Simulink, for numpy, or as C99.
+
+    Parameters
+    ----------
+    design : ObserverDesign
+        A linear design.
+    path : path
+        Its suffix says what is written.  ``.mat`` and ``.npz``: ``A (nz, nz)``, ``B (nz, nu + ny)``, ``C``, ``D``,
+        ``x0 (nz, 1)`` and ``Ts`` (seconds, 0 for continuous time) of the system from ``[u; y]`` to
+        ``[xhat; fhat; r]``, as a State-Space block takes them, with ``input_names``, ``output_names``, ``delays``
+        (samples, of states and faults), ``input_point``, ``output_point``, ``name``, ``method`` and ``sha256``.
+        ``.c``: a source file and the header beside it, with functions ``<stem>_reset`` and ``<stem>_step``.
+    sample_time : float, optional, seconds
+        Samples a continuous-time observer by a first-order hold; needed for C.
+
+    Returns
+    -------
+    tuple of Path
+        The files.
+
+    Raises
+    ------
+    SpecError
+        The design is recursive, the suffix is unknown, the sample time is missing or does not fit, or a file cannot
+        be written.
+
+    Notes
+    -----
+    Every file holds the sha256 digest of the gain set.  Signals are deviations from the operating point.
+    """
+    target = Path(path)
+    suffix = target.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise SpecError(f"{target} has an unknown suffix: use one of {', '.join(SUFFIXES)}.", path=str(target))
+    found = Realisation.of(design, sample_time)
+    if suffix == ".c":
+        return _write_c(found, target)
+    buffer = io.BytesIO()
+    if suffix == ".npz":
+        np.savez(buffer, **found.as_arrays())
+    else:
+        from scipy.io import savemat
+
+        arrays = found.as_arrays()
+        # Cell arrays of texts, and vectors as columns.
+        named = {
+            key: np.array(value, dtype=object) if isinstance(value, list) else value for key, value in arrays.items()
+        }
+        savemat(buffer, named, oned_as="column")
+    return (write_atomically(target, buffer.getvalue()),)
+
+
+def _write_c(found: Realisation, target: Path) -> tuple[Path, ...]:
+    if found.observer.dt == 0.0:
+        raise SpecError("The observer is continuous in time: give the sample time, in seconds, for C.",
+                        path="sample_time")  # fmt: skip
+    prefix = c_identifier(target.stem)
+    header = target.with_suffix(".h")
+    source = source_text(found, prefix, header.name)
+    # The source is refused first if it cannot be written, so that no header stays behind alone.
+    written = write_atomically(target, source)
+    return written, write_atomically(header, header_text(found, prefix))

@@ -1,0 +1,91 @@
+"""``obsynth export`` and ``obsynth report``: what they print and write, and how bad input ends."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from obsynth.cli.main import main
+from obsynth.results.serialise import digest_of
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("gains")
+    for name in ("wang2015", "filasova", "moussaali2013_ltv"):
+        spec = ROOT / "designs" / name / "spec.yaml"
+        assert main(["design", "--system", str(spec), "--output", str(path / f"{name}.json"), "--quiet"]) == 0
+    return path
+
+
+@pytest.fixture(autouse=True)
+def _work_in_an_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def export(gains: Path, target: str, *more: str) -> int:
+    return main(["export", "--gains", str(gains), "--to", target, *more])
+
+
+@pytest.mark.parametrize("target", ["a.mat", "a.npz", "a.c"])
+def test_export_writes_what_its_name_says(folder, capsys, target):
+    assert export(folder / "wang2015.json", target) == 0
+    files = ["a.c", "a.h"] if target == "a.c" else [target]
+    assert capsys.readouterr().out == f"Written: {', '.join(files)}\n"
+    assert sorted(path.name for path in Path().iterdir()) == files
+
+
+def test_export_samples_and_speaks_json(folder, capsys):
+    assert export(folder / "filasova.json", "a.npz", "--sample-time", "0.01", "--json") == 0
+    assert json.loads(capsys.readouterr().out)["files"] == ["a.npz"]
+    assert np.load("a.npz")["Ts"] == 0.01
+
+
+@pytest.mark.parametrize(
+    ("gains", "arguments", "message"),
+    [
+        ("wang2015", ["a.xlsx"], "unknown suffix"),
+        ("wang2015", ["nowhere/a.c"], "cannot be written"),
+        ("wang2015", ["a.mat", "--sample-time", "1"], "sampled already"),
+        ("filasova", ["a.c"], "continuous in time"),
+        ("moussaali2013_ltv", ["a.mat"], "no linear time-invariant observer"),
+        ("missing", ["a.mat"], "cannot be read"),
+    ],
+)
+def test_export_refuses(folder, capsys, gains, arguments, message):
+    assert export(folder / f"{gains}.json", *arguments) == 2
+    assert message in capsys.readouterr().err
+    assert list(Path().iterdir()) == []
+
+
+def test_report_verifies_again_and_writes_the_page(folder, capsys):
+    assert main(["report", "--gains", str(folder / "wang2015.json"), "--out", "report.html"]) == 0
+    assert capsys.readouterr().out == "Written: report.html\n"
+    page = Path("report.html").read_text(encoding="utf-8")
+    assert '<p class="verdict holds">Verified: all' in page
+    assert json.loads((folder / "wang2015.json").read_text())["sha256"] in page
+
+
+def test_report_of_wrong_gains_says_so_and_ends_in_six(folder, capsys):
+    """The saved report still says that all is well; what counts is the new one."""
+    document = json.loads((folder / "wang2015.json").read_text())
+    document["design"]["observer"]["By"]["data"][0] += 1e-3
+    document["sha256"] = digest_of(document["design"])
+    Path("wrong.json").write_text(json.dumps(document))
+    assert main(["report", "--gains", "wrong.json", "--out", "report.html", "--json"]) == 6
+    assert json.loads(capsys.readouterr().out)["passed"] is False
+    assert '<p class="verdict fails">FAILS:' in Path("report.html").read_text(encoding="utf-8")
+
+
+def test_report_refuses(folder, capsys):
+    gains = str(folder / "wang2015.json")
+    assert main(["report", "--gains", gains, "--out", gains]) == 2
+    assert main(["report", "--gains", gains, "--out", "."]) == 2
+    assert main(["report", "--gains", "missing.json", "--out", "report.html"]) == 2
+    assert list(Path().iterdir()) == []
+    assert json.loads(Path(gains).read_text())["kind"] == "obsynth gain set"

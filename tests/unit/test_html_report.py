@@ -1,0 +1,194 @@
+"""The HTML page: complete in itself, verdict first, every text escaped, numbers and pictures those of the design."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+
+mpl.use("Agg")
+
+import obsynth
+from obsynth.errors import SpecError
+from obsynth.plotting.frequency import fault_estimate_gains, plot_continuous_poles, plot_gains
+from obsynth.report.page import html_report
+from obsynth.results.report import VerificationReport
+from obsynth.spec import load_spec
+
+ROOT = Path(__file__).parents[2]
+VOID = {"meta", "img", "br", "link"}
+NASTY = '<script src="http://x.example/a.js">alert(1)</script>&amp;\'"'
+
+
+class Page(HTMLParser):
+    """Tags, their attributes, and the text of a page; a tag that is not closed is an error."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(convert_charrefs=True)
+        self.open: list[str] = []
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.texts: list[str] = []
+        self.feed(text)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append((tag, dict(attributes)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if data.strip() and (not self.open or self.open[-1] != "style"):
+            self.texts.append(data.strip())
+
+    @property
+    def text(self) -> str:
+        return " ".join(self.texts)
+
+
+def designed(path: str) -> obsynth.ObserverDesign:
+    spec = load_spec(ROOT / "designs" / path)
+    recovery = None if spec.transformation is None else spec.transformation.recovery
+    return obsynth.design(spec.plant, spec.method, name=spec.name, recovery=recovery, **dict(spec.options))
+
+
+@pytest.fixture(scope="module")
+def network() -> obsynth.ObserverDesign:
+    return designed("smib/spec.yaml")
+
+
+@pytest.fixture(scope="module")
+def continuous() -> obsynth.ObserverDesign:
+    return designed("sharepasand/spec.yaml")
+
+
+@pytest.fixture(scope="module")
+def recursive() -> obsynth.ObserverDesign:
+    return designed("moussaali2013_ltv/spec.yaml")
+
+
+def page_of(design, tmp_path, **more) -> tuple[str, Page]:
+    text = html_report(design, tmp_path / "report.html", **more).read_text(encoding="utf-8")
+    return text, Page(text)
+
+
+@pytest.mark.parametrize("which", ["network", "continuous", "recursive"])
+def test_the_page_needs_nothing_else(request, tmp_path, which):
+    text, page = page_of(request.getfixturevalue(which), tmp_path)
+    assert {tag for tag, _ in page.tags} & {"script", "link", "iframe", "object", "base", "form"} == set()
+    sources = [attributes["src"] for _, attributes in page.tags if "src" in attributes]
+    assert all(source.startswith("data:image/png;base64,") for source in sources)
+    assert len(sources) == (0 if which == "recursive" else 2)
+    for source in sources:
+        assert base64.b64decode(source.partition(",")[2]).startswith(b"\x89PNG\r\n\x1a\n")
+    assert not any("href" in attributes or "srcset" in attributes for _, attributes in page.tags)
+    assert "url(" not in text
+    assert "@import" not in text
+    assert "http" not in re.sub(r"base64,[^\"]*", "", text)
+
+
+def test_the_verdict_comes_first(network, tmp_path):
+    _, page = page_of(network, tmp_path)
+    assert page.texts[1] == "smib: fault-estimation-filter"
+    assert re.fullmatch(r"Verified: all \d+ checks hold\.", page.texts[2])
+
+
+def test_a_failure_is_said_at_the_top_and_in_its_row(network, tmp_path):
+    first, *others = network.report.checks
+    broken = VerificationReport((type(first)(**{**first.__dict__, "passed": False, "kind": "computed"}), *others))
+    text, page = page_of(network, tmp_path, report=broken)
+    assert page.texts[2].startswith("FAILS: 1 of")
+    assert first.name in page.texts[2]
+    assert text.count('data-label="verdict">FAILS') == 1
+    assert page_of(network, tmp_path, report=VerificationReport())[1].texts[2].startswith("FAILS: the report is empty")
+
+
+@pytest.mark.parametrize("which", ["network", "continuous", "recursive"])
+def test_everything_is_there(request, tmp_path, which):
+    design = request.getfixturevalue(which)
+    _, page = page_of(design, tmp_path, gains_file="my gains.json")
+    digest = json.loads(design.save(tmp_path / "gains.json").read_text())["sha256"]
+    for check in design.report.checks:
+        assert check.name in page.texts, check.name
+        assert check.claim in page.text
+    for note in design.notes:
+        assert note in page.text
+    for name in (*design.gains, *design.certificate.claims, *design.plant.output_names):
+        assert name in page.text
+    assert digest in page.texts
+    assert "obsynth verify 'my gains.json'" in page.text
+    gain = next(iter(design.gains.values()))
+    assert f"{gain.ravel()[0]:.6g}" in page.texts
+
+
+def test_every_text_is_escaped(continuous, tmp_path):
+    plant, observer = continuous.linear
+    changed = continuous.replace(
+        name=NASTY, method=NASTY, notes=(NASTY,), gains={NASTY: np.eye(2)}, options={NASTY: NASTY},
+        plant=plant.replace(output_names=[NASTY, "y2"]),
+        observer=type(observer)(**{**observer.as_dict(), "output_names": (NASTY, "y2")}),
+        report=VerificationReport(
+            tuple(
+                type(check)(**{**check.__dict__, "name": NASTY, "claim": NASTY, "detail": NASTY, "source": NASTY})
+                for check in continuous.report.checks[:2]
+            )
+        ),
+    )  # fmt: skip
+    text, page = page_of(changed, tmp_path, gains_file=NASTY)
+    assert "<script" not in text
+    usual = {tag for tag, _ in page_of(continuous, tmp_path)[1].tags}
+    assert {tag for tag, _ in page.tags} <= usual | {"ul", "li"}
+    assert page.texts.count(NASTY) >= 4
+
+
+def test_the_page_fits_a_narrow_screen(network, tmp_path):
+    """What can be wide scrolls by itself or folds up, and the numbers keep their names."""
+    text, page = page_of(network, tmp_path)
+    assert ("meta", {"name": "viewport", "content": "width=device-width, initial-scale=1"}) in page.tags
+    assert "@media (max-width" in text
+    tables = sum(tag == "table" for tag, _ in page.tags)
+    assert tables == sum(attributes.get("class") == "scroll" for _, attributes in page.tags)
+    labels = [attributes["data-label"] for _, attributes in page.tags if "data-label" in attributes]
+    for label in ("value", "bound", "margin", "verdict"):
+        assert labels.count(label) == len(network.report.checks)
+
+
+class TestPictures:
+    def test_the_gain_from_disturbances_peaks_at_the_verified_norm(self, network):
+        """The norm is recomputed on a pencil by `verify`, the curve from plant and realisation: two routes."""
+        peak = fault_estimate_gains(network).gains["disturbances"].max()
+        norm = network.report["H-infinity norm"].value
+        assert 0.98 * norm <= peak <= norm * (1.0 + 1e-9)
+
+    def test_a_filter_that_only_delays_faults_has_gain_one(self, network):
+        assert np.allclose(fault_estimate_gains(network).gains["faults"], 1.0, rtol=0.0, atol=1e-6)
+
+    def test_faults_are_those_of_the_tracking_analysis(self, continuous):
+        found = fault_estimate_gains(continuous)
+        wanted = np.abs(obsynth.fault_response(continuous, found.frequencies)[:, 0, 0])
+        assert np.allclose(found.gains["faults"], wanted, rtol=1e-6)
+
+    def test_decoupled_disturbances_are_said_not_to_get_through(self, continuous):
+        assert not fault_estimate_gains(continuous).gains["disturbances"].any()
+        labels = [text.get_text() for text in plot_gains(continuous).get_legend().get_texts()]
+        assert labels == ["faults to fault estimates", "disturbances: nothing gets through"]
+
+    def test_poles_are_those_of_the_observer(self, continuous, network):
+        (points,) = [line for line in plot_continuous_poles(continuous).get_lines() if line.get_marker() == "x"]
+        wanted = np.linalg.eigvals(continuous.observer.Az)
+        assert np.allclose(np.sort(points.get_xdata()), np.sort(wanted.real))
+        with pytest.raises(SpecError, match="sampled: use plot_poles"):
+            plot_continuous_poles(network)
+
+    def test_a_recursive_design_has_none(self, recursive):
+        with pytest.raises(SpecError, match="no linear time-invariant observer"):
+            plot_gains(recursive)
