@@ -6,6 +6,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from obsynth.analysis.dae_identifiability import Identifiability, identifiability
     from obsynth.analysis.structure import analyse_structure
     from obsynth.analysis.transformations import discretise, eliminate_algebraic_states
     from obsynth.errors import (
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
         SpecError,
         VerificationError,
     )
+    from obsynth.models.dae import DAEModel
     from obsynth.models.descriptor import DescriptorSystem
     from obsynth.models.fault_models import FaultModel, fault_model
     from obsynth.models.time_varying import TimeVaryingDescriptorSystem
@@ -50,6 +52,9 @@ __version__ = "0.1.0"
 
 # Names are imported when they are first used, so that `import obsynth` stays fast.
 _HOMES = {
+    "Identifiability": "obsynth.analysis.dae_identifiability",
+    "identifiability": "obsynth.analysis.dae_identifiability",
+    "DAEModel": "obsynth.models.dae",
     "Adaptation": "obsynth.observers.recursive",
     "Alarm": "obsynth.observers.decisions",
     "BatchEstimates": "obsynth.observers.gain_schedule",
@@ -106,11 +111,13 @@ __all__ = [
     "BatchEstimates",
     "Certificate",
     "Check",
+    "DAEModel",
     "Decision",
     "DeltaScan",
     "DescriptorSystem",
     "Estimates",
     "FaultModel",
+    "Identifiability",
     "InfeasibleError",
     "LinearObserver",
     "ObserverDesign",
@@ -138,6 +145,7 @@ __all__ = [
     "fault_estimation_filter_from_gains",
     "fault_model",
     "fault_response",
+    "identifiability",
     "load",
     "pd_delta_scan",
     "pd_observer",

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-HEAVY = ("cvxpy", "control", "slycot", "matplotlib", "pydantic", "scipy.linalg")
+HEAVY = ("cvxpy", "casadi", "control", "slycot", "matplotlib", "pydantic", "scipy.linalg")
 SOURCE = Path(__file__).parents[2] / "src"
 
 IMPORT = "import obsynth"
