@@ -21,6 +21,9 @@ if TYPE_CHECKING:
     from obsynth.models.descriptor import DescriptorSystem
     from obsynth.models.fault_models import FaultModel, fault_model
     from obsynth.models.time_varying import TimeVaryingDescriptorSystem
+    from obsynth.observers.dae import DAEObserver
+    from obsynth.observers.dae_estimates import DAEEstimates
+    from obsynth.observers.dae_running import RunningDAEObserver
     from obsynth.observers.decisions import Alarm, Decision, decide
     from obsynth.observers.gain_schedule import BatchEstimates, run_batch
     from obsynth.observers.linear import Estimates, LinearObserver, RunningObserver
@@ -43,6 +46,7 @@ if TYPE_CHECKING:
     from obsynth.results.design import Certificate, ObserverDesign
     from obsynth.results.report import Check, VerificationReport
     from obsynth.results.serialise import load
+    from obsynth.simulation.dae import DAETrajectory, simulate_dae
     from obsynth.simulation.time_varying import simulate_time_varying
     from obsynth.synthesis.steady_filter import SteadyState, steady_state_filter
     from obsynth.verification import verify
@@ -52,6 +56,11 @@ __version__ = "0.1.0"
 
 # Names are imported when they are first used, so that `import obsynth` stays fast.
 _HOMES = {
+    "DAETrajectory": "obsynth.simulation.dae",
+    "simulate_dae": "obsynth.simulation.dae",
+    "DAEEstimates": "obsynth.observers.dae_estimates",
+    "RunningDAEObserver": "obsynth.observers.dae_running",
+    "DAEObserver": "obsynth.observers.dae",
     "Identifiability": "obsynth.analysis.dae_identifiability",
     "identifiability": "obsynth.analysis.dae_identifiability",
     "DAEModel": "obsynth.models.dae",
@@ -111,7 +120,10 @@ __all__ = [
     "BatchEstimates",
     "Certificate",
     "Check",
+    "DAEEstimates",
     "DAEModel",
+    "DAEObserver",
+    "DAETrajectory",
     "Decision",
     "DeltaScan",
     "DescriptorSystem",
@@ -125,6 +137,7 @@ __all__ = [
     "PreconditionError",
     "RecursiveEstimates",
     "RecursiveObserver",
+    "RunningDAEObserver",
     "RunningObserver",
     "RunningRecursiveObserver",
     "SolverError",
@@ -152,6 +165,7 @@ __all__ = [
     "pd_observer_from_gains",
     "run_batch",
     "sample_observer",
+    "simulate_dae",
     "simulate_time_varying",
     "steady_state_filter",
     "ui_pi_observer",
