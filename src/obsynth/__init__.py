@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from obsynth.observers.recursive_running import RunningRecursiveObserver
     from obsynth.observers.sampling import sample_observer
     from obsynth.pipeline.adaptive_observer import adaptive_observer
+    from obsynth.pipeline.dae_adaptive_observer import dae_adaptive_observer
     from obsynth.pipeline.descriptor_kalman import descriptor_kalman
     from obsynth.pipeline.designing import design
     from obsynth.pipeline.fault_estimation_filter import fault_estimation_filter, fault_estimation_filter_from_gains
@@ -56,6 +57,7 @@ __version__ = "0.1.0"
 
 # Names are imported when they are first used, so that `import obsynth` stays fast.
 _HOMES = {
+    "dae_adaptive_observer": "obsynth.pipeline.dae_adaptive_observer",
     "DAETrajectory": "obsynth.simulation.dae",
     "simulate_dae": "obsynth.simulation.dae",
     "DAEEstimates": "obsynth.observers.dae_estimates",
@@ -149,6 +151,7 @@ __all__ = [
     "adaptive_observer",
     "analyse_structure",
     "apply_adaptation_gain",
+    "dae_adaptive_observer",
     "decide",
     "descriptor_kalman",
     "design",

@@ -58,10 +58,17 @@ class Identifiability:
     @property
     def unseen(self) -> tuple[dict[str, float], ...]:
         """Each direction that leaves no trace in the outputs: signal -> share, of entries worth naming."""
+        return tuple(self._shares(row) for row in self.directions[self.rank :])
+
+    @property
+    def faint(self) -> tuple[dict[str, float], ...]:
+        """Each direction, unseen ones included, of which one unit moves the outputs by less than their noise."""
         return tuple(
-            {name: float(share) for name, share in zip(self.names, row, strict=True) if abs(share) > NAMED_SHARE}
-            for row in self.directions[self.rank :]
+            self._shares(row) for value, row in zip(self.singular_values, self.directions, strict=True) if value < 1.0
         )
+
+    def _shares(self, row: FloatArray) -> dict[str, float]:
+        return {name: float(share) for name, share in zip(self.names, row, strict=True) if abs(share) > NAMED_SHARE}
 
     @property
     def unidentifiable(self) -> tuple[str, ...]:
@@ -118,7 +125,8 @@ def identifiability(
     ----------
     .. [MoussaAliDAE2013] (26) asks for excitation; that the paper's own example has none is our finding.
     """
-    inputs, noise = as_matrix(u, "u"), as_matrix(R, "R")
+    inputs = as_matrix(u, "u") if model.nu else np.zeros((len(np.asarray(u)), 0))
+    noise = as_matrix(R, "R")
     if len(inputs) < FEWEST_SAMPLES:
         raise SpecError(f"u has {len(inputs)} samples: a trajectory needs at least {FEWEST_SAMPLES}.", path="u")
     if inputs.shape[1] != model.nu or noise.shape != (model.ny, model.ny):
