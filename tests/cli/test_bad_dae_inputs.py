@@ -67,7 +67,7 @@ def test_the_good_one_is_designed_saved_and_verified(tmp_path, capsys) -> None:
         ("plant/equations/valve", "outflow = c * sqrt(levle)", 2, ["equations.valve", "'levle'"]),
         ("plant/equations/valve", None, 2, ["1 equations for 2 states", "too few"]),
         ("plant/equations/valve", "inflow = 1", 2, ["'valve'", "neither a state"]),
-        ("plant/equations/valve", "outflow = import os", 2, ["not expected here"]),
+        ("plant/equations/valve", "outflow = import os", 2, ["equations.valve", "'import os'", "not expected here"]),
         ("plant/equations/valve", 3.0, 2, ["equations", "a text"]),
         ("plant/units/c", None, 2, ["units", "'c'"]),
         ("plant/units/x", "m", 2, ["units names 'x'"]),
@@ -81,8 +81,9 @@ def test_the_good_one_is_designed_saved_and_verified(tmp_path, capsys) -> None:
         ("method/options/Q", {"balance": -1.0}, 2, ["method.options.Q"]),
         ("method/options/integration", "euler", 2, ["'backward-euler'"]),
         ("method/id", "adaptive-observer", 2, ["method.options"]),
-        ("plant/equations/valve", "level = c", 3, ["index 2", "'valve'"]),
-        ("plant/equations/balance", "outflow = 2 * c * sqrt(level)", 3, []),
+        ("plant/equations/valve", "level = c", 3, ["index 2", "valve"]),
+        ("plant/equations/balance", "2 * outflow = 2 * c * sqrt(level)", 3, ["not independent", "'balance'"]),
+        ("plant/equations/balance", "outflow = 2 * c * sqrt(level)", 5, ["No solution at k = 0", "equation"]),
     ],
 )  # fmt: skip
 def test_what_is_wrong_is_named(path, value, code, words, tmp_path, capsys) -> None:

@@ -73,8 +73,8 @@ def _from_texts(model: DAEModel, equations: Mapping[str, str]) -> DAESymbols:
     for names, column in ((model.state_names, x), (model.input_names, u), (model.parameter_names, theta)):
         known |= {name: column[i] for i, name in enumerate(names)}
     for name, text in model.definitions.items():
-        known[name] = _value(parse_expression(text), known, f"definitions.{name}")
-    parsed = {name: _equation(text) for name, text in equations.items()}
+        known[name] = _value(_parsed(text, f"definitions.{name}"), known, f"definitions.{name}")
+    parsed = {name: _equation(text, f"equations.{name}") for name, text in equations.items()}
     stored: dict[str, Any] = {}
     for name, expression in parsed.items():
         for key, inner in expression.rates.items():
@@ -82,7 +82,10 @@ def _from_texts(model: DAEModel, equations: Mapping[str, str]) -> DAESymbols:
     rates = ca.SX.sym("rates", len(stored))
     with_rates = known | {key: rates[i] for i, key in enumerate(stored)}
     rows = [_value(expression, with_rates, f"equations.{name}") for name, expression in parsed.items()]
-    seen = [_value(parse_expression(text), known, f"outputs.{name}") for name, text in _texts(model.outputs).items()]
+    seen = [
+        _value(_parsed(text, f"outputs.{name}"), known, f"outputs.{name}")
+        for name, text in _texts(model.outputs).items()
+    ]
     return DAESymbols(rates, x, u, theta, ca.vertcat(*rows), ca.vertcat(*stored.values()), ca.vertcat(*seen))
 
 
@@ -93,10 +96,20 @@ def _texts(outputs: Mapping[str, str] | Callable[..., Any]) -> Mapping[str, str]
     return outputs
 
 
-def _equation(text: str) -> Expression:
+def _parsed(text: str, path: str, *, rates: bool = False) -> Expression:
+    """Parse a text, and say where it stands when it is malformed."""
+    try:
+        return parse_expression(text, rates=rates)
+    except SpecError as error:
+        raise SpecError(f"{path}: {error}", path=path) from error
+
+
+def _equation(text: str, path: str) -> Expression:
     """Parse ``left = right``, or an expression that is zero."""
     left, sign, right = text.partition("=")
-    return parse_expression(f"({left}) - ({right})" if sign else left, rates=True)
+    for side in (left, right) if sign else (left,):
+        _parsed(side.strip(), path, rates=True)
+    return _parsed(f"({left}) - ({right})" if sign else left, path, rates=True)
 
 
 def _value(expression: Expression, known: Mapping[str, Any], path: str) -> Any:

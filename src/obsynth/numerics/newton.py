@@ -130,7 +130,8 @@ def newton(
     residuals = np.full(len(x), np.inf)
     for iteration in range(1, MOST_ITERATIONS + 1):
         if not (np.isfinite(value).all() and np.isfinite(jacobian).all()):
-            return NewtonResult(x, False, iteration - 1, np.where(np.isfinite(value), 0.0, np.inf))
+            defined = np.isfinite(value) & np.isfinite(jacobian).all(axis=1)
+            return NewtonResult(x, False, iteration - 1, np.where(defined, 0.0, np.inf))
         scaled = ScaledMatrix.of(jacobian, sizes)
         residuals = scaled.rows * value
         try:
