@@ -6,6 +6,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from obsynth.analysis.dae_identifiability import Identifiability, identifiability
     from obsynth.analysis.structure import analyse_structure
     from obsynth.analysis.transformations import discretise, eliminate_algebraic_states
     from obsynth.data.run import DataRun, run_on_data
@@ -23,9 +24,13 @@ if TYPE_CHECKING:
     from obsynth.evaluation.simulating import Simulation, simulate
     from obsynth.evaluation.watching import monitor
     from obsynth.exporting.files import export
+    from obsynth.models.dae import DAEModel
     from obsynth.models.descriptor import DescriptorSystem
     from obsynth.models.fault_models import FaultModel, fault_model
     from obsynth.models.time_varying import TimeVaryingDescriptorSystem
+    from obsynth.observers.dae import DAEObserver
+    from obsynth.observers.dae_estimates import DAEEstimates
+    from obsynth.observers.dae_running import RunningDAEObserver
     from obsynth.observers.decisions import Alarm, Decision, decide
     from obsynth.observers.gain_schedule import BatchEstimates, run_batch
     from obsynth.observers.linear import Estimates, LinearObserver, RunningObserver
@@ -34,6 +39,7 @@ if TYPE_CHECKING:
     from obsynth.observers.recursive_running import RunningRecursiveObserver
     from obsynth.observers.sampling import sample_observer
     from obsynth.pipeline.adaptive_observer import adaptive_observer
+    from obsynth.pipeline.dae_adaptive_observer import dae_adaptive_observer
     from obsynth.pipeline.descriptor_kalman import descriptor_kalman
     from obsynth.pipeline.designing import design
     from obsynth.pipeline.fault_estimation_filter import fault_estimation_filter, fault_estimation_filter_from_gains
@@ -49,6 +55,7 @@ if TYPE_CHECKING:
     from obsynth.results.design import Certificate, ObserverDesign
     from obsynth.results.report import Check, VerificationReport
     from obsynth.results.serialise import load
+    from obsynth.simulation.dae import DAETrajectory, simulate_dae
     from obsynth.simulation.failures import Gaussian, LostEffectiveness, Stuck, Uniform
     from obsynth.simulation.profiles import Drift, Intermittent, Ramp, Sine, Step
     from obsynth.simulation.scenario import Scenario
@@ -61,6 +68,15 @@ __version__ = "0.1.0"
 
 # Names are imported when they are first used, so that `import obsynth` stays fast.
 _HOMES = {
+    "dae_adaptive_observer": "obsynth.pipeline.dae_adaptive_observer",
+    "DAETrajectory": "obsynth.simulation.dae",
+    "simulate_dae": "obsynth.simulation.dae",
+    "DAEEstimates": "obsynth.observers.dae_estimates",
+    "RunningDAEObserver": "obsynth.observers.dae_running",
+    "DAEObserver": "obsynth.observers.dae",
+    "Identifiability": "obsynth.analysis.dae_identifiability",
+    "identifiability": "obsynth.analysis.dae_identifiability",
+    "DAEModel": "obsynth.models.dae",
     "Adaptation": "obsynth.observers.recursive",
     "Alarm": "obsynth.observers.decisions",
     "BatchEstimates": "obsynth.observers.gain_schedule",
@@ -139,6 +155,10 @@ __all__ = [
     "BatchEstimates",
     "Certificate",
     "Check",
+    "DAEEstimates",
+    "DAEModel",
+    "DAEObserver",
+    "DAETrajectory",
     "DataRun",
     "Decision",
     "DeltaScan",
@@ -149,6 +169,7 @@ __all__ = [
     "Evaluation",
     "FaultModel",
     "Gaussian",
+    "Identifiability",
     "InfeasibleError",
     "Intermittent",
     "Interval",
@@ -161,6 +182,7 @@ __all__ = [
     "Ramp",
     "RecursiveEstimates",
     "RecursiveObserver",
+    "RunningDAEObserver",
     "RunningObserver",
     "RunningRecursiveObserver",
     "Scenario",
@@ -178,6 +200,7 @@ __all__ = [
     "adaptive_observer",
     "analyse_structure",
     "apply_adaptation_gain",
+    "dae_adaptive_observer",
     "decide",
     "descriptor_kalman",
     "design",
@@ -190,6 +213,7 @@ __all__ = [
     "fault_model",
     "fault_response",
     "html_report",
+    "identifiability",
     "load",
     "monitor",
     "pd_delta_scan",
@@ -199,6 +223,7 @@ __all__ = [
     "run_on_data",
     "sample_observer",
     "simulate",
+    "simulate_dae",
     "simulate_time_varying",
     "steady_state_filter",
     "ui_pi_observer",

@@ -9,7 +9,9 @@ from pathlib import Path
 
 import pytest
 
-HEAVY = ("cvxpy", "control", "slycot", "matplotlib", "pydantic", "numba", "scipy.linalg", "pandas", "pyarrow")
+HEAVY = (
+    "casadi", "control", "cvxpy", "matplotlib", "numba", "pandas", "pyarrow", "pydantic", "scipy.linalg", "slycot",
+)  # fmt: skip
 SOURCE = Path(__file__).parents[2] / "src"
 
 IMPORT = "import obsynth"

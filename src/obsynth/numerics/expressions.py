@@ -1,6 +1,7 @@
 """A small arithmetic language for data: parsed into a tree of known operations, never executed as code.
 
-Numbers, names, ``+ - * / **``, parentheses and a fixed list of functions.
+Numbers, names, ``+ - * / **``, parentheses and a fixed list of functions; in equations of a DAE also ``der(...)``, the
+derivative with respect to time of any expression.
 """
 
 from __future__ import annotations
@@ -18,12 +19,15 @@ from obsynth.errors import SpecError
 MAXIMUM_LENGTH = 2000
 MAXIMUM_DEPTH = 50
 
-Evaluator: TypeAlias = Callable[[Mapping[str, Any]], Any]
+#: From an operation on numbers to the one that stands for it on other values, such as symbols.
+Translation: TypeAlias = Callable[[Callable[..., Any]], Callable[..., Any]]
+Evaluator: TypeAlias = Callable[[Mapping[str, Any], Translation], Any]
 
 _TOKEN = re.compile(r"\s*(?:((?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)|([A-Za-z_]\w*)|(\*\*|[-+*/(),]))", re.ASCII)
 
 
-def _step(value: Any) -> Any:
+def step_function(value: Any) -> Any:
+    """Return 1 where ``value >= 0`` and 0 elsewhere."""
     return np.where(np.asarray(value) >= 0.0, 1.0, 0.0)
 
 
@@ -31,11 +35,16 @@ def _step(value: Any) -> Any:
 FUNCTIONS: Mapping[str, Callable[[Any], Any]] = {
     "sin": np.sin, "cos": np.cos, "tan": np.tan, "asin": np.arcsin, "acos": np.arccos, "atan": np.arctan,
     "sinh": np.sinh, "cosh": np.cosh, "tanh": np.tanh, "exp": np.exp, "log": np.log, "log10": np.log10,
-    "sqrt": np.sqrt, "abs": np.abs, "sign": np.sign, "floor": np.floor, "ceil": np.ceil, "step": _step,
+    "sqrt": np.sqrt, "abs": np.abs, "sign": np.sign, "floor": np.floor, "ceil": np.ceil, "step": step_function,
 }  # fmt: skip
 #: Functions of two arguments.
 FUNCTIONS_OF_TWO: Mapping[str, Callable[[Any, Any], Any]] = {"min": np.minimum, "max": np.maximum}
 CONSTANTS: Mapping[str, float] = {"pi": float(np.pi)}
+
+
+def _as_it_is(operation: Callable[..., Any]) -> Callable[..., Any]:
+    """Translate nothing: numbers and arrays."""
+    return operation
 
 
 @dataclass(frozen=True)
@@ -48,26 +57,43 @@ class Expression:
         As written.
     names : frozenset of str
         The names whose values are needed.
+    rates : mapping of str to Expression, optional
+        What ``der(...)`` is taken of, by the name under which the value of the derivative is looked up.
     """
 
     text: str
     names: frozenset[str]
     _evaluator: Evaluator = field(repr=False, compare=False)
+    rates: Mapping[str, Expression] = field(default_factory=dict, compare=False)
 
     def __call__(self, values: Mapping[str, Any]) -> Any:
         """Return the value, NaN or infinite where there is none; ``values`` are numbers or arrays by name."""
         # What is not finite is found by the caller, who knows where it came from.
         with np.errstate(all="ignore"):
-            return self._evaluator(values)
+            return self._evaluator(values, _as_it_is)
+
+    def translated(self, values: Mapping[str, Any], translation: Translation) -> Any:
+        """Return the value on other things than numbers.
+
+        Parameters
+        ----------
+        values : mapping
+            By name, rates included.
+        translation : callable
+            From numpy's operation to the one for these values.
+        """
+        return self._evaluator(values, translation)
 
 
-def parse_expression(text: str) -> Expression:
+def parse_expression(text: str, *, rates: bool = False) -> Expression:
     """Parse a text into an expression.
 
     Parameters
     ----------
     text : str
         For example ``"(k + 1) / (k + 0.5)"``.
+    rates : bool, optional
+        Whether ``der(...)`` is allowed.
 
     Returns
     -------
@@ -81,17 +107,18 @@ def parse_expression(text: str) -> Expression:
     """
     if len(text) > MAXIMUM_LENGTH:
         raise SpecError(f"An expression has {len(text)} characters: at most {MAXIMUM_LENGTH} are read.")
-    parser = _Parser(text)
+    parser = _Parser(text, rates=rates)
     evaluator = parser.whole()
-    return Expression(text, frozenset(parser.names), evaluator)
+    return Expression(text, frozenset(parser.names), evaluator, dict(parser.rates))
 
 
 class _Parser:
     """Recursive descent: sum, term, sign, power, atom."""
 
-    def __init__(self, text: str) -> None:
+    def __init__(self, text: str, *, rates: bool) -> None:
         self.text, self.tokens, self.names = text, _tokens(text), set[str]()
         self.position = self.depth = 0
+        self.rates, self.rates_allowed = dict[str, Expression](), rates
 
     def whole(self) -> Evaluator:
         found = self.sum()
@@ -151,16 +178,18 @@ class _Parser:
         self.position += 1
         if token[0].isdigit() or token[0] == ".":
             number = np.float64(token)
-            return lambda values: number
+            return lambda values, _: number
         if self.take("("):
             return self.function(token)
         if token in CONSTANTS:
             constant = CONSTANTS[token]
-            return lambda values: constant
+            return lambda values, _: constant
         self.names.add(token)
-        return lambda values: values[token]
+        return lambda values, _: values[token]
 
     def function(self, name: str) -> Evaluator:
+        if name == "der" and self.rates_allowed:
+            return self.rate()
         first = self.sum()
         if name in FUNCTIONS:
             self.close()
@@ -172,6 +201,19 @@ class _Parser:
         second = self.sum()
         self.close()
         return _binary(FUNCTIONS_OF_TWO[name], first, second)
+
+    def rate(self) -> Evaluator:
+        """Read what a derivative is taken of; it stands for a value of its own, found under its text."""
+        begin, outside = self.position, self.names
+        self.names, self.rates_allowed = set[str](), False
+        inner = self.sum()
+        text = "".join(self.tokens[begin : self.position])
+        self.close()
+        found = Expression(text, frozenset(self.names), inner)
+        self.names, self.rates_allowed = outside, True
+        key = f"der({text})"
+        self.rates[key] = found
+        return lambda values, _: values[key]
 
     def close(self) -> None:
         if not self.take(")"):
@@ -191,8 +233,8 @@ def _tokens(text: str) -> list[str]:
 
 
 def _unary(operation: Callable[[Any], Any], inner: Evaluator) -> Evaluator:
-    return lambda values: operation(inner(values))
+    return lambda values, translate: translate(operation)(inner(values, translate))
 
 
 def _binary(operation: Callable[[Any, Any], Any], left: Evaluator, right: Evaluator) -> Evaluator:
-    return lambda values: operation(left(values), right(values))
+    return lambda values, translate: translate(operation)(left(values, translate), right(values, translate))

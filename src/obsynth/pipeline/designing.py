@@ -10,16 +10,17 @@ from typing import Any, TypeAlias
 from obsynth.analysis.conditions import Condition
 from obsynth.analysis.transformations import StateRecovery
 from obsynth.errors import SpecError, VerificationError
+from obsynth.models.dae import DAEModel
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.models.time_varying import TimeVaryingDescriptorSystem
 from obsynth.results.design import ObserverDesign
 from obsynth.results.report import VerificationReport
-from obsynth.synthesis.methods import REGISTRY, TIME_VARYING, method_module
+from obsynth.synthesis.methods import NONLINEAR, REGISTRY, TIME_VARYING, method_module
 from obsynth.synthesis.result import Synthesis
 from obsynth.verification import verify
 from obsynth.verification.plant import condition_rows
 
-Plant: TypeAlias = DescriptorSystem | TimeVaryingDescriptorSystem
+Plant: TypeAlias = DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel
 
 
 def _silent(_: str) -> None:
@@ -39,7 +40,7 @@ def design(
 
     Parameters
     ----------
-    plant : DescriptorSystem or TimeVaryingDescriptorSystem
+    plant : DescriptorSystem, TimeVaryingDescriptorSystem or DAEModel
         The plant.
     method : str, optional
         Method id; for its options see the function of the same name, such as `fault_estimation_filter`.
@@ -84,7 +85,7 @@ def check(plant: Plant, options: Mapping[str, Mapping[str, Any]] | None = None) 
 
     Parameters
     ----------
-    plant : DescriptorSystem or TimeVaryingDescriptorSystem
+    plant : DescriptorSystem, TimeVaryingDescriptorSystem or DAEModel
         The plant.
     options : mapping, optional
         Method id -> options of a spec; those that decide about existence, such as the fault model, are used.
@@ -102,13 +103,17 @@ def check(plant: Plant, options: Mapping[str, Mapping[str, Any]] | None = None) 
 
 
 def _kind_conditions(plant: Plant, method: str) -> tuple[Condition, ...]:
-    """Return the failing condition where a method does not take plants that change with k, else nothing."""
-    if not isinstance(plant, (DescriptorSystem, TimeVaryingDescriptorSystem)):
+    """Return the failing condition where a method does not take plants of this kind, else nothing."""
+    if not isinstance(plant, (DescriptorSystem, TimeVaryingDescriptorSystem, DAEModel)):
         raise SpecError(
-            f"The plant is a {type(plant).__name__}: give an obsynth.DescriptorSystem (or a "
-            "TimeVaryingDescriptorSystem).",
+            f"The plant is a {type(plant).__name__}: give an obsynth.DescriptorSystem, TimeVaryingDescriptorSystem or "
+            "DAEModel.",
             path="plant",
         )
+    if method in NONLINEAR:
+        return () if isinstance(plant, DAEModel) else (_other_kind(method, "a nonlinear DAEModel"),)
+    if isinstance(plant, DAEModel):
+        return (_other_kind(method, f"a linear plant; methods for nonlinear ones are: {', '.join(NONLINEAR)}"),)
     if isinstance(plant, DescriptorSystem) or method in TIME_VARYING:
         return ()
     return (
@@ -117,6 +122,10 @@ def _kind_conditions(plant: Plant, method: str) -> tuple[Condition, ...]:
             f"the matrices change with k; methods for such plants are: {', '.join(TIME_VARYING)}",
         ),
     )  # fmt: skip
+
+
+def _other_kind(method: str, wanted: str) -> Condition:
+    return Condition("kind of plant", f"{method} needs {wanted}", False, 0.0, 1.0, method, "a plant of another kind.")
 
 
 def door_of(method: str) -> Callable[..., ObserverDesign]:
@@ -151,7 +160,7 @@ def draft_of(
 
     Parameters
     ----------
-    plant : DescriptorSystem or TimeVaryingDescriptorSystem
+    plant : DescriptorSystem, TimeVaryingDescriptorSystem or DAEModel
         The plant that the method was given.
     method : str
         Method id.

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, as_matrix
+from obsynth.observers.dae_estimates import DAEEstimates
 from obsynth.observers.decisions import Decision
 from obsynth.observers.recursive_estimates import RecursiveEstimates
 from obsynth.plotting.faults import ESTIMATE_STYLE, PANEL_HEIGHT, TRUE_STYLE, WIDTH
@@ -24,7 +25,7 @@ _THRESHOLD: dict[str, Any] = {"color": "tab:red", "linewidth": 1.6, "linestyle":
 
 
 def plot_parameters(
-    estimates: RecursiveEstimates,
+    estimates: RecursiveEstimates | DAEEstimates,
     *,
     parameters: ArrayLike | None = None,
     dt: float = 1.0,
@@ -34,7 +35,7 @@ def plot_parameters(
 
     Parameters
     ----------
-    estimates : RecursiveEstimates
+    estimates : RecursiveEstimates or DAEEstimates
         From a run.
     parameters : array_like, optional
         True parameters ``(samples, nq)``; a single one may be ``(samples,)``.
@@ -59,7 +60,7 @@ def plot_parameters(
 
 
 def plot_states(
-    estimates: RecursiveEstimates,
+    estimates: RecursiveEstimates | DAEEstimates,
     *,
     states: ArrayLike | None = None,
     dt: float = 1.0,
@@ -69,7 +70,7 @@ def plot_states(
 
     Parameters
     ----------
-    estimates : RecursiveEstimates
+    estimates : RecursiveEstimates or DAEEstimates
         From a run.
     states : array_like, optional
         True states ``(samples, nx)``.

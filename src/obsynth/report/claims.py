@@ -42,6 +42,12 @@ _MEANINGS = {
         "excitation": "least information on the parameters in a window, per parameter unit squared",
         "excitation_k": "sample that ends that window",
     },
+    "dae-adaptive-observer": {
+        "index": "index of the plant",
+        "condition": "largest condition number of (7) along the nominal run",
+        "contraction": "spectral radius of F (I - K H) at its end",
+        "steps": "steps of the nominal run",
+    },
 }
 
 

@@ -10,9 +10,11 @@ from rich.table import Table
 from rich.text import Text
 
 from obsynth.analysis.transformations import StateRecovery
+from obsynth.models.dae import DAEModel
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.models.time_varying import TimeVaryingDescriptorSystem
 from obsynth.observers.linear import LinearObserver
+from obsynth.observers.recursive import RecursiveObserver
 from obsynth.report.claims import meaning_of
 from obsynth.report.layout import facts_table, headed_table, name_list, number, print_section
 from obsynth.report.verification import verification_report
@@ -20,12 +22,12 @@ from obsynth.results.delta_scan import DeltaScan
 from obsynth.results.design import ObserverDesign
 
 
-def plant_facts(plant: DescriptorSystem | TimeVaryingDescriptorSystem) -> Iterator[tuple[str, str]]:
+def plant_facts(plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel) -> Iterator[tuple[str, str]]:
     """Yield label and value of what is known about a plant.
 
     Parameters
     ----------
-    plant : DescriptorSystem or TimeVaryingDescriptorSystem
+    plant : DescriptorSystem, TimeVaryingDescriptorSystem or DAEModel
         The plant.
 
     Yields
@@ -35,6 +37,9 @@ def plant_facts(plant: DescriptorSystem | TimeVaryingDescriptorSystem) -> Iterat
     """
     if isinstance(plant, TimeVaryingDescriptorSystem):
         yield from _varying_facts(plant)
+        return
+    if isinstance(plant, DAEModel):
+        yield from _nonlinear_facts(plant)
         return
     yield "time", f"discrete, {plant.dt:g} s between samples" if plant.is_discrete else "continuous"
     signals = {
@@ -51,6 +56,16 @@ def _varying_facts(plant: TimeVaryingDescriptorSystem) -> Iterator[tuple[str, st
     varying = [name for name, matrix in plant.matrices.items() if not matrix.is_constant]
     yield "change with k", name_list(varying) if varying else "nothing"
     yield "equations", str(plant.ne)
+    signals = {
+        "states": plant.state_names, "known inputs": plant.input_names, "outputs": plant.output_names,
+        "parameters": plant.parameter_names,
+    }  # fmt: skip
+    for label, names in signals.items():
+        yield label, f"{len(names)}: {name_list(names)}" if names else "none"
+
+
+def _nonlinear_facts(plant: DAEModel) -> Iterator[tuple[str, str]]:
+    yield "equations", f"{plant.nx}: {name_list(plant.equation_names)}"
     signals = {
         "states": plant.state_names, "known inputs": plant.input_names, "outputs": plant.output_names,
         "parameters": plant.parameter_names,
@@ -139,7 +154,10 @@ def _fault_estimates(design: ObserverDesign) -> Table:
     observer, units = design.observer, design.plant.units
     deviations = {check.name: check.value for check in design.report.checks}
     if not isinstance(observer, LinearObserver):
-        table = headed_table("parameter", "std at the end of the horizon")
+        table = headed_table(
+            "parameter",
+            "std at the end of the horizon" if isinstance(observer, RecursiveObserver) else "std after the nominal run",
+        )
         for name in observer.fault_names:
             table.add_row(Text(name), f"{number(deviations[f'noise in fhat[{name}]'])} {units.get(name, '')}".strip())
         return table

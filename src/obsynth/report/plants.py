@@ -8,6 +8,7 @@ from rich.console import Console
 from rich.text import Text
 
 from obsynth.analysis.structure import Structure
+from obsynth.models.dae import DAEModel
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.models.time_varying import TimeVaryingDescriptorSystem
 from obsynth.report.designs import plant_facts
@@ -17,7 +18,7 @@ from obsynth.results.report import VerificationReport
 
 
 def check_report(
-    plant: DescriptorSystem | TimeVaryingDescriptorSystem,
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel,
     structures: Mapping[str, Structure],
     methods: Mapping[str, VerificationReport],
     *,
@@ -28,7 +29,7 @@ def check_report(
 
     Parameters
     ----------
-    plant : DescriptorSystem or TimeVaryingDescriptorSystem
+    plant : DescriptorSystem, TimeVaryingDescriptorSystem or DAEModel
         The plant as the methods see it.
     structures : mapping of str to Structure
         Structures to compare, by a heading such as ``as written``; none for a plant that changes with k.

@@ -10,9 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 from obsynth.analysis.transformations import StateRecovery
 from obsynth.errors import SpecError
+from obsynth.models.dae import DAEModel
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.models.time_varying import TimeVaryingDescriptorSystem
 from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.observers.dae import DAEObserver
 from obsynth.observers.linear import LinearObserver
 from obsynth.observers.recursive import RecursiveObserver
 from obsynth.results.report import VerificationReport
@@ -52,13 +54,13 @@ class ObserverDesign:
         Name of the design, from the spec or the caller.
     method : str
         Identifier of the method.
-    plant : DescriptorSystem or TimeVaryingDescriptorSystem
+    plant : DescriptorSystem, TimeVaryingDescriptorSystem or DAEModel
         The plant the observer is for (after the transformations a spec asks for).
     options : mapping
         Options as resolved, plain data.
     gains : mapping of str to FloatArray
         Gains with the paper's letters, for readers; what is shipped is `observer`.
-    observer : LinearObserver or RecursiveObserver
+    observer : LinearObserver, RecursiveObserver or DAEObserver
         What is shipped.
     certificate : Certificate
         Enough to recheck every claim without a solver.
@@ -74,10 +76,10 @@ class ObserverDesign:
 
     name: str
     method: str
-    plant: DescriptorSystem | TimeVaryingDescriptorSystem
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel
     options: Mapping[str, Any]
     gains: Mapping[str, FloatArray]
-    observer: LinearObserver | RecursiveObserver
+    observer: LinearObserver | RecursiveObserver | DAEObserver
     certificate: Certificate
     solver: Mapping[str, Any]
     notes: tuple[str, ...] = ()
@@ -114,6 +116,19 @@ class ObserverDesign:
         """
         if not isinstance(self.plant, TimeVaryingDescriptorSystem) or not isinstance(self.observer, RecursiveObserver):
             raise SpecError(f"Design {self.name!r} is no recursive observer.", path="observer")
+        return self.plant, self.observer
+
+    @property
+    def nonlinear(self) -> tuple[DAEModel, DAEObserver]:
+        """Plant and observer of a nonlinear design.
+
+        Raises
+        ------
+        SpecError
+            The design is for a linear plant.
+        """
+        if not isinstance(self.plant, DAEModel) or not isinstance(self.observer, DAEObserver):
+            raise SpecError(f"Design {self.name!r} is no observer of a nonlinear plant.", path="observer")
         return self.plant, self.observer
 
     def replace(self, **changes: Any) -> ObserverDesign:
@@ -154,7 +169,7 @@ class ObserverDesign:
         Raises
         ------
         SpecError
-            The design is recursive: it has no constant realisation.
+            The design is recursive or nonlinear: it has no constant realisation.
         """
         import control
         import numpy as np

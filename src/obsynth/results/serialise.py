@@ -16,8 +16,10 @@ import numpy as np
 
 from obsynth.analysis.transformations import StateRecovery
 from obsynth.errors import SpecError
+from obsynth.models.dae import DAEModel
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.models.time_varying import TimeVaryingDescriptorSystem
+from obsynth.observers.dae import DAEObserver
 from obsynth.observers.linear import LinearObserver
 from obsynth.observers.recursive import RecursiveObserver
 from obsynth.results.design import Certificate, ObserverDesign
@@ -25,8 +27,11 @@ from obsynth.results.report import VerificationReport
 
 SCHEMA_VERSION = 1
 _KIND = "obsynth gain set"
-# Designs of the other kind, linear and time-invariant, have no tag.
-_RECURSIVE = "recursive"
+# Linear time-invariant designs have no tag.
+_KINDS: dict[str | None, tuple[Any, Any]] = {
+    None: (DescriptorSystem, LinearObserver), "recursive": (TimeVaryingDescriptorSystem, RecursiveObserver),
+    "dae": (DAEModel, DAEObserver),
+}  # fmt: skip
 # What JSON does not have is marked by these sets of keys; a mapping that happens to have one of them is wrapped.
 _ARRAY, _FLOAT, _MAPPING = {"shape", "data"}, {"float"}, {"mapping"}
 _MARKS = (_ARRAY, _FLOAT, _MAPPING)
@@ -87,10 +92,16 @@ def design_as_dict(design: ObserverDesign) -> dict[str, Any]:
             "notes": design.notes,
             "recovery": None if design.recovery is None else _fields_of(design.recovery),
             "report": design.report.as_dict(),
-            **({"kind": _RECURSIVE} if isinstance(design.observer, RecursiveObserver) else {}),
+            **_tag(design),
         }
     )
     return {"kind": _KIND, "schema_version": SCHEMA_VERSION, "sha256": digest_of(body), "design": body}
+
+
+def _tag(design: ObserverDesign) -> dict[str, str]:
+    """Return the entry that tells of which kind plant and observer are."""
+    kinds = [kind for kind, (_, observer) in _KINDS.items() if isinstance(design.observer, observer)]
+    return {"kind": kinds[0]} if kinds and kinds[0] is not None else {}
 
 
 def write_atomically(path: str | Path, content: str | bytes) -> Path:
@@ -181,16 +192,16 @@ def _fields_of(record: StateRecovery) -> dict[str, Any]:
 
 
 def _design_from(data: dict[str, Any]) -> ObserverDesign:
-    recursive = data.get("kind") == _RECURSIVE
-    if data.get("kind") not in (None, _RECURSIVE):
+    if data.get("kind") not in _KINDS:
         raise SpecError(f"A design of the kind {data['kind']!r} is unknown to this obsynth.", path="kind")
+    plant, observer = _KINDS[data.get("kind")]
     return ObserverDesign(
         name=data["name"],
         method=data["method"],
-        plant=TimeVaryingDescriptorSystem(**data["plant"]) if recursive else DescriptorSystem(**data["plant"]),
+        plant=plant(**data["plant"]),
         options=data["options"],
         gains=data["gains"],
-        observer=(RecursiveObserver if recursive else LinearObserver).from_dict(data["observer"]),
+        observer=observer.from_dict(data["observer"]),
         certificate=Certificate(**data["certificate"]),
         solver=data["solver"],
         notes=tuple(data["notes"]),

@@ -15,7 +15,7 @@ from obsynth.spec.documents import described
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
-    from obsynth.spec.schema import PlantDocument, SpecDocument, TimeVaryingDocument
+    from obsynth.spec.schema import DAEDocument, PlantDocument, SpecDocument, TimeVaryingDocument
 
     Model = TypeVar("Model", bound=BaseModel)
 
@@ -109,7 +109,7 @@ def checked_spec(document: Mapping[str, Any], source: Path) -> tuple[SpecDocumen
     return checked, {name: getattr(options, name) for name in options.model_fields_set}
 
 
-def checked_plant(document: Mapping[str, Any], source: Path) -> PlantDocument | TimeVaryingDocument:
+def checked_plant(document: Mapping[str, Any], source: Path) -> PlantDocument | TimeVaryingDocument | DAEDocument:
     """Check a plant in a file of its own.
 
     Parameters
@@ -121,7 +121,7 @@ def checked_plant(document: Mapping[str, Any], source: Path) -> PlantDocument | 
 
     Returns
     -------
-    PlantDocument or TimeVaryingDocument
+    PlantDocument, TimeVaryingDocument or DAEDocument
         The plant's section.
 
     Raises
@@ -129,13 +129,15 @@ def checked_plant(document: Mapping[str, Any], source: Path) -> PlantDocument | 
     SpecError
         The document does not fit the schema; all problems at once.
     """
-    from obsynth.spec.schema import PlantDocument, TimeVaryingDocument
+    from obsynth.spec.schema import DAEDocument, PlantDocument, TimeVaryingDocument
 
     problems = DocumentProblems(source, what="plant")
     _check_version(document, problems)
-    checked: PlantDocument | TimeVaryingDocument | None
+    checked: PlantDocument | TimeVaryingDocument | DAEDocument | None
     if document.get("kind") == "time-varying":
         checked = _validated(TimeVaryingDocument, document, problems)
+    elif document.get("kind") == "dae":
+        checked = _validated(DAEDocument, document, problems)
     else:
         checked = _validated(PlantDocument, document, problems)
     problems.raise_if_any()
@@ -229,6 +231,7 @@ def _known_keys(location: Sequence[str | int]) -> list[str]:
         "<file>": schema.MatrixFile,
         "<inline>": schema.PlantSection,
         "<varying>": schema.TimeVaryingSection,
+        "<dae>": schema.DAESection,
         "<one>": schema.ProfileSection,
     }
     by_name: dict[str, type[BaseModel]] = {

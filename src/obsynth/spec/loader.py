@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from obsynth.errors import SpecError
+from obsynth.models.dae import DAEModel
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.models.names import index_of
 from obsynth.models.time_varying import TimeVaryingDescriptorSystem
@@ -21,7 +22,7 @@ from obsynth.spec.scenarios import built_scenario
 if TYPE_CHECKING:
     from obsynth.analysis.transformations import Transformation
     from obsynth.simulation.scenario import Scenario
-    from obsynth.spec.schema import PlantSection, TimeVaryingSection, TransformSection
+    from obsynth.spec.schema import DAESection, PlantSection, TimeVaryingSection, TransformSection
 
 _MATRICES = ("E", "A", "B", "C", "D", "Bf", "Df", "Bd", "Dd", "Bw", "Dw")
 _NAME_LISTS = ("state_names", "input_names", "output_names", "fault_names", "disturbance_names", "noise_names")
@@ -41,7 +42,7 @@ class Spec:
         Free text; empty if there is none.
     path : Path
         The file it was read from.
-    plant : DescriptorSystem or TimeVaryingDescriptorSystem
+    plant : DescriptorSystem, TimeVaryingDescriptorSystem or DAEModel
         The plant as the method sees it, after the transformation.
     transformation : Transformation, optional
         What was done to the plant as written, and the way back.
@@ -56,7 +57,7 @@ class Spec:
     name: str
     description: str
     path: Path
-    plant: DescriptorSystem | TimeVaryingDescriptorSystem
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel
     transformation: Transformation | None
     method: str
     options: Mapping[str, Any]
@@ -98,7 +99,8 @@ def load_spec(path: str | Path) -> Spec:
     }
     problems.raise_if_any()
     if hasattr(section, "kind"):
-        varying = _varying_plant(section, plant_source, prefix)
+        make: Any = _nonlinear_plant if section.kind == "dae" else _varying_plant
+        varying = make(section, plant_source, prefix)
         built_scenario(checked.scenario, varying, source)
         return Spec(
             name=checked.name, description=checked.description or "", path=source, plant=varying, transformation=None,
@@ -163,6 +165,18 @@ def _varying_plant(section: TimeVaryingSection, source: Path, prefix: str) -> Ti
     problems.raise_if_any()
     try:
         return TimeVaryingDescriptorSystem(**arguments)
+    except SpecError as error:
+        raise SpecError(
+            f"{source}: {error.args[0].splitlines()[0]}",
+            path=_joined(prefix, error.path or ""),
+            problems=error.problems,
+        ) from error
+
+
+def _nonlinear_plant(section: DAESection, source: Path, prefix: str) -> DAEModel:
+    arguments = section.model_dump(exclude={"kind", "schema_version"}, exclude_none=True)
+    try:
+        return DAEModel(**arguments)
     except SpecError as error:
         raise SpecError(
             f"{source}: {error.args[0].splitlines()[0]}",

@@ -100,6 +100,31 @@ class AdaptiveObserverOptions(DescriptorKalmanOptions):
     reset: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0
 
 
+Named = Positive | Matrix | dict[Text, Annotated[float, Field(ge=0.0)]]
+NamedVector = list[float] | dict[Text, float]
+
+
+class DaeAdaptiveObserverOptions(Section):
+    """Options of the method ``dae-adaptive-observer``: covariances as matrices, or variances by name."""
+
+    dt: Positive | None = None
+    Q: Named | None = None
+    R: Named | None = None
+    form: Literal["forgetting", "random-walk", "augmented-kalman"] = "forgetting"
+    forgetting: Annotated[float, Field(gt=0.0, le=1.0)] = 0.98
+    guard: Literal["regularise", "none"] = "regularise"
+    weight: Literal["innovation", "paper"] = "innovation"
+    integration: Literal["backward-euler", "radau"] = "backward-euler"
+    random_walk: Named | None = None
+    initial_state: NamedVector | None = None
+    initial_covariance: Named | None = None
+    initial_parameters: NamedVector | None = None
+    initial_parameter_covariance: Named | None = None
+    bounds: dict[Text, Two] | None = None
+    largest_move: Positive | None = None
+    window: Annotated[int, Field(ge=1)] = 50
+
+
 #: Options of every method, by its identifier.
 METHOD_OPTIONS: dict[str, type[Section]] = {
     "fault-estimation-filter": FaultEstimationFilterOptions,
@@ -107,4 +132,5 @@ METHOD_OPTIONS: dict[str, type[Section]] = {
     "ui-pi-observer": UiPiObserverOptions,
     "descriptor-kalman": DescriptorKalmanOptions,
     "adaptive-observer": AdaptiveObserverOptions,
+    "dae-adaptive-observer": DaeAdaptiveObserverOptions,
 }

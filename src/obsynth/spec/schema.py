@@ -26,6 +26,7 @@ SCHEMA_VERSION = 1
 # Tags of unions appear in the locations of pydantic's errors; the bracket marks them for removal.
 _ROWS, _FILE, _PICK, _LIST, _INLINE, _VARYING = "<rows>", "<file>", "<pick>", "<list>", "<inline>", "<varying>"
 _ONE = "<one>"
+_NONLINEAR = "<dae>"
 
 
 def _rectangular(rows: Any, check_entries: ValidatorFunctionWrapHandler) -> Any:
@@ -66,6 +67,8 @@ def _kind_of_names(value: Any) -> str:
 def _kind_of_plant(value: Any) -> str:
     if isinstance(value, dict) and value.get("kind") == "time-varying":
         return _VARYING
+    if isinstance(value, dict) and value.get("kind") == "dae":
+        return _NONLINEAR
     return _FILE if isinstance(value, dict) and "file" in value else _INLINE
 
 
@@ -199,6 +202,26 @@ class TimeVaryingDocument(TimeVaryingSection):
     schema_version: int
 
 
+class DAESection(Section):
+    """A nonlinear plant: equations and outputs as texts, signals with nominal values and units."""
+
+    kind: Literal["dae"]
+    equations: dict[Text, Text]
+    outputs: dict[Text, Text]
+    states: dict[Text, float]
+    units: dict[Text, str]
+    inputs: dict[Text, float] | None = None
+    parameters: dict[Text, float] | None = None
+    constants: dict[Text, float] | None = None
+    definitions: dict[Text, Text] | None = None
+
+
+class DAEDocument(DAESection):
+    """A nonlinear plant in a file of its own."""
+
+    schema_version: int
+
+
 class PlantReference(Section):
     """A plant in another file: ``{file: plant.yaml}``; a transform given here takes the place of the file's."""
 
@@ -271,7 +294,8 @@ class SpecDocument(Section):
     plant: Annotated[
         Annotated[PlantReference, Tag(_FILE)]
         | Annotated[PlantSection, Tag(_INLINE)]
-        | Annotated[TimeVaryingSection, Tag(_VARYING)],
+        | Annotated[TimeVaryingSection, Tag(_VARYING)]
+        | Annotated[DAESection, Tag(_NONLINEAR)],
         Discriminator(_kind_of_plant),
     ]
     method: MethodSection

@@ -9,6 +9,7 @@ from typing import Any
 from obsynth.analysis.transformations import Transformation
 from obsynth.models.time_varying import TimeVaryingDescriptorSystem
 from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.dae import DAEObserver
 from obsynth.observers.linear import LinearObserver
 from obsynth.observers.recursive import RecursiveObserver
 from obsynth.results.design import Certificate
@@ -24,7 +25,7 @@ class Synthesis:
         Options as resolved, plain data.
     gains : mapping
         Gains with the paper's letters.
-    observer : LinearObserver or RecursiveObserver
+    observer : LinearObserver, RecursiveObserver or DAEObserver
         The realisation.
     certificate : Certificate
         Witnesses and claims.
@@ -41,7 +42,7 @@ class Synthesis:
 
     options: Mapping[str, Any]
     gains: Mapping[str, FloatArray]
-    observer: LinearObserver | RecursiveObserver
+    observer: LinearObserver | RecursiveObserver | DAEObserver
     certificate: Certificate
     solver: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()

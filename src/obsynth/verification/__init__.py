@@ -20,6 +20,7 @@ _CHECKERS = {
     "ui-pi-observer": "obsynth.verification.ui_pi_observer",
     "descriptor-kalman": "obsynth.verification.recursive",
     "adaptive-observer": "obsynth.verification.recursive",
+    "dae-adaptive-observer": "obsynth.verification.dae",
 }
 
 

@@ -12,9 +12,12 @@ REGISTRY = {
     "ui-pi-observer": "obsynth.synthesis.methods.ui_pi_observer",
     "descriptor-kalman": "obsynth.synthesis.methods.descriptor_kalman",
     "adaptive-observer": "obsynth.synthesis.methods.adaptive_observer",
+    "dae-adaptive-observer": "obsynth.synthesis.methods.dae_adaptive_observer",
 }
 #: Methods that take plants whose matrices change with k.
 TIME_VARYING = ("descriptor-kalman", "adaptive-observer")
+#: Methods for nonlinear plants, and for no others.
+NONLINEAR = ("dae-adaptive-observer",)
 
 
 def method_module(method: str) -> Any:

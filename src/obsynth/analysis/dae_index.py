@@ -1,0 +1,91 @@
+"""Solvability and index of a DAE, from the condition of (7) as the step gets shorter."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from obsynth.models.dae import DAEModel
+from obsynth.models.dae_functions import DAEFunctions
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.newton import ScaledMatrix
+
+#: A matrix of (7) whose condition is above this is singular: three digits are left of sixteen.
+SINGULAR_CONDITION = 1e13
+#: The step is shortened by these factors.  Short enough that dF/dx' rules, long enough that index 3 stays countable.
+SHORTENINGS = (1e-2, 1e-3)
+#: Equations and states with at least this share of the largest entry of a singular vector are named.
+NAMED_SHARE = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class IndexReport:
+    """Index of a DAE at one point.
+
+    Parameters
+    ----------
+    index : int
+        1, 2, 3, ...; 0 where the matrix of (7) is singular for every step.
+    conditions : tuple of float
+        Equilibrated condition numbers of (7) at the shortened steps.
+    equations, states : tuple of str
+        Those that are involved where the index is not 1.
+    """
+
+    index: int
+    conditions: tuple[float, ...]
+    equations: tuple[str, ...]
+    states: tuple[str, ...]
+
+
+def index_report(
+    model: DAEModel, dt: float, *, x: FloatArray | None = None, u: FloatArray | None = None,
+    theta: FloatArray | None = None,
+) -> IndexReport:  # fmt: skip
+    """Find the index of a model: the condition of (7) grows by ``10^(index - 1)`` when the step falls to a tenth.
+
+    Parameters
+    ----------
+    model : DAEModel
+        The model.
+    dt : float
+        Seconds: the step from which shorter ones are taken.
+    x, u, theta : FloatArray, optional
+        The point ``(nx,)``, ``(nu,)``, ``(nq,)``; nominal values by default.
+
+    Returns
+    -------
+    IndexReport
+        With the equations and states of the direction in which (7) becomes singular.
+    """
+    x = model.nominal_state if x is None else x
+    u = model.nominal_input if u is None else u
+    theta = model.nominal_parameters if theta is None else theta
+    functions = DAEFunctions(model)
+    matrices = []
+    for factor in SHORTENINGS:
+        _, jacobian = functions.residual(x, x, u, theta, np.array([factor * dt]))
+        matrices.append(ScaledMatrix.of(jacobian, model.state_scales))
+    conditions = tuple(matrix.condition for matrix in matrices)
+    if not np.isfinite(conditions[0]) or conditions[0] > SINGULAR_CONDITION:
+        return IndexReport(0, conditions, *_involved(model, matrices[0]))
+    decades = np.log10(SHORTENINGS[0] / SHORTENINGS[-1])
+    slope = np.log10(min(conditions[-1], 1.0 / np.finfo(np.float64).eps) / conditions[0]) / decades
+    index = 1 + max(0, round(float(slope)))
+    involved = ((), ()) if index == 1 else _involved(model, matrices[-1])
+    return IndexReport(index, conditions, *involved)
+
+
+def _involved(model: DAEModel, scaled: ScaledMatrix) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return equations and states of the least singular direction."""
+    if not np.isfinite(scaled.matrix).all():
+        bad = [i for i, row in enumerate(scaled.matrix) if not np.isfinite(row).all()]
+        return tuple(model.equation_names[i] for i in bad), ()
+    left, _, right = np.linalg.svd(scaled.matrix)
+    return _named(left[:, -1], model.equation_names), _named(right[-1], model.state_names)
+
+
+def _named(vector: FloatArray, names: tuple[str, ...]) -> tuple[str, ...]:
+    sizes = np.abs(vector)
+    return tuple(name for name, size in zip(names, sizes, strict=True) if size >= NAMED_SHARE * sizes.max())

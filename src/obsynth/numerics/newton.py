@@ -1,0 +1,163 @@
+"""Damped Newton iteration on scaled equations, and the scaling of a square matrix."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from obsynth.numerics.arrays import FloatArray
+
+#: Iterations before we give up: a damped iteration that needs more is not converging.
+MOST_ITERATIONS = 25
+#: Convergence is quadratic, so that a step below this size is the last one: the error after it is about its square.
+LAST_STEP = 1e-8
+#: After the last step the scaled residual must be below this: rounding, with room for ill-conditioned equations.
+LARGEST_RESIDUAL = 1e-9
+#: A step is halved at most so often; 2^-12 of a Newton step that does not help is no progress.
+MOST_HALVINGS = 12
+
+
+@dataclass(frozen=True, eq=False)
+class ScaledMatrix:
+    """A square matrix with columns scaled by given sizes and rows scaled to a largest entry of one.
+
+    Parameters
+    ----------
+    matrix : FloatArray
+        ``diag(rows) J diag(columns)``.
+    rows, columns : FloatArray
+        ``(n,)``.
+    """
+
+    matrix: FloatArray
+    rows: FloatArray
+    columns: FloatArray
+
+    @classmethod
+    def of(cls, jacobian: FloatArray, columns: FloatArray) -> ScaledMatrix:
+        """Scale a matrix.
+
+        Parameters
+        ----------
+        jacobian : FloatArray
+            ``(n, n)``.
+        columns : FloatArray
+            ``(n,)``: sizes of the unknowns.
+        """
+        scaled = jacobian * columns
+        peaks = np.abs(scaled).max(axis=1)
+        rows = 1.0 / np.where(peaks > 0.0, peaks, 1.0)
+        return cls(rows[:, None] * scaled, rows, columns)
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        """Return ``J^-1 right`` by pivoted elimination.
+
+        Parameters
+        ----------
+        right : FloatArray
+            ``(n,)`` or ``(n, m)``.
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            The matrix is singular.
+        """
+        rows, columns = (self.rows, self.columns) if right.ndim == 1 else (self.rows[:, None], self.columns[:, None])
+        return np.asarray(columns * np.linalg.solve(self.matrix, rows * right))
+
+    @property
+    def condition(self) -> float:
+        """Condition number of the scaled matrix; infinite where it is singular."""
+        if not np.isfinite(self.matrix).all():
+            return float("inf")
+        values = np.linalg.svd(self.matrix, compute_uv=False)
+        return float(values[0] / values[-1]) if values[-1] > 0.0 else float("inf")
+
+
+@dataclass(frozen=True, eq=False)
+class NewtonResult:
+    """Where an iteration ended.
+
+    Parameters
+    ----------
+    x : FloatArray
+        ``(n,)``.
+    converged : bool
+        The verdict.
+    iterations : int
+        Steps taken.
+    residuals : FloatArray
+        ``(n,)``: the last residuals in units of the unknowns' sizes.
+    """
+
+    x: FloatArray
+    converged: bool
+    iterations: int
+    residuals: FloatArray
+
+    @property
+    def residual(self) -> float:
+        """Largest scaled residual; infinite where there is no value."""
+        return float(np.nan_to_num(np.abs(self.residuals), nan=np.inf).max())
+
+    @property
+    def worst(self) -> int:
+        """Index of the equation with the largest residual."""
+        return int(np.argmax(np.nan_to_num(np.abs(self.residuals), nan=np.inf)))
+
+
+def newton(
+    evaluate: Callable[[FloatArray], tuple[FloatArray, FloatArray]], start: FloatArray, sizes: FloatArray
+) -> NewtonResult:
+    """Solve ``f(x) = 0``.
+
+    Parameters
+    ----------
+    evaluate : callable
+        x -> residual ``(n,)`` and Jacobian ``(n, n)``; may hold what is not finite.
+    start, sizes : FloatArray
+        ``(n,)``: first guess, and sizes of the unknowns.
+
+    Returns
+    -------
+    NewtonResult
+        Not converged where the iteration stalls, leaves the domain, or meets a singular Jacobian.
+    """
+    x = start.copy()
+    value, jacobian = evaluate(x)
+    residuals = np.full(len(x), np.inf)
+    for iteration in range(1, MOST_ITERATIONS + 1):
+        if not (np.isfinite(value).all() and np.isfinite(jacobian).all()):
+            defined = np.isfinite(value) & np.isfinite(jacobian).all(axis=1)
+            return NewtonResult(x, False, iteration - 1, np.where(defined, 0.0, np.inf))
+        scaled = ScaledMatrix.of(jacobian, sizes)
+        residuals = scaled.rows * value
+        try:
+            step = scaled.solve(-value)
+        except np.linalg.LinAlgError:
+            return NewtonResult(x, False, iteration - 1, residuals)
+        sizes_now = np.maximum(np.abs(x), sizes)
+        if np.abs(step / sizes_now).max() <= LAST_STEP:
+            x = x + step
+            last = scaled.rows * evaluate(x)[0]
+            return NewtonResult(x, bool(np.abs(last).max() <= LARGEST_RESIDUAL), iteration, last)
+        found = _damped(evaluate, x, step, scaled.rows, float(np.abs(residuals).max()))
+        if found is None:
+            return NewtonResult(x, False, iteration, residuals)
+        x, value, jacobian = found
+    return NewtonResult(x, False, MOST_ITERATIONS, residuals)
+
+
+def _damped(
+    evaluate: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
+    x: FloatArray, step: FloatArray, rows: FloatArray, before: float,
+) -> tuple[FloatArray, FloatArray, FloatArray] | None:  # fmt: skip
+    """Return the first of x + step, x + step / 2, ... at which the scaled residual is smaller, with what is there."""
+    for halvings in range(MOST_HALVINGS + 1):
+        tried = x + 0.5**halvings * step
+        value, jacobian = evaluate(tried)
+        if np.isfinite(value).all() and np.abs(rows * value).max() < before:
+            return tried, value, jacobian
+    return None

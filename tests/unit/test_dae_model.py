@@ -1,0 +1,179 @@
+"""Models of DAEs: what is refused and why, the index, and what can be identified."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from dae_plants import ROD, diode, exchanger, pendulum
+
+from obsynth import DAEModel, SpecError, identifiability
+from obsynth.analysis.dae_index import index_report
+from obsynth.models.dae_functions import DAEFunctions
+from obsynth.models.dae_step import ImplicitStep
+
+UNITS = dict.fromkeys(["a", "b", "go", "c", "seen"], "1")
+
+
+def small(**changes) -> DAEModel:
+    fields = {
+        "equations": {"moves": "der(a) = -c * a + b", "holds": "b = go + 0.1 * a"}, "outputs": {"seen": "b"},
+        "states": {"a": 1.0, "b": 1.0}, "inputs": {"go": 1.0}, "parameters": {"c": 0.5}, "units": UNITS,
+    }  # fmt: skip
+    return DAEModel(**{**fields, **changes})
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"equations": {"moves": "der(a) = -c * a + bb", "holds": "b = go"}}, ["equations.moves", "'bb'"]),
+        ({"equations": {"moves": "der(a) = -c * a + b"}}, ["1 equations for 2 states", "1 too few"]),
+        ({"equations": {"moves": "der(a) = -c * a + b", "holds": "go = 1"}}, ["'holds'", "neither a state"]),
+        ({"equations": {"moves": "der(a) = -c * a", "holds": "a = go"}}, ["state 'b' enters no equation"]),
+        ({"equations": {"moves": "der(a) = -a + b", "holds": "b = go"}}, ["parameter 'c' enters no equation"]),
+        ({"equations": {"moves": "der(a) = -c * a + der(go)", "holds": "b = a"}}, ["der(...)", "'go'"]),
+        ({"equations": {"moves": "der(der(a)) = -c * a", "holds": "b = a"}}, ["no function 'der'"]),
+        ({"equations": {"moves": "der(a) = __import__", "holds": "b = c"}}, ["'__import__'"]),
+        ({"equations": {"moves": "der(a) = a.real", "holds": "b = c"}}, ["'.' is not allowed"]),
+        ({"units": {k: v for k, v in UNITS.items() if k != "c"}}, ["units", "'c'"]),
+        ({"states": {"a": 1.0, "b": float("nan")}}, ["states.b", "finite"]),
+        ({"inputs": {"go": 1.0, "a": 2.0}}, ["'a'", "more than one"]),
+        ({"outputs": {"seen": "b + go"}}, ["output depends on an input"]),
+        ({"parameters": {"sin": 1.0}}, ["'sin'"]),
+        ({"outputs": {}}, ["outputs is empty"]),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_is_named(changes, words) -> None:
+    with pytest.raises(SpecError) as caught:
+        small(**changes)
+    assert [word for word in words if word not in str(caught.value)] == []
+
+
+def test_an_if_on_a_state_is_refused_and_where_is_not() -> None:
+    fields = {"states": {"a": 1.0}, "units": {"a": "1", "seen": "1"}, "output_names": ["seen"]}
+
+    def with_if(rates, x, u, theta):
+        return [rates[0] - (1.0 if x[0] > 0 else 2.0)]
+
+    def with_where(rates, x, u, theta):
+        return [rates[0] - np.where(x[0] > 0, np.sqrt(np.maximum(x[0], 0.0)), 2.0)]
+
+    with pytest.raises(SpecError, match=r"numpy\.where"):
+        DAEModel(with_if, lambda x, theta: [x[0]], **fields)
+    model = DAEModel(with_where, lambda x, theta: [x[0]], **fields)
+    found = ImplicitStep(DAEFunctions(model), 0.5).solve(np.array([4.0]), np.zeros(0), np.zeros(0)).x[0]
+    assert found == pytest.approx(((0.5 + np.sqrt(0.25 + 16.0)) / 2) ** 2, rel=1e-14)
+
+
+def test_functions_cannot_be_saved_and_texts_can() -> None:
+    with pytest.raises(SpecError, match="Python functions"):
+        DAEModel(lambda r, x, u, t: [r[0] + x[0]], lambda x, t: [x[0]], states={"a": 1.0},
+                 units={"a": "1", "y": "1"}, output_names=["y"]).as_dict()  # fmt: skip
+    model = exchanger()
+    assert DAEModel(**model.as_dict()).as_dict() == model.as_dict()
+
+
+@pytest.mark.parametrize("index", [1, 2, 3])
+def test_the_index_of_a_pendulum(index) -> None:
+    found = index_report(pendulum(ROD[index]), 0.01)
+    assert found.index == index
+    assert ("rod" in found.equations) == (index > 1)
+    assert ("tension" in found.states) == (index > 1)
+
+
+def test_a_redundant_equation_is_index_zero_and_named() -> None:
+    found = index_report(small(equations={"first": "a + c * b = go", "again": "2 * a + 2 * c * b = go"}), 1.0)
+    assert found.index == 0
+    assert set(found.equations) == {"first", "again"}
+
+
+def test_examples_have_index_one() -> None:
+    assert index_report(exchanger(), 1.0).index == 1
+    assert index_report(diode(), 1e-4).index == 1
+
+
+def test_steady_state_of_the_heat_exchanger() -> None:
+    """The audit's digits: 412.78 K and 375.38 K; 87 Pa between the cells."""
+    model = exchanger()
+    step = ImplicitStep(DAEFunctions(model), 100.0)
+    x = model.nominal_state
+    for _ in range(50):
+        x = step.solve(x, model.nominal_input, model.nominal_parameters).x
+    assert x[2:] == pytest.approx([412.78, 375.38], abs=0.006)
+    assert x[1] - x[0] == pytest.approx(87.0, abs=1.0)
+
+
+def excited(model: DAEModel, samples: int = 1000, share: float = 0.0) -> np.ndarray:
+    rng = np.random.default_rng(6)
+    u = np.tile(model.nominal_input, (samples, 1))
+    u[:, 0] *= 1.0 + share * rng.standard_normal(samples)
+    if model.input_names[1] == "Tin":
+        u[:, 1] += 100.0 * share * rng.standard_normal(samples)
+        u[:, 2] *= 1.0 + 2.0 * share * rng.standard_normal(samples)
+    return u
+
+
+def test_both_faults_are_identifiable_from_pressure_and_temperature() -> None:
+    """The audit: Cramer-Rao 2e-4 and 5.4 Pa, full rank, without excitation."""
+    model = exchanger()
+    found = identifiability(model, excited(model), dt=1.0, R=np.diag([1e4, 0.25]), parameter_scales=[0.1, 1e3])
+    assert found.rank == 5
+    assert found.unseen == ()
+    assert found.deviations[4] == pytest.approx(2e-4, rel=0.1)
+    assert found.deviations[5] == pytest.approx(5.4, rel=0.01)
+
+
+def test_pressure_alone_needs_excitation() -> None:
+    """The audit: rank 4 of 5 without excitation; with white noise of 5 % all can be told, 1e2 Pa."""
+    units = {name: unit for name, unit in exchanger().units.items() if name != "temperature"}
+    model = exchanger(outputs={"pressure": "p2 + psi"}, units=units)
+    known = {"dt": 1.0, "R": [[1e4]], "parameter_scales": [0.1, 1e3]}
+    still = identifiability(model, excited(model), initial_state=steady(model), **known)
+    assert still.rank == 4
+    assert {"phi", "psi"} <= set(still.unidentifiable)
+    moved = identifiability(model, excited(model, share=0.05), **known)
+    assert moved.rank == 5
+    assert 70.0 < moved.deviations[5] < 140.0
+
+
+def steady(model: DAEModel) -> np.ndarray:
+    step = ImplicitStep(DAEFunctions(model), 1000.0)
+    x = np.array(model.nominal_state)
+    for _ in range(100):
+        x = step.solve(x, model.nominal_input, model.nominal_parameters).x
+    return x
+
+
+def printed(momentum: str) -> DAEModel:
+    """The paper's three sums with its known inputs: T2 and the outlet flow measured, pressure the only output."""
+    model = exchanger()
+    definitions = {k: v for k, v in model.definitions.items() if k not in ("m2", "h1", "U1", "U2", "M1", "M2")}
+    definitions |= {"h1": model.definitions["h1"], "M": "v1 * p1 / (R * T1) + v2 * p2 / (R * T2)",
+                    "U": "v1 * p1 / (R * T1) * (h1 - R * T1) + v2 * p2 / (R * T2) * (h2 - R * T2)"}  # fmt: skip
+    names = {"p1": "Pa", "p2": "Pa", "T1": "K", "Mass": "kg", "Energy": "J", "m1": "kg/s", "m2": "kg/s", "Tin": "K",
+             "T2": "K", "Qn": "W", "phi": "1", "psi": "Pa", "pressure": "Pa"}  # fmt: skip
+    return DAEModel(
+        {"mass": "der(Mass) = m1 - m2", "energy": "der(Energy) = m1 * hin - m2 * h2 - phi * Qn", "masses": "Mass = M",
+         "energies": "Energy = U", "momentum": momentum},
+        {"pressure": "p2 + psi"},
+        states={"p1": 200014.0, "p2": 200101.0, "T1": 412.78, "Mass": 3.545, "Energy": 1.0e6},
+        inputs={"m1": 0.2, "m2": 0.2, "Tin": 450.0, "T2": 375.38, "Qn": 15150.0},
+        parameters=dict(model.parameters), constants=dict(model.constants), definitions=definitions, units=names,
+    )  # fmt: skip
+
+
+FLUX = "m1 ** 2 * T1 / p1 - m2 ** 2 * T2 / p2"
+
+
+def test_as_printed_the_efficiency_never_reaches_the_output() -> None:
+    model = printed(f"{FLUX} = 0")
+    found = identifiability(model, excited(model, 200, 0.01), dt=1.0, R=[[1e4]], parameter_scales=[0.1, 1e3])
+    assert "phi" in found.unidentifiable
+    assert any(set(direction) <= {"T1", "p1", "Energy", "phi"} and "phi" in direction for direction in found.unseen)
+
+
+def test_corrected_with_the_papers_inputs_the_bias_is_stored_energy() -> None:
+    model = printed(f"{FLUX} + A ** 2 / R * (p1 - p2) = 0")
+    found = identifiability(model, excited(model, 200), dt=1.0, R=[[1e4]], parameter_scales=[0.1, 1e3])
+    assert "psi" in found.unidentifiable
+    assert any({"psi", "Energy"} <= set(direction) for direction in found.unseen)
+    assert "phi" not in found.unidentifiable
