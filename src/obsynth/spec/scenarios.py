@@ -43,7 +43,9 @@ def built_scenario(
         return None
     problems = DocumentProblems(source, what="spec")
     if not isinstance(plant, DescriptorSystem):
-        problems.add("scenario", "scenarios are for linear time-invariant plants, and this one is not: it changes with k or is nonlinear.")
+        problems.add(
+            "scenario", "scenarios are for linear time-invariant plants; this one changes with k or is nonlinear."
+        )
         problems.raise_if_any()
         return None
     given: dict[str, Any] = {name: getattr(section, name) for name in section.model_fields_set}
