@@ -88,7 +88,7 @@ def _joint_root(gains: GainStep) -> FloatArray:
     """Return the square root of the covariance of states and parameters after a step."""
     nq = gains.spread.shape[0]
     top = np.hstack([gains.factor, gains.Upsilon @ gains.spread])
-    return np.vstack([top, np.hstack([np.zeros((nq, gains.factor.shape[1])), gains.spread])])
+    return np.asarray(np.vstack([top, np.hstack([np.zeros((nq, gains.factor.shape[1])), gains.spread])]))
 
 
 def _terms(gains: GainStep, factor: FloatArray) -> FloatArray:
