@@ -115,7 +115,7 @@ def data_deviations(step: StepMatrices, factor: FloatArray) -> FloatArray:
     """
     deviations = np.linalg.norm(step.noise, axis=1)
     deviations[: len(step.A)] = np.hypot(deviations[: len(step.A)], np.linalg.norm(step.A @ factor, axis=1))
-    return deviations
+    return np.asarray(deviations)
 
 
 def state_terms(step: StepMatrices, sizes: FloatArray) -> FloatArray:
