@@ -111,6 +111,11 @@ class TestRefusals:
             obsynth.adaptive_observer(printed(horizon=100), form="literal", **NOISE)
         assert caught.value.condition == "residual directions"
 
+    def test_the_check_knows_the_form(self) -> None:
+        plant = printed(horizon=100)
+        assert check(plant)["adaptive-observer"].passed
+        assert not check(plant, {"adaptive-observer": {"form": "literal"}})["adaptive-observer"].passed
+
     def test_the_worst_k_is_named(self) -> None:
         open_at_7 = [[1, 0, "1 - step(k - 7) + step(k - 8)"], [0, 1, 0]]
         plant = varying(E=np.diag([1.0, 1, 0]), C=open_at_7, horizon=20)
@@ -152,6 +157,15 @@ class TestRefusals:
             design.to_control()
         with pytest.raises(SpecError, match="no recursive observer"):
             _ = obsynth.load(linear_file()).recursive
+
+
+def test_an_empty_record_has_empty_estimates() -> None:
+    for design in (obsynth.descriptor_kalman(varying(horizon=20), **NOISE),
+                   obsynth.adaptive_observer(varying(horizon=20), **NOISE)):  # fmt: skip
+        found, nq = design.observer.run(np.zeros((0, 2)), np.zeros((0, 1))), len(design.observer.fault_names)
+        assert found.states.shape == found.state_deviations.shape == (0, 3)
+        assert found.parameters.shape == (0, nq)
+        assert found.parameter_covariances.shape == (0, nq, nq)
 
 
 def linear_file() -> Path:

@@ -18,8 +18,9 @@ from obsynth.numerics.ranks import RANK_TOLERANCE
 #: A column of H that keeps less than this of its length beside the others goes to the rank-revealing step: far below
 #: what a condition number of 1e12 does, far above rounding.
 DEPENDENT_COLUMN = 1e-14
-#: The same for a row of the parity covariance, relative to the whole noise: the rank-revealing step then decides.
-SUSPECT_PARITY = 1e-15
+#: The same for a row of the parity covariance, relative to the whole noise: the rank-revealing step then decides. It
+#: must lie above `PERFECT_PARITY`, or rounding passes for noise.
+SUSPECT_PARITY = 1e-12
 #: Parity directions whose noise is below this share of the terms it is made of are free of noise: a few roundings.
 PERFECT_PARITY = 1e-14
 #: Noise-free parity directions must vanish to this share of their terms; rounding of data in double precision.
@@ -144,7 +145,9 @@ def least_squares_step(H: FloatArray, S: FloatArray, Y: FloatArray) -> LeastSqua
     return projected_step(projection, (projection.rotation @ S).T, projection.rotation @ Y)
 
 
-def rank_revealing_step(H: FloatArray, S: FloatArray, Y: FloatArray, unknown: FloatArray) -> LeastSquaresStep:
+def rank_revealing_step(
+    H: FloatArray, S: FloatArray, Y: FloatArray, unknown: FloatArray, *, mapped: int = 0
+) -> LeastSquaresStep:
     """Solve one step in which x may be undetermined, noise may be missing, and earlier directions are unknown.
 
     Parameters
@@ -153,6 +156,8 @@ def rank_revealing_step(H: FloatArray, S: FloatArray, Y: FloatArray, unknown: Fl
         As for `least_squares_step`; here H may have any rank.
     unknown : FloatArray
         ``(rows, r)``: columns of further unknowns without prior, eliminated together with x.
+    mapped : int, optional
+        How many columns of Y, the first, make a map of the data instead of data: nothing need be consistent in them.
 
     Returns
     -------
@@ -175,7 +180,7 @@ def rank_revealing_step(H: FloatArray, S: FloatArray, Y: FloatArray, unknown: Fl
     sizes = np.abs(np.diagonal(r))
     rank = int(np.sum(sizes > RANK_TOLERANCE * max(float(sizes[0]), 0.0))) if sizes.size else 0
     q1, q2, head = q[:, :rank], q[:, rank:], r[:rank, :rank]
-    innovation, carried, rest = _whitened(q1, q2, S, Y)
+    innovation, carried, rest = _whitened(q1, q2, S, Y, mapped)
     noise = qr(rest.T, mode="economic")[1].T if rest.size else np.zeros((rank, 0))
     solved = solve_triangular(head, np.hstack([q1.T @ Y - carried, noise])) if rank else np.zeros((0, Y.shape[1]))
     back = np.zeros((whole.shape[1], solved.shape[1]))
@@ -200,7 +205,7 @@ def _basis(null: FloatArray) -> FloatArray:
 
 
 def _whitened(
-    q1: FloatArray, q2: FloatArray, S: FloatArray, Y: FloatArray
+    q1: FloatArray, q2: FloatArray, S: FloatArray, Y: FloatArray, mapped: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the whitened parity of Y, what it tells about the rest, and the noise that is left in the rest."""
     from scipy.linalg import qr, solve_triangular
@@ -218,7 +223,11 @@ def _whitened(
     # What is left is free of noise: it must vanish, or the constraints contradict each other.
     left = scaled[rank:] - (t[:rank, rank:].T @ innovation if rank else 0.0)
     terms = ((np.abs(q2.T) @ np.abs(Y)) / sizes[:, None])[order][rank:]
-    _require_consistent(left, terms)
+    if mapped:
+        _require_consistent(np.hstack([np.zeros((len(left), 1)), left[:, mapped:]]),
+                            np.hstack([np.zeros((len(left), 1)), terms[:, mapped:]]))  # fmt: skip
+    else:
+        _require_consistent(left, terms)
     rotated = q1.T @ S @ z
     return innovation, rotated[:, :rank] @ innovation, rotated[:, rank:]
 

@@ -78,7 +78,9 @@ def gain_steps(observer: RecursiveObserver, steps: int) -> Iterator[GainStep]:
         right = np.eye(rows)
         if nq:
             right = np.hstack([right, np.vstack([step.A @ Upsilon + step.Phi, -step.Psi])])
-        found = least_squares_step(step.H, S, right) or rank_revealing_step(step.H, S, right, np.zeros((rows, 0)))
+        found = least_squares_step(step.H, S, right) or rank_revealing_step(
+            step.H, S, right, np.zeros((rows, 0)), mapped=rows
+        )
         gain, Upsilon, factor = found.estimate[:, :rows], found.estimate[:, rows:], found.factor
         parity, G = found.innovation[:, :rows], -found.innovation[:, rows:]
         learn, forget = np.zeros((nq, rows)), np.eye(nq)

@@ -75,7 +75,7 @@ class RecursiveEstimates:
         observer : RecursiveObserver
             Whose rows they are.
         rows : sequence of RawEstimate
-            At least one.
+            May be empty.
         window : sequence of FloatArray, optional
             Regressors of the latest samples, when only the last row is given.
         """
@@ -86,7 +86,7 @@ class RecursiveEstimates:
             if window is None
             else excitation_levels(list(window), length)[-len(rows) :]
         )
-        nq = len(rows[0].parameters.theta)
+        nx, nq = observer.plant.nx, len(observer.fault_names)
         most = max((len(row.innovation) for row in rows), default=0)
         innovations, padded = np.full((len(rows), most), np.nan), np.full((len(rows), most, nq), np.nan)
         for i, row in enumerate(rows):
@@ -96,8 +96,8 @@ class RecursiveEstimates:
         spreads = np.array([row.parameters.spread @ row.parameters.spread.T for row in rows]).reshape(len(rows), nq, nq)
         parameters = np.array([row.parameters.theta for row in rows]).reshape(len(rows), nq)
         return cls(
-            states=read_only(np.array([row.x for row in rows])),
-            state_deviations=read_only(np.array([deviations_of(row) for row in rows])),
+            states=read_only(np.array([row.x for row in rows]).reshape(len(rows), nx)),
+            state_deviations=read_only(np.array([deviations_of(row) for row in rows]).reshape(len(rows), nx)),
             parameters=read_only(parameters),
             parameter_covariances=read_only(spreads),
             innovations=read_only(innovations),

@@ -6,10 +6,12 @@ import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.least_squares_step import LeastSquaresStep, least_squares_step, rank_revealing_step
+from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.observers.recursive import RecursiveObserver
 from obsynth.observers.recursive_running import RunningRecursiveObserver, step_model_of
 from obsynth.observers.schedule_facts import looked_at
 from obsynth.observers.step_model import EarlySteps, StepMatrices
+from obsynth.verification.consistency import data_deviations, state_terms
 
 #: Steps in the batch: enough for every matrix to matter, few enough for one dense problem.
 BATCH_STEPS = 6
@@ -30,19 +32,20 @@ def batch_residuals(stated: RecursiveObserver, shipped: RecursiveObserver) -> di
     Returns
     -------
     dict
-        The largest gaps of ``state``, ``covariance`` and ``regressor`` after the last step, relative to standard
-        deviations of the state (and of the record, which has size one).
+        The largest gaps of ``state``, ``covariance`` and ``regressor`` after the last step, relative to the terms
+        that these are made of in that step.
     """
     steps = min(BATCH_STEPS, looked_at(stated))
-    plant, rng = stated.plant, np.random.default_rng(SEED)
-    y, u = rng.standard_normal((steps + 1, plant.ny)), rng.standard_normal((steps + 1, plant.nu))
-    running = RunningRecursiveObserver(shipped)
+    y, u = _record(stated, steps + 1)
+    running, reference = RunningRecursiveObserver(shipped), RunningRecursiveObserver(stated)
     for k in range(steps + 1):
+        before = reference.x, reference.factor, reference.Upsilon
         running.raw_step(y[k], u[k])
-    exact = _batch(stated, y, u)
+        reference.raw_step(y[k], u[k])
+    exact = _solved(stated, y, u)
+    made_of = _terms(reference.model.at(steps - 1), before, (y[-1], u[-2], u[-1]))
     covariance = exact.factor @ exact.factor.T
-    deviations = np.sqrt(np.diag(covariance))
-    size = deviations + np.abs(exact.estimate[:, 0]) + np.finfo(np.float64).tiny
+    size = made_of[:, 0] + np.abs(exact.estimate[:, 0]) + np.finfo(np.float64).tiny
     found = running.factor @ running.factor.T
     gaps = {
         "state": np.abs(running.x - exact.estimate[:, 0]) / size,
@@ -50,13 +53,58 @@ def batch_residuals(stated: RecursiveObserver, shipped: RecursiveObserver) -> di
     }
     if running.Upsilon.shape[1]:
         regressor = exact.estimate[:, 1:]
-        sizes = np.linalg.norm(regressor, axis=0) + np.finfo(np.float64).tiny
+        sizes = np.linalg.norm(regressor, axis=0) + np.linalg.norm(made_of[:, 1:], axis=0) + np.finfo(np.float64).tiny
         gaps["regressor"] = np.abs(running.Upsilon - regressor) / sizes
     return {name: float(np.max(gap)) for name, gap in gaps.items()}
 
 
-def _batch(observer: RecursiveObserver, y: FloatArray, u: FloatArray) -> LeastSquaresStep:
+def _terms(
+    step: StepMatrices, before: tuple[FloatArray, FloatArray, FloatArray], data: tuple[FloatArray, ...]
+) -> FloatArray:
+    """Return what state (with its deviation) and regressor of the last step are made of, ``(nx, 1 + nq)``.
+
+    A deviation or a regressor that tends to zero is a difference of such terms, and rounds as they do.
+    """
+    (x, factor, upsilon), (y, u, after) = before, data
+    driven = np.abs(step.A) @ np.abs(x) + np.abs(step.B) @ np.abs(u)
+    values = np.concatenate([driven, np.abs(y), np.abs(step.Dn) @ np.abs(after)]) + data_deviations(step, factor)
+    nq = upsilon.shape[1]
+    regressors = np.vstack([np.abs(step.A) @ np.abs(upsilon) + np.abs(step.Phi[:, :nq]), np.abs(step.Psi[:, :nq])])
+    return state_terms(step, np.hstack([values[:, None], regressors]))
+
+
+def _record(observer: RecursiveObserver, samples: int) -> tuple[FloatArray, FloatArray]:
+    """Return a random record, changed as little as is needed where equations without noise would contradict it."""
+    plant, rng = observer.plant, np.random.default_rng(SEED)
+    y, u = rng.standard_normal((samples, plant.ny)), rng.standard_normal((samples, plant.nu))
+    H, S, data = _problem(observer, y, u)
+    left, values, _ = np.linalg.svd(np.hstack([H, S]))
+    perfect = left[:, int(np.sum(values > RANK_TOLERANCE * values[0])) :]
+    if not perfect.shape[1]:
+        return y, u
+    # The data are affine in the record: a column of the map is the difference that one sample makes.
+    zero = np.zeros(y.size + u.size)
+    none = _problem(observer, *_split(zero, y, u))[2][:, 0]
+    unit = np.eye(zero.size)
+    effect = np.array([perfect.T @ (_problem(observer, *_split(one, y, u))[2][:, 0] - none) for one in unit]).T
+    flat = np.concatenate([y.ravel(), u.ravel()])
+    return _split(flat - np.linalg.pinv(effect, rcond=RANK_TOLERANCE) @ (perfect.T @ data[:, 0]), y, u)
+
+
+def _split(flat: FloatArray, y: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray]:
+    return flat[: y.size].reshape(y.shape), flat[y.size :].reshape(u.shape)
+
+
+def _solved(observer: RecursiveObserver, y: FloatArray, u: FloatArray) -> LeastSquaresStep:
     """Return the last state of the solution over all states at once; further columns belong to the parameters."""
+    H, S, data = _problem(observer, y, u)
+    n = H.shape[1] // len(y)
+    found = least_squares_step(H, S, data) or rank_revealing_step(H, S, data, np.zeros((len(H), 0)))
+    return LeastSquaresStep(found.estimate[-n:], found.factor[-n:], found.innovation, found.diffuse[-n:])
+
+
+def _problem(observer: RecursiveObserver, y: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return H, S and data of ``data = H x + S e`` for all states at once."""
     start = RunningRecursiveObserver(observer)
     model, steps = step_model_of(observer), len(y) - 1
     n, nq = len(start.x), start.Upsilon.shape[1]
@@ -85,5 +133,4 @@ def _batch(observer: RecursiveObserver, y: FloatArray, u: FloatArray) -> LeastSq
     for root in roots:
         S[top : top + len(root), left : left + root.shape[1]] = root
         top, left = top + len(root), left + root.shape[1]
-    found = least_squares_step(H, S, data) or rank_revealing_step(H, S, data, np.zeros((len(H), 0)))
-    return LeastSquaresStep(found.estimate[-n:], found.factor[-n:], found.innovation, found.diffuse[-n:])
+    return H, S, data

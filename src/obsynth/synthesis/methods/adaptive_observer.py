@@ -28,10 +28,10 @@ from obsynth.synthesis.result import Synthesis
 
 
 def conditions(
-    plant: DescriptorSystem | TimeVaryingDescriptorSystem, *, literal: bool = False
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem, *, form: str = "innovation"
 ) -> tuple[Condition, ...]:
     """Return the existence conditions; the list ends at the first failure."""
-    return tuple(recursive_conditions(plant, parameters=True, literal=literal))
+    return tuple(recursive_conditions(plant, parameters=True, literal=form == "literal"))
 
 
 def synthesise(
@@ -60,7 +60,7 @@ def synthesise(
         raise SpecError("random_walk belongs to form 'random-walk': the other forms forget instead.",
                         path="method.options.random_walk")  # fmt: skip
     progress("checking the existence conditions along the horizon")
-    require_all(conditions(plant, literal=form == "literal"))
+    require_all(conditions(plant, form=form))
     options = with_stated_noise(plant, {
         "Q": Q, "R": R, "initial_state": initial_state, "initial_covariance": initial_covariance,
         "early_constraints": early_constraints, "form": form, "forgetting": forgetting,
