@@ -272,7 +272,7 @@ class TestEndings:
         def interrupted(spec: Any, report_stage: Any) -> Any:
             raise KeyboardInterrupt
 
-        monkeypatch.setattr(commands, "_designed", interrupted)
+        monkeypatch.setattr(commands, "designed", interrupted)
         assert main(["design", "--system", str(WANG), "--quiet"]) == 130
         assert capsys.readouterr().err == "Interrupted.\n"
         assert list(Path.cwd().iterdir()) == []

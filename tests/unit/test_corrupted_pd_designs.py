@@ -9,13 +9,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from corruption_tables import (
+    assert_every_row_is_broken,
+    assert_exactly_the_untrue_rows_fail,
+    assert_information_does_not_fail,
+)
 
 from obsynth import (
     Certificate,
     DescriptorSystem,
     ObserverDesign,
     SpecError,
-    VerificationReport,
     pd_observer,
     pd_observer_from_gains,
     verify,
@@ -375,29 +379,15 @@ def test_a_good_design_passes(name: str) -> None:
 
 @pytest.mark.parametrize("case", TABLE)
 def test_exactly_the_rows_that_are_untrue_fail(case: str) -> None:
-    name, corrupt, expected = TABLE[case]
-    report = verify(corrupt(good(name)))
-    assert {check.name for check in report.failures} == set(expected)
-    assert not report.passed
-
-
-def rows_that_decide(report: VerificationReport) -> set[str]:
-    return {check.name for check in report.checks if check.kind != "information"}
+    assert_exactly_the_untrue_rows_fail(TABLE, case, good)
 
 
 def test_the_table_breaks_every_row_that_verification_produces() -> None:
-    produced = set().union(*(rows_that_decide(good(name).report) for name in GOOD))
-    for name, corrupt, _ in TABLE.values():
-        produced |= rows_that_decide(verify(corrupt(good(name))))
-    broken = set().union(*(expected for _, _, expected in TABLE.values()))
-    assert broken == produced
+    assert_every_row_is_broken(TABLE, GOOD, good)
 
 
 def test_rows_that_inform_do_not_fail() -> None:
-    for name, corrupt, _ in TABLE.values():
-        report = verify(corrupt(good(name)))
-        assert all(check.passed for check in report.checks if check.kind == "information")
-        assert len({check.name for check in report.checks}) == len(report.checks)
+    assert_information_does_not_fail(TABLE, good)
 
 
 #: Observer matrix -> for each part of its rows, the row of the report that must fail.

@@ -43,8 +43,8 @@ def run_design(options: argparse.Namespace) -> int:
         from obsynth.spec import load_spec
 
         spec = load_spec(options.system)
-        target = _output_file(options.output, spec)
-        design = _designed(spec, report_stage)
+        target = output_file(options.output, spec)
+        design = designed(spec, report_stage)
         file = design.save(target)
     if options.json:
         print_json({
@@ -58,7 +58,7 @@ def run_design(options: argparse.Namespace) -> int:
     return 0
 
 
-def _designed(spec: Spec, report_stage: Any) -> ObserverDesign:
+def designed(spec: Spec, report_stage: Any) -> ObserverDesign:
     """Return the design that a spec asks for, proved; stages go to ``report_stage``."""
     from obsynth.pipeline.designing import design
 
@@ -68,8 +68,14 @@ def _designed(spec: Spec, report_stage: Any) -> ObserverDesign:
     )
 
 
-def _output_file(wanted: Path | None, spec: Spec, *, option: str = "--output") -> Path:
-    """Return where to write; refuse a hopeless place before any work is done."""
+def output_file(wanted: Path | None, spec: Spec, *, option: str = "--output") -> Path:
+    """Return where to write; refuse a hopeless place before any work is done.
+
+    Raises
+    ------
+    SpecError
+        The place is a folder, in no folder, or the spec itself.
+    """
     target = wanted if wanted is not None else Path(f"{spec.name}.gains.json")
     if target.is_dir():
         raise SpecError(f"{target} is a folder: give the name of a file to {option}.", path=str(target))

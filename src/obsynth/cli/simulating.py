@@ -26,7 +26,7 @@ def run_simulate(options: argparse.Namespace) -> int:
     ObsynthError
         As its exit code says; nothing is written then.
     """
-    from obsynth.cli.commands import _designed, _output_file
+    from obsynth.cli.commands import designed, output_file
     from obsynth.spec import load_spec
 
     with progress(quiet=options.quiet) as report_stage:
@@ -35,8 +35,8 @@ def run_simulate(options: argparse.Namespace) -> int:
         if spec.scenario is None:
             raise SpecError(f"{spec.path} has no scenario: add one, for example scenario: {{horizon: 100}}.",
                             path="scenario")  # fmt: skip
-        target = None if options.out is None else _output_file(options.out, spec, option="--out")
-        design = _designed(spec, report_stage)
+        target = None if options.out is None else output_file(options.out, spec, option="--out")
+        design = designed(spec, report_stage)
         report_stage("simulating")
         from obsynth.evaluation.simulating import simulate
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from collections import deque
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
 from obsynth.data.bridge import Bridge
 from obsynth.data.clock import Clock
 from obsynth.data.holds import KeptHolds, transient
-from obsynth.errors import SpecError
+from obsynth.errors import ObsynthError, SpecError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.sampling import first_order_hold
 from obsynth.results.design import ObserverDesign
@@ -21,6 +21,22 @@ from obsynth.results.design import ObserverDesign
 OK, WARM_UP, GAP, RECOVERING = "ok", "warm-up", "gap", "recovering"
 #: Gaps longer than this many samples are not bridged: the observer starts again.
 LONGEST_BRIDGE = 10_000
+
+
+_Part = TypeVar("_Part")
+
+
+def _running(part: _Part | None) -> _Part:
+    """Return a part that is there while the observer runs.
+
+    Raises
+    ------
+    ObsynthError
+        It is not: the run is in a state that no order of calls should lead to.
+    """
+    if part is None:
+        raise ObsynthError("The run is in an impossible state: its observer or plant model is missing. Start it again.")
+    return part
 
 
 class Row(NamedTuple):
@@ -140,34 +156,31 @@ class DataObserver:
         return Row(status, found)
 
     def _measured(self, seconds: float, v: FloatArray) -> FloatArray:
-        assert self.z is not None
         if self.observer.dt == 0.0:
             self._flow(seconds, v)
-        self.row = np.asarray(self.observer.Cz @ self.z + self.d @ v)
+        self.row = np.asarray(self.observer.Cz @ _running(self.z) + self.d @ v)
         self.measured = v
         self._taken(v)
         return self.row
 
     def _lost(self, seconds: float, v: FloatArray) -> bool:
         """Whether the model, after a gap, misses the outputs by more than their whole size before and after it."""
-        assert self.bridge is not None
         self._propagate(seconds, v[: self.nu])
+        bridge = _running(self.bridge)
         # The outputs and the model may both be huge; a miss that is not finite is lost as well.
-        return not self.bridge.miss(v, self.model, self.fault) <= self.bridge.miss(self.measured) + self.bridge.miss(v)
+        return not bridge.miss(v, self.model, self.fault) <= bridge.miss(self.measured) + bridge.miss(v)
 
     def _taken(self, v: FloatArray) -> None:
-        assert self.z is not None
         if self.observer.dt > 0.0:
-            self.z = np.asarray(self.observer.Az @ self.z + self.b @ v)
+            self.z = np.asarray(self.observer.Az @ _running(self.z) + self.b @ v)
         self.v = v
         self.inputs.append(self.v[: self.nu])
 
     def _flow(self, seconds: float, v: FloatArray) -> None:
         """Bring z of a continuous observer to the time of ``v``, which is reached along a straight line."""
-        assert self.z is not None
         if seconds > 0.0:
             transition, constant, ramp = self.observer_hold.at(seconds)
-            self.z = np.asarray(transition @ self.z + constant @ self.v + ramp @ (v - self.v))
+            self.z = np.asarray(transition @ _running(self.z) + constant @ self.v + ramp @ (v - self.v))
 
     def _bridge_interval(self, seconds: float, missing: int, u: FloatArray) -> None:
         """Cross the rows that are not there; in continuous time, up to and including this row's time."""
@@ -211,17 +224,14 @@ class DataObserver:
         return row
 
     def _propagate(self, seconds: float, u: FloatArray) -> None:
-        assert self.bridge is not None
-        assert self.plant_hold is not None
-        assert self.model is not None
-        before = self.v[: self.nu]
+        before, model = self.v[: self.nu], _running(self.model)
         if self.observer.dt > 0.0:
-            self.model = self.bridge.sampled(self.model, before, self.fault)
+            self.model = _running(self.bridge).sampled(model, before, self.fault)
         elif seconds > 0.0:
-            transition, constant, ramp = self.plant_hold.at(seconds)
+            transition, constant, ramp = _running(self.plant_hold).at(seconds)
             rise = np.concatenate([u - before, np.zeros(len(self.fault))])
             start = np.concatenate([before, self.fault])
-            self.model = np.asarray(transition @ self.model + constant @ start + ramp @ rise)
+            self.model = np.asarray(transition @ model + constant @ start + ramp @ rise)
 
     def _restart(self) -> None:
         self.z = self.model = None

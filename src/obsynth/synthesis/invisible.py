@@ -19,18 +19,21 @@ from obsynth.synthesis.gain_problem import GainProblem
 GROWTH_MARGIN = 1e-6
 
 
+def _rank(values: FloatArray) -> int:
+    """Return how many singular values, largest first, count; data are normalised, so that one is a natural size."""
+    return int(np.sum(values > RANK_TOLERANCE * max(1.0, float(values[0])))) if values.size else 0
+
+
 def null_space(matrix: FloatArray) -> FloatArray:
     """Return an orthonormal null basis of a matrix of any rank."""
     _, values, right = np.linalg.svd(matrix)
-    rank = int(np.sum(values > RANK_TOLERANCE * max(1.0, float(values[0])))) if values.size else 0
-    return np.asarray(right[rank:].T)
+    return np.asarray(right[_rank(values) :].T)
 
 
 def _range(matrix: FloatArray) -> FloatArray:
     """Return an orthonormal basis of the range."""
     left, values, _ = np.linalg.svd(matrix, full_matrices=False)
-    rank = int(np.sum(values > RANK_TOLERANCE * max(1.0, float(values[0])))) if values.size else 0
-    return np.asarray(left[:, :rank])
+    return np.asarray(left[:, : _rank(values)])
 
 
 def invisible_pairs(problem: GainProblem) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -116,7 +119,7 @@ def _pairs_from_rest(top: FloatArray, image: FloatArray) -> tuple[FloatArray, Fl
         pairs = null_space(np.hstack([top, -reached]))[:size]
         point = point + 0.5 * pairs @ pairs.T
         left, values, _ = np.linalg.svd(image @ pairs * np.sqrt(0.5), full_matrices=False)
-        rank = int(np.sum(values > RANK_TOLERANCE * max(1.0, float(values[0])))) if values.size else 0
+        rank = _rank(values)
         reached = left[:, :rank] * values[:rank]
     return 0.5 * (point + point.T), _range(reached)
 

@@ -65,8 +65,8 @@ def small_gain_design(
         # Without a noise model the objective is the size of the gains themselves, and zero is least.
         return nothing, records
     candidates: list[Injection] = []
+    target = least_noise_filter(problem) if goal.noisy else nothing
     if engine != "lmi":
-        target = least_noise_filter(problem) if goal.noisy else nothing
         central = [item for item in (*noise_weighted_filters(problem, gain), fresh.start) if goal.met(item)]
         candidates += [_towards(goal, item, target) for item in central]
         records.append({"what": "small gains", "solver": "central filter", "status": f"{len(central)} filters"})
@@ -79,7 +79,7 @@ def small_gain_design(
     # An inaccurate solution may be far from the least noise: the true cost decides, not the solver.
     fast = [item for item in candidates if goal.met_fast(item)]
     found = min(fast or candidates, key=goal.cost)
-    return (_towards(goal, found, least_noise_filter(problem)) if goal.noisy else found), records
+    return (_towards(goal, found, target) if goal.noisy else found), records
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +118,7 @@ def _by_inequality(
     )  # fmt: skip
     for normalised, decay in attempts:
         if normalised is None:
-            injection = _small_gains_step_by_step(problem, gain, records, solver=solver)
+            injection = _small_gains_step_by_step(problem, fresh, gain, records, solver=solver)
         else:
             injection = _small_gains_in(problem, normalised, gain, records, solver=solver, decay=decay)
         if injection is not None and goal.met(injection):
@@ -135,13 +135,13 @@ def _towards(goal: _Goal, injection: Injection, target: Injection | None) -> Inj
     """Go towards a cheaper filter as far as the true gain allows: one P for gain and noise leaves room."""
     if target is None:
         return injection
-    best, share, step = injection, 0.0, 1.0
+    best, least, share, step = injection, goal.cost(injection), 0.0, 1.0
     judge = goal.met_fast if goal.met_fast(injection) else goal.met
     for _ in range(LINE_STEPS):
         tried = share + step
         mixed = Injection(*((1.0 - tried) * a + tried * b for a, b in zip(injection.parts, target.parts, strict=True)))
-        if tried <= 1.0 and judge(mixed) and goal.cost(mixed) <= goal.cost(best):
-            best, share = mixed, tried
+        if tried <= 1.0 and judge(mixed) and (cost := goal.cost(mixed)) <= least:
+            best, least, share = mixed, cost, tried
         step *= 0.5
     return best
 
@@ -170,14 +170,13 @@ def _small_gains_in(
 
 
 def _small_gains_step_by_step(
-    problem: GainProblem, gain: float, records: list[dict[str, Any]], *, solver: str
+    problem: GainProblem, normalised: NormalisedProblem, gain: float, records: list[dict[str, Any]], *, solver: str
 ) -> Injection | None:
-    """Walk from the starting filter down to ``gain``, each filter giving the coordinates for the next level.
+    """Walk from the filter of ``normalised`` down to ``gain``, each filter giving the coordinates for the next level.
 
     Far below the starting filter's gain its coordinates are too bad for one jump, and those of the least gain can
     be extreme (a decoupled disturbance).
     """
-    normalised = coordinates(problem, solver=solver)
     reached = problem.achieved_gain(normalised.start)
     for _ in range(MOST_STEPS):
         for ratio in STEP_RATIOS:
@@ -199,7 +198,7 @@ def _reaches(problem: GainProblem, injection: Injection, gain: float) -> bool:
     if limit is not None and float(np.linalg.norm(limit.fixed + injection.V @ limit.free, 2)) > limit.bound:
         return False
     if problem.disturbances == 0:
-        return spectral_radius(problem.closed_loop(injection)[0]) < 1.0
+        return _radius(problem, injection) < 1.0
     return problem.reaches(injection, gain)
 
 

@@ -132,14 +132,27 @@ def worst(found: list[Residual]) -> Residual:
     return max(found, key=lambda item: item.severity)
 
 
-def equality(name: str, claim: str, found: Residual, source: str) -> Check:
-    """Return the row of a report for an identity."""
+def relative_tolerance(printed_digits: int | None, products: int) -> float:
+    """Return what an equality may miss by, relative to its terms.
+
+    Parameters
+    ----------
+    printed_digits : int or None
+        Decimals to which the gains were printed; ``None`` for double precision.
+    products : int
+        How many products an entry sums up, each with half a unit in the last printed place.
+    """
+    return EQUALITY_TOLERANCE if printed_digits is None else 0.5 * 10.0 ** (-printed_digits) * products
+
+
+def equality(name: str, claim: str, found: Residual, source: str, *, bound: float | None = None) -> Check:
+    """Return the row of a report for an identity; without a bound of the caller's, the residual knows its own."""
     printed = f"; printed digits allow {found.allowance:.1e}" if found.allowance else ""
     return upper_bound_check(
         name,
         claim,
         found.relative,
-        found.bound,
+        found.bound if bound is None else bound,
         source=source,
         kind="equality",
         detail=f"largest miss {found.error:.1e} among terms of size {found.scale:.1e}{printed}",

@@ -22,14 +22,12 @@ from obsynth.numerics.scaling import balance_by_least_squares
 from obsynth.observers.linear import LinearObserver
 from obsynth.results.design import ObserverDesign
 from obsynth.results.report import Check, information, lower_bound_check, upper_bound_check
-from obsynth.verification.identities import Residual, residual, tracking_identities
+from obsynth.verification.identities import equality, relative_tolerance, residual, tracking_identities, worst
 from obsynth.verification.pd_error_system import PdErrorSystem
 from obsynth.verification.pd_norms import norm_rows
 from obsynth.verification.pd_proofs import fitting_claims, proof_rows, stacked_gains
 from obsynth.verification.plant import condition_rows, plant_information
 
-#: Equalities may miss by this much, relative to the terms they are made of.
-EQUALITY_TOLERANCE = 1e-9
 _IDENTITIES = {
     "dynamics": ("unbiased: dynamics", "Az + By C = A, with the faults as states", "Filasova et al., eq. (29)"),
     "inputs": ("unbiased: inputs", "Bu + By D = B", "Filasova et al., eq. (4)"),
@@ -53,20 +51,16 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     )  # fmt: skip
     if not fitting:
         return
-    tolerance = EQUALITY_TOLERANCE
-    if printed_digits is not None:
-        # Half a unit in the last printed place, in each of the products that an identity sums up.
-        tolerance = 0.5 * 10.0 ** (-printed_digits) * (plant.nx + plant.nf + plant.ny)
+    tolerance = relative_tolerance(printed_digits, plant.nx + plant.nf + plant.ny)
     augmented = with_faults_as_states(with_sensor_noise(plant))
     # The faults are states of the augmented plant, so that their estimates are state estimates of it.
     whole = replace(
         observer, state_names=augmented.state_names, fault_names=(), state_delays=(0,) * augmented.nx, fault_delays=()
     )
     for key, identity in tracking_identities(augmented, whole, np.eye(augmented.nx), 0).items():
-        found = identity.residual()
         if key in _IDENTITIES:
             name, claim, source = _IDENTITIES[key]
-            yield _equality(name, claim, found, tolerance, source)
+            yield equality(name, claim, identity.residual(), source, bound=tolerance)
     errors = PdErrorSystem.of(augmented, observer, plant.nx)
     yield _gains_row(design, augmented, tolerance)
     yield from _spectra(design, errors)
@@ -88,13 +82,6 @@ def _fits(plant: DescriptorSystem, observer: LinearObserver) -> bool:
         and observer.fault_names == plant.fault_names
         and not any((*observer.state_delays, *observer.fault_delays))
     )
-
-
-def _equality(name: str, claim: str, found: Residual, tolerance: float, source: str) -> Check:
-    return upper_bound_check(
-        name, claim, found.relative, tolerance, source=source, kind="equality",
-        detail=f"largest miss {found.error:.1e} among terms of size {found.scale:.1e}",
-    )  # fmt: skip
 
 
 def _negative(name: str, claim: str, value: float, *, source: str, detail: str) -> Check:
@@ -119,10 +106,9 @@ def _gains_row(design: ObserverDesign, augmented: DescriptorSystem, tolerance: f
             units=units,
         ),
     ]  # fmt: skip
-    worst = max(found, key=lambda item: np.inf if np.isnan(item.relative) else item.relative)
-    return _equality(
-        "gains", "the realisation is that of the listed J, L, M, N (and G)", worst, tolerance,
-        "Filasova et al., eqs. (4)-(6), (31)",
+    return equality(
+        "gains", "the realisation is that of the listed J, L, M, N (and G)", worst(found),
+        "Filasova et al., eqs. (4)-(6), (31)", bound=tolerance,
     )  # fmt: skip
 
 

@@ -21,13 +21,11 @@ from obsynth.results.design import ObserverDesign
 from obsynth.results.report import Check, information, upper_bound_check
 from obsynth.verification.decoupling import decoupling_norm
 from obsynth.verification.fault_tracking import tracking_rows
-from obsynth.verification.identities import Residual, residual
+from obsynth.verification.identities import Residual, equality, relative_tolerance, residual
 from obsynth.verification.plant import condition_rows, plant_information
 from obsynth.verification.ui_pi_numbers import noise_rows, stability_rows
 
-#: Equalities may miss by this much, relative to the terms they are made of.
-EQUALITY_TOLERANCE = 1e-9
-#: The same for estimates at a frequency, whose terms pass through the inverse of ``sI - Az``.
+#: Estimates at a frequency may miss by this much, relative to terms that pass through the inverse of ``sI - Az``.
 DECOUPLING_TOLERANCE = 1e-8
 _PAPER = "Share Pasand, eq. (19)"
 _MATRICES = ("tracking", "Phi", "Cw", "poles", "stability")
@@ -55,15 +53,9 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
         yield information(last.name, "poles that no gain moves", last.value, source=last.source, detail=last.detail)
     else:
         yield from condition_rows([last])
-    tolerance = EQUALITY_TOLERANCE
-    if printed_digits is not None:
-        # Half a unit in the last printed place, in each of the products that an identity sums up.
-        tolerance = 0.5 * 10.0 ** (-printed_digits) * (plant.nx + len(phi) + plant.ny)
+    tolerance = relative_tolerance(printed_digits, plant.nx + len(phi) + plant.ny)
     for name, claim, found, source in _identities(plant, observer, AugmentedPlant.of(plant, model), tracking, cw):
-        yield upper_bound_check(
-            name, claim, found.relative, tolerance, source=source, kind="equality",
-            detail=f"largest miss {found.error:.1e} among terms of size {found.scale:.1e}",
-        )  # fmt: skip
+        yield equality(name, claim, found, source, bound=tolerance)
     yield from stability_rows(design, poles, factor)
     norm = decoupling_norm(plant, observer)
     yield upper_bound_check(
