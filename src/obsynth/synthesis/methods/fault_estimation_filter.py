@@ -46,7 +46,7 @@ from obsynth.synthesis.small_gains import small_gain_design
 
 #: Who finds the gains: Riccati equations, the matrix inequality started from them, or both up to so many states.
 ENGINES = ("auto", "riccati", "lmi")
-MOST_STATES_FOR_BOTH = 20
+MOST_STATES_FOR_BOTH = 0
 #: Fictitious noise on the measurements, relative to the given one, so that no direction of the gains is free of cost.
 BACKGROUND_NOISE = 1e-3
 #: Asking for a gain above this multiple of the starting filter's adds nothing but bad scaling.
