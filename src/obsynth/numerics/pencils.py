@@ -178,17 +178,18 @@ def _clearly_without_zeros(
     and ``rest`` cannot map it to less than ``|rest v| (1 - r) - |rest| r``.  Where that is more than t for every v, there
     is no z left to look at.  Ill-conditioned eigenvectors and close eigenvalues leave the question open.
     """
-    try:
-        values, vectors = np.linalg.eig(np.linalg.solve(square_e, square_a))
-        weights = np.linalg.norm(np.linalg.inv(square_e @ vectors), axis=1)
-        spread = float(np.linalg.norm(np.linalg.inv(vectors)))
-    except np.linalg.LinAlgError:
-        return False
-    residual = float(np.linalg.norm(square_a @ vectors - square_e @ vectors * values))
-    tolerances = RANK_TOLERANCE * (scales[1] + np.abs(values) * scales[0])
-    apart = np.abs(values - values[:, None])
-    np.fill_diagonal(apart, np.inf)
-    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+    # What overflows is not clear.
+    with np.errstate(all="ignore"):
+        try:
+            values, vectors = np.linalg.eig(np.linalg.solve(square_e, square_a))
+            weights = np.linalg.norm(np.linalg.inv(square_e @ vectors), axis=1)
+            spread = float(np.linalg.norm(np.linalg.inv(vectors)))
+        except np.linalg.LinAlgError:
+            return False
+        residual = float(np.linalg.norm(square_a @ vectors - square_e @ vectors * values))
+        tolerances = RANK_TOLERANCE * (scales[1] + np.abs(values) * scales[0])
+        apart = np.abs(values - values[:, None])
+        np.fill_diagonal(apart, np.inf)
         # Closest to lambda_i means up to half way to the others.
         away = (tolerances + residual * spread) * np.sum(2.0 * weights / apart, axis=1)
         least = np.linalg.norm(rest @ vectors, axis=0) * (1.0 - away) - float(np.linalg.norm(rest)) * away

@@ -44,9 +44,8 @@ from obsynth.synthesis.lmi import SOLVER_SETTINGS
 from obsynth.synthesis.result import Synthesis
 from obsynth.synthesis.small_gains import small_gain_design
 
-#: Who finds the gains: Riccati equations, the matrix inequality started from them, or both up to so many states.
+#: Who finds the gains: Riccati equations, or the matrix inequality started from them.
 ENGINES = ("auto", "riccati", "lmi")
-MOST_STATES_FOR_BOTH = 0
 #: Fictitious noise on the measurements, relative to the given one, so that no direction of the gains is free of cost.
 BACKGROUND_NOISE = 1e-3
 #: Asking for a gain above this multiple of the starting filter's adds nothing but bad scaling.
@@ -137,7 +136,8 @@ def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **op
     size = max(problem.disturbance_size, NOMINAL_GAIN)
     engine = asked.engine
     if engine == "auto":
-        engine = "both" if problem.order <= MOST_STATES_FOR_BOTH else "riccati"
+        # Riccati equations do not cover a limit on the weight.
+        engine = "riccati" if problem.weight_limit is None else "lmi"
     progress("searching the least gain")
     least = _least_gain(problem, asked, engine)
     if problem.disturbances and least.starting_gain <= ROUNDING_GAIN * problem.disturbance_size:
