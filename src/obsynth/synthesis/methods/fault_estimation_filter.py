@@ -224,7 +224,9 @@ def gain_problem(prepared: PreparedPlant, *, free_weight: bool) -> tuple[GainPro
     measure, na = v.T, prepared.TA.shape[0]
     if prepared.Bw.shape[1]:
         size = BACKGROUND_NOISE * max(
-            float(np.linalg.norm(measure @ prepared.Dw)), float(np.linalg.norm(w0 @ prepared.Dw))
+            float(np.linalg.norm(measure @ prepared.Dw)),
+            # In units of the outputs: W may be large.
+            float(np.linalg.norm(w0 @ prepared.Dw) / np.linalg.norm(w0)),
         )
         background = size if size > 0.0 else BACKGROUND_NOISE
         bn = np.hstack([prepared.Bw - l0 @ prepared.Dw, np.zeros((na, v.shape[1]))])
