@@ -132,7 +132,7 @@ def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **op
     free = asked.free_residual_weight if asked.free_residual_weight is not None else plant.nw > 0 or limit is not None
     problem, parts = gain_problem(prepared, free_weight=free)
     if limit is not None:
-        problem = _with_weight_limit(problem, prepared, parts, limit)
+        problem = with_weight_limit(problem, prepared, parts, limit)
     size = max(problem.disturbance_size, NOMINAL_GAIN)
     engine = asked.engine
     if engine == "auto":
@@ -291,7 +291,7 @@ def _gains(prepared: PreparedPlant, parts: _Parts, chosen: Injection) -> dict[st
     }
 
 
-def _with_weight_limit(problem: GainProblem, prepared: PreparedPlant, parts: _Parts, bound: float) -> GainProblem:
+def with_weight_limit(problem: GainProblem, prepared: PreparedPlant, parts: _Parts, bound: float) -> GainProblem:
     """Return the problem with the norm of W bounded, in the user's output units.
 
     Raises
