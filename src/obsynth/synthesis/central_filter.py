@@ -33,9 +33,10 @@ from obsynth.synthesis.gain_problem import GainProblem, Injection
 #: Artificial noise relative to the disturbance, in turn: the first is bisected, and each of the others only where it reaches a level below.
 NOISES = (1e-6, 1e-8, 1e-7, 1e-5, 1e-4, 1e-2)
 #: Relative width of the bracket at which the search ends, for few and for many states.
-FEW_STATES = 40
+FEW_STATES = 80
 LEVEL_TOLERANCE = 1e-7
-COARSE_LEVEL_TOLERANCE = 1e-5
+COARSE_LEVEL_TOLERANCE = 1e-4
+COARSE_NOISES = (1e-6, 1e-4)
 MOST_LEVELS = 60
 #: Distance below the best gain, in tolerances, at which another noise is tried, and from which a failure ends that.
 PROBE = 10.0
@@ -51,6 +52,9 @@ START_SHARE = 0.5
 NOISE_WEIGHTS = np.logspace(-6.0, 3.0, 31)
 LEVEL_FACTORS = (1.0, 1.5)
 WEIGHT_STEPS = 4
+#: The same for many states, where each filter counts.
+COARSE_NOISE_WEIGHTS = np.logspace(-6.0, 3.0, 15)
+COARSE_LEVEL_FACTORS = (1.0,)
 #: A level this far above anything a disturbance could do is no limit.
 WITHOUT_LIMIT = 1e4
 
@@ -238,7 +242,7 @@ def search_central_filter(
         tolerance = LEVEL_TOLERANCE if problem.order <= FEW_STATES else COARSE_LEVEL_TOLERANCE
     best, gain = start, problem.achieved_gain(start) if gain is None else gain
     low = least_level(problem)
-    for noise in NOISES:
+    for noise in NOISES if problem.order <= FEW_STATES else COARSE_NOISES:
         if gain <= low * (1.0 + 2.0 * tolerance):
             break
         equation = CentralEquation.of(problem, noise=noise)
@@ -339,14 +343,15 @@ def noise_weighted_filters(problem: GainProblem, gain: float) -> Iterator[Inject
     sizes = [float(np.linalg.norm(np.vstack(pair))) for pair in ((work.B, work.D), (work.Bn, work.Dn))]
     if work.order == 0 or work.measured == 0 or not min(sizes) > 0.0:
         return
-    last = 0
-    for factor in LEVEL_FACTORS:
+    few = work.order <= FEW_STATES
+    weights, last = (NOISE_WEIGHTS if few else COARSE_NOISE_WEIGHTS) * sizes[0] / sizes[1], 0
+    for factor in LEVEL_FACTORS if few else COARSE_LEVEL_FACTORS:
         # More weight than at a lower level, and not more than can be hoped for.
-        low, high = last, len(NOISE_WEIGHTS) if factor == 1.0 else min(last + WEIGHT_STEPS, len(NOISE_WEIGHTS))
+        low, high = last, len(weights) if factor == 1.0 else min(last + WEIGHT_STEPS, len(weights))
         best = None
         while low < high:
             middle = (low + high) // 2
-            equation = CentralEquation.of(_with_noise(work, NOISE_WEIGHTS[middle] * sizes[0] / sizes[1]), noise=NOISES[0])
+            equation = CentralEquation.of(_with_noise(work, weights[middle]), noise=NOISES[0])
             found = equation.filter_at(factor * gain)
             if found is not None and (factor == 1.0 or problem.reaches(found, gain)):
                 best, low = found, middle + 1

@@ -13,7 +13,7 @@ import numpy as np
 from obsynth.errors import SolverError
 from obsynth.numerics.norms import spectral_radius
 from obsynth.synthesis import gain_design
-from obsynth.synthesis.central_filter import least_noise_filter, noise_weighted_filters
+from obsynth.synthesis.central_filter import FEW_STATES, least_noise_filter, noise_weighted_filters
 from obsynth.synthesis.gain_problem import GainProblem, Injection, NormalisedProblem
 from obsynth.synthesis.gain_search import LeastGain, coordinates
 
@@ -25,8 +25,9 @@ MOST_STEPS = 24
 SLOWEST_DECAY = 0.999
 #: Up to so many states the whole inequality competes although nothing needs it.
 MOST_STATES_FOR_WHOLE = 12
-#: Halvings of the step towards the filter of least noise.
+#: Halvings of the step towards the filter of least noise, for few and for many states.
 LINE_STEPS = 7
+COARSE_LINE_STEPS = 3
 #: A step counts when its level is met to this relative accuracy.
 LEVEL_ACCURACY = 1e-6
 
@@ -145,7 +146,10 @@ def _towards(goal: _Goal, injection: Injection, target: Injection | None) -> Inj
         return injection
     best, least, share, step = injection, goal.cost(injection), 0.0, 1.0
     judge = goal.met_fast if goal.met_fast(injection) else goal.met
-    for _ in range(LINE_STEPS):
+    few = goal.problem.order <= FEW_STATES
+    if not few and not goal.noisy:
+        step = 0.5  # without noise the target is no filter of this gain
+    for _ in range(LINE_STEPS if few else COARSE_LINE_STEPS):
         tried = share + step
         mixed = Injection(*((1.0 - tried) * a + tried * b for a, b in zip(injection.parts, target.parts, strict=True)))
         if tried <= 1.0 and judge(mixed) and (cost := goal.cost(mixed)) <= least:
