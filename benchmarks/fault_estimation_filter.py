@@ -1,8 +1,8 @@
 """The fault-estimation filter against what a user would write: processor time on one thread, verification included.
 
-``python benchmarks/fault_estimation_filter.py [section ...]`` prints the tables of ``benchmarks/README.md``; sections are
-``speed``, ``growth``, ``verified``, ``constraints`` and ``networks``, all by default.  ``--small`` runs a small instance of
-each, so that nothing here can rot.
+``python benchmarks/fault_estimation_filter.py [section ...]`` prints the tables of ``benchmarks/README.md``; sections
+are ``speed``, ``growth``, ``verified``, ``constraints`` and ``networks``, all by default.  ``--small`` runs a small
+instance of each, so that nothing here can rot.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -41,7 +42,8 @@ WEIGHT_BOUND = 1.5
 def random_plant(nx: int, family: str, seed: int) -> obsynth.DescriptorSystem:
     """Return a plant with two faults of index one, E of rank nx - 2, and nx / 4 outputs more than faults.
 
-    ``brief``: two disturbances; ``noise``: nx / 2 + 2, more than the outputs; ``delay``: two, which no output shows at once.
+    ``brief``: two disturbances; ``noise``: nx / 2 + 2, more than the outputs; ``delay``: two, which no output shows at
+    once.
     """
     rng = np.random.default_rng([nx, FAMILIES.index(family), seed])
     ny, nd = 2 + max(2, nx // 4), nx // 2 + 2 if family == "noise" else 2
@@ -65,7 +67,9 @@ class Script:
     verified: bool
 
 
-def inequality(problem: GainProblem, p: object, y: object, squared: object, z: object, zd: object) -> list[list[object]]:
+def inequality(
+    problem: GainProblem, p: object, y: object, squared: object, z: object, zd: object
+) -> list[list[object]]:
     """Return the blocks of the paper's inequality."""
     a, b, c, d = problem.A, problem.B, problem.C, problem.D
     n, nd, q = len(a), b.shape[1], len(problem.Z)
@@ -156,7 +160,9 @@ def speed(*, small: bool) -> None:
         "nx, family", "seeds", "riccati (default)", "lmi (polished)", "direct inequality", "rebuilt bisection",
         "direct / riccati", "bisection / riccati", "direct / lmi",
     )  # fmt: skip
-    for nx, seeds, bisected in [(6, 1, FAMILIES)] if small else [(8, 3, FAMILIES), (16, 3, FAMILIES), (32, 1, ("noise",))]:
+    for nx, seeds, bisected in (
+        [(6, 1, FAMILIES)] if small else [(8, 3, FAMILIES), (16, 3, FAMILIES), (32, 1, ("noise",))]
+    ):
         for family in FAMILIES:
             seconds: dict[str, list[float]] = {}
             distances: dict[str, list[float]] = {}
@@ -178,13 +184,17 @@ def speed(*, small: bool) -> None:
                     distances.setdefault(way, []).append(gain / min(gains.values()) - 1.0)
             spent = {way: float(np.median(values)) for way, values in seconds.items()}
             cells = [f"{spent[way]:.3g}, {max(distances[way]):.0e}" for way in ("auto", "lmi", "direct")]
-            cells.append(f"{spent['bisection']:.3g}, {max(distances['bisection']):.0e}" if "bisection" in spent else "-")
+            cells.append(
+                f"{spent['bisection']:.3g}, {max(distances['bisection']):.0e}" if "bisection" in spent else "-"
+            )
             ratios = [spent[a] / spent[b] if a in spent else np.nan
                       for a, b in (("direct", "auto"), ("bisection", "auto"), ("direct", "lmi"))]  # fmt: skip
             row(f"{nx}, {family}", seeds, *cells, *("-" if np.isnan(ratio) else f"{ratio:.3g}" for ratio in ratios))
     if not small:
         spent, found = timed(lambda: obsynth.fault_estimation_filter(random_plant(48, "noise", 0), engine="lmi"))
-        print(f"\nnx = 48, noise, lmi: {spent:.1f} s, verified: {isinstance(found, obsynth.ObserverDesign)}", flush=True)
+        print(
+            f"\nnx = 48, noise, lmi: {spent:.1f} s, verified: {isinstance(found, obsynth.ObserverDesign)}", flush=True
+        )
 
 
 def growth(*, small: bool) -> None:
@@ -213,7 +223,7 @@ def one(nx: int, family: str) -> None:
 
 
 def verified(*, small: bool) -> None:
-    """Print the share of designs that are verified; the scripts' share is that of answers that meet their inequality."""
+    """Print the share of verified designs, and of the scripts' answers that meet their own inequality."""
     table("Verified share", "nx, family", "ours", "direct inequality (its own P, Y and gamma)")
     sizes, seeds = ((6,), 2) if small else ((8, 16, 32), 20)
     for nx in sizes:
@@ -229,8 +239,8 @@ def verified(*, small: bool) -> None:
 def constraints(*, small: bool) -> None:
     """Print the whole inequality with a bound on the residual weight, in normalised coordinates and raw."""
     table(
-        f"Residual weight free within {WEIGHT_BOUND} times its least norm", "nx, family", "ours verified", "ours, seconds",
-        "raw inequality verified", "raw, seconds",
+        f"Residual weight free within {WEIGHT_BOUND} times its least norm", "nx, family", "ours verified",
+        "ours, seconds", "raw inequality verified", "raw, seconds",
     )  # fmt: skip
     sizes, seeds = ((6,), 1) if small else ((8, 16), 5)
     for nx in sizes:
@@ -254,7 +264,9 @@ def constraints(*, small: bool) -> None:
 
 def networks(*, small: bool) -> None:
     """Print wall and processor time from the spec to the verified filter."""
-    table("Power networks, from spec to verified filter", "network", "states", "wall", "processor", "verified", "progress")
+    table(
+        "Power networks, from spec to verified filter", "network", "states", "wall", "processor", "verified", "progress"
+    )
     for name in ("kundur/spec_fault_filter.yaml",) if small else ("kundur/spec_fault_filter.yaml", "ieee14/spec.yaml"):
         stages: list[str] = []
         wall, processor = time.perf_counter(), time.process_time()

@@ -82,7 +82,9 @@ def test_torques_are_followed_whatever_the_loads_do(
     for found in (design, by_default):
         assert np.max(np.abs(errors(found, torques, np.zeros_like(loads)))) < 1e-8
         # The proved gain bounds the energy of what the loads leave.
-        assert np.linalg.norm(errors(found, torques, loads)) <= found.certificate.claims["gamma"] * np.linalg.norm(loads)
+        assert np.linalg.norm(errors(found, torques, loads)) <= found.certificate.claims["gamma"] * np.linalg.norm(
+            loads
+        )
     assert np.max(np.abs(errors(design, torques, loads))) < expected["shipped"]
     np.testing.assert_allclose(
         np.max(np.abs(errors(by_default, torques, loads)), axis=0), expected["by_default"], rtol=0.02

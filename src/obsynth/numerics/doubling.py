@@ -108,7 +108,8 @@ def compared_gain(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, le
         if not np.all(np.isfinite(left)) or is_positive(left):
             return True
         # Below zero by more than what rounding may have done to the solution.
-        refuted = bool(np.linalg.eigvalsh(left)[0] < -REFUTED * float(np.linalg.norm(b)) ** 2 * float(np.linalg.norm(p)))
+        margin = REFUTED * float(np.linalg.norm(b)) ** 2 * float(np.linalg.norm(p))
+        refuted = bool(np.linalg.eigvalsh(left)[0] < -margin)
         return not refuted
 
     with np.errstate(all="ignore"):

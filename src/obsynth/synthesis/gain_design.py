@@ -96,7 +96,7 @@ def _eliminated_constraints(problem: GainProblem, p: Any, squared: Any, *, ceili
     outputs = np.hstack([problem.Z, problem.Zd])
     basis = null_basis(np.hstack([problem.C, problem.D]))
     top, bottom, image = basis[:n], basis[n:], np.hstack([problem.A, problem.B]) @ basis
-    # Each cone costs its size to the sixth: the trace bounds P from above, and P > Z'Z does from below where it is asked.
+    # Each cone costs its size to the sixth: the trace bounds P from above, and P > Z'Z from below where it is asked.
     constraints = [lmi.at_most(lmi.scalar_block(lmi.trace(p)), ceiling * n)] if n else []
     if basis.shape[1]:
         reduced = top.T @ p @ top - image.T @ p @ image - (outputs @ basis).T @ (outputs @ basis)

@@ -19,7 +19,7 @@ from obsynth.synthesis.gain_problem import GainProblem, Injection, NormalisedPro
 #: The search stops when another pass in better coordinates improves the gain by less than this.
 PASS_IMPROVEMENT = 1e-6
 MOST_PASSES = 8
-#: Riccati equations need no other coordinates when the gain is not below this fraction of that behind the ones they had.
+#: Riccati equations need no other coordinates when the gain is at least this fraction of that behind those they had.
 GOOD_COORDINATES = 0.1
 #: Bounds on P in normalised coordinates, tried in turn: a tight one is easier, and the next pass moves on from it.
 CEILINGS = (1e4, 1e2, 1e1)

@@ -124,4 +124,3 @@ def normalising_change(p: FloatArray) -> FloatArray:
     values, vectors = np.linalg.eigh(0.5 * (p + p.T))
     floor = CONDITION_LIMIT * max(float(values[-1]), np.finfo(np.float64).tiny)
     return np.asarray(vectors / np.sqrt(np.maximum(values, floor)))
-
