@@ -16,7 +16,7 @@ mpl.use("Agg")
 
 import obsynth
 from obsynth.errors import SpecError
-from obsynth.plotting.frequency import fault_estimate_gains, plot_continuous_poles, plot_gains
+from obsynth.plotting import estimate_gains, plot_gains, plot_poles
 from obsynth.report.page import html_report
 from obsynth.results.report import VerificationReport
 from obsynth.spec import load_spec
@@ -165,29 +165,27 @@ def test_the_page_fits_a_narrow_screen(network, tmp_path):
 class TestPictures:
     def test_the_gain_from_disturbances_peaks_at_the_verified_norm(self, network):
         """The norm is recomputed on a pencil by `verify`, the curve from plant and realisation: two routes."""
-        peak = fault_estimate_gains(network).gains["disturbances"].max()
+        peak = estimate_gains(network).gains["disturbances"].max()
         norm = network.report["H-infinity norm"].value
         assert 0.98 * norm <= peak <= norm * (1.0 + 1e-9)
 
     def test_a_filter_that_only_delays_faults_has_gain_one(self, network):
-        assert np.allclose(fault_estimate_gains(network).gains["faults"], 1.0, rtol=0.0, atol=1e-6)
+        assert np.allclose(estimate_gains(network).gains["faults"], 1.0, rtol=0.0, atol=1e-6)
 
     def test_faults_are_those_of_the_tracking_analysis(self, continuous):
-        found = fault_estimate_gains(continuous)
+        found = estimate_gains(continuous)
         wanted = np.abs(obsynth.fault_response(continuous, found.frequencies)[:, 0, 0])
         assert np.allclose(found.gains["faults"], wanted, rtol=1e-6)
 
     def test_decoupled_disturbances_are_said_not_to_get_through(self, continuous):
-        assert not fault_estimate_gains(continuous).gains["disturbances"].any()
+        assert not estimate_gains(continuous).gains["disturbances"].any()
         labels = [text.get_text() for text in plot_gains(continuous).get_legend().get_texts()]
         assert labels == ["faults to fault estimates", "disturbances: nothing gets through"]
 
-    def test_poles_are_those_of_the_observer(self, continuous, network):
-        (points,) = [line for line in plot_continuous_poles(continuous).get_lines() if line.get_marker() == "x"]
+    def test_poles_are_those_of_the_observer(self, continuous):
+        (points,) = [line for line in plot_poles(continuous).get_lines() if line.get_marker() == "x"]
         wanted = np.linalg.eigvals(continuous.observer.Az)
         assert np.allclose(np.sort(points.get_xdata()), np.sort(wanted.real))
-        with pytest.raises(SpecError, match="sampled: use plot_poles"):
-            plot_continuous_poles(network)
 
     def test_a_recursive_design_has_none(self, recursive):
         with pytest.raises(SpecError, match="no linear time-invariant observer"):

@@ -9,7 +9,8 @@ import numpy as np
 
 from obsynth.evaluation.monitors import Detection
 from obsynth.evaluation.simulating import Simulation
-from obsynth.plotting.faults import RESIDUAL_STYLE, THRESHOLD_STYLES, new_panels, plot_faults, tidy
+from obsynth.plotting.faults import plot_faults
+from obsynth.plotting.panels import MARK_STYLE, RESIDUAL_STYLE, THRESHOLD_STYLES, new_panels, tidy
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -114,9 +115,8 @@ def plot_detection(detection: Detection, *, dt: float, axes: Axes | None = None)
             panel.set_ylim(bottom=float(np.min(detection.threshold[deciding])) * 10.0**-DECADES_BELOW)
     if detection.k is not None:
         panel.plot(
-            time[detection.k], detection.values[detection.k], marker="o", markersize=9, markerfacecolor="none",
-            markeredgewidth=1.6, color="black", linestyle="none",
-            label=f"alarm at {detection.time:g} s" + (f": {detection.fault}" if detection.fault else ""),
+            time[detection.k], detection.values[detection.k], marker="o", color="black",
+            label=f"alarm at {detection.time:g} s" + (f": {detection.fault}" if detection.fault else ""), **MARK_STYLE,
         )  # fmt: skip
     panel.set_ylabel(_LABELS[detection.kind])
     panel.set_xlabel("time (s)")

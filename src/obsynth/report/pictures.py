@@ -8,8 +8,8 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from obsynth.observers.linear import LinearObserver
-from obsynth.plotting.faults import plot_poles
-from obsynth.plotting.frequency import plot_continuous_poles, plot_gains
+from obsynth.plotting.frequency import plot_gains
+from obsynth.plotting.spectra import plot_poles
 from obsynth.results.design import ObserverDesign
 
 #: Dots per inch: sharp on a screen that shows two for each pixel.
@@ -27,11 +27,14 @@ class Picture(NamedTuple):
         The same for who cannot see it, and as a caption.
     source : str
         A data URL.
+    wide : bool, optional
+        Whether it takes a row of its own.
     """
 
     title: str
     text: str
     source: str
+    wide: bool = False
 
 
 def pictures_of(design: ObserverDesign) -> Iterator[Picture]:
@@ -54,7 +57,7 @@ def pictures_of(design: ObserverDesign) -> Iterator[Picture]:
     sampled = design.observer.dt > 0.0
     if design.observer.order:
         figure = Figure(figsize=(5.0, 5.4) if sampled else (7.5, 4.0), layout="constrained")
-        (plot_poles if sampled else plot_continuous_poles)(design, axes=figure.subplots())
+        plot_poles(design, axes=figure.subplots())
         region = "inside the circle" if sampled else "left of the dashed line"
         yield Picture("Poles", f"Eigenvalues of the observer: it forgets its start where all are {region}.",
                       _data_url(figure))  # fmt: skip
