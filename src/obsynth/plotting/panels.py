@@ -62,9 +62,9 @@ def tidy(panel: Axes) -> None:
 
 
 def with_unit(name: str, units: Mapping[str, str] | None) -> str:
-    """Return the name of a signal, with its unit where it has one."""
+    """Return the name of a signal, with its unit where it has one; ``1`` is none."""
     unit = (units or {}).get(name)
-    return f"{name} ({unit})" if unit else name
+    return f"{name} ({unit})" if unit and unit != "1" else name
 
 
 def plain_decades(panel: Axes) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Sequence
 from html import escape
 from pathlib import Path
@@ -10,20 +9,22 @@ from pathlib import Path
 from obsynth.report.claims import source_of
 from obsynth.report.designs import fault_estimates_table, plant_facts, promises, recovered_states
 from obsynth.report.page_style import STYLE
-from obsynth.report.page_tables import check_rows, copied_table, fact_rows, matrix_rows
+from obsynth.report.page_tables import check_rows, copied_table, fact_rows, matrix_rows, value_text
 from obsynth.report.pictures import pictures_of
 from obsynth.report.verification import verdict_line
 from obsynth.results.design import ObserverDesign
 from obsynth.results.report import VerificationReport
-from obsynth.results.serialise import design_as_dict, plain, write_atomically
+from obsynth.results.serialise import design_as_dict, write_atomically
+from obsynth.simulation.scenario import Scenario
 
 #: Gains with more entries are not printed: the gain set has them.
 MOST_ENTRIES = 900
 
 
 def html_report(
-    design: ObserverDesign, path: str | Path, *, report: VerificationReport | None = None, gains_file: str | None = None
-) -> Path:
+    design: ObserverDesign, path: str | Path, *, report: VerificationReport | None = None,
+    gains_file: str | None = None, scenario: Scenario | None = None,
+) -> Path:  # fmt: skip
     """Write one HTML page about a design, complete in itself: it needs no network and no other file.
 
     Parameters
@@ -36,6 +37,8 @@ def html_report(
         A new one, from `verify`; by default the one that the design holds.
     gains_file : str, optional
         Name of the gain set's file, for the command that reproduces the page.
+    scenario : Scenario, optional
+        What the design is shown on; by default each fault in turn.
 
     Returns
     -------
@@ -45,12 +48,18 @@ def html_report(
     Raises
     ------
     SpecError
-        The file cannot be written.
+        The file cannot be written, or the scenario does not fit the plant.
+    PreconditionError
+        The plant cannot be simulated on the scenario.
     """
-    return write_atomically(path, page_text(design, design.report if report is None else report, gains_file=gains_file))
+    shown = design.report if report is None else report
+    return write_atomically(path, page_text(design, shown, gains_file=gains_file, scenario=scenario))
 
 
-def page_text(design: ObserverDesign, report: VerificationReport, *, gains_file: str | None = None) -> str:
+def page_text(
+    design: ObserverDesign, report: VerificationReport, *, gains_file: str | None = None,
+    scenario: Scenario | None = None,
+) -> str:  # fmt: skip
     """Return the page.
 
     Parameters
@@ -61,6 +70,8 @@ def page_text(design: ObserverDesign, report: VerificationReport, *, gains_file:
         Its verdict and its checks.
     gains_file : str, optional
         Name of the gain set's file.
+    scenario : Scenario, optional
+        What the design is shown on.
     """
     digest = str(design_as_dict(design)["sha256"])
     title = escape(f"{design.name}: {design.method}")
@@ -71,7 +82,7 @@ def page_text(design: ObserverDesign, report: VerificationReport, *, gains_file:
         "The plant": list(fact_rows(plant_facts(design.plant))),
         "Checks": list(check_rows(report.checks)) if report.checks else [],
         "Gains": list(_gains(design)),
-        "Pictures": list(_pictures(design)),
+        "Pictures": list(_pictures(design, scenario)),
         "How to reproduce this": list(_reproduction(design, digest, gains_file)),
     }
     shown = {heading: lines for heading, lines in sections.items() if lines}
@@ -112,12 +123,12 @@ def _notes(notes: Sequence[str]) -> Iterator[str]:
         yield "</ul>"
 
 
-def _pictures(design: ObserverDesign) -> Iterator[str]:
+def _pictures(design: ObserverDesign, scenario: Scenario | None) -> Iterator[str]:
     figures = [
         f'<figure class="{"wide" if picture.wide else "half"}"><h3>{escape(picture.title)}</h3>'
         f'<img alt="{escape(picture.text)}" src="{picture.source}">'
         f"<figcaption>{escape(picture.text)}</figcaption></figure>"
-        for picture in pictures_of(design)
+        for picture in pictures_of(design, scenario=scenario)
     ]
     if figures:
         yield '<div class="pictures">'
@@ -156,4 +167,4 @@ def _reproduction(design: ObserverDesign, digest: str, gains_file: str | None) -
     for title, data in (("Options", design.options), ("Solver", design.solver)):
         if data:
             yield f"<h3>{title}</h3>"
-            yield f"<pre>{escape(json.dumps(plain(data), indent=1, ensure_ascii=False))}</pre>"
+            yield from fact_rows((key, value_text(value)) for key, value in data.items())

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from html import escape
 from itertools import groupby
+from typing import Any
 
+import numpy as np
 from rich.table import Table
 
 from obsynth.numerics.arrays import FloatArray
@@ -15,6 +17,8 @@ from obsynth.results.report import Check, CheckKind
 #: Prefix of a check's name -> heading of its group; the others are about the shipped observer.
 _GROUPS = {"plant": "The plant", "exists": "Does such an observer exist?"}
 _SHIPPED = "The shipped observer"
+#: Characters of an option; a solver's log may be long.
+LONGEST_VALUE = 400
 #: What each kind of check is worth.
 KINDS: dict[CheckKind, str] = {
     "proved": "an inequality that was proved, with bounds on every rounding error",
@@ -128,3 +132,31 @@ def matrix_rows(matrix: FloatArray) -> Iterator[str]:
         )
         yield f"<tr>{''.join(cells)}</tr>"
     yield "</tbody></table></div>"
+
+
+def value_text(value: Any) -> str:
+    """Return an option or a solver's setting as one line: matrices by rows, diagonal ones as such; long ones are cut.
+
+    Parameters
+    ----------
+    value : object
+        Plain data or an array.
+    """
+    text = _text(value)
+    return text if len(text) <= LONGEST_VALUE else f"{text[:LONGEST_VALUE]} ... (the gain set has all of it)"
+
+
+def _text(value: Any) -> str:
+    if value is None or isinstance(value, (bool, np.bool_)):
+        return {None: "none", True: "yes", False: "no"}[None if value is None else bool(value)]
+    if isinstance(value, (int, float)):
+        return number(float(value), digits=7)
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key}: {_text(item)}" for key, item in value.items()) or "none"
+    if isinstance(value, np.ndarray) and value.ndim == 2:
+        if len(value) > 1 and value.shape[0] == value.shape[1] and not np.any(value[~np.eye(len(value), dtype=bool)]):
+            return f"diag({', '.join(map(_text, np.diag(value).tolist()))})"
+        return f"[{'; '.join(', '.join(map(_text, row)) for row in value.tolist())}]"
+    if isinstance(value, (list, tuple, np.ndarray)):
+        return f"[{', '.join(_text(item) for item in value)}]"
+    return str(value)
