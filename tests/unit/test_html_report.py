@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import re
+from functools import cache
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -76,6 +77,18 @@ def recursive() -> obsynth.ObserverDesign:
     return designed("moussaali2013_ltv/spec.yaml")
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _drawn_once():
+    """The pictures of a design are drawn once: most tests are about what stands around them."""
+    from obsynth.report import page, pictures
+
+    patch = pytest.MonkeyPatch()
+    drawn = cache(lambda design, scenario: list(pictures.pictures_of(design, scenario=scenario)))
+    patch.setattr(page, "pictures_of", lambda design, *, scenario=None: drawn(design, scenario))
+    yield
+    patch.undo()
+
+
 def page_of(design, tmp_path, **more) -> tuple[str, Page]:
     text = html_report(design, tmp_path / "report.html", **more).read_text(encoding="utf-8")
     return text, Page(text)
@@ -87,10 +100,14 @@ def test_the_page_needs_nothing_else(request, tmp_path, which):
     assert {tag for tag, _ in page.tags} & {"script", "link", "iframe", "object", "base", "form"} == set()
     sources = [attributes["src"] for _, attributes in page.tags if "src" in attributes]
     assert all(source.startswith("data:image/png;base64,") for source in sources)
-    assert len(sources) == (0 if which == "recursive" else 2)
+    # The design at work and its states; of linear ones the spectrum, and gains to faults and states.
+    assert len(sources) == (2 if which == "recursive" else 5)
     for source in sources:
         assert base64.b64decode(source.partition(",")[2]).startswith(b"\x89PNG\r\n\x1a\n")
-    assert not any("href" in attributes or "srcset" in attributes for _, attributes in page.tags)
+    links = [attributes["href"] for _, attributes in page.tags if "href" in attributes]
+    anchors = {attributes["id"] for _, attributes in page.tags if "id" in attributes}
+    assert {link.removeprefix("#") for link in links} == anchors
+    assert not any("srcset" in attributes for _, attributes in page.tags)
     assert "url(" not in text
     assert "@import" not in text
     assert "http" not in re.sub(r"base64,[^\"]*", "", text)
@@ -156,7 +173,7 @@ def test_the_page_fits_a_narrow_screen(network, tmp_path):
     assert ("meta", {"name": "viewport", "content": "width=device-width, initial-scale=1"}) in page.tags
     assert "@media (max-width" in text
     tables = sum(tag == "table" for tag, _ in page.tags)
-    assert tables == sum(attributes.get("class") == "scroll" for _, attributes in page.tags)
+    assert tables == sum(str(attributes.get("class")).startswith("scroll") for _, attributes in page.tags)
     labels = [attributes["data-label"] for _, attributes in page.tags if "data-label" in attributes]
     for label in ("value", "bound", "margin", "verdict"):
         assert labels.count(label) == len(network.report.checks)

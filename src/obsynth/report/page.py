@@ -91,7 +91,7 @@ def page_text(
         "<!DOCTYPE html>", '<html lang="en">', "<head>", '<meta charset="utf-8">',
         '<meta name="viewport" content="width=device-width, initial-scale=1">', f"<title>{title}</title>",
         f"<style>{STYLE}</style>", "</head>", "<body>", f"<h1>{title}</h1>",
-        f'<p class="verdict {state}" style="margin-top: 1rem">{escape(verdict_line(report).plain)}</p>',
+        f'<p class="verdict {state}">{escape(verdict_line(report).plain)}</p>',
         f"<nav>{links}</nav>",
     ]  # fmt: skip
     for heading, lines in shown.items():

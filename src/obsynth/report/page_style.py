@@ -15,7 +15,7 @@ h3 { font-size: 1rem; margin: 1.6rem 0 0.5rem; }
 p { max-width: 46rem; margin: 0.5rem 0; } ul { max-width: 46rem; padding-left: 1.2rem; }
 .soft { color: var(--soft); font-weight: 400; }
 .under { margin: 0.2rem 0 1.2rem; color: var(--soft); }
-.verdict { max-width: none; border-left: 0.5rem solid; border-radius: 3px; padding: 0.9rem 1.2rem; margin: 0;
+.verdict { max-width: none; border-left: 0.5rem solid; border-radius: 3px; padding: 0.9rem 1.2rem; margin: 1rem 0 0;
   font-size: 1.25rem; font-weight: 600; }
 .verdict.holds { background: var(--good-shade); } .verdict.fails { background: var(--bad-shade); }
 .holds { color: var(--good); } .fails { color: var(--bad); font-weight: 700; } .info { color: var(--soft); }
@@ -36,11 +36,12 @@ td.number, th.number { text-align: right; white-space: nowrap; }
 .checks td.source { color: var(--soft); font-size: 0.92rem; min-width: 9rem; }
 .checks td:nth-child(2) { min-width: 18rem; width: 52%; }
 .gains { display: flex; flex-wrap: wrap; gap: 0 3rem; } .gains > div { max-width: 100%; min-width: 0; }
+.tall { max-height: 26rem; overflow-y: auto; }
 .matrix { border-left: 2px solid var(--ink); border-right: 2px solid var(--ink); font-size: 0.92rem; }
 .matrix td { padding: 0.15rem 0.7rem; border: 0 !important; } .matrix .zero { color: #9aa0a8; }
 .pictures { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(30rem, 100%), 1fr)); gap: 1rem 2.5rem;
   align-items: start; }
-figure { margin: 0; min-width: 0; } figure.wide { grid-column: 1 / -1; max-width: 54rem; }
+figure { margin: 0; min-width: 0; } figure.wide { grid-column: 1 / -1; max-width: 50rem; }
 figure h3 { margin: 0.8rem 0 0.3rem; }
 img { display: block; width: 100%; height: auto; } figcaption { color: var(--soft); font-size: 0.95rem; }
 pre { background: var(--shade); border: 1px solid var(--hair); border-radius: 3px; padding: 0.8rem 1rem;
@@ -53,8 +54,8 @@ pre { background: var(--shade); border: 1px solid var(--hair); border-radius: 3p
   .checks, .checks tbody, .checks tr { display: block; }
   .checks tbody th { display: block; white-space: normal; margin-top: 0.8rem; }
   .checks tr { padding: 0.55rem 0; } .checks tr + tr { border-top: 1px solid var(--hair); }
-  .checks td, .checks tr > * { border: 0 !important; padding: 0; display: block; min-width: 0 !important; width: auto;
-    overflow-wrap: anywhere; }
+  .checks td, .checks tr > * { border: 0 !important; padding: 0; display: block; min-width: 0 !important;
+    width: auto !important;     overflow-wrap: anywhere; }
   .checks td.word { float: right; margin-left: 0.8rem; text-align: right; }
   .checks td.none { display: none; } .checks td.number:not(.none) { display: inline-block; text-align: left;
     margin-right: 1rem; font-size: 0.92rem; }
@@ -69,7 +70,8 @@ pre { background: var(--shade); border: 1px solid var(--hair); border-radius: 3p
   @page { margin: 16mm 14mm; } body { max-width: none; padding: 0; font-size: 10pt; } nav { display: none; }
   h2 { break-after: avoid; margin-top: 1.6rem; } h3 { break-after: avoid; } tr, figure { break-inside: avoid; }
   .verdict, .checks tbody th, pre { print-color-adjust: exact; -webkit-print-color-adjust: exact; }
-  .scroll { overflow: visible; } .matrix { font-size: 7.5pt; } pre { white-space: pre-wrap; overflow-wrap: anywhere; }
+  .scroll { overflow: visible; max-height: none; }
+  .matrix { font-size: 7.5pt; } pre { white-space: pre-wrap; overflow-wrap: anywhere; }
   .checks td:nth-child(2) { min-width: 0; } .checks td.source { min-width: 0; }
 }
 """

@@ -124,7 +124,10 @@ def matrix_rows(matrix: FloatArray) -> Iterator[str]:
     matrix : FloatArray
         ``(rows, cols)``.
     """
-    yield '<div class="scroll"><table class="matrix"><tbody>'
+    if not matrix.size:
+        yield '<p class="soft">empty</p>'
+        return
+    yield '<div class="scroll tall"><table class="matrix"><tbody>'
     for row in matrix.tolist():
         cells = (
             f'<td class="number{"" if value else " zero"}">{number(value, digits=6) if value else "0"}</td>'
@@ -158,5 +161,5 @@ def _text(value: Any) -> str:
             return f"diag({', '.join(map(_text, np.diag(value).tolist()))})"
         return f"[{'; '.join(', '.join(map(_text, row)) for row in value.tolist())}]"
     if isinstance(value, (list, tuple, np.ndarray)):
-        return f"[{', '.join(_text(item) for item in value)}]"
+        return f"[{', '.join(_text(item) for item in value)}]" if len(value) else "none"
     return str(value)

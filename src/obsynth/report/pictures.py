@@ -24,9 +24,9 @@ if TYPE_CHECKING:
 #: Dots per inch: sharp on a screen that shows two for each pixel.
 RESOLUTION = 160
 #: Inches: a picture beside another one, and one of a row of its own; small, so that texts stay readable on a phone.
-HALF, WIDE = 5.6, 8.4
+HALF, WIDE = 5.6, 6.6
 #: Inches: a panel of several, and what the axis of time takes.
-PANEL, MARGIN = 1.75, 0.7
+PANEL, MARGIN = 1.5, 0.6
 #: More states than this are not drawn.
 MOST_STATES = 6
 
@@ -134,7 +134,7 @@ def _story(scenario: Scenario, *, given: bool, linear: bool) -> str:
     if given:
         return f"{scenario.horizon:g} s, seed {scenario.seed}."
     if not linear:
-        return "a step of one initial standard deviation, with the stated noise. The bands hold 95 % while parameters stay."
+        return "a step of one initial standard deviation, with the stated noise. Bands hold 95 % while parameters stay."
     closed = " A stabilising state feedback was added, as the plant is unstable." if scenario.stabilise else ""
     return (
         "a unit step, from rest and without noise. It shows how fast each estimate answers, and how little of the "
