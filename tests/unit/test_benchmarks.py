@@ -15,3 +15,13 @@ def test_the_fault_filter_benchmark_runs():
     gains = [float(cell.split(", ")[1]) for cell in rows[0][1:]]
     # The bisection ends within 1e-4 of the least gain, the others much closer.
     assert max(gains) <= min(gains) * (1.0 + 2e-4)
+
+
+def test_the_evaluation_benchmark_runs():
+    """Its own comparison with python-control holds, and every rate is a number."""
+    script = ROOT / "benchmarks" / "evaluate.py"
+    done = subprocess.run([sys.executable, script, "--small"], capture_output=True, text=True, check=True)
+    (row,) = [line.strip("| ").split(" | ") for line in done.stdout.splitlines()[2:]]
+    assert row[0] == "4"
+    assert len(row) == 5
+    assert all(float(cell.replace(",", "")) > 0.0 for cell in row[1:])
