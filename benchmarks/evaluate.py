@@ -39,7 +39,7 @@ def best(work: Callable[[], object], count: int) -> float:
 def rates(nx: int, steps: int, runs: int) -> list[float]:
     """Return trial-steps per second: evaluate, plant and observer alone, observer alone, forced_response."""
     design = made_up(nx)
-    plant, observer = design.linear
+    plant = design.linear[0]
     noisy = plant.replace(Bw=np.eye(nx, 2), Dw=np.zeros((plant.ny, 2)), noise_names=None)
     design = design.replace(plant=noisy)
     scenario = obsynth.Scenario(

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from obsynth.plotting.panels import WIDTH, new_panels, plain_decades, tidy
+from obsynth.plotting.panels import WIDTH, legend_above, new_panels, plain_decades, tidy
 from obsynth.results.delta_scan import DeltaScan
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ def plot_delta_scan(scan: DeltaScan, *, axes: Iterable[Axes] | None = None) -> l
         panel.set_xscale("log")
         plain_decades(panel)
         panel.set_ylabel(label)
-        panel.legend(loc="best")
+        legend_above(panel)
         tidy(panel)
     panels[-1].set_xlabel("delta (s)")
     if (figure := panels[0].get_figure()) is not None:

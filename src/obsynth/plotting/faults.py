@@ -17,6 +17,7 @@ from obsynth.plotting.panels import (
     RESIDUAL_STYLE,
     THRESHOLD_STYLES,
     TRUE_STYLE,
+    legend_above,
     new_panels,
     tidy,
     with_unit,
@@ -71,7 +72,7 @@ def plot_faults(
             panel.plot(time[delay:], truth[: steps - delay, i], label=label, **TRUE_STYLE)
         panel.plot(time, estimates.faults[:, i], label="estimate", **ESTIMATE_STYLE)
         panel.set_ylabel(with_unit(name, units))
-        panel.legend(loc="best")
+        legend_above(panel)
         tidy(panel)
     if panels:
         panels[-1].set_xlabel("time (s)")
@@ -134,7 +135,7 @@ def plot_residuals(
             )  # fmt: skip
     panel.set_ylabel("norm of the residual")
     panel.set_xlabel("time (s)")
-    panel.legend(loc="best")
+    legend_above(panel)
     tidy(panel)
     return panel
 

@@ -33,6 +33,9 @@ MARK_STYLE: dict[str, Any] = {
     "markersize": 9, "markerfacecolor": "none", "markeredgewidth": 1.6, "linestyle": "none",
 }  # fmt: skip
 
+#: Letters that fit above a panel in small print, and those that the sample of a line takes.
+LINE_LETTERS, KEY_LETTERS = 84, 8
+
 
 def new_panels(axes: Iterable[Axes] | None, count: int, *, size: tuple[float, float] | None = None) -> list[Axes]:
     """Return ``count`` axes: the given ones, or new ones one above the other."""
@@ -59,6 +62,17 @@ def tidy(panel: Axes) -> None:
     for side in ("top", "right"):
         panel.spines[side].set_visible(False)
     panel.margins(x=0.01)
+
+
+def legend_above(panel: Axes) -> None:
+    """Put the legend above a panel, where it hides nothing: in one line, or in two where one is too long."""
+    _, labels = panel.get_legend_handles_labels()
+    rows = 1 if sum(len(label) + KEY_LETTERS for label in labels) <= LINE_LETTERS else 2
+    columns = max(-(-len(labels) // rows), 1)
+    panel.legend(
+        loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns, frameon=False, fontsize="small",
+        borderaxespad=0.1, columnspacing=1.4, handlelength=2.4,
+    )  # fmt: skip
 
 
 def with_unit(name: str, units: Mapping[str, str] | None) -> str:

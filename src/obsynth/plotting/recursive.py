@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from obsynth.observers.decisions import Decision
-from obsynth.plotting.panels import MARK_STYLE, RESIDUAL_STYLE, THRESHOLD_STYLES, new_panels, tidy
+from obsynth.plotting.panels import MARK_STYLE, RESIDUAL_STYLE, THRESHOLD_STYLES, legend_above, new_panels, tidy
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -57,6 +57,6 @@ def plot_decision(decision: Decision, *, dt: float = 1.0, axes: Axes | None = No
         panel.axvline(dt * alarm.onset, color="0.4", linestyle=":", label=f"onset at {dt * alarm.onset:g} s")
     panel.set_ylabel(_LABELS.get(decision.statistic, decision.statistic))
     panel.set_xlabel("time (s)")
-    panel.legend(loc="best", fontsize="small")
+    legend_above(panel)
     tidy(panel)
     return panel

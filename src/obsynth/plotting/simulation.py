@@ -12,7 +12,7 @@ from obsynth.evaluation.recursive_simulating import RecursiveSimulation
 from obsynth.evaluation.simulating import Simulation
 from obsynth.observers.decisions import Decision
 from obsynth.plotting.faults import plot_faults
-from obsynth.plotting.panels import MARK_STYLE, RESIDUAL_STYLE, THRESHOLD_STYLES, new_panels, tidy
+from obsynth.plotting.panels import MARK_STYLE, RESIDUAL_STYLE, THRESHOLD_STYLES, legend_above, new_panels, tidy
 from obsynth.plotting.recursive import plot_decision
 from obsynth.plotting.states import plot_parameters
 
@@ -100,7 +100,7 @@ def _plot_linear(simulation: Simulation, panels: list[Axes], dt: float, units: M
             truth, band = panel.get_lines()
             truth.set(**_TRUTH_ON_BAND)
             band.set(**_BAND)
-            panel.legend(loc="best")
+            legend_above(panel)
 
 
 def plot_detection(detection: Detection, *, dt: float, axes: Axes | None = None) -> Axes:
@@ -143,6 +143,6 @@ def plot_detection(detection: Detection, *, dt: float, axes: Axes | None = None)
         )  # fmt: skip
     panel.set_ylabel(_LABELS[detection.kind])
     panel.set_xlabel("time (s)")
-    panel.legend(loc="best")
+    legend_above(panel)
     tidy(panel)
     return panel

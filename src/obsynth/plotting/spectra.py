@@ -66,7 +66,7 @@ def plot_poles(design: ObserverDesign, *, axes: Axes | None = None) -> Axes:
         _discrete_plane(axes, poles, zeros)
     else:
         _continuous_plane(axes, poles, zeros)
-    _draw_region(axes, _region(design))
+    _draw_region(axes, region_asked_for(design))
     axes.plot(poles.real, poles.imag, label=f"observer eigenvalues ({len(poles)})", **_POLES)
     axes.plot(zeros.real, zeros.imag, label=f"fault zeros ({len(zeros)})", **_ZEROS)
     axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False)
@@ -106,8 +106,14 @@ def _continuous_plane(axes: Axes, poles: ComplexArray, zeros: ComplexArray) -> N
     axes.set_ylabel("imaginary part (1/s)")
 
 
-def _region(design: ObserverDesign) -> list[Excess]:
-    """Return the parts of the region that was asked for; none where none was."""
+def region_asked_for(design: ObserverDesign) -> list[Excess]:
+    """Return the parts of the region that was asked for (or proved, of a PD observer); none where none was.
+
+    Parameters
+    ----------
+    design : ObserverDesign
+        Of a linear method.
+    """
     claims, options, dt = design.certificate.claims, design.options, design.linear[1].dt
     asked = options.get("region") or {}
     asked = dict(asked) if isinstance(asked, Mapping) else {}

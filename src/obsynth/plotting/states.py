@@ -19,6 +19,7 @@ from obsynth.plotting.panels import (
     BAND_WIDTH,
     ESTIMATE_STYLE,
     TRUE_STYLE,
+    legend_above,
     new_panels,
     tidy,
     with_unit,
@@ -26,6 +27,9 @@ from obsynth.plotting.panels import (
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+#: Around what is drawn there is this share of its range, and room for this many usual half-widths of the band.
+ROOM_SHARE, USUAL_BANDS = 0.2, 3.0
 
 
 def plot_parameters(
@@ -141,7 +145,20 @@ def _panels(
         panel.plot(time, values[:, i], **ESTIMATE_STYLE, label="estimate")
         panel.set_ylabel(with_unit(names[i], units))
         tidy(panel)
+        if deviations is not None:
+            _show_what_moves(panel, values[:, i] if true is None else np.hstack([values[:, i], true[:, i]]), half)
     if panels:
-        panels[0].legend(loc="best", fontsize="small")
+        legend_above(panels[0])
         panels[-1].set_xlabel("time (s)")
     return panels
+
+
+def _show_what_moves(panel: Axes, drawn: FloatArray, half: FloatArray) -> None:
+    """Let a wide band at the start, or where samples are missing, leave the picture: not what is in it vanish."""
+    known = drawn[np.isfinite(drawn)]
+    usual = half[np.isfinite(half)]
+    if not known.size or not usual.size:
+        return
+    room = max(ROOM_SHARE * float(np.ptp(known)), USUAL_BANDS * float(np.median(usual)))
+    if room > 0.0:
+        panel.set_ylim(float(known.min()) - room, float(known.max()) + room)
