@@ -21,6 +21,7 @@ from obsynth.plotting import estimate_gains, plot_gains, plot_poles
 from obsynth.report.page import html_report
 from obsynth.results.report import VerificationReport
 from obsynth.spec import load_spec
+from obsynth.verification import verify
 
 ROOT = Path(__file__).parents[2]
 VOID = {"meta", "img", "br", "link"}
@@ -83,8 +84,12 @@ def _drawn_once():
     from obsynth.report import page, pictures
 
     patch = pytest.MonkeyPatch()
-    drawn = cache(lambda design, scenario: list(pictures.pictures_of(design, scenario=scenario)))
-    patch.setattr(page, "pictures_of", lambda design, *, scenario=None: drawn(design, scenario))
+    drawn = cache(lambda design: list(pictures.pictures_of(design)))
+
+    def pictures_once(design, *, scenario=None):
+        return drawn(design) if scenario is None else pictures.pictures_of(design, scenario=scenario)
+
+    patch.setattr(page, "pictures_of", pictures_once)
     yield
     patch.undo()
 
@@ -145,6 +150,30 @@ def test_everything_is_there(request, tmp_path, which):
     assert "obsynth verify 'my gains.json'" in page.text
     gain = next(iter(design.gains.values()))
     assert f"{gain.ravel()[0]:.6g}" in page.texts
+
+
+def test_an_observer_that_does_not_fit_or_is_unstable_has_a_page_too(continuous, tmp_path):
+    _, observer = continuous.linear
+    short = type(observer)(**{**observer.as_dict(), "By": observer.By[:, :1], "Dy": observer.Dy[:, :1],
+                              "output_names": observer.output_names[:1]})  # fmt: skip
+    wrong = continuous.replace(observer=short)
+    _, page = page_of(wrong, tmp_path, report=verify(wrong))
+    assert page.texts[2].startswith("FAILS")
+    assert "None: the observer does not fit its plant." in page.texts
+    unstable = continuous.replace(observer=type(observer)(**{**observer.as_dict(), "Az": -observer.Az}))
+    _, page = page_of(unstable, tmp_path, report=verify(unstable))
+    assert page.texts[2].startswith("FAILS")
+    assert "What fails" in page.texts
+
+
+def test_a_scenario_is_shown_with_its_alarm(tmp_path):
+    spec = load_spec(ROOT / "designs" / "wang2015" / "spec.yaml")
+    design = obsynth.fault_estimation_filter(spec.plant)
+    _, page = page_of(design, tmp_path, scenario=spec.scenario, system_file="my spec.yaml", gains_file="g.json")
+    assert "On the scenario: 300 s, seed 2015." in page.texts
+    assert "obsynth report --gains g.json --out report.html --system 'my spec.yaml'" in page.text
+    with pytest.raises(SpecError, match="nothing"):
+        page_of(design, tmp_path, scenario=spec.scenario.replace(faults={"nothing": obsynth.Step(size=1)}))
 
 
 def test_every_text_is_escaped(continuous, tmp_path):

@@ -257,6 +257,16 @@ def test_legends_hide_nothing() -> None:
         assert panel.get_legend().get_window_extent().y0 >= panel.get_window_extent().y1 - 1.0
 
 
+def test_long_legends_leave_their_panels_as_they_are() -> None:
+    curves = {"a threshold with quite a long name and a remark": 0.1, "and another one, which is rigorous": 0.2}
+    panel = plot_residuals(made_estimates(), threshold=curves)
+    panel.figure.canvas.draw()
+    assert panel.get_position().width > 0.75
+    legend = panel.get_legend().get_window_extent()
+    assert legend.x1 <= panel.figure.bbox.x1
+    assert legend.y0 >= panel.get_window_extent().y1 - 1.0
+
+
 def test_axes_given_for_residuals_and_poles_are_used() -> None:
     _, (left, right) = plt.subplots(1, 2)
     design = obsynth.fault_estimation_filter(load_spec(DESIGNS / "wang2015" / "spec.yaml").plant)

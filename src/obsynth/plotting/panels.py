@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -33,8 +33,8 @@ MARK_STYLE: dict[str, Any] = {
     "markersize": 9, "markerfacecolor": "none", "markeredgewidth": 1.6, "linestyle": "none",
 }  # fmt: skip
 
-#: Letters that fit above a panel in small print, and those that the sample of a line takes.
-LINE_LETTERS, KEY_LETTERS = 84, 8
+#: Letters of small print that fit in an inch, and those that the sample of a line takes.
+LETTERS_PER_INCH, KEY_LETTERS = 12.5, 8
 
 
 def new_panels(axes: Iterable[Axes] | None, count: int, *, size: tuple[float, float] | None = None) -> list[Axes]:
@@ -65,14 +65,31 @@ def tidy(panel: Axes) -> None:
 
 
 def legend_above(panel: Axes) -> None:
-    """Put the legend above a panel, where it hides nothing: in one line, or in two where one is too long."""
+    """Put the legend above a panel, where it hides nothing: in as few lines as fit its width.
+
+    A title has to stand higher then: ``panel.set_title(text, pad=20)``.
+    """
     _, labels = panel.get_legend_handles_labels()
-    rows = 1 if sum(len(label) + KEY_LETTERS for label in labels) <= LINE_LETTERS else 2
-    columns = max(-(-len(labels) // rows), 1)
+    figure = panel.get_figure(root=True)
+    inches = panel.get_position().width * (WIDTH if figure is None else float(figure.get_figwidth()))
+    columns = max(len(labels), 1)
+    while columns > 1 and _letters(labels, columns) > inches * LETTERS_PER_INCH:
+        columns -= 1
     panel.legend(
         loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns, frameon=False, fontsize="small",
         borderaxespad=0.1, columnspacing=1.4, handlelength=2.4,
     )  # fmt: skip
+
+
+def _letters(labels: Sequence[str], columns: int) -> int:
+    """Return how wide a legend is: matplotlib fills it column by column, the first ones with one more."""
+    rows, longer = divmod(len(labels), columns)
+    widths, begin = 0, 0
+    for column in range(columns):
+        end = begin + rows + (column < longer)
+        widths += max(map(len, labels[begin:end]), default=0) + KEY_LETTERS
+        begin = end
+    return widths
 
 
 def with_unit(name: str, units: Mapping[str, str] | None) -> str:

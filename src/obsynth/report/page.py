@@ -17,13 +17,15 @@ from obsynth.results.report import VerificationReport
 from obsynth.results.serialise import design_as_dict, write_atomically
 from obsynth.simulation.scenario import Scenario
 
+#: The check without which observer and plant cannot be run together.
+FITS = "fits the plant"
 #: Gains with more entries are not printed: the gain set has them.
 MOST_ENTRIES = 900
 
 
 def html_report(
     design: ObserverDesign, path: str | Path, *, report: VerificationReport | None = None,
-    gains_file: str | None = None, scenario: Scenario | None = None,
+    gains_file: str | None = None, scenario: Scenario | None = None, system_file: str | None = None,
 ) -> Path:  # fmt: skip
     """Write one HTML page about a design, complete in itself: it needs no network and no other file.
 
@@ -39,6 +41,8 @@ def html_report(
         Name of the gain set's file, for the command that reproduces the page.
     scenario : Scenario, optional
         What the design is shown on; by default each fault in turn.
+    system_file : str, optional
+        Name of the spec with that scenario, for the same command.
 
     Returns
     -------
@@ -53,26 +57,13 @@ def html_report(
         The plant cannot be simulated on the scenario.
     """
     shown = design.report if report is None else report
-    return write_atomically(path, page_text(design, shown, gains_file=gains_file, scenario=scenario))
+    return write_atomically(path, _page_text(design, shown, gains_file, scenario, system_file))
 
 
-def page_text(
-    design: ObserverDesign, report: VerificationReport, *, gains_file: str | None = None,
-    scenario: Scenario | None = None,
+def _page_text(
+    design: ObserverDesign, report: VerificationReport, gains_file: str | None, scenario: Scenario | None,
+    system_file: str | None,
 ) -> str:  # fmt: skip
-    """Return the page.
-
-    Parameters
-    ----------
-    design : ObserverDesign
-        Any design.
-    report : VerificationReport
-        Its verdict and its checks.
-    gains_file : str, optional
-        Name of the gain set's file.
-    scenario : Scenario, optional
-        What the design is shown on.
-    """
     digest = str(design_as_dict(design)["sha256"])
     title = escape(f"{design.name}: {design.method}")
     state = "holds" if report.passed else "fails"
@@ -82,8 +73,8 @@ def page_text(
         "The plant": list(fact_rows(plant_facts(design.plant))),
         "Checks": list(check_rows(report.checks)) if report.checks else [],
         "Gains": list(_gains(design)),
-        "Pictures": list(_pictures(design, scenario)),
-        "How to reproduce this": list(_reproduction(design, digest, gains_file)),
+        "Pictures": list(_pictures(design, scenario, report)),
+        "How to reproduce this": list(_reproduction(design, digest, gains_file, system_file)),
     }
     shown = {heading: lines for heading, lines in sections.items() if lines}
     links = "".join(f'<a href="#{_anchor(heading)}">{heading}</a>' for heading in shown)
@@ -123,7 +114,10 @@ def _notes(notes: Sequence[str]) -> Iterator[str]:
         yield "</ul>"
 
 
-def _pictures(design: ObserverDesign, scenario: Scenario | None) -> Iterator[str]:
+def _pictures(design: ObserverDesign, scenario: Scenario | None, report: VerificationReport) -> Iterator[str]:
+    if any(check.name == FITS for check in report.failures):
+        yield "<p>None: the observer does not fit its plant.</p>"
+        return
     figures = [
         f'<figure class="{"wide" if picture.wide else "half"}"><h3>{escape(picture.title)}</h3>'
         f'<img alt="{escape(picture.text)}" src="{picture.source}">'
@@ -154,14 +148,19 @@ def _gains(design: ObserverDesign) -> Iterator[str]:
     yield "</div>"
 
 
-def _reproduction(design: ObserverDesign, digest: str, gains_file: str | None) -> Iterator[str]:
+def _reproduction(
+    design: ObserverDesign, digest: str, gains_file: str | None, system_file: str | None
+) -> Iterator[str]:
     import shlex
 
     from obsynth import __version__
 
     file = shlex.quote(gains_file or f"{design.name}.gains.json")
     yield "<p>Every check again, from the gain set alone and without a solver; and this page:</p>"
-    yield f"<pre>{escape(f'obsynth verify {file}')}\n{escape(f'obsynth report --gains {file} --out report.html')}</pre>"
+    again = f"obsynth report --gains {file} --out report.html"
+    if system_file is not None:
+        again += f" --system {shlex.quote(system_file)}"
+    yield f"<pre>{escape(f'obsynth verify {file}')}\n{escape(again)}</pre>"
     yield from fact_rows([("obsynth", __version__)])
     yield f'<p class="soft">sha256 of the gain set</p><p class="digest">{digest}</p>'
     for title, data in (("Options", design.options), ("Solver", design.solver)):

@@ -5,12 +5,18 @@ from __future__ import annotations
 import base64
 import io
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
-from obsynth.errors import ObsynthError
+from obsynth.errors import ObsynthError, SpecError
 from obsynth.evaluation.demonstration import demonstration_scenario
+from obsynth.evaluation.monitors import Detection
+from obsynth.evaluation.recursive_simulating import RecursiveSimulation
 from obsynth.evaluation.simulating import Simulation, simulate
+from obsynth.evaluation.watching import monitor
+from obsynth.observers.decisions import Decision, decide
 from obsynth.observers.linear import LinearObserver
+from obsynth.observers.recursive import RecursiveObserver
+from obsynth.observers.recursive_estimates import RecursiveEstimates
 from obsynth.plotting.frequency import plot_gains
 from obsynth.plotting.simulation import plot_simulation
 from obsynth.plotting.spectra import plot_poles
@@ -60,7 +66,7 @@ def pictures_of(design: ObserverDesign, *, scenario: Scenario | None = None) -> 
     design : ObserverDesign
         Any design.
     scenario : Scenario, optional
-        What the design is shown on; by default each fault in turn.
+        What the design is shown on, with what a monitor sees where there is one; by default each fault in turn.
 
     Yields
     ------
@@ -117,10 +123,12 @@ def _at_work(design: ObserverDesign, scenario: Scenario | None) -> Iterator[Pict
     text = f"{what}: {_story(shown, given=given, linear=linear)}"
     faults, states = len(design.observer.fault_names), simulation.estimates.state_names
     units, dt = design.plant.units, float(simulation.time[1]) if len(simulation.time) > 1 else 1.0
-    if faults:
+    seen = [*_watched(design, shown, simulation)] if given else []
+    panels = faults + len(seen)
+    if panels:
         yield Picture("The design at work", text, _drawn(
-            (WIDE, PANEL * faults + MARGIN), faults,
-            lambda axes: plot_simulation(simulation, units=units, axes=axes),
+            (WIDE, PANEL * panels + MARGIN), panels,
+            lambda axes: plot_simulation(simulation, detections=seen, units=units, axes=axes),
         ), wide=True)  # fmt: skip
     if 0 < len(states) <= MOST_STATES:
         bands = "" if linear else ", with 95 % bands"
@@ -128,6 +136,22 @@ def _at_work(design: ObserverDesign, scenario: Scenario | None) -> Iterator[Pict
             (WIDE, PANEL * len(states) + MARGIN), len(states),
             lambda axes: plot_states(simulation.estimates, states=simulation.states, dt=dt, units=units, axes=axes),
         ), wide=True)  # fmt: skip
+
+
+def _watched(
+    design: ObserverDesign, scenario: Scenario, simulation: Simulation | RecursiveSimulation
+) -> Iterator[Detection | Decision]:
+    """Yield what the first monitor sees that this design and this scenario have; nothing where they have none."""
+    if isinstance(simulation, Simulation):
+        for kind in ("pointwise", "chi-square"):
+            try:
+                yield monitor(design, scenario, kind).watch(simulation.estimates)
+            except SpecError:
+                # A signal without a bound, or without a covariance; a continuous design has neither threshold.
+                continue
+            return
+    elif isinstance(simulation.estimates, RecursiveEstimates) and simulation.estimates.parameter_names:
+        yield decide(cast(RecursiveObserver, design.observer), simulation.estimates)
 
 
 def _story(scenario: Scenario, *, given: bool, linear: bool) -> str:
