@@ -4,6 +4,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[2]
 
 
@@ -17,11 +19,12 @@ def test_the_fault_filter_benchmark_runs():
     assert max(gains) <= min(gains) * (1.0 + 2e-4)
 
 
-def test_the_evaluation_benchmark_runs():
-    """Its own comparison with python-control holds, and every rate is a number."""
-    script = ROOT / "benchmarks" / "evaluate.py"
+@pytest.mark.parametrize("name", ["evaluate", "run_on_data"])
+def test_the_benchmarks_of_running_run(name):
+    """Their own comparisons with python-control hold, and every rate is a number."""
+    script = ROOT / "benchmarks" / f"{name}.py"
     done = subprocess.run([sys.executable, script, "--small"], capture_output=True, text=True, check=True)
-    (row,) = [line.strip("| ").split(" | ") for line in done.stdout.splitlines()[2:]]
+    row = done.stdout.splitlines()[-1].strip("| ").split(" | ")
     assert row[0] == "4"
     assert len(row) == 5
     assert all(float(cell.replace(",", "")) > 0.0 for cell in row[1:])
