@@ -166,6 +166,15 @@ def test_an_observer_that_does_not_fit_or_is_unstable_has_a_page_too(continuous,
     assert "What fails" in page.texts
 
 
+def test_a_kalman_filter_shows_its_states(tmp_path):
+    plant = obsynth.TimeVaryingDescriptorSystem(
+        E=None, A=[["0.9 + 0.05 * sin(k)", 0.1], [0, 0.5]], C=[[1, 0]], dt=1.0, horizon=100
+    )
+    _, page = page_of(obsynth.descriptor_kalman(plant, Q=1e-4, R=1e-2), tmp_path)
+    assert sum(tag == "img" for tag, _ in page.tags) == 1
+    assert "States in a run with the stated noise, and their estimates, with 95 % bands." in page.texts
+
+
 def test_a_scenario_is_shown_with_its_alarm(tmp_path):
     spec = load_spec(ROOT / "designs" / "wang2015" / "spec.yaml")
     design = obsynth.fault_estimation_filter(spec.plant)

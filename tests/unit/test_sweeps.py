@@ -69,3 +69,13 @@ def test_threads_and_processes_give_the_same_numbers(kind: str, recursive) -> No
     make = ThreadPoolExecutor(2) if kind == "threads" else ProcessPoolExecutor(1, mp_context=get_context("spawn"))
     with make as executor:
         assert swept(recursive, executor) == swept(recursive, None)
+
+
+def test_a_bar_shows_how_far_it_is(linear, capsys) -> None:
+    design, scenario, _ = linear
+    obsynth.evaluate(design, scenario, runs=RUNS, progress=True)
+    shown = capsys.readouterr()
+    assert f"{RUNS}/{RUNS}" in shown.err
+    obsynth.evaluate(design, scenario, runs=3, progress=False)
+    silent = capsys.readouterr()
+    assert (shown.out, silent.out, silent.err) == ("", "", "")

@@ -36,7 +36,7 @@ def demonstration_scenario(design: ObserverDesign) -> Scenario | None:
     -------
     Scenario or None
         Linear designs: unit steps, from rest, nothing else.  Recursive ones: steps of one initial standard deviation
-        each, with the stated noise.  `None` where there is nothing to estimate, or no time for it.
+        each, with the stated noise; Kalman filters: that noise.  `None` where there is no fault, or no time for it.
 
     Raises
     ------
@@ -44,10 +44,8 @@ def demonstration_scenario(design: ObserverDesign) -> Scenario | None:
         The plant of a linear design has index 2 or more.
     """
     observer = design.observer
-    if not observer.fault_names:
-        return None
     if isinstance(observer, LinearObserver):
-        return _of_linear(design.linear[0], observer)
+        return _of_linear(design.linear[0], observer) if observer.fault_names else None
     return _of_recursive(observer)
 
 
@@ -86,11 +84,12 @@ def _of_recursive(observer: RecursiveObserver | DAEObserver) -> Scenario | None:
         spread, forgetting = observer.initial_parameter_covariance, observer.forgetting
         longest, forgets = None, observer.form == "forgetting"
     else:
-        adaptation = observer.adaptation
-        if adaptation is None:
-            return None
-        spread, forgetting = adaptation.initial_covariance, adaptation.forgetting
-        longest, forgets = observer.plant.horizon, adaptation.form != "random-walk"
+        adaptation, longest = observer.adaptation, observer.plant.horizon
+        # A Kalman filter has noise to show, and nothing else.
+        spread, forgetting, forgets = np.zeros((0, 0)), 1.0, False
+        if adaptation is not None:
+            spread, forgetting = adaptation.initial_covariance, adaptation.forgetting
+            forgets = adaptation.form != "random-walk"
     memory = min(forgetting, LONG_MEMORY) if forgets else LONG_MEMORY
     samples = int(np.clip(np.log(SETTLED) / np.log(memory), SHORTEST, LONGEST))
     count = len(observer.fault_names) + 1

@@ -14,6 +14,7 @@ from obsynth.errors import SpecError
 from obsynth.evaluation.bench import Bench, Runs, make_bench
 from obsynth.evaluation.intervals import Interval, mean, share
 from obsynth.evaluation.monitors import Monitor
+from obsynth.evaluation.progress import Progress, shown_progress
 from obsynth.evaluation.recursive_bench import make_recursive_bench
 from obsynth.evaluation.recursive_monte_carlo import ParameterMonitor, RecursiveTask, recursive_tasks
 from obsynth.evaluation.simulating import aligned_errors, warm_up_ends
@@ -91,7 +92,7 @@ def evaluate(
     runs: int = 100,
     monitor: Monitor | ParameterMonitor | None = None,
     executor: Executor | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | bool | None = None,
     confidence: float = 0.95,
 ) -> Evaluation:
     """Run a scenario many times, with the seeds ``scenario.seed``, ``scenario.seed + 1``, ...
@@ -109,8 +110,8 @@ def evaluate(
         estimates are counted.
     executor : concurrent.futures.Executor, optional
         Where batches of runs go; by default they run here.  The result does not depend on it.
-    progress : callable, optional
-        Called with the number of runs done and their total after each batch.
+    progress : callable or bool, optional
+        Called with the number of runs done and their total after each batch; `True` shows a bar on standard error.
     confidence : float, optional
         Of every interval: Clopper-Pearson for shares, Student for means.
 
@@ -138,7 +139,8 @@ def evaluate(
         bench = make_recursive_bench(design, scenario)
         onset, dt = bench.onset, bench.drive.dt
         tasks = recursive_tasks(bench, monitor, seeds, max(1, BATCH_SAMPLES // bench.drive.steps))
-    parts = _done(tasks, executor, progress, runs)
+    with shown_progress(progress) as told:
+        parts = _done(tasks, executor, told, runs)
     return _summed(parts, design, onset, dt, watched=monitor is not None, level=confidence)
 
 
@@ -162,7 +164,7 @@ def _linear_tasks(
 def _done(
     tasks: Sequence[Callable[[], dict[str, FloatArray]]],
     executor: Executor | None,
-    progress: Callable[[int, int], None] | None,
+    progress: Progress | None,
     runs: int,
 ) -> dict[str, FloatArray]:
     """Return the numbers of all runs in the order of their seeds."""

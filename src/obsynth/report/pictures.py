@@ -131,8 +131,9 @@ def _at_work(design: ObserverDesign, scenario: Scenario | None) -> Iterator[Pict
             lambda axes: plot_simulation(simulation, detections=seen, units=units, axes=axes),
         ), wide=True)  # fmt: skip
     if 0 < len(states) <= MOST_STATES:
+        run = "in the same run" if panels else "in a run with the stated noise"
         bands = "" if linear else ", with 95 % bands"
-        yield Picture("States", f"States in the same run, and their estimates{bands}.", _drawn(
+        yield Picture("States", f"States {run}, and their estimates{bands}.", _drawn(
             (WIDE, PANEL * len(states) + MARGIN), len(states),
             lambda axes: plot_states(simulation.estimates, states=simulation.states, dt=dt, units=units, axes=axes),
         ), wide=True)  # fmt: skip
