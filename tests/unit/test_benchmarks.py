@@ -4,6 +4,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[2]
 
 
@@ -39,3 +41,14 @@ def test_the_fault_filter_benchmark_runs():
     assert [line[1] for line in verified[1:]] == ["2 of 2"] * 3
     assert [line[1] for line in constraints[1:]] == ["1 of 1"] * 3
     assert [line[4] for line in networks[1:]] == ["True"]
+
+
+@pytest.mark.parametrize("name", ["evaluate", "run_on_data"])
+def test_the_benchmarks_of_running_run(name):
+    """Their own comparisons with python-control hold, and every rate is a number."""
+    script = ROOT / "benchmarks" / f"{name}.py"
+    done = subprocess.run([sys.executable, script, "--small"], capture_output=True, text=True, check=True)
+    row = done.stdout.splitlines()[-1].strip("| ").split(" | ")
+    assert row[0] == "4"
+    assert len(row) == 5
+    assert all(float(cell.replace(",", "")) > 0.0 for cell in row[1:])

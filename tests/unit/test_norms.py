@@ -5,7 +5,14 @@ import numpy as np
 import pytest
 import slycot
 
-from obsynth.numerics.norms import frequency_response, hinf_norm, norm_is_at_most, output_covariance, spectral_radius
+from obsynth.numerics.norms import (
+    frequency_response,
+    highest_gain_found,
+    hinf_norm,
+    norm_is_at_most,
+    output_covariance,
+    spectral_radius,
+)
 
 
 def system(a, b, c, d):
@@ -51,6 +58,7 @@ class TestManyStates:
             realisation = a, b, c, rng.standard_normal((2, 3))
             true = by_slicot(*realisation)
             check_encloses(hinf_norm(*realisation), true, width=1.1e-3, slack=1e-8)
+            assert highest_gain_found(*realisation) == pytest.approx(true, rel=1e-4)
             assert norm_is_at_most(*realisation, 1.002 * true)
             assert not norm_is_at_most(*realisation, 0.999 * true)
 

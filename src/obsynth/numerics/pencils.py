@@ -172,7 +172,7 @@ def _clearly_without_zeros(
 ) -> bool:
     """Return whether ``[square_a - z square_e; rest]`` clearly has full rank at every z; false says nothing.
 
-    Suppose it maps ``x`` of unit norm to no more than t.  Let V hold eigenvectors of the square part, of residual F, let
+    Suppose it maps ``x`` of unit norm to no more than t.  Let V hold eigenvectors of the square part, F their residual,
     w_j be the rows of ``(square_e V)^-1``, and ``x = V y``.  Then ``|y_j| <= |w_j| (t + |F| |V^-1|) / |lambda_j - z|``.
     So x is a multiple of the eigenvector v whose lambda is closest to z, but for r, the sum of these over the others,
     and ``rest`` cannot map it to less than ``|rest v| (1 - r) - |rest| r``.  Where that is more than t for every v,
