@@ -146,10 +146,12 @@ def highest_gain_found(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArra
     Parameters
     ----------
     a, b, c, d : FloatArray
-        ``(n, n)``, ``(n, m)``, ``(p, n)``, ``(p, m)``, ``a`` Schur stable.
+        ``(n, n)``, ``(n, m)``, ``(p, n)``, ``(p, m)``; infinite when ``a`` is not Schur stable.
     """
     if a.shape[0] < MANY_STATES or b.shape[1] == 0 or c.shape[0] == 0 or not np.all(np.isfinite(a)):
         return hinf_norm(a, b, c, d).upper
+    if spectral_radius(a) >= 1.0:
+        return float("inf")
     best, _ = _modal_peak(*_balanced(a, b, c), d)
     return best if np.isfinite(best) else hinf_norm(a, b, c, d).upper
 

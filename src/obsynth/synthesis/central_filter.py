@@ -173,7 +173,7 @@ def least_noise_filter(problem: GainProblem) -> Injection | None:
 
 
 def noise_weighted_filters(problem: GainProblem, gain: float) -> Iterator[Injection]:
-    """Yield central filters of true gain at most ``gain`` for which the noise counts as much as it can.
+    """Yield central filters that promise a gain of at most ``gain``, for which the noise counts as much as it can.
 
     The noise of the problem, times a weight, is one more disturbance.  At the level ``gain`` for both together the gain
     of the true disturbance alone is lower; at a higher level the weight may be larger, and must then be searched with
@@ -205,7 +205,7 @@ def noise_weighted_filters(problem: GainProblem, gain: float) -> Iterator[Inject
                 best, low = found, middle + 1
             else:
                 high = middle
-        if best is not None and problem.reaches(best, gain):
+        if best is not None:
             yield best
             last = low - 1
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from obsynth.errors import SolverError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.norms import hinf_norm, norm_is_at_most, output_covariance
+from obsynth.numerics.norms import highest_gain_found, hinf_norm, norm_is_at_most, output_covariance
 from obsynth.synthesis.riccati import bounded_real_matrix, normalising_change, stabilising_gain
 
 #: The normalising Riccati solution is taken at this multiple of the starting filter's norm.
@@ -214,7 +214,8 @@ def normalise(
         No stable starting filter was found; existence conditions should have told why before.
     """
     start = start if start is not None else _starting_filter(problem)
-    gain = problem.achieved_gain(start) if gain is None else gain
+    # As a scale, a gain that is attained is as good as the largest one, and for many states much cheaper.
+    gain = highest_gain_found(*problem.closed_loop(start)) if gain is None else gain
     size = gain if np.isfinite(gain) and gain > 0.0 else 1.0
     a, b, z, zd = problem.closed_loop(start)
     tail = 1e-6 * max(float(np.linalg.norm(z, 2)) ** 2, np.finfo(np.float64).tiny)

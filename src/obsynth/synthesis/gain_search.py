@@ -13,7 +13,7 @@ import numpy as np
 
 from obsynth.errors import SolverError
 from obsynth.synthesis import gain_design, lmi
-from obsynth.synthesis.central_filter import least_level, search_central_filter, with_least_weight
+from obsynth.synthesis.central_filter import FEW_STATES, least_level, search_central_filter, with_least_weight
 from obsynth.synthesis.gain_problem import GainProblem, Injection, NormalisedProblem, normalise
 
 #: The search stops when another pass in better coordinates improves the gain by less than this.
@@ -95,7 +95,12 @@ def search_least_gain(problem: GainProblem, *, solver: str, polish: bool = True)
             if best is not normalised.start:
                 normalised = coordinates(problem, solver=solver, start=best, gain=gain)
             better = improve(normalised, best, gain, records, solver=solver, first=number == 0)
-            reached = np.inf if better is None else problem.achieved_gain(better)
+            if better is None:
+                reached = np.inf
+            elif improve is _central_filter and problem.order > FEW_STATES:
+                reached = records[-1]["gain"] * normalised.gain  # known already, in the other coordinates
+            else:
+                reached = problem.achieved_gain(better)
             last = gain
             if better is not None and reached < gain:
                 best, gain = better, reached

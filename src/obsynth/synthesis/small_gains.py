@@ -5,7 +5,7 @@ No number of a solver is believed: the true gain, the true variance and the spec
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -69,7 +69,7 @@ def small_gain_design(
         return nothing, records
     candidates: list[Injection] = []
     target = least_noise_filter(problem) if goal.noisy else nothing
-    central = [*noise_weighted_filters(problem, gain)]
+    central = [item for item in noise_weighted_filters(problem, gain) if goal.met(item)]
     if fresh.start_gain <= gain and goal.met(fresh.start):
         central.append(fresh.start)
     central = [item for item in central if goal.is_fast(item)] or central
@@ -96,6 +96,7 @@ class _Goal:
     problem: GainProblem
     gain: float
     slowest: float
+    judged: dict[int, tuple[Injection, bool]] = field(default_factory=dict, repr=False)
 
     @property
     def noisy(self) -> bool:
@@ -103,7 +104,10 @@ class _Goal:
         return bool(np.any(self.problem.Bn) or np.any(self.problem.Zn))
 
     def met(self, injection: Injection) -> bool:
-        return _reaches(self.problem, injection, self.gain)
+        # A filter is asked for more than once, and for many states each answer takes a Riccati equation.
+        if id(injection) not in self.judged:
+            self.judged[id(injection)] = (injection, _reaches(self.problem, injection, self.gain))
+        return self.judged[id(injection)][1]
 
     def is_fast(self, injection: Injection) -> bool:
         return _radius(self.problem, injection) <= self.slowest

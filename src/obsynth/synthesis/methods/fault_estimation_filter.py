@@ -31,6 +31,7 @@ from obsynth.errors import InfeasibleError, SpecError
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.norms import spectral_radius
+from obsynth.numerics.ranks import SLOW_ZERO_RADIUS
 from obsynth.observers.linear import LinearObserver
 from obsynth.results.design import Certificate
 from obsynth.synthesis import gain_search
@@ -125,7 +126,8 @@ def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **op
     """Design the filter; see `obsynth.fault_estimation_filter` for the options, results and errors."""
     asked = FilterOptions(**options)
     progress("checking the existence conditions")
-    require_all(conditions(plant))
+    held = conditions(plant)
+    require_all(held)
     s = None if asked.S is None else as_matrix(asked.S, "S")
     prepared = prepare(plant, s)
     limit = asked.residual_weight_limit
@@ -175,7 +177,7 @@ def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **op
         observer,
         Certificate({"P_factor": factor, "tracking": tracking}, claims),
         {"engine": engine, "runs": [*least.records, *records]},
-        notes(plant, prepared.detectability, observer),
+        notes(plant, prepared.detectability, observer, largest_zero=held[-1].value),
     )
 
 
@@ -311,9 +313,18 @@ def with_weight_limit(problem: GainProblem, prepared: PreparedPlant, parts: _Par
     return replace(problem, weight_limit=WeightLimit(parts.W0 * outputs, parts.V.T * outputs, bound))
 
 
-def notes(plant: DescriptorSystem, detectability: FaultDetectability, observer: LinearObserver) -> tuple[str, ...]:
-    """Return what a user should know: slow zeros, ill-conditioned faults, amplified noise, slow filters."""
-    found = list(sampling_zero_warnings(plant))
+def notes(
+    plant: DescriptorSystem,
+    detectability: FaultDetectability,
+    observer: LinearObserver,
+    *,
+    largest_zero: float = np.inf,
+) -> tuple[str, ...]:
+    """Return what a user should know: slow zeros, ill-conditioned faults, amplified noise, slow filters.
+
+    ``largest_zero`` is the largest modulus of a fault zero, where that is known already.
+    """
+    found = list(sampling_zero_warnings(plant)) if largest_zero > SLOW_ZERO_RADIUS else []
     if detectability.condition_number > WARN_CONDITION:
         found.append(
             f"Upsilon has condition number {detectability.condition_number:.3g}: some combination of faults is "
