@@ -168,7 +168,7 @@ for name, gain in {"least gamma": R_least, "shipped": R}.items():
 # taken one by one, give its $L$ exactly.
 
 # %%
-design = obsynth.fault_estimation_filter(plant, S=S, name="wang2015")
+design = obsynth.fault_estimation_filter(plant, S=S, engine="lmi", name="wang2015")
 ours = {"T": T, "N": N, "Psi": Psi, "Upsilon": Upsilon, "W": W}
 for name, matrix in ours.items():
     np.testing.assert_allclose(matrix, design.gains[name], rtol=0, atol=1e-12, err_msg=name)
