@@ -21,6 +21,7 @@ import numpy as np
 
 from obsynth.analysis.conditions import Condition
 from obsynth.analysis.fault_model_conditions import model_conditions, order_conditions
+from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.transformations import Transformation, eliminate_algebraic_states
 from obsynth.analysis.unknown_input_pencils import (
     MOST_NAMES,
@@ -30,7 +31,7 @@ from obsynth.analysis.unknown_input_pencils import (
     number,
     system_pencil,
 )
-from obsynth.analysis.unknown_inputs import AugmentedPlant, balancing
+from obsynth.analysis.unknown_inputs import AugmentedPlant
 from obsynth.analysis.zeros import Zero, are_outside, invariant_zeros, leading_names
 from obsynth.errors import PreconditionError
 from obsynth.models.descriptor import DescriptorSystem
@@ -58,7 +59,7 @@ class Existence:
         For which they were decided: the plant as given, or without its algebraic states.
     transformation : Transformation or None
         The elimination, where there was one.
-    fixed_modes : ComplexArray
+    fixed_modes : ComplexArray, 1/s (dimensionless for sampled plants)
         Poles that every such observer has; all stable when the conditions hold.
     """
 
@@ -83,22 +84,30 @@ def existence(plant: DescriptorSystem, model: Exosystem) -> Existence:
     if not enough.holds:
         return Existence((enough,), plant, None, nothing)
     working, transformation, solvable = _decoupling_data(plant)
+    # Powers of two: what is exact in the data, such as a zero at the origin, stays exact.
+    units = PlantUnits.of(working, model).rounded()
+    scaled, courses = units.scaled_plant(working), units.scaled_model(model)
     # (D1) and the others fail independently: a user wants to know both.
-    found = [enough, solvable, _zero_condition(working)]
+    found = [enough, solvable, _zero_condition(scaled, units)]
     if found[-1].holds:
-        found += model_conditions(working, model)
+        found += model_conditions(scaled, courses, units)
     if not all(condition.holds for condition in found):
         return Existence(tuple(found), working, transformation, nothing)
-    found += order_conditions(working, model)
+    found += order_conditions(scaled, courses, units)
     if not found[-1].holds:
         return Existence(tuple(found), working, transformation, nothing)
-    fixed, condition = _fixed_modes(working, model)
+    fixed, condition = _fixed_modes(scaled, courses, units)
     return Existence((*found, condition), working, transformation, fixed)
 
 
 def decoupling_rank(plant: DescriptorSystem) -> RankDecision:
     """Decide (D1): ``rank [E 0 Bd; C Dd 0; 0 0 Dd]``, with what it must be."""
-    return decide_rank(_decoupling_matrix(plant), expected=plant.nx + _rank(plant.Dd) + disturbance_rank(plant))
+    scaled = _scaled(plant)
+    return decide_rank(_decoupling_matrix(scaled), expected=plant.nx + _rank(scaled.Dd) + disturbance_rank(plant))
+
+
+def _scaled(plant: DescriptorSystem) -> DescriptorSystem:
+    return PlantUnits.of(plant).rounded().scaled_plant(plant)
 
 
 def _decoupling_matrix(plant: DescriptorSystem) -> FloatArray:
@@ -112,7 +121,8 @@ def _decoupling_matrix(plant: DescriptorSystem) -> FloatArray:
 
 def disturbance_rank(plant: DescriptorSystem) -> int:
     """Return ``rank [Bd; Dd]``: repeated disturbances count once."""
-    return _rank(np.vstack([plant.Bd, plant.Dd]))
+    scaled = _scaled(plant)
+    return _rank(np.vstack([scaled.Bd, scaled.Dd]))
 
 
 def _rank(matrix: FloatArray) -> int:
@@ -157,13 +167,14 @@ def _decoupling_data(plant: DescriptorSystem) -> tuple[DescriptorSystem, Transfo
 def _without_rounding(transformation: Transformation) -> Transformation:
     """Set to zero what elimination left of a direct effect that is none: a rank decision would take it for one."""
     plant = transformation.plant
-    scaling = balancing(plant)
+    # What may be rounding must have no say in the units in which it is judged.
+    units = PlantUnits.of(plant.replace(Dd=np.zeros_like(plant.Dd), Df=np.zeros_like(plant.Df)))
+    scaled = units.scaled_plant(plant)
     changes = {}
-    for direct, entering in (("Dd", plant.Bd), ("Df", plant.Bf)):
-        matrix = getattr(plant, direct)
-        sizes = np.max(np.abs(scaling.scale_input(entering)), axis=0, initial=0.0)
-        negligible = np.abs(scaling.scale_feedthrough(matrix)) <= ELIMINATION_ROUNDING * sizes
-        changes[direct] = np.where(negligible, 0.0, matrix)
+    for direct, entering in (("Dd", scaled.Bd), ("Df", scaled.Bf)):
+        sizes = np.max(np.abs(entering), axis=0, initial=0.0)
+        negligible = np.abs(getattr(scaled, direct)) <= ELIMINATION_ROUNDING * sizes
+        changes[direct] = np.where(negligible, 0.0, getattr(plant, direct))
     return replace(transformation, plant=plant.replace(**changes))
 
 
@@ -191,7 +202,7 @@ def _decoupling_condition(plant: DescriptorSystem, decision: RankDecision, detai
 
 def _undecoupled(plant: DescriptorSystem) -> tuple[str, ...]:
     """Return the unknown inputs that move what no output shows at once, or else the states in question."""
-    matrix = _decoupling_matrix(plant)
+    matrix = _decoupling_matrix(_scaled(plant))
     pencil = equilibrate_pencil(np.zeros_like(matrix), matrix)
     hidden = np.linalg.svd(pencil.A)[2][decide_rank(matrix).rank :].T
     # Of all null vectors the one that moves the states most: some are there only because disturbances repeat.
@@ -203,7 +214,7 @@ def _undecoupled(plant: DescriptorSystem) -> tuple[str, ...]:
     return leading_names(np.abs(direction[: plant.nx]), plant.state_names, most=MOST_NAMES)
 
 
-def _zero_condition(plant: DescriptorSystem) -> Condition:
+def _zero_condition(plant: DescriptorSystem, units: PlantUnits) -> Condition:
     claim = "rank [sE - A, -Bd; C, Dd] = nx + rank [Bd; Dd] on and outside the boundary of stability"
     source = "Share Pasand, Lemma 4 (9.2)"
     inputs, direct = independent_disturbances(plant)
@@ -217,35 +228,44 @@ def _zero_condition(plant: DescriptorSystem) -> Condition:
     outside = [zero for zero, out in zip(zeros, are_outside(wide_e, wide_a, found, plant.dt), strict=True) if out]
     if outside:
         worst = max(outside, key=lambda zero: instability(zero.value, plant.dt))
-        return _zero_failure(plant, worst, inputs, direct, claim, source)
+        return _zero_failure(plant, units, worst, inputs, direct, claim, source)
     return Condition(
         "(D2) zeros", claim, True, float(found.normal_rank), float(full), source, f"{len(zeros)} stable zero(s)"
     )
 
 
 def _zero_failure(
-    plant: DescriptorSystem, zero: Zero, inputs: FloatArray, direct: FloatArray, claim: str, source: str
+    plant: DescriptorSystem,
+    units: PlantUnits,
+    zero: Zero,
+    inputs: FloatArray,
+    direct: FloatArray,
+    claim: str,
+    source: str,
 ) -> Condition:
+    value = units.eigenvalue(zero.value)
     states = leading_names(np.abs(zero.state_direction), plant.state_names, most=MOST_NAMES)
     shares = in_disturbances(plant, inputs, direct, zero.input_direction)
     disturbances = () if zero.is_unobservable_mode else leading_names(shares, plant.disturbance_names, most=MOST_NAMES)
-    where = f"s = {number(zero.value)}" if plant.dt == 0.0 else f"z = {number(zero.value)}"
+    where = f"s = {number(value)}" if plant.dt == 0.0 else f"z = {number(value)}"
     masked = f" under the unknown input {', '.join(map(repr, disturbances))}" if disturbances else ""
     detail = (
         f"at {where} the states {', '.join(map(repr, states))} move{masked} without showing in any output, and do not "
         "come to rest: no observer can know them. Measure something they move."
     )
     return Condition(
-        "(D2) zeros", claim, False, zero.value.real if plant.dt == 0.0 else abs(zero.value), 0.0, source, detail,
-        mode=zero.value, signals=(*states, *disturbances),
+        "(D2) zeros", claim, False, value.real if plant.dt == 0.0 else abs(value), 0.0, source, detail, mode=value,
+        signals=(*states, *disturbances),
     )  # fmt: skip
 
 
-def _fixed_modes(plant: DescriptorSystem, model: Exosystem) -> tuple[ComplexArray, Condition]:
+def _fixed_modes(plant: DescriptorSystem, model: Exosystem, units: PlantUnits) -> tuple[ComplexArray, Condition]:
     augmented = AugmentedPlant.of(plant, model)
     inputs, direct = independent_disturbances(plant)
     below = np.vstack([inputs, np.zeros((model.order, inputs.shape[1]))])
-    zeros = finite_zeros(*system_pencil(augmented.E, augmented.A, below, augmented.C, direct)).values
+    zeros = units.eigenvalues(
+        finite_zeros(*system_pencil(augmented.E, augmented.A, below, augmented.C, direct)).values
+    )
     text = ", ".join(number(complex(value)) for value in zeros if value.imag >= 0.0)
     return zeros, Condition(
         "fixed modes",

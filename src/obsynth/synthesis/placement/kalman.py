@@ -105,14 +105,13 @@ class Compromise:
         ``(n, ny)``.
     decay : float
         1/s.
-    deviation, quietest : float
-        Largest standard deviation of an estimate, of this gain and of the Kalman gain without a rate.
+    price : float
+        Largest ratio of the standard deviation of an estimate to that with the Kalman gain without a rate.
     """
 
     K: FloatArray
     decay: float
-    deviation: float
-    quietest: float
+    price: float
 
 
 def compromise(problem: KalmanProblem, rate: float) -> Compromise | None:
@@ -131,15 +130,17 @@ def compromise(problem: KalmanProblem, rate: float) -> Compromise | None:
     plain = problem.gain(0.0)
     if plain is None:
         return None
-    quietest = float(np.max(problem.deviations(plain), initial=0.0))
-    best = Compromise(plain, 0.0, quietest, quietest)
+    # Each estimate by itself: they have units of their own.
+    quietest = problem.deviations(plain)
+    counted = quietest > 0.0
+    best = Compromise(plain, 0.0, 1.0)
 
     def attempt(decay: float) -> Compromise | None:
         gain = problem.gain(decay)
         if gain is None:
             return None
-        deviation = float(np.max(problem.deviations(gain), initial=0.0))
-        return Compromise(gain, decay, deviation, quietest) if deviation <= NOISE_PRICE * quietest else None
+        price = float(np.max(problem.deviations(gain)[counted] / quietest[counted], initial=0.0))
+        return Compromise(gain, decay, price) if price <= NOISE_PRICE else None
 
     high = rate
     for _ in range(MOST_HALVINGS):

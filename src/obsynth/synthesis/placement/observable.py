@@ -14,14 +14,13 @@ import numpy as np
 
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.numerics.log_balance import LogBalance
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, HIDDEN_MODE_TOLERANCE, RANK_TOLERANCE
 from obsynth.numerics.spectra import eigenvalues
 
 #: Fixed modes closer than this, relative to their size, are peeled off together, at their mean: a double one that
 #: rounding split lies at about the square root of the unit roundoff from it.
 SAME_MODE = 1e-5
-#: Weight of leaving the states' units alone.
-SMALL_RIDGE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +34,7 @@ class ObservableSplit:
     basis : FloatArray
         ``(n, n)``, orthogonal.
     units : FloatArray
-        ``(n,)``, powers of two: the states are balanced first.
+        ``(n,)``: the states are balanced first.
     F, C : FloatArray
         The observable part, ``(no, no)`` and ``(ny, no)``.
     fixed_modes : ComplexArray
@@ -126,30 +125,18 @@ def _hidden_directions(f: FloatArray, c: FloatArray, value: complex, size: float
 
 
 def _balancing(f: FloatArray, c: FloatArray) -> FloatArray:
-    """Return powers of two by which the states are scaled, so that the entries of F, and of each row of C, are alike.
+    """Return factors of the states with which the entries of F, and of each row of C, are alike.
 
     Least squares on the logarithms, with the common size of F free: unlike the usual balancing it does not run away
     where F is reducible, as that of a fault model is.
     """
     n, outputs = f.shape[0], c.shape[0]
-    if n == 0:
-        return np.ones(0)
-    rows, right = [], []
-
-    floor = CANCELLATION_TOLERANCE * float(np.max(np.abs(f), initial=0.0))
-    for i, j in zip(*np.nonzero(np.abs(f) > floor), strict=True):
-        if i != j:
-            row = np.zeros(n + 1 + outputs)
-            row[j], row[i], row[n] = 1.0, -1.0, -1.0
-            rows.append(row)
-            right.append(-np.log2(abs(f[i, j])))
-    floor = CANCELLATION_TOLERANCE * float(np.max(np.abs(c), initial=0.0))
-    for k, j in zip(*np.nonzero(np.abs(c) > floor), strict=True):
-        row = np.zeros(n + 1 + outputs)
-        row[j], row[n + 1 + k] = 1.0, -1.0
-        rows.append(row)
-        right.append(-np.log2(abs(c[k, j])))
-    # The ridge leaves a state alone that nothing ties to the others.
-    whole = np.vstack([*rows, SMALL_RIDGE * np.eye(n + 1 + outputs)])
-    exponents = np.linalg.lstsq(whole, np.concatenate([right, np.zeros(n + 1 + outputs)]), rcond=None)[0][:n]
-    return np.asarray(np.exp2(np.round(exponents)))
+    problem = LogBalance(n + outputs + 1)
+    states = range(n)
+    links = np.where(np.eye(n, dtype=bool), 0.0, f)
+    floor_f, floor_c = (CANCELLATION_TOLERANCE * float(np.max(np.abs(part), initial=0.0)) for part in (f, c))
+    problem.add(np.where(np.abs(links) > floor_f, f, 0.0), states, states, signs=(-1, 1), common=n + outputs)
+    problem.add(np.where(np.abs(c) > floor_c, c, 0.0), range(n, n + outputs), states)
+    for state in states:
+        problem.wish(state, 0.0)
+    return np.asarray(np.exp2(problem.solve()[:n]))

@@ -9,7 +9,7 @@ References
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -34,7 +34,7 @@ class Region:
 
     Parameters
     ----------
-    decay : float, optional, 1/s
+    decay : float, optional, 1/s (of whatever time the problem has)
         Every mode decays at least as ``exp(-decay t)``.
     radius : float, optional, 1/s
         No mode is faster than this: ``abs(s) <= radius``; continuous time only.
@@ -80,6 +80,12 @@ class Region:
                 problems=problems or ["give at least one of decay, radius, damping."],
             )  # fmt: skip
         return cls(**data)
+
+    def in_time(self, unit: float) -> Region:
+        """Return the region with rates per ``unit`` (seconds) instead of per second."""
+        return replace(
+            self, decay=unit * self.decay, radius=None if self.radius is None else unit * self.radius
+        )
 
     def holds(self, values: Any, dt: float) -> bool:
         """Whether all ``values`` lie in the region."""
