@@ -124,7 +124,7 @@ class TestKalman:
         problem = noisy(PAIR, OUTPUTS)
         found = compromise(problem, 10.0)
         assert found is not None
-        assert 0.5 * NOISE_PRICE < found.deviation / found.quietest <= NOISE_PRICE
+        assert 0.5 * NOISE_PRICE < found.price <= NOISE_PRICE
         easy = compromise(problem, 0.1)
         assert easy is not None
         assert easy.decay == 0.1

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.analysis.conditions import Condition
+from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.unknown_input_pencils import (
     MOST_NAMES,
     equilibrated,
@@ -21,7 +22,6 @@ from obsynth.analysis.unknown_input_pencils import (
     number,
     system_pencil,
 )
-from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.unknown_inputs import AugmentedPlant
 from obsynth.analysis.zeros import is_outside, leading_names
 from obsynth.models.descriptor import DescriptorSystem

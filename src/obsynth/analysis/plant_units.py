@@ -20,7 +20,6 @@ from obsynth.numerics.arrays import ComplexArray, FloatArray, read_only
 from obsynth.numerics.log_balance import LogBalance
 from obsynth.numerics.ranks import RANK_TOLERANCE
 
-
 #: Weight of inputs and outputs beside equations and states, which they scale only where A and E leave that open.
 SIGNALS_WEIGHT = 1e-3
 

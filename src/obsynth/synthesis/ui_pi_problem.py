@@ -33,6 +33,9 @@ from obsynth.synthesis.ui_pi_realisation import ObserverGains
 
 #: Modes slower than this share of the fastest do not count for the plant's time scale: integrators and rounding.
 SLOW_SHARE = 1e-6
+#: Poles of sampled plants are not asked to decay by more than this exponent in one sample: nearer to zero they cannot
+#: be told apart, and printed gains miss them.
+MOST_PER_SAMPLE = 2.0
 #: Noise on innovations that have none of their own, relative to the outputs' noise.
 BACKGROUND_NOISE = 0.1
 
@@ -195,7 +198,8 @@ def _own_rate(plant: DescriptorSystem, f: FloatArray) -> float:
         found = found[np.isfinite(found)]
         found = found[found > max(SLOW_SHARE * float(np.max(found, initial=0.0)), DEAD_BEAT)]
         if found.size:
-            return float(np.median(found))
+            median = float(np.median(found))
+            return min(median, MOST_PER_SAMPLE / plant.dt) if plant.dt > 0.0 else median
     size = float(np.linalg.norm(f, 2)) if f.size else 0.0
     return 1.0 / plant.dt if plant.dt > 0.0 else size or 1.0
 

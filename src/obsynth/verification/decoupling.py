@@ -132,9 +132,7 @@ class _Shipped:
         offsets = (units.states / states[:nx])[:, None] * np.abs(dy[:nx])
         return cls(az, by, cz, dy, np.abs(by) + np.abs(az[:, :nx]) @ offsets, observer.fault_rows, units)
 
-    def misses(
-        self, plant: DescriptorSystem, point: complex, trajectories: ComplexArray
-    ) -> tuple[float, float] | None:
+    def misses(self, plant: DescriptorSystem, point: complex, trajectories: ComplexArray) -> tuple[float, float] | None:
         """Return the largest relative error of an estimate and that of a fault; ``None`` at a pole."""
         nx = plant.nx
         x, d = trajectories[:nx], trajectories[nx:]

@@ -125,18 +125,20 @@ def _hidden_directions(f: FloatArray, c: FloatArray, value: complex, size: float
 
 
 def _balancing(f: FloatArray, c: FloatArray) -> FloatArray:
-    """Return factors of the states with which the entries of F, and of each row of C, are alike.
+    """Return factors of the states with which the entries of F, and those of C, are alike.
 
     Least squares on the logarithms, with the common size of F free: unlike the usual balancing it does not run away
     where F is reducible, as that of a fault model is.
     """
-    n, outputs = f.shape[0], c.shape[0]
-    problem = LogBalance(n + outputs + 1)
+    n = f.shape[0]
+    problem = LogBalance(n + 2)
     states = range(n)
     links = np.where(np.eye(n, dtype=bool), 0.0, f)
-    floor_f, floor_c = (CANCELLATION_TOLERANCE * float(np.max(np.abs(part), initial=0.0)) for part in (f, c))
-    problem.add(np.where(np.abs(links) > floor_f, f, 0.0), states, states, signs=(-1, 1), common=n + outputs)
-    problem.add(np.where(np.abs(c) > floor_c, c, 0.0), range(n, n + outputs), states)
+    # All outputs together: which combinations of them are looked at must not matter.
+    shown = np.linalg.norm(c, axis=0, keepdims=True)
+    floor_f, floor_c = (CANCELLATION_TOLERANCE * float(np.max(np.abs(part), initial=0.0)) for part in (f, shown))
+    problem.add(np.where(np.abs(links) > floor_f, f, 0.0), states, states, signs=(-1, 1), common=n)
+    problem.add(np.where(shown > floor_c, shown, 0.0), range(n + 1, n + 2), states)
     for state in states:
         problem.wish(state, 0.0)
     return np.asarray(np.exp2(problem.solve()[:n]))

@@ -83,9 +83,7 @@ class Region:
 
     def in_time(self, unit: float) -> Region:
         """Return the region with rates per ``unit`` (seconds) instead of per second."""
-        return replace(
-            self, decay=unit * self.decay, radius=None if self.radius is None else unit * self.radius
-        )
+        return replace(self, decay=unit * self.decay, radius=None if self.radius is None else unit * self.radius)
 
     def holds(self, values: Any, dt: float) -> bool:
         """Whether all ``values`` lie in the region."""
