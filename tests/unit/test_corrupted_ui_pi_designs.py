@@ -251,8 +251,8 @@ TABLE: dict[str, tuple[str, Callable[[ObserverDesign], ObserverDesign], tuple[st
     "unstable gain": ("paper", unstable, (STABILITY, POLES, DECAY, DIGITS, NOISE)),
     "unstable gain, discrete": ("direct", unstable,
         (INPUTS, IN_ERROR, STABILITY, POLES, DECAY, DIGITS, DECOUPLING, NOISE)),
-    "coordinates that cost digits": ("paper", lambda d: in_other_coordinates(d, 1e4), (POLES,)),
-    "coordinates that cost digits, discrete": ("direct", lambda d: in_other_coordinates(d, 3e5),
+    "coordinates that cost digits": ("paper", lambda d: in_other_coordinates(d, 3e4), (POLES, DIGITS)),
+    "coordinates that cost digits, discrete": ("direct", lambda d: in_other_coordinates(d, 5e5),
         (POLES, DECAY, DIGITS)),
     # The certificate.
     "tracking": ("paper", certificate("tracking", 1, 0, 0.4), (SYLVESTER, IN_ERROR, STATE, RESIDUAL)),

@@ -33,9 +33,13 @@ from obsynth.synthesis.ui_pi_realisation import ObserverGains
 
 #: Modes slower than this share of the fastest do not count for the plant's time scale: integrators and rounding.
 SLOW_SHARE = 1e-6
+#: Where all modes are slower than this share of the pair's size, they are integrators that rounding has scattered.
+SCATTER = 3e-5
 #: Poles of sampled plants are not asked to decay by more than this exponent in one sample: nearer to zero they cannot
 #: be told apart, and printed gains miss them.
 MOST_PER_SAMPLE = 2.0
+#: How strongly states are driven by default, beside fault models: a plant is better known than the course of a fault.
+PROCESS_SHARE = 0.1
 #: Noise on innovations that have none of their own, relative to the outputs' noise.
 BACKGROUND_NOISE = 0.1
 
@@ -193,14 +197,14 @@ def _given_decoupling(plant: DescriptorSystem, units: PlantUnits, given: Mapping
 def _own_rate(plant: DescriptorSystem, f: FloatArray) -> float:
     """Return the median speed of the plant's modes; of the pair's where it has none; or its size."""
     structure = pencil_structure(plant.E, plant.A)
+    size = float(np.linalg.norm(f, 2)) if f.size else 0.0
     for values in (structure.finite_eigenvalues, eigenvalues(f)):
         found = speeds(values, plant.dt)
         found = found[np.isfinite(found)]
         found = found[found > max(SLOW_SHARE * float(np.max(found, initial=0.0)), DEAD_BEAT)]
-        if found.size:
+        if found.size and (plant.dt > 0.0 or np.max(found) > SCATTER * size):
             median = float(np.median(found))
             return min(median, MOST_PER_SAMPLE / plant.dt) if plant.dt > 0.0 else median
-    size = float(np.linalg.norm(f, 2)) if f.size else 0.0
     return 1.0 / plant.dt if plant.dt > 0.0 else size or 1.0
 
 
@@ -241,7 +245,7 @@ def kalman_problem(problem: PlacementProblem, weights: NoiseWeights) -> KalmanPr
             [measured, np.zeros((len(measured), problem.free))],
         ])  # fmt: skip
     per_step = problem.rate * (plant.dt if plant.dt > 0.0 else 1.0)
-    strength = np.concatenate([np.full(plant.nx, weights.process), np.full(order, weights.fault)])
+    strength = np.concatenate([np.full(plant.nx, PROCESS_SHARE * weights.process), np.full(order, weights.fault)])
     faults = np.hstack([np.zeros((plant.nf, plant.nx)), problem.model.Cw])
     return KalmanProblem(
         F=split.F,

@@ -169,14 +169,15 @@ def compromise(problem: KalmanProblem, rate: float) -> Compromise | None:
         return None
     # Each estimate by itself: they have units of their own.
     quietest = problem.deviations(plain)
-    counted = quietest > 0.0
+    counted = (quietest > 0.0) & np.isfinite(quietest)
     best = Compromise(plain, 0.0, 1.0)
 
     def attempt(decay: float) -> Compromise | None:
         gain = problem.gain(decay)
         if gain is None:
             return None
-        price = float(np.max(problem.deviations(gain)[counted] / quietest[counted], initial=0.0))
+        ratios = problem.deviations(gain)[counted] / quietest[counted]
+        price = float(np.max(ratios)) if ratios.size else 1.0
         return Compromise(gain, decay, price) if price <= NOISE_PRICE else None
 
     high = rate

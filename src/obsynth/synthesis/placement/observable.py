@@ -84,7 +84,7 @@ def observable_split(f: FloatArray, c: FloatArray, fixed_modes: ComplexArray) ->
     units = _balancing(f, c)
     work_f, work_c, basis = f * units / units[:, None], c * units, np.eye(n)
     size = max(float(np.linalg.norm(work_f, 2)), float(np.linalg.norm(work_c, 2))) if n else 1.0
-    waiting = [complex(value) for value in fixed_modes if value.imag >= 0.0]
+    waiting = _upper_half(fixed_modes)
     seen = n
     while waiting:
         value = waiting[0]
@@ -108,6 +108,17 @@ def observable_split(f: FloatArray, c: FloatArray, fixed_modes: ComplexArray) ->
             waiting.remove(other)
     hidden = eigenvalues(work_f[seen:, seen:])
     return ObservableSplit(basis, units, work_f[:seen, :seen], work_c[:, :seen], hidden)
+
+
+def _upper_half(modes: ComplexArray) -> list[complex]:
+    """Return one mode of each pair; a double real mode that rounding has split into a pair is real twice."""
+    found: list[complex] = []
+    for mode in map(complex, modes):
+        if 0.0 < abs(mode.imag) <= SAME_MODE * max(1.0, abs(mode)):
+            found.append(complex(mode.real, 0.0))
+        elif mode.imag >= 0.0:
+            found.append(mode)
+    return found
 
 
 def _hidden_directions(f: FloatArray, c: FloatArray, value: complex, size: float) -> FloatArray:
