@@ -14,6 +14,7 @@ from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.unknown_input_pencils import equilibrated
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.numerics.norms import balancing_factors
 from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.numerics.spectra import boundary_points, eigenvalues, speeds
 from obsynth.observers.linear import LinearObserver
@@ -126,7 +127,7 @@ class _Shipped:
         system = np.zeros((order + outputs + len(cz),) * 2)
         system[:order, :order], system[:order, order : order + outputs] = az, by
         system[order + outputs :, :order] = cz
-        states = _balance(system)[:order]
+        states = balancing_factors(system)[:order]
         az, by, cz = az * states / states[:, None], by / states[:, None], cz * states
         # Bhat = Ahat D + K may cancel: what it is formed of says how well it can be known.
         offsets = (units.states / states[:nx])[:, None] * np.abs(dy[:nx])
@@ -152,10 +153,3 @@ class _Shipped:
         rows = np.maximum(np.max(size, axis=1), UNMOVED * possible)
         relative = float(np.max(np.max(np.abs(error), axis=1) / np.where(rows > 0.0, rows, 1.0), initial=0.0))
         return relative, float(np.max(np.linalg.norm(error[self.faults], axis=1), initial=0.0))
-
-
-def _balance(system: FloatArray) -> FloatArray:
-    """Return powers of two that balance a matrix."""
-    from scipy.linalg import matrix_balance
-
-    return np.asarray(matrix_balance(system, permute=False, separate=True)[1][0])

@@ -20,6 +20,8 @@ NOISE_PRICE = 10.0
 RATE_STEP = 1.05
 #: Times the Riccati equation is solved, each time in the coordinates of the last solution, which improve it.
 ROUNDS = 2
+#: Estimates with less than this share of the outputs' noise have none but rounding.
+SILENT = 1e-8
 #: Halvings of the default rate before the quietest filter is taken as it is.
 MOST_HALVINGS = 12
 
@@ -169,7 +171,8 @@ def compromise(problem: KalmanProblem, rate: float) -> Compromise | None:
         return None
     # Each estimate by itself: they have units of their own.
     quietest = problem.deviations(plain)
-    counted = (quietest > 0.0) & np.isfinite(quietest)
+    silent = SILENT * np.linalg.norm(problem.estimates, axis=1) * float(np.linalg.norm(problem.D))
+    counted = (quietest > silent) & np.isfinite(quietest)
     best = Compromise(plain, 0.0, 1.0)
 
     def attempt(decay: float) -> Compromise | None:

@@ -26,6 +26,8 @@ INNER_SHARE = 1e-3
 STATE_WEIGHT = 1e-3
 #: The matrix of the Lyapunov function stays above this multiple of the identity, in scaled states.
 LEAST_LYAPUNOV = 1e-6
+#: Above this many states the inequality moves only those poles that a Kalman gain leaves outside the region.
+LARGE = 20
 
 
 @dataclass(frozen=True)
@@ -85,6 +87,15 @@ class Region:
         """Return the region with rates per ``unit`` (seconds) instead of per second."""
         return replace(self, decay=unit * self.decay, radius=None if self.radius is None else unit * self.radius)
 
+    def shrunk(self) -> Region:
+        """Return the region inside of which poles count as well within it."""
+        return replace(
+            self,
+            decay=(1.0 + 0.5 * INNER_SHARE) * self.decay,
+            radius=None if self.radius is None else (1.0 - 0.5 * INNER_SHARE) * self.radius,
+            damping=None if self.damping is None else min((1.0 + 0.5 * INNER_SHARE) * self.damping, 1.0),
+        )
+
     def holds(self, values: Any, dt: float) -> bool:
         """Whether all ``values`` lie in the region."""
         poles = np.asarray(values, dtype=np.complex128)
@@ -100,6 +111,8 @@ class Region:
 
 def region_gain(problem: KalmanProblem, region: Region, *, solver: str) -> tuple[FloatArray, dict[str, Any]]:
     """Return K ``(n, ny)`` with all poles of ``F - K C`` in the region and little noise, and the solver's record.
+
+    Above `LARGE` states a Kalman gain of the region's rate comes first, and the record is empty where it is enough.
 
     Parameters
     ----------
@@ -119,6 +132,46 @@ def region_gain(problem: KalmanProblem, region: Region, *, solver: str) -> tuple
     n, dt = problem.F.shape[0], problem.dt
     if n == 0:
         return np.zeros((0, problem.C.shape[0])), {}
+    found = _partly(problem, region, solver=solver) if n > LARGE else None
+    gain, record = _by_inequality(problem, region, solver=solver) if found is None else found
+    if not region.holds(eigenvalues(problem.F - gain @ problem.C), dt):
+        raise SolverError(
+            f"{solver} ended with poles outside the region: nothing is known. Widen the region, or use decay= instead.",
+            record=record,
+        )
+    return gain, record
+
+
+def _partly(problem: KalmanProblem, region: Region, *, solver: str) -> tuple[FloatArray, dict[str, Any]] | None:
+    """Move only those poles into the region that a Kalman gain of the same rate leaves outside; ``None`` without one.
+
+    With ``F - K C = V diag(T1, T2) V^-1``, the poles of T1 inside, a further gain ``V [0; K2]`` keeps these and moves
+    the others to those of ``T2 - K2 C V2``: the inequality has the size of T2.
+    """
+    from scipy.linalg import schur, solve_sylvester
+
+    gain = problem.gain((1.0 + INNER_SHARE) * region.decay)
+    if gain is None:
+        return None
+    inner = region.shrunk()
+    triangular, turn, good = schur(
+        problem.F - gain @ problem.C, output="real", sort=lambda re, im: inner.holds([complex(re, im)], problem.dt)
+    )
+    if good == len(triangular):
+        return gain, {}
+    first, mixed, second = triangular[:good, :good], triangular[:good, good:], triangular[good:, good:]
+    apart = np.vstack([solve_sylvester(first, -second, -mixed), np.eye(len(second))])
+    moved, rows = turn @ apart, turn[:, good:].T
+    rest = replace(
+        problem, F=second, C=problem.C @ moved, B=rows @ (problem.B - gain @ problem.D), drive=rows @ problem.drive,
+        estimates=problem.estimates @ moved,
+    )  # fmt: skip
+    more, record = _by_inequality(rest, region, solver=solver)
+    return np.asarray(gain + moved @ more), record
+
+
+def _by_inequality(problem: KalmanProblem, region: Region, *, solver: str) -> tuple[FloatArray, dict[str, Any]]:
+    n, dt = problem.F.shape[0], problem.dt
     change = _scaling(problem, region)
     inverse = np.linalg.inv(change)
     f, c = inverse @ problem.F @ change, problem.C @ change
@@ -145,14 +198,7 @@ def region_gain(problem: KalmanProblem, region: Region, *, solver: str) -> tuple
         constraints.append(lmi.at_most(moved + moved.T + weight, 0.0))
         constraints += _continuous_region(region, p, moved)
     record = lmi.minimise(lmi.trace(z), constraints, what="poles in a region", solver=solver)
-    gain = change @ np.linalg.solve(lmi.value_of(p), lmi.value_of(y))
-    poles = eigenvalues(problem.F - gain @ problem.C)
-    if not region.holds(poles, dt):
-        raise SolverError(
-            f"{solver} ended with poles outside the region: nothing is known. Widen the region, or use decay= instead.",
-            record=record,
-        )
-    return np.asarray(gain), record
+    return np.asarray(change @ np.linalg.solve(lmi.value_of(p), lmi.value_of(y))), record
 
 
 def _continuous_region(region: Region, p: Any, moved: Any) -> list[Any]:
