@@ -15,3 +15,12 @@ def test_the_fault_filter_benchmark_runs():
     gains = [float(cell.split(", ")[1]) for cell in rows[0][1:]]
     # The bisection ends within 1e-4 of the least gain, the others much closer.
     assert max(gains) <= min(gains) * (1.0 + 2e-4)
+
+
+def test_the_unknown_input_observer_benchmark_runs():
+    script = ROOT / "benchmarks" / "ui_pi_observer.py"
+    done = subprocess.run([sys.executable, script, "--small"], capture_output=True, text=True, check=True)
+    (row,) = [line.strip("| ").split(" | ") for line in done.stdout.splitlines()[2:]]
+    rates = [float(cell.split(", ")[1].split()[0]) for cell in row[1:]]
+    assert row[0] == "16"
+    assert min(rates[:3]) > max(rates[3], 0.0)

@@ -1,4 +1,4 @@
-"""Unknown-input PI observers in the units that people use: kilohertz, nanofarads, millimetres; and hundreds of states."""
+"""Unknown-input PI observers in people's units: kilohertz, nanofarads, microseconds; and rods of many states."""
 
 from __future__ import annotations
 
@@ -45,9 +45,7 @@ def test_a_resonator_of_any_frequency(frequency: float) -> None:
 
 
 def test_an_oscillating_circuit_in_farad_and_henry() -> None:
-    circuit = DescriptorSystem(
-        np.diag([1e-9, 1e-6]), [[-1 / 50, 1], [-1, -0.1]], [[0], [1]], C=[[1, 0]], Bf=[[1], [0]]
-    )
+    circuit = DescriptorSystem(np.diag([1e-9, 1e-6]), [[-1 / 50, 1], [-1, -0.1]], [[0], [1]], C=[[1, 0]], Bf=[[1], [0]])
     design = ui_pi_observer(circuit)
     assert design.report.passed
     assert design.certificate.claims["decay"] > 1e5

@@ -11,6 +11,7 @@ the scaled plant is the same whatever units the plant came in.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -54,7 +55,7 @@ class PlantUnits:
         nx, ny, order = plant.nx, plant.ny, 0 if model is None else model.order
         ends = np.cumsum([1, nx, nx, ny, plant.nf, plant.nd, order])
         equations, states, outputs, faults, disturbances, fault_model = (
-            range(int(start), int(end)) for start, end in zip(ends[:-1], ends[1:], strict=True)
+            range(int(start), int(end)) for start, end in pairwise(ends)
         )
         problem = LogBalance(int(ends[-1]))
         time = None if plant.is_discrete else 0
@@ -77,8 +78,11 @@ class PlantUnits:
             _inverse_sizes((left[:, None] * inner).T, (shown[:, None] * direct).T)
             for inner, direct in ((plant.Bf, plant.Df), (plant.Bd, plant.Dd))
         ]
-        parts = [factors[equations], own, shown, *entering, _model_units(model, factors[fault_model], entering[0])]
-        return cls(plant.dt or float(factors[0]), *map(read_only, parts), discrete=plant.is_discrete)
+        courses = _model_units(model, factors[fault_model], entering[0])
+        return cls(
+            plant.dt or float(factors[0]), read_only(factors[equations]), read_only(own), read_only(shown),
+            read_only(entering[0]), read_only(entering[1]), read_only(courses), plant.is_discrete,
+        )  # fmt: skip
 
     @property
     def rate(self) -> float:
@@ -102,8 +106,10 @@ class PlantUnits:
             return read_only(np.exp2(np.round(np.log2(factors))))
 
         time = self.time if self.discrete else float(np.exp2(np.round(np.log2(self.time))))
-        names = ("equations", "states", "outputs", "faults", "disturbances", "model")
-        return replace(self, time=time, **{name: nearest(getattr(self, name)) for name in names})
+        return PlantUnits(
+            time, nearest(self.equations), nearest(self.states), nearest(self.outputs), nearest(self.faults),
+            nearest(self.disturbances), nearest(self.model), self.discrete,
+        )  # fmt: skip
 
     def for_decoupling(self, plant: DescriptorSystem) -> PlantUnits:
         """Return the same with each equation that holds a derivative scaled by its row of E.

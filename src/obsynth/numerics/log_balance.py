@@ -1,8 +1,8 @@
 """Units in which the entries of several matrices are near one, by robust least squares on their logarithms.
 
-Changing the units of the data only shifts the unknowns, and every pass keeps it at that, so that the scaled matrices are
-the same whatever units the data came in.  Rounding the factors to powers of two makes the scaling exact, at the price of
-a factor of two in that.
+Changing the units of the data only shifts the unknowns, and every pass keeps it at that, so that the scaled matrices
+are the same whatever units the data came in.  Rounding the factors to powers of two makes the scaling exact, at the
+price of a factor of two in that.
 """
 
 from __future__ import annotations

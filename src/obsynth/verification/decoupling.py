@@ -114,8 +114,8 @@ class _Shipped:
     Cz: FloatArray
     Dy: FloatArray
     formed: FloatArray
+    direct: FloatArray
     faults: slice
-    units: PlantUnits
 
     @classmethod
     def of(cls, observer: LinearObserver, units: PlantUnits) -> _Shipped:
@@ -131,7 +131,9 @@ class _Shipped:
         az, by, cz = az * states / states[:, None], by / states[:, None], cz * states
         # Bhat = Ahat D + K may cancel: what it is formed of says how well it can be known.
         offsets = (units.states / states[:nx])[:, None] * np.abs(dy[:nx])
-        return cls(az, by, cz, dy, np.abs(by) + np.abs(az[:, :nx]) @ offsets, observer.fault_rows, units)
+        formed = np.abs(by) + np.abs(az[:, :nx]) @ offsets
+        # The same holds for a residual, y - C xhat with xhat = z + D y.
+        return cls(az, by, cz, dy, formed, np.abs(dy) + np.abs(cz[:, :nx]) @ offsets, observer.fault_rows)
 
     def misses(self, plant: DescriptorSystem, point: complex, trajectories: ComplexArray) -> tuple[float, float] | None:
         """Return the largest relative error of an estimate and that of a fault; ``None`` at a pole."""
@@ -144,7 +146,7 @@ class _Shipped:
             return None
         error = self.Cz @ (resolvent @ (self.By @ y)) + self.Dy @ y
         error[:nx] -= x
-        passed = np.abs(self.Cz) @ (np.abs(resolvent) @ self.formed) + np.abs(self.Dy)
+        passed = np.abs(self.Cz) @ (np.abs(resolvent) @ self.formed) + self.direct
         size = passed @ (np.abs(plant.C) @ np.abs(x) + np.abs(plant.Dd) @ np.abs(d))
         size[:nx] += np.abs(x)
         # A signal that a trajectory does not move is rounding: it is judged by what trajectories of its size could do.

@@ -23,10 +23,8 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.conditions import Condition, require_all
-from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.unknown_input_conditions import existence
 from obsynth.analysis.unknown_input_pencils import number
-from obsynth.analysis.unknown_inputs import direct_part
 from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.models.exosystems import Exosystem, exosystem
@@ -39,15 +37,10 @@ from obsynth.synthesis.placement.eigenstructure import place
 from obsynth.synthesis.placement.kalman import compromise
 from obsynth.synthesis.placement.region import Region, region_gain
 from obsynth.synthesis.result import Synthesis
+from obsynth.synthesis.ui_pi_noise import NoiseWeights, kalman_problem
 from obsynth.synthesis.ui_pi_options import UiPiOptions, checked_poles, plain
-from obsynth.synthesis.ui_pi_problem import (
-    NoiseWeights,
-    PlacementProblem,
-    kalman_problem,
-    placement_problem,
-    with_faults,
-)
-from obsynth.synthesis.ui_pi_realisation import ObserverGains, realise
+from obsynth.synthesis.ui_pi_problem import PlacementProblem, placement_problem, with_faults
+from obsynth.synthesis.ui_pi_realisation import ObserverGains, combinations_seen, realise
 
 
 def conditions(plant: DescriptorSystem, *, fault_model: Any = "step") -> tuple[Condition, ...]:
@@ -192,7 +185,7 @@ def _assembled(
     structured: bool,
 ) -> Synthesis:
     """Return realisation and certificate of gains in the plant's units; poles that were not asked for are computed."""
-    observer, letters = realise(plant, model, gains, _seen(plant))
+    observer, letters = realise(plant, model, gains, combinations_seen(plant))
     nx = plant.nx
     if structured:
         letters |= {"U": gains.U[:nx, :nx], "D": gains.D[:nx], "K": gains.K[:nx], "F": gains.K[nx:]}
@@ -211,15 +204,6 @@ def _assembled(
     claims = {"decay": slowest, "noise_amplification": noise_amplification(observer), **claims}
     finite = {name: value for name, value in claims.items() if np.isfinite(value)}
     return Synthesis({}, letters, observer, Certificate(matrices, finite))
-
-
-def _seen(plant: DescriptorSystem) -> FloatArray:
-    """Return the combinations of outputs that no disturbance reaches directly, each of unit length."""
-    if not plant.Dd.any():
-        return np.eye(plant.ny)
-    units = PlantUnits.of(plant)
-    seen = direct_part(units.scaled_plant(plant))[0] * units.outputs
-    return np.asarray(seen / np.linalg.norm(seen, axis=1, keepdims=True))
 
 
 def noise_amplification(observer: LinearObserver) -> float:

@@ -94,7 +94,11 @@ class KalmanProblem:
 
 
 def _filtered(
-    f: FloatArray, c: FloatArray, driven: FloatArray, measured: FloatArray, asked: tuple[float, float],
+    f: FloatArray,
+    c: FloatArray,
+    driven: FloatArray,
+    measured: FloatArray,
+    asked: tuple[float, float],
     change: FloatArray,
 ) -> tuple[FloatArray, FloatArray] | None:
     """Return the gain of a Kalman filter, and states in which its error covariance is the identity.
@@ -120,10 +124,14 @@ def _filtered(
             moved, noise = inverse @ f @ change, inverse @ driven @ inverse.T
             noise = 0.5 * (noise + noise.T)
             if dt > 0.0:
-                found, covariance, _ = control.dlqe(moved / bound, np.eye(n), c @ change, noise, measured, method="scipy")
+                found, covariance, _ = control.dlqe(
+                    moved / bound, np.eye(n), c @ change, noise, measured, method="scipy"
+                )
                 found = bound * np.asarray(found)
             else:
-                found, covariance, _ = control.lqe(moved - bound * np.eye(n), np.eye(n), c @ change, noise, measured, method="scipy")
+                found, covariance, _ = control.lqe(
+                    moved - bound * np.eye(n), np.eye(n), c @ change, noise, measured, method="scipy"
+                )
             values, vectors = np.linalg.eigh(0.5 * (covariance + np.asarray(covariance).T))
         except (np.linalg.LinAlgError, ValueError, ArithmeticError):
             return None
