@@ -4,6 +4,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[2]
 
 
@@ -24,3 +26,14 @@ def test_the_unknown_input_observer_benchmark_runs():
     rates = [float(cell.split(", ")[1].split()[0]) for cell in row[1:]]
     assert row[0] == "16"
     assert min(rates[:3]) > max(rates[3], 0.0)
+
+
+@pytest.mark.parametrize("name", ["evaluate", "run_on_data"])
+def test_the_benchmarks_of_running_run(name):
+    """Their own comparisons with python-control hold, and every rate is a number."""
+    script = ROOT / "benchmarks" / f"{name}.py"
+    done = subprocess.run([sys.executable, script, "--small"], capture_output=True, text=True, check=True)
+    row = done.stdout.splitlines()[-1].strip("| ").split(" | ")
+    assert row[0] == "4"
+    assert len(row) == 5
+    assert all(float(cell.replace(",", "")) > 0.0 for cell in row[1:])

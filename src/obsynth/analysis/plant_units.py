@@ -163,14 +163,11 @@ def _model_units(model: Exosystem | None, factors: FloatArray, faults: FloatArra
     """Return the factors of the states of the fault model, such that the rows of Cw have unit length for each fault."""
     if model is None:
         return factors
-    found = factors.copy()
+    found, links = factors.copy(), model.Phi != 0.0
     for fault, row in zip(faults, model.Cw, strict=True):
         linked = row != 0.0
-        for _ in range(model.order.bit_length()):
-            links = model.Phi != 0.0
+        for _ in range(model.order):
             linked = linked | np.any(links[linked], axis=0) | np.any(links[:, linked], axis=1)
-            if np.all(linked):
-                break
         size = float(np.linalg.norm(row * factors))
         found[linked] = factors[linked] * (fault / size if size > 0.0 else 1.0)
     return found

@@ -8,6 +8,7 @@ References
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -132,18 +133,26 @@ def region_gain(problem: KalmanProblem, region: Region, *, solver: str) -> tuple
     n, dt = problem.F.shape[0], problem.dt
     if n == 0:
         return np.zeros((0, problem.C.shape[0])), {}
-    found = _partly(problem, region, solver=solver) if n > LARGE else None
-    gain, record = _by_inequality(problem, region, solver=solver) if found is None else found
-    if not region.holds(eigenvalues(problem.F - gain @ problem.C), dt):
-        raise SolverError(
+    # What one way cannot find, the other may.
+    ways = [_partly, _by_inequality] if n > LARGE else [_by_inequality, _partly]
+    failures: list[SolverError] = []
+    for way in ways:
+        try:
+            gain, record = way(problem, region, solver=solver)
+        except SolverError as error:
+            failures.append(error)
+            continue
+        if region.holds(eigenvalues(problem.F - gain @ problem.C), dt):
+            return gain, record
+        failures.append(SolverError(
             f"{solver} ended with poles outside the region: nothing is known. Widen the region, or use decay= instead.",
             record=record,
-        )
-    return gain, record
+        ))  # fmt: skip
+    raise failures[ways.index(_by_inequality)]
 
 
-def _partly(problem: KalmanProblem, region: Region, *, solver: str) -> tuple[FloatArray, dict[str, Any]] | None:
-    """Move only those poles into the region that a Kalman gain of the same rate leaves outside; ``None`` without one.
+def _partly(problem: KalmanProblem, region: Region, *, solver: str) -> tuple[FloatArray, dict[str, Any]]:
+    """Move only those poles into the region that a Kalman gain of the same rate leaves outside.
 
     With ``F - K C = V diag(T1, T2) V^-1``, the poles of T1 inside, a further gain ``V [0; K2]`` keeps these and moves
     the others to those of ``T2 - K2 C V2``: the inequality has the size of T2.
@@ -152,7 +161,7 @@ def _partly(problem: KalmanProblem, region: Region, *, solver: str) -> tuple[Flo
 
     gain = problem.gain((1.0 + INNER_SHARE) * region.decay)
     if gain is None:
-        return None
+        raise SolverError("The Riccati equation has no usable solution: give poles=, or a slower region.")
     inner = region.shrunk()
     triangular, turn, good = schur(
         problem.F - gain @ problem.C, output="real", sort=lambda re, im: inner.holds([complex(re, im)], problem.dt)
@@ -226,13 +235,18 @@ def _scaling(problem: KalmanProblem, region: Region) -> FloatArray:
     closed, entering = problem.F - gain @ problem.C, problem.B - gain @ problem.D
     noise = entering @ entering.T + problem.drive @ problem.drive.T
     noise = noise + gain @ problem.background @ problem.background.T @ gain.T
-    if problem.dt > 0.0:
-        radius = np.exp(-region.decay * problem.dt)
-        covariance = solve_discrete_lyapunov(closed / radius, noise)
-    else:
-        covariance = solve_continuous_lyapunov(closed + region.decay * np.eye(len(closed)), -noise)
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        # A poor scaling is judged by what the solver makes of it.
+        warnings.simplefilter("ignore")
+        if problem.dt > 0.0:
+            radius = np.exp(-region.decay * problem.dt)
+            covariance = solve_discrete_lyapunov(closed / radius, noise)
+        else:
+            covariance = solve_continuous_lyapunov(closed + region.decay * np.eye(len(closed)), -noise)
+    if not np.all(np.isfinite(covariance)):
+        return np.eye(len(closed))
     values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
-    if not np.all(np.isfinite(values)) or values[-1] <= 0.0:
+    if values[-1] <= 0.0:
         return np.eye(len(closed))
     floor = float(np.finfo(np.float64).eps) * values[-1]
     return np.asarray(vectors * np.sqrt(np.maximum(values, floor)))
