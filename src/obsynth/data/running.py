@@ -4,24 +4,20 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Mapping
 from functools import partial
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
 from obsynth.data.bridge import Bridge
 from obsynth.data.clock import Clock
-from obsynth.data.holds import KeptHolds, transient
+from obsynth.data.engine import GAP, LONGEST_BRIDGE, OK, RECOVERING, WARM_UP, Row, estimate_columns
+from obsynth.data.holds import KeptHolds, checked_warm_up, transient
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.sampling import first_order_hold
 from obsynth.results.design import ObserverDesign
-
-#: What a row of estimates is.
-OK, WARM_UP, GAP, RECOVERING = "ok", "warm-up", "gap", "recovering"
-#: Gaps longer than this many samples are not bridged: the observer starts again.
-LONGEST_BRIDGE = 10_000
-
 
 _Part = TypeVar("_Part")
 
@@ -37,21 +33,6 @@ def _running(part: _Part | None) -> _Part:
     if part is None:
         raise ObsynthError("The run is in an impossible state: its observer or plant model is missing. Start it again.")
     return part
-
-
-class Row(NamedTuple):
-    """Estimates at one row of data.
-
-    Parameters
-    ----------
-    status : str
-        ``ok``, ``warm-up``, ``gap`` or ``recovering``.
-    values : FloatArray
-        ``[xhat, fhat, r]``, deviations; NaN where nothing is known.
-    """
-
-    status: str
-    values: FloatArray
 
 
 class DataObserver:
@@ -77,13 +58,13 @@ class DataObserver:
         self.plant, self.observer = design.linear
         if gap is not None and not (math.isfinite(gap) and gap > 0.0):
             raise SpecError(f"gap is {gap}: give seconds, a positive number.", path="gap")
-        if warm_up is not None and not (math.isfinite(warm_up) and warm_up >= 0.0):
-            raise SpecError(f"warm_up is {warm_up}: give seconds, 0 or more.", path="warm_up")
         if gap is not None and self.observer.dt > 0.0:
             raise SpecError(
                 "gap is for continuous-time designs: a sampled one knows which rows are missing.", path="gap"
             )
-        self.warm_up = transient(self.observer) if warm_up is None else warm_up
+        self.warm_up = checked_warm_up(warm_up, transient(self.observer))
+        self.columns = estimate_columns(self.state_names, self.fault_names, self.observer.residual_names)
+        self.notes: tuple[str, ...] = ()
         self.clock = Clock(self.observer.dt, gap)
         self.bridge = Bridge.of(self.plant)
         lags = set(self.observer.state_delays) or {0}
@@ -102,6 +83,46 @@ class DataObserver:
         self.measured = self.v
         self.settled_at, self.phase = math.inf, WARM_UP
         self.inputs: deque[FloatArray] = deque(maxlen=max(lags) + 1)
+
+    @property
+    def input_names(self) -> tuple[str, ...]:
+        """Known inputs."""
+        return self.observer.input_names
+
+    @property
+    def output_names(self) -> tuple[str, ...]:
+        """Outputs of the plant."""
+        return self.observer.output_names
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """States that are estimated."""
+        return self.observer.state_names
+
+    @property
+    def fault_names(self) -> tuple[str, ...]:
+        """Faults that are estimated."""
+        return self.observer.fault_names
+
+    @property
+    def state_delays(self) -> tuple[int, ...]:
+        """Samples by which each state estimate lags."""
+        return self.observer.state_delays
+
+    @property
+    def fault_delays(self) -> tuple[int, ...]:
+        """Samples by which each fault estimate lags."""
+        return self.observer.fault_delays
+
+    @property
+    def dt(self) -> float:
+        """Seconds between samples; 0 for continuous time."""
+        return self.observer.dt
+
+    @property
+    def point(self) -> Mapping[str, float]:
+        """Operating point by name of the signal."""
+        return self.plant.operating_point
 
     def step(self, time: float, values: FloatArray, row: int) -> Row:
         """Take one row of data.
@@ -148,12 +169,12 @@ class DataObserver:
             else:
                 found, status = self._unmeasured(seconds, u), GAP
         if status == GAP:
-            return Row(GAP, found)
+            return Row(GAP, found, missing)
         if self.z is None or not (np.isfinite(self.z).all() and np.isfinite(found).all()):
             self._restart()
-            return Row(GAP, self._held())
+            return Row(GAP, self._held(), missing)
         self.fault = found[self.observer.fault_rows].copy()
-        return Row(status, found)
+        return Row(status, found, missing)
 
     def _measured(self, seconds: float, v: FloatArray) -> FloatArray:
         if self.observer.dt == 0.0:

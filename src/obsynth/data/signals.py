@@ -8,10 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from obsynth.data.engine import Engine
 from obsynth.errors import SpecError
-from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray, read_only
-from obsynth.observers.linear import LinearObserver
 
 #: The column of time stamps, in seconds.
 TIME = "time"
@@ -42,19 +41,16 @@ class Signals:
     @classmethod
     def of(
         cls,
-        plant: DescriptorSystem,
-        observer: LinearObserver,
+        engine: Engine,
         columns: Mapping[str, str] | None,
         scales: Mapping[str, float] | None,
     ) -> Signals:
-        """Return the signals that an observer reads.
+        """Return the signals that a design in motion reads.
 
         Parameters
         ----------
-        plant : DescriptorSystem
-            With the operating point.
-        observer : LinearObserver
-            What is run.
+        engine : Engine
+            What is run, with its operating point.
         columns : mapping or None
             Column of a signal, or of ``time``, where the two names differ.
         scales : mapping or None
@@ -65,7 +61,7 @@ class Signals:
         SpecError
             A key is no signal that is read, or a factor is not finite or zero.
         """
-        names = observer.input_names + observer.output_names
+        names = engine.input_names + engine.output_names
         renamed, factors = dict(columns or {}), dict(scales or {})
         unknown = [name for name in renamed if name not in (TIME, *names)]
         unknown += [name for name in factors if name not in names]
@@ -80,8 +76,8 @@ class Signals:
             names,
             tuple(renamed.get(name, name) for name in (TIME, *names)),
             read_only(np.array([factors.get(name, 1.0) for name in names])),
-            read_only(np.array([plant.operating_point.get(name, 0.0) for name in names])),
-            dict(plant.operating_point),
+            read_only(np.array([engine.point.get(name, 0.0) for name in names])),
+            dict(engine.point),
         )
 
     def positions(self, header: tuple[str, ...]) -> list[int]:
@@ -109,47 +105,8 @@ class Signals:
             raise SpecError(f"The data have more than one column {', '.join(map(repr, repeated))}.", path="data")
         return [header.index(name) for name in self.columns]
 
-    def estimates_point(self, observer: LinearObserver) -> FloatArray:
-        """Return what is added to the rows ``[xhat, fhat, r]``: the operating point of states and faults."""
-        named = observer.state_names + observer.fault_names
-        values = [self.point.get(name, 0.0) for name in named] + [0.0] * len(observer.residual_names)
-        return np.array(values)
-
-
-def output_columns(observer: LinearObserver, *, alarms: bool) -> tuple[str, ...]:
-    """Return the header of the estimates.
-
-    Parameters
-    ----------
-    observer : LinearObserver
-        Whose estimates they are.
-    alarms : bool
-        Whether there is a column of alarms.
-
-    Returns
-    -------
-    tuple of str
-        ``time, status``, a column ``time of ...`` for each kind of estimate that lags, ``xhat[...]``, ``fhat[...]``,
-        ``r[...]`` and ``alarm``.
-    """
-    late = [f"time of {name}" for name, _ in delayed(observer)]
-    return (TIME, "status", *late, *estimate_columns(observer), *(("alarm",) if alarms else ()))
-
-
-def estimate_columns(observer: LinearObserver) -> tuple[str, ...]:
-    """Return the names of the rows ``[xhat, fhat, r]`` of an observer."""
-    return (
-        *(f"xhat[{name}]" for name in observer.state_names),
-        *(f"fhat[{name}]" for name in observer.fault_names),
-        *(f"r[{name}]" for name in observer.residual_names),
-    )
-
-
-def delayed(observer: LinearObserver) -> tuple[tuple[str, int], ...]:
-    """Return name and delay in samples of what lags: the states (together where they lag alike), and each fault."""
-    states = set(observer.state_delays)
-    found = [(f"xhat[{name}]", delay) for name, delay in zip(observer.state_names, observer.state_delays, strict=True)]
-    if len(states) == 1:
-        found = [("xhat", observer.state_delays[0])]
-    found += [(f"fhat[{name}]", delay) for name, delay in zip(observer.fault_names, observer.fault_delays, strict=True)]
-    return tuple((name, delay) for name, delay in found if delay)
+    def estimates_point(self, engine: Engine) -> FloatArray:
+        """Return what is added to the columns of estimates: the operating point of states and faults."""
+        named = engine.state_names + engine.fault_names
+        values = [self.point.get(name, 0.0) for name in named]
+        return np.array(values + [0.0] * (len(engine.columns) - len(named)))

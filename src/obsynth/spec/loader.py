@@ -157,7 +157,8 @@ def _listed(row: Any) -> list[Any]:
 
 def _varying_plant(section: TimeVaryingSection, source: Path, prefix: str) -> TimeVaryingDescriptorSystem:
     problems = DocumentProblems(source, what="plant" if not prefix else "spec")
-    arguments: dict[str, Any] = {name: getattr(section, name) for name in ("dt", "horizon", "constants", "units")}
+    kept = ("dt", "horizon", "constants", "operating_point", "units")
+    arguments: dict[str, Any] = {name: getattr(section, name) for name in kept}
     for name in ("E", "A", "B", "C", "Phi", "Psi"):
         arguments[name] = _matrix(getattr(section, name), source.parent, _joined(prefix, name), problems)
     for name in ("state_names", "input_names", "output_names", "parameter_names"):

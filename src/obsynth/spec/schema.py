@@ -193,6 +193,7 @@ class TimeVaryingSection(Section):
     input_names: Names | None = None
     output_names: Names | None = None
     parameter_names: Names | None = None
+    operating_point: dict[Text, float] | None = None
     units: dict[Text, str] | None = None
 
 
