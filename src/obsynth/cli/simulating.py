@@ -47,5 +47,5 @@ def run_simulate(options: argparse.Namespace) -> int:
         return 0
     from obsynth.report.simulation import simulation_report
 
-    simulation_report(design.name, found, console=stdout_console(), units=design.linear[0].units, file=written)
+    simulation_report(design.name, found, console=stdout_console(), units=design.plant.units, file=written)
     return 0

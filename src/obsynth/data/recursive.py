@@ -6,15 +6,15 @@ import math
 
 import numpy as np
 
-from obsynth.data.holds import checked_warm_up
+from obsynth.data.holds import FORGOTTEN, checked_warm_up
 from obsynth.data.stepping import SteppingEngine
-from obsynth.data.transients import MOST_STEPS, transient_steps
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.evaluation.online import Evidence
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.records import require_horizon
 from obsynth.observers.recursive_estimates import deviations_of
 from obsynth.observers.recursive_running import RawEstimate, RunningRecursiveObserver
+from obsynth.observers.transients import MOST_STEPS, transient_steps
 from obsynth.results.design import ObserverDesign
 
 
@@ -39,7 +39,7 @@ class RecursiveDataObserver(SteppingEngine[RawEstimate]):
 
     def __init__(self, design: ObserverDesign, *, warm_up: float | None = None) -> None:
         self.plant, self.observer = design.recursive
-        steps = 0.0 if warm_up is not None else transient_steps(self.observer)
+        steps = 0.0 if warm_up is not None else transient_steps(self.observer, FORGOTTEN)
         # H_k has as many directions beside the state as there are parity innovations.
         self.directions = self.plant.ne + self.plant.ny - self.plant.nx
         residuals = tuple(f"innovation {i + 1}" for i in range(self.directions))

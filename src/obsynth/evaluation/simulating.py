@@ -8,9 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from obsynth.errors import SpecError
 from obsynth.evaluation.bench import Bench, make_bench
 from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.observers.dae import DAEObserver
 from obsynth.observers.linear import Estimates
+from obsynth.observers.recursive import RecursiveObserver
 from obsynth.results.design import ObserverDesign
 from obsynth.results.serialise import write_atomically
 from obsynth.simulation.scenario import Scenario
@@ -141,7 +144,7 @@ def simulate(design: ObserverDesign, scenario: Scenario) -> Simulation:
     Parameters
     ----------
     design : ObserverDesign
-        Of a linear method, either time; plant of index 0 or 1.
+        Of a linear or a recursive method; plant of index 0 or 1.
     scenario : Scenario
         What happens.
 
@@ -153,7 +156,7 @@ def simulate(design: ObserverDesign, scenario: Scenario) -> Simulation:
     Raises
     ------
     SpecError
-        A recursive design, an unknown name, a missing sample time, or states that outgrow double precision.
+        A nonlinear design, an unknown name, a missing sample time, or states that outgrow double precision.
     PreconditionError
         The plant is not regular, has index 2 or more (its states then depend on derivatives of the signals, which a
         scenario does not have), or cannot be stabilised.
@@ -162,8 +165,19 @@ def simulate(design: ObserverDesign, scenario: Scenario) -> Simulation:
     -----
     Discrete plants step by their own equations.  Continuous ones step by the matrix exponential, exactly for signals
     that are constant between samples (steps, intermittent ones, random ones) or linear (ramps); sines and drifts are
-    taken as linear between samples.  The continuous observer runs on the samples, by a first-order hold.
+    taken as linear between samples.  The continuous observer runs on the samples, by a first-order hold.  Plants of
+    recursive designs step by their own equations, which begin with y(1); their noise has the covariances Q and R of the
+    design, ``scenario.noise`` times in deviations, and their parameters are the scenario's faults.
     """
+    if isinstance(design.observer, RecursiveObserver):
+        from obsynth.evaluation.simulating_recursive import simulate_recursive
+
+        return simulate_recursive(design, scenario)
+    if isinstance(design.observer, DAEObserver):
+        raise SpecError(
+            f"Design {design.name!r} is for a nonlinear plant, for which there are no scenarios: use "
+            "obsynth.simulate_dae, and run the observer on its outputs.", path="observer",
+        )  # fmt: skip
     bench = make_bench(design, scenario)
     runs = bench.run([scenario.seed])
     plant, _ = design.linear

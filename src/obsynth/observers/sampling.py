@@ -39,10 +39,14 @@ def sample_observer(observer: LinearObserver, dt: float) -> LinearObserver:
     SpecError
         The observer is discrete in time already, or ``dt`` is not positive and finite.
     """
+    if not isinstance(observer, LinearObserver):
+        raise SpecError(f"observer is a {type(observer).__name__}: give the LinearObserver of a continuous design.",
+                        path="observer")  # fmt: skip
     if observer.dt > 0.0:
         raise SpecError(f"The observer is discrete in time already (dt = {observer.dt:g} s).", path="dt")
-    if not (math.isfinite(dt) and dt > 0.0):
-        raise SpecError(f"dt is {dt}: give the seconds between two samples, a positive number.", path="dt")
+    number = isinstance(dt, (int, float, np.integer, np.floating)) and not isinstance(dt, bool)
+    if not (number and math.isfinite(dt) and dt > 0.0):
+        raise SpecError(f"dt is {dt!r}: give the seconds between two samples, a positive number.", path="dt")
     inputs = len(observer.input_names)
     b, d = np.hstack([observer.Bu, observer.By]), np.hstack([observer.Du, observer.Dy])
     transition, constant, ramp = first_order_hold(observer.Az, b, dt)

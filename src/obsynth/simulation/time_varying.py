@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from obsynth.analysis.time_varying import algebraic_rows
 from obsynth.errors import PreconditionError, SpecError
+from obsynth.models.descriptor import DescriptorSystem
 from obsynth.models.time_varying import TimeVaryingDescriptorSystem
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.ranks import decide_rank
@@ -111,3 +112,33 @@ def _record(value: ArrayLike | None, shape: tuple[int, int], name: str) -> Float
     if array.shape != shape:
         raise SpecError(f"{name} has shape {array.shape}, but {shape} is needed.", path=name)
     return array
+
+
+def signals_of(plant: TimeVaryingDescriptorSystem) -> DescriptorSystem:
+    """Return a plant with the signals of a time-varying one, its parameters as faults: what a scenario speaks of.
+
+    Only names, sizes and sampling count.  B and Bf are those of the plant where they are constant, so that a failing
+    actuator is found; the rest stands for nothing.
+
+    Parameters
+    ----------
+    plant : TimeVaryingDescriptorSystem
+        As many equations as states.
+
+    Raises
+    ------
+    SpecError
+        Another number of equations than of states.
+    """
+    if plant.ne != plant.nx:
+        raise SpecError(f"{plant.ne} equations do not determine {plant.nx} states: the plant cannot be simulated.",
+                        path="E")  # fmt: skip
+    constant = plant.B.is_constant and plant.Phi.is_constant and plant.Psi.is_constant
+    inputs, faults = (plant.B.at(0), plant.Phi.at(0)) if constant else (
+        np.zeros((plant.nx, plant.nu)), np.ones((plant.nx, plant.nq)),
+    )  # fmt: skip
+    return DescriptorSystem(
+        None, np.eye(plant.nx), inputs, np.zeros((plant.ny, plant.nx)), Bf=faults,
+        Df=plant.Psi.at(0) if constant else None, dt=plant.dt, state_names=plant.state_names,
+        input_names=plant.input_names, output_names=plant.output_names, fault_names=plant.parameter_names,
+    )  # fmt: skip

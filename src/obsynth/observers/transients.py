@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 
-from obsynth.data.holds import FORGOTTEN
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.gain_schedule import gain_steps
 from obsynth.observers.recursive import RecursiveObserver
@@ -15,13 +14,15 @@ from obsynth.observers.recursive import RecursiveObserver
 MOST_STEPS = 2_000
 
 
-def transient_steps(observer: RecursiveObserver) -> float:
-    """Return the steps after which an error at the start has shrunk to `FORGOTTEN` of its largest, and stays there.
+def transient_steps(observer: RecursiveObserver, share: float) -> float:
+    """Return the steps after which an error at the start has shrunk to a share of its largest, and stays there.
 
     Parameters
     ----------
     observer : RecursiveObserver
         At rest.
+    share : float
+        Such as 0.02.
 
     Returns
     -------
@@ -44,15 +45,15 @@ def transient_steps(observer: RecursiveObserver) -> float:
         lessons.append(_size(memory))
         if not (np.isfinite(errors[-1]) and np.isfinite(lessons[-1])):
             return math.inf
-    return max(_forgotten(errors), _forgotten(lessons))
+    return max(_forgotten(errors, share), _forgotten(lessons, share))
 
 
 def _size(product: FloatArray) -> float:
     return float(np.abs(product).max(initial=0.0))
 
 
-def _forgotten(sizes: list[float]) -> float:
+def _forgotten(sizes: list[float], share: float) -> float:
     # What is compared is each product with its own largest size: units of the states do not decide.
-    late = np.flatnonzero(np.array([1.0, *sizes]) > FORGOTTEN * max([1.0, *sizes]))
+    late = np.flatnonzero(np.array([1.0, *sizes]) > share * max([1.0, *sizes]))
     last = int(late[-1]) if late.size else -1
     return math.inf if last >= len(sizes) else float(last + 1)
