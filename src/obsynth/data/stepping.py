@@ -12,7 +12,7 @@ import numpy as np
 from obsynth.data.carried import carried, resume
 from obsynth.data.clock import Clock
 from obsynth.data.engine import GAP, LONGEST_BRIDGE, OK, PARTIAL, RECOVERING, WARM_UP, Row, estimate_columns
-from obsynth.errors import SpecError
+from obsynth.errors import ObsynthError, SpecError
 from obsynth.evaluation.online import Evidence
 from obsynth.numerics.arrays import FloatArray
 
@@ -99,12 +99,9 @@ class SteppingEngine(ABC, Generic[Found]):
         if missing > LONGEST_BRIDGE and self.may_restart:
             self.running, fresh = self.started(), True
         else:
-            for _ in range(missing):
-                self._required(held, row)
-        found = self._safe(y, u, row)
-        spoiled = found is None
-        found = self._required(u, row) if found is None else found
-        self.u = u
+            fresh = self._bridged(missing, held, row) or fresh
+        found, spoiled, restarted = self._found(y, u, row, may_restart=self.may_restart and not fresh)
+        self.u, fresh = u, fresh or restarted
         if fresh:
             self.settled_at, self.phase = time + self.warm_up, WARM_UP
         elif nu and (missing or not known[:nu].all()):
@@ -115,6 +112,33 @@ class SteppingEngine(ABC, Generic[Found]):
         heard = np.ones_like(known[nu:]) if fresh and not self.uses_first_outputs else known[nu:]
         status = self._status(time, known[:nu], heard, spoiled=spoiled)
         return Row(status, self.values(found), missing, self.evidence(found))
+
+    def _bridged(self, missing: int, held: FloatArray, row: int) -> bool:
+        """Take samples without outputs; return whether the observer had to start again."""
+        for _ in range(missing):
+            try:
+                self._required(held, row)
+            except ObsynthError:
+                if not self.may_restart:
+                    raise
+                self.running = self.started()
+                return True
+        return False
+
+    def _found(self, y: FloatArray, u: FloatArray, row: int, *, may_restart: bool) -> tuple[Found, bool, bool]:
+        """Take one sample; return also whether its outputs were left out, and whether the observer started again."""
+        found = self._safe(y, u, row)
+        if found is not None:
+            return found, False, False
+        try:
+            return self._required(u, row), True, False
+        except ObsynthError:
+            # An outlier may have led where the model cannot go on.
+            if not may_restart:
+                raise
+        self.running = self.started()
+        found = self._safe(y, u, row)
+        return (self._required(u, row), True, True) if found is None else (found, False, True)
 
     def _status(self, time: float, inputs: np.ndarray, outputs: np.ndarray, *, spoiled: bool) -> str:
         if spoiled or not inputs.all() or not outputs.any():

@@ -24,7 +24,7 @@ from obsynth.observers.sampling import first_order_hold
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario
 
-_FORGOTTEN = ", once the error at the start is forgotten (it is not stated)"
+_FORGOTTEN = ", once the error at the start, which is not stated, is forgotten (else give a longer warm-up)"
 _ANY_LENGTH = " (the run may have any length)"
 _PARAMETER_STATEMENTS = {
     "chi-square": "distance of the parameters from their nominal values in the metric of their covariance: passed in a "
@@ -112,6 +112,13 @@ def online_monitor(
             table, limit = endless_paper(model, bounds, start, gamma)
         else:
             table, limit = endless_bound(kind, model, scaled_inputs(model, bounds, noise_bound), start, window)
+        if not limit > 0.0:
+            raise SpecError(
+                "As stated, no disturbance and no noise reaches the residual: its bound would be zero, which rounding "
+                "passes. State noise (noise_bound, sensor_noise of the plant), or give a level of your own "
+                "(thresholds).",
+                path="noise_bound",
+            )  # fmt: skip
         rule = NormRule(table, limit, window=window if kind == "window" else 1, dt=dt)
         ending = _FORGOTTEN if initial_error is None else ""
     else:

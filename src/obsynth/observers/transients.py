@@ -12,6 +12,8 @@ from obsynth.observers.recursive import RecursiveObserver
 
 #: Steps that are looked at where a model goes on for ever.
 MOST_STEPS = 2_000
+#: An error this far below the share that counts is gone.
+GONE = 1e-4
 
 
 def transient_steps(observer: RecursiveObserver, share: float) -> float:
@@ -45,6 +47,9 @@ def transient_steps(observer: RecursiveObserver, share: float) -> float:
         lessons.append(_size(memory))
         if not (np.isfinite(errors[-1]) and np.isfinite(lessons[-1])):
             return math.inf
+        # So far below that it will not come back: a plant that lasts for ever need not be followed to the end.
+        if errors[-1] <= GONE * share * max(1.0, *errors) and lessons[-1] <= GONE * share * max(1.0, *lessons):
+            break
     return max(_forgotten(errors, share), _forgotten(lessons, share))
 
 
