@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Mapping
 from typing import Any
@@ -16,6 +15,7 @@ from obsynth.data.recovered import LATE, RecoveredStates
 from obsynth.data.signals import TIME, Signals
 from obsynth.errors import SpecError
 from obsynth.evaluation.online import OnlineMonitor
+from obsynth.models.arguments import is_number
 from obsynth.numerics.arrays import FloatArray
 
 
@@ -53,8 +53,8 @@ class Job:
             if name not in names:
                 raise SpecError(f"There is no column {name!r} to watch: there are {', '.join(names)}.",
                                 path="thresholds")  # fmt: skip
-            if not (math.isfinite(level) and level > 0.0):
-                raise SpecError(f"The threshold of {name!r} is {level}: give a positive number.", path="thresholds")
+            if not (is_number(level) and level > 0.0):
+                raise SpecError(f"The threshold of {name!r} is {level!r}: give a positive number.", path="thresholds")
         self._levels = tuple((name, names.index(name), level) for name, level in thresholds.items())
         lags = list(delayed(engine))
         if self.recovered is not None and self.recovered.delay:

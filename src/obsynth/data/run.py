@@ -16,6 +16,7 @@ from obsynth.data.starting import engine_of
 from obsynth.data.states import digest_of_gains, resume_state, save_state
 from obsynth.errors import SpecError
 from obsynth.evaluation.online import OnlineMonitor
+from obsynth.models.arguments import require_kind, require_mapping
 from obsynth.results.design import ObserverDesign
 
 if TYPE_CHECKING:
@@ -148,6 +149,15 @@ def run_on_data(
     the rows after that are ``recovering``.  ``r`` is the innovation at the parameters estimated one sample before
     (whitened, for recursive designs).
     """
+    require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
+    for name, value in (("columns", columns), ("scales", scales), ("thresholds", thresholds)):
+        require_mapping(value, name)
+    if monitor is not None:
+        require_kind(monitor, OnlineMonitor, "monitor", "what obsynth.online_monitor returns")
+    if state is not None:
+        require_kind(state, (str, Path), "state", "the name of a file")
+    if out is not None and not hasattr(out, "write"):
+        require_kind(out, (str, Path), "out", "the name of a file, or a text stream")
     if isinstance(chunk_rows, bool) or not isinstance(chunk_rows, int) or chunk_rows < 1:
         raise SpecError(f"chunk_rows is {chunk_rows!r}: give a whole number, 1 or more.", path="chunk_rows")
     engine = engine_of(design, gap=gap, warm_up=warm_up)

@@ -15,6 +15,7 @@ from obsynth.data.clock import Clock
 from obsynth.data.engine import GAP, LONGEST_BRIDGE, OK, RECOVERING, WARM_UP, Row, estimate_columns
 from obsynth.data.holds import KeptHolds, checked_warm_up, transient
 from obsynth.errors import ObsynthError, SpecError
+from obsynth.models.arguments import is_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.sampling import first_order_hold
 from obsynth.results.design import ObserverDesign
@@ -56,8 +57,8 @@ class DataObserver:
 
     def __init__(self, design: ObserverDesign, *, gap: float | None = None, warm_up: float | None = None) -> None:
         self.plant, self.observer = design.linear
-        if gap is not None and not (math.isfinite(gap) and gap > 0.0):
-            raise SpecError(f"gap is {gap}: give seconds, a positive number.", path="gap")
+        if gap is not None and not (is_number(gap) and gap > 0.0):
+            raise SpecError(f"gap is {gap!r}: give seconds, a positive number.", path="gap")
         if gap is not None and self.observer.dt > 0.0:
             raise SpecError(
                 "gap is for continuous-time designs: a sampled one knows which rows are missing.", path="gap"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -10,6 +9,7 @@ import numpy as np
 
 from obsynth.data.engine import Engine
 from obsynth.errors import SpecError
+from obsynth.models.arguments import is_number
 from obsynth.numerics.arrays import FloatArray, read_only
 
 #: The column of time stamps, in seconds.
@@ -70,8 +70,8 @@ class Signals:
                 f"{unknown[0]!r} is no signal that this observer reads: it reads {', '.join(names)}.", path="columns"
             )
         for name, factor in factors.items():
-            if not math.isfinite(factor) or factor == 0.0:
-                raise SpecError(f"The scale of {name!r} is {factor}: give a finite number, not zero.", path="scales")
+            if not is_number(factor) or factor == 0.0:
+                raise SpecError(f"The scale of {name!r} is {factor!r}: give a finite number, not zero.", path="scales")
         return cls(
             names,
             tuple(renamed.get(name, name) for name in (TIME, *names)),

@@ -29,9 +29,6 @@ def engine_of(design: ObserverDesign, *, gap: float | None = None, warm_up: floa
     SpecError
         An option is out of range, or not for this design.
     """
-    if not isinstance(design, ObserverDesign):
-        raise SpecError(f"design is a {type(design).__name__}: give an ObserverDesign, such as obsynth.load(path).",
-                        path="design")  # fmt: skip
     if not isinstance(design.observer, (RecursiveObserver, DAEObserver)):
         return DataObserver(design, gap=gap, warm_up=warm_up)
     if gap is not None:

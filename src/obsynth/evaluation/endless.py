@@ -90,6 +90,8 @@ def endless_bound(
         return EndlessBound(_start_added(model, bare, initial_error), pointwise + start)
     table = window_threshold(model, inputs, initial_error, window)
     # No window has more energy than its samples one by one; for a sampled plant its own bound may be smaller.
+    # Such a window may begin in the table, where more is left of the start.
+    start = max(max(shown[-window:]), max(shown) * left) * initial_error
     limit = float(np.sqrt(window)) * (pointwise + start)
     if model.flow is None:
         limit = min(limit, _window_limit(model, inputs, (initial_error, left, last), window))

@@ -16,6 +16,7 @@ from obsynth.evaluation.residual_model import ResidualModel, residual_model
 from obsynth.evaluation.thresholds import scaled_inputs
 from obsynth.evaluation.watching import bounds_of, require_options
 from obsynth.evaluation.whitening import innovation_whitener, steady_mean, whitener_of, window_covariance
+from obsynth.models.arguments import is_number, require_kind, require_mapping
 from obsynth.models.names import index_of
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae import DAEObserver
@@ -91,8 +92,11 @@ def online_monitor(
     SpecError
         The kind does not go with the design, an option is out of range, or a signal has no bound or covariance.
     """
-    if not isinstance(design, ObserverDesign):
-        raise SpecError(f"design is a {type(design).__name__}: give an ObserverDesign.", path="design")
+    require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
+    if scenario is not None:
+        require_kind(scenario, Scenario, "scenario", "an obsynth.Scenario")
+    for name, given in (("disturbance_bounds", disturbance_bounds), ("nominal", nominal)):
+        require_mapping(given, name)
     require_options(noise_bound, initial_error, gamma, window, false_alarms, change, 0)
     if isinstance(design.observer, (RecursiveObserver, DAEObserver)):
         return _of_parameters(design.observer, kind, nominal or {}, change, false_alarms)
@@ -140,7 +144,7 @@ def _endless_model(
         raise SpecError("sample_time is for continuous designs: this one is sampled already.", path="sample_time")
     asked = sample_time if sample_time is not None or scenario is None else scenario.sample_time
     dt = plant.dt if plant.is_discrete else asked
-    if dt is None or not (np.isfinite(dt) and dt > 0.0):
+    if dt is None or not (is_number(dt) and dt > 0.0):
         raise SpecError("A continuous design needs the sample_time of its data, in seconds, for a threshold.",
                         path="sample_time")  # fmt: skip
     transition = observer.Az if plant.is_discrete else first_order_hold(observer.Az, observer.By, dt)[0]
@@ -190,8 +194,8 @@ def _of_parameters(
     theta = np.array(start, dtype=np.float64)
     for name, value in nominal.items():
         place = index_of(name, names, what="nominal")
-        if not np.isfinite(value):
-            raise SpecError(f"The nominal value of {name!r} is {value}: give a finite number.", path="nominal")
+        if not is_number(value):
+            raise SpecError(f"The nominal value of {name!r} is {value!r}: give a finite number.", path="nominal")
         theta[place] = float(value)
     if kind != "nis" and not len(theta):
         raise SpecError(f"{kind} watches parameters, and this design estimates none: use nis.", path="kind")

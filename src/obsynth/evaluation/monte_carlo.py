@@ -15,6 +15,7 @@ from obsynth.evaluation.bench import Bench, Runs, make_bench
 from obsynth.evaluation.intervals import Interval, mean, share
 from obsynth.evaluation.monitors import Monitor
 from obsynth.evaluation.simulating import aligned_errors, warm_up_ends
+from obsynth.models.arguments import is_number, require_kind
 from obsynth.numerics.arrays import FloatArray
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario
@@ -118,10 +119,12 @@ def evaluate(
     PreconditionError
         As for `simulate`.
     """
+    require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
+    require_kind(scenario, Scenario, "scenario", "an obsynth.Scenario")
     if isinstance(runs, bool) or not isinstance(runs, int) or runs < 1:
         raise SpecError(f"runs is {runs!r}: give a whole number, 1 or more.", path="runs")
-    if not 0.0 < confidence < 1.0:
-        raise SpecError(f"confidence is {confidence}: give a number between 0 and 1.", path="confidence")
+    if not (is_number(confidence) and 0.0 < confidence < 1.0):
+        raise SpecError(f"confidence is {confidence!r}: give a number between 0 and 1.", path="confidence")
     bench = make_bench(design, scenario)
     nu, nf, _ = bench.sizes
     onset = bench.drive.first_fault(slice(nu, nu + nf))

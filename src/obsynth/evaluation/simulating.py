@@ -10,6 +10,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.evaluation.bench import Bench, make_bench
+from obsynth.models.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.dae import DAEObserver
 from obsynth.observers.linear import Estimates
@@ -169,6 +170,8 @@ def simulate(design: ObserverDesign, scenario: Scenario) -> Simulation:
     recursive designs step by their own equations, which begin with y(1); their noise has the covariances Q and R of the
     design, ``scenario.noise`` times in deviations, and their parameters are the scenario's faults.
     """
+    require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
+    require_kind(scenario, Scenario, "scenario", "an obsynth.Scenario")
     if isinstance(design.observer, RecursiveObserver):
         from obsynth.evaluation.simulating_recursive import simulate_recursive
 

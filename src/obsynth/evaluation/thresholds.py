@@ -120,8 +120,9 @@ def window_threshold(model: ResidualModel, inputs: ScaledInputs, initial_error: 
     """Return what the l2 norm of the residual over the last ``window`` samples never passes.
 
     The inputs give at most their l2 gain times ``sqrt(window m)``; the error at the window's start gives the square
-    root of its energy, bounded as the pointwise bound is.  Of a continuous design, whose disturbances may do anything
-    between samples, it is the pointwise bound of each sample in the window, summed up in squares.
+    root of its energy, bounded as the pointwise bound is.  No window has more than the pointwise bounds of its samples,
+    summed up in squares: that is used where it is less, and for continuous designs, whose disturbances may do anything
+    between samples.
 
     Parameters
     ----------
@@ -134,10 +135,10 @@ def window_threshold(model: ResidualModel, inputs: ScaledInputs, initial_error: 
     window : int
         Samples.
     """
+    one_by_one = pointwise_threshold(model, inputs, initial_error)
+    summed = np.array([np.linalg.norm(one_by_one[max(k - window + 1, 0) : k + 1]) for k in range(model.steps)])
     if model.flow is not None:
-        squares = np.concatenate([[0.0], np.cumsum(pointwise_threshold(model, inputs, initial_error) ** 2)])
-        oldest = np.maximum(np.arange(model.steps) - window + 1, 0)
-        return np.asarray(np.sqrt(squares[1:] - squares[oldest]))
+        return summed
     B, D = inputs.B, inputs.D
     powers = model.powers()
     count = int(np.sum(np.any(B != 0.0, axis=0) | np.any(D != 0.0, axis=0)))
@@ -160,4 +161,4 @@ def window_threshold(model: ResidualModel, inputs: ScaledInputs, initial_error: 
     for k in range(window, model.steps):
         begin = k - window + 1
         bound[k] += float(np.linalg.norm(full @ powers[begin], 2)) * initial_error + gathered[begin]
-    return bound
+    return np.asarray(np.minimum(bound, summed))

@@ -10,6 +10,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.exporting.c_source import c_identifier, header_text, source_text
 from obsynth.exporting.realisation import Realisation
+from obsynth.models.arguments import require_kind
 from obsynth.results.design import ObserverDesign
 from obsynth.results.serialise import write_atomically
 
@@ -50,8 +51,7 @@ def export(design: ObserverDesign, path: str | Path, *, sample_time: float | Non
     -----
     Every file holds the sha256 digest of the gain set.  Signals are deviations from the operating point.
     """
-    if not isinstance(path, (str, Path)):
-        raise SpecError(f"path is a {type(path).__name__}: give the name of a file.", path="path")
+    require_kind(path, (str, Path), "path", "the name of a file")
     target = Path(path)
     suffix = target.suffix.lower()
     if suffix not in SUFFIXES:

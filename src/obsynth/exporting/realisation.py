@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
+from obsynth.models.arguments import require_kind
 from obsynth.models.dae import DAEModel
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae import DAEObserver
@@ -68,9 +69,7 @@ class Realisation:
         PreconditionError, SolverError
             A recursive design has no stable steady state.
         """
-        if not isinstance(design, ObserverDesign):
-            raise SpecError(f"design is a {type(design).__name__}: give an ObserverDesign, such as obsynth.load(path).",
-                            path="design")  # fmt: skip
+        require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
         digest = str(design_as_dict(design)["sha256"])
         if isinstance(design.observer, RecursiveObserver):
             found = steady_observer(design.observer)
