@@ -11,12 +11,12 @@ from obsynth.data.stepping import SteppingEngine
 from obsynth.errors import SolverError, SpecError
 from obsynth.evaluation.online import Evidence
 from obsynth.numerics.arrays import FloatArray
-from obsynth.observers.dae_estimates import DAERow
+from obsynth.observers.dae_estimates import DAEEstimates
 from obsynth.observers.dae_running import RunningDAEObserver
 from obsynth.results.design import ObserverDesign
 
 
-class DAEDataObserver(SteppingEngine[DAERow]):
+class DAEDataObserver(SteppingEngine[DAEEstimates]):
     """An observer of a DAE in motion on measured data; signals are absolute values, as the model's.
 
     Parameters
@@ -69,7 +69,7 @@ class DAEDataObserver(SteppingEngine[DAERow]):
             )  # fmt: skip
         return values
 
-    def taken(self, y: FloatArray, u: FloatArray, row: int) -> DAERow | Exception | None:
+    def taken(self, y: FloatArray, u: FloatArray, row: int) -> DAEEstimates | Exception | None:
         """Take one sample, or return why it cannot be taken.
 
         Parameters
@@ -80,34 +80,35 @@ class DAEDataObserver(SteppingEngine[DAERow]):
             Of the data, for errors.
         """
         try:
-            found: DAERow = self.running.raw_step(y, u)
+            found: DAEEstimates = self.running.step(y, u)
         except SolverError as error:
             return SolverError(f"Row {row}: {error}")
         except (np.linalg.LinAlgError, ValueError):
             return None
-        arrays = (found.x, found.theta, found.covariance, found.parameter_covariance)
+        arrays = (found.states, found.parameters, found.state_deviations, found.parameter_covariances)
         return found if all(bool(np.isfinite(array).all()) for array in arrays) else None
 
-    def values(self, found: DAERow) -> FloatArray:
+    def values(self, found: DAEEstimates) -> FloatArray:
         """Return a row: estimates, standard deviations, innovation.
 
         Parameters
         ----------
-        found : DAERow
+        found : DAEEstimates
             Of one sample.
         """
-        variances = np.concatenate([np.diag(found.covariance), np.diag(found.parameter_covariance)])
-        return np.concatenate([found.x, found.theta, np.sqrt(np.maximum(variances, 0.0)), found.innovation])
+        parts = (found.states, found.parameters, found.state_deviations, found.parameter_deviations, found.innovations)
+        return np.concatenate([part[0] for part in parts])
 
-    def evidence(self, found: DAERow) -> Evidence:
+    def evidence(self, found: DAEEstimates) -> Evidence:
         """Return what the sample says, for decisions; to first order, as the covariances.
 
         Parameters
         ----------
-        found : DAERow
+        found : DAEEstimates
             Of one sample.
         """
         # Only the length of the innovation counts, which is known in units of its own covariance.
-        white = np.zeros(found.degrees)
-        white[:1] = np.sqrt(found.nis)
-        return Evidence(found.theta, found.parameter_covariance, white, np.zeros((found.degrees, 0)))
+        degrees = int(found.nis_degrees[0])
+        white = np.zeros(degrees)
+        white[:1] = np.sqrt(max(float(found.nis[0]), 0.0))
+        return Evidence(found.parameters[0], found.parameter_covariances[0], white, np.zeros((degrees, 0)))
