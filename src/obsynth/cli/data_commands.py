@@ -182,9 +182,12 @@ def _monitor(design: ObserverDesign, options: argparse.Namespace) -> OnlineMonit
 
     scenario = None
     if options.system is not None:
+        from obsynth.cli.commands import require_same_signals
         from obsynth.spec import load_spec
 
-        scenario = load_spec(options.system).scenario
+        spec = load_spec(options.system)
+        require_same_signals(design, options.gains, spec)
+        scenario = spec.scenario
         if scenario is None:
             raise SpecError(f"{options.system} has no scenario, which would tell what is to be expected.",
                             path="scenario")  # fmt: skip

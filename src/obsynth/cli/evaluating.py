@@ -61,7 +61,7 @@ def run_evaluate(options: argparse.Namespace) -> int:
     ObsynthError
         As its exit code says.
     """
-    from obsynth.cli.commands import designed
+    from obsynth.cli.commands import designed_or_loaded
     from obsynth.cli.data_commands import numbers_of
     from obsynth.spec import load_spec
 
@@ -71,12 +71,7 @@ def run_evaluate(options: argparse.Namespace) -> int:
         if spec.scenario is None:
             raise SpecError(f"{spec.path} has no scenario: add one, for example scenario: {{horizon: 100}}.",
                             path="scenario")  # fmt: skip
-        if options.gains is None:
-            design = designed(spec, report_stage)
-        else:
-            from obsynth.results.serialise import load
-
-            design = load(options.gains)
+        design = designed_or_loaded(spec, options.gains, report_stage)
         report_stage("running")
         from obsynth.evaluation.monte_carlo import evaluate
         from obsynth.evaluation.watching import monitor

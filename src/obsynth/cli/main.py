@@ -96,6 +96,9 @@ def _parser() -> argparse.ArgumentParser:
 
     simulate = verbs.add_parser("simulate", help=_SIMULATE, description=_SIMULATE)
     _add_system(simulate)
+    simulate.add_argument(
+        "--gains", type=Path, metavar="FILE", help="a gain set for the spec's plant: nothing is designed"
+    )
     simulate.add_argument("--out", type=Path, metavar="FILE", help="write every signal to this file (CSV)")
     _add_json(simulate)
     simulate.add_argument("--quiet", action="store_true", help="print no progress")

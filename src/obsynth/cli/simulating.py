@@ -14,7 +14,7 @@ def run_simulate(options: argparse.Namespace) -> int:
     Parameters
     ----------
     options : argparse.Namespace
-        ``system``, ``out``, ``json``, ``quiet``.
+        ``system``, ``gains``, ``out``, ``json``, ``quiet``.
 
     Returns
     -------
@@ -26,7 +26,7 @@ def run_simulate(options: argparse.Namespace) -> int:
     ObsynthError
         As its exit code says; nothing is written then.
     """
-    from obsynth.cli.commands import designed, output_file
+    from obsynth.cli.commands import designed_or_loaded, output_file
     from obsynth.spec import load_spec
 
     with progress(quiet=options.quiet) as report_stage:
@@ -36,7 +36,7 @@ def run_simulate(options: argparse.Namespace) -> int:
             raise SpecError(f"{spec.path} has no scenario: add one, for example scenario: {{horizon: 100}}.",
                             path="scenario")  # fmt: skip
         target = None if options.out is None else output_file(options.out, spec, option="--out")
-        design = designed(spec, report_stage)
+        design = designed_or_loaded(spec, options.gains, report_stage)
         report_stage("simulating")
         from obsynth.evaluation.simulating import simulate
 

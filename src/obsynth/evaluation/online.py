@@ -99,7 +99,20 @@ class OnlineMonitor:
         self._decided = False
 
     def require_fit(self, residuals: int, fault_names: tuple[str, ...]) -> None:
-        """Raise `SpecError` unless a design has the residuals and faults that this monitor watches."""
+        """Refuse a design that this monitor was not made for.
+
+        Parameters
+        ----------
+        residuals : int
+            Columns of its residual.
+        fault_names : tuple of str
+            What it estimates.
+
+        Raises
+        ------
+        SpecError
+            They differ from those that are watched.
+        """
         if residuals != self._residuals or fault_names != self._names:
             raise SpecError("The monitor was made for another design.", path="monitor")
 
