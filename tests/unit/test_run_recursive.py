@@ -252,3 +252,32 @@ def test_deviations_are_honest_in_a_gap():
     ratio = np.sqrt(np.mean(np.array(errors) ** 2, axis=0)) / said[0]
     # Of the algebraic state, noise of the next equation is not in the record's model of a start: the first two count.
     assert ((ratio[:2] > 0.8) & (ratio[:2] < 1.2)).all()
+
+
+@pytest.mark.parametrize("kind", ["recursive", "linear"])
+def test_scales_of_a_plant_are_those_of_its_log(kind):
+    """What the log holds, times the factor, is in the signal's unit; a call may say otherwise."""
+    if kind == "recursive":
+        scaled = obsynth.descriptor_kalman(PLANT.replace(scales={"level": 1e-3, "valve": -1.0}), Q=Q, R=1e-2)
+        plain, table = DESIGNS["filter"], log_of("filter")
+    else:
+        plain = obsynth.pd_observer(obsynth.DescriptorSystem(
+            None, [[-1.0, 1.0], [0.0, -2.0]], [[0.0], [1.0]], np.eye(2), Bf=[[0.0], [1.0]], input_names=["valve"],
+            output_names=["level", "flow"],
+        ))  # fmt: skip
+        scaled = plain.replace(plant=plain.plant.replace(scales={"level": 1e-3, "valve": -1.0}))
+        table = log_of("filter")
+        table.iloc[0, 2:] = 10.0
+    raw = table.copy()
+    raw["level"] *= 1e3
+    raw["valve"] *= -1.0
+    wanted = run_on_data(plain, table).table
+    pd.testing.assert_frame_equal(run_on_data(scaled, raw).table, wanted, rtol=1e-9, atol=1e-9)
+    raw["level"] *= 2.0
+    pd.testing.assert_frame_equal(
+        run_on_data(scaled, raw, scales={"level": 0.5e-3}).table, wanted, rtol=1e-9, atol=1e-9
+    )
+    with pytest.raises(SpecError, match="no input or output"):
+        PLANT.replace(scales={"x1": 2.0})
+    with pytest.raises(SpecError, match="scale of 'level' is 0"):
+        PLANT.replace(scales={"level": 0.0})

@@ -49,7 +49,7 @@ def run_run(options: argparse.Namespace) -> int:
     watched = _monitor(design, options)
     from obsynth.data.run import run_on_data
 
-    with _rows_done(quiet=options.quiet or out is sys.stdout) as progress:
+    with _rows_done(options.data, quiet=options.quiet or out is sys.stdout) as progress:
         found = run_on_data(
             design, sys.stdin if options.data == STREAM else Path(options.data), out,
             columns=dict(options.map), scales=numbers_of(options.scale), thresholds=numbers_of(options.threshold),
@@ -217,13 +217,37 @@ def _summary(found: DataRun, watched: OnlineMonitor | None) -> str:
 
 
 @contextmanager
-def _rows_done(*, quiet: bool) -> Iterator[Callable[[int], None] | None]:
-    """Show on a terminal how many rows are done."""
+def _rows_done(data: str, *, quiet: bool) -> Iterator[Callable[[int], None] | None]:
+    """Show a bar on a terminal: how many rows are done, of how many where that can be known."""
     if quiet or not sys.stderr.isatty():
         yield None
         return
     from rich.console import Console
-    from rich.text import Text
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    with Console(stderr=True).status(Text("reading")) as status:
-        yield lambda rows: status.update(Text(f"{rows} rows done"))
+    columns = (TextColumn("rows"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("rows", total=None if data == STREAM else rows_in(Path(data)))
+        yield lambda rows: bar.update(task, completed=rows)
+
+
+def rows_in(path: Path) -> int | None:
+    """Return how many rows a file of data has, about; `None` where that cannot be told without reading it whole.
+
+    Parameters
+    ----------
+    path : Path
+        CSV or Parquet.
+    """
+    try:
+        if path.suffix.lower() == ".parquet":
+            import pyarrow.parquet
+
+            return int(pyarrow.parquet.ParquetFile(path).metadata.num_rows)
+        with path.open("rb") as stream:
+            sample = stream.read(1 << 20)
+        # The rows of the beginning stand for all.
+        lines = sample.count(b"\n")
+        return round(path.stat().st_size / len(sample) * lines) - 1 if lines > 1 else None
+    except (OSError, ImportError, ValueError):
+        return None

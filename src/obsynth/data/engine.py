@@ -55,6 +55,8 @@ class Engine(Protocol):
         Seconds between samples; 0 for continuous time.
     point : mapping
         Operating point by name of the signal.
+    scales : mapping
+        Factor of inputs and outputs by name, where the plant states one.
     notes : tuple of str
         What a user should know before anything is run.
     """
@@ -102,6 +104,11 @@ class Engine(Protocol):
     @property
     def point(self) -> Mapping[str, float]:
         """Operating point by name of the signal."""
+        ...
+
+    @property
+    def scales(self) -> Mapping[str, float]:
+        """Factor of inputs and outputs by name, where the plant states one."""
         ...
 
     @property

@@ -50,7 +50,7 @@ class RecursiveDataObserver(SteppingEngine[RawEstimate]):
             dt=self.plant.dt, warm_up=checked_warm_up(warm_up, steps * self.plant.dt),
             may_restart=constant and self.plant.horizon is None,
         )  # fmt: skip
-        self.point = self.plant.operating_point
+        self.point, self.scales = self.plant.operating_point, self.plant.scales
         if math.isinf(steps):
             self.notes = (
                 f"The start is not forgotten within the model's horizon (or {MOST_STEPS} steps), so all rows are "

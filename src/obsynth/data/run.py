@@ -102,7 +102,7 @@ def run_on_data(
     columns : mapping, optional
         Column of a signal (or of ``time``) where their names differ.
     scales : mapping, optional, signal's unit per column's unit
-        Factor of a signal's column.
+        Factor of a signal's column; by default the plant's.
     thresholds : mapping, optional
         Level of the absolute value by column of the output, such as ``fhat[actuator]`` or ``r[speed]`` (of faults
         with an operating point, of the deviation): the column ``alarm`` names those above their level.  Alarms are

@@ -121,6 +121,11 @@ class DataObserver:
         return self.observer.dt
 
     @property
+    def scales(self) -> Mapping[str, float]:
+        """Factor of inputs and outputs by name."""
+        return self.plant.scales
+
+    @property
     def point(self) -> Mapping[str, float]:
         """Operating point by name of the signal."""
         return self.plant.operating_point

@@ -54,7 +54,7 @@ class Signals:
         columns : mapping or None
             Column of a signal, or of ``time``, where the two names differ.
         scales : mapping or None
-            Factor of a signal: the column's value times the factor is in the signal's unit.
+            Factor of a signal: the column's value times the factor is in the signal's unit; the plant's by default.
 
         Raises
         ------
@@ -75,7 +75,7 @@ class Signals:
         return cls(
             names,
             tuple(renamed.get(name, name) for name in (TIME, *names)),
-            read_only(np.array([factors.get(name, 1.0) for name in names])),
+            read_only(np.array([factors.get(name, engine.scales.get(name, 1.0)) for name in names])),
             read_only(np.array([engine.point.get(name, 0.0) for name in names])),
             dict(engine.point),
         )

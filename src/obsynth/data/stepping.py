@@ -43,6 +43,7 @@ class SteppingEngine(ABC, Generic[Found]):
         self.state_delays, self.fault_delays = (0,) * len(self.state_names), (0,) * len(self.fault_names)
         self.dt, self.warm_up, self.may_restart = dt, warm_up, may_restart
         self.point: Mapping[str, float] = {}
+        self.scales: Mapping[str, float] = {}
         self.notes: tuple[str, ...] = ()
         self.clock = Clock(dt, None)
         self.running: Any = self.started()
