@@ -216,6 +216,31 @@ def test_chi_square_of_a_sampled_continuous_design(machine):
     assert stats.kstest(late, stats.chi2(degrees + 1).cdf).pvalue < 1e-3
 
 
+def test_the_sampled_residual_is_what_the_observer_says(machine):
+    """Of sensor noise, sample by sample and from rest, with a start: no straight line is wrong about that."""
+    from obsynth.evaluation.residual_model import residual_model
+
+    plant = machine.plant.replace(A=[[0.0, 0.0], [0.0, 0.0]], B=[[0.0], [0.0]])
+    still = obsynth.pd_observer(plant, decay=1.0)
+    scenario = obsynth.Scenario(
+        horizon=3, sample_time=0.02, noise=1, seed=4, initial_state={"x1": 0.3, "x2": -0.2}
+    )  # fmt: skip
+    run, model = obsynth.simulate(still, scenario), residual_model(still, scenario)
+    noise = np.random.default_rng(4).standard_normal((151, 2))
+    error = model.start + model.start_noise @ noise[0]
+    for k in range(151):
+        np.testing.assert_allclose(run.estimates.residuals[k], model.C @ error + model.Dw @ noise[k], atol=1e-11)
+        error = model.A @ error + model.Bw @ noise[k]
+
+
+def test_a_monitor_is_not_used_up(wang):
+    design, scenario = wang
+    table = log_of(obsynth.simulate(design, scenario))
+    monitor = obsynth.online_monitor(design, "cusum", scenario=scenario)
+    first, second = (run_on_data(design, table, monitor=monitor).table for _ in range(2))
+    pd.testing.assert_frame_equal(first, second)
+
+
 def test_a_continuous_design_on_a_log(machine):
     scenario = obsynth.Scenario(
         horizon=30, sample_time=0.02, noise=1, disturbances={"load": obsynth.Sine(amplitude=0.5, frequency=2.0)},

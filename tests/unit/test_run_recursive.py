@@ -210,6 +210,26 @@ def test_contradicting_data_are_refused_with_the_row():
         run_on_data(design, log_of("filter"))
 
 
+def test_a_stream_goes_on_after_a_row_that_was_refused(tmp_path):
+    """The state of the rows that were answered is saved, and the next part may begin with the row as it should be."""
+    import io
+
+    design = obsynth.descriptor_kalman(PLANT, Q=0.0, R=0.0)
+    run = obsynth.simulate_time_varying(PLANT, samples=12, u=np.ones((12, 1)))
+    table = table_of(np.hstack([np.full((12, 1), 3.0), run.outputs + POINT]), ["valve", "level", "flow"])
+    lines = table.to_csv(index=False).splitlines(keepends=True)
+    whole = io.StringIO()
+    run_on_data(design, io.StringIO("".join(lines)), whole)
+    cells = lines[6].split(",")
+    wrong = ",".join([*cells[:2], "99.0", *cells[3:]])
+    parts, out = ([*lines[:6], wrong], lines[:1] + lines[6:]), io.StringIO()
+    with pytest.raises(PreconditionError, match="Row 6: Equations or outputs"):
+        run_on_data(design, io.StringIO("".join(parts[0])), out, state=tmp_path / "state.json")
+    rest = io.StringIO()
+    run_on_data(design, io.StringIO("".join(parts[1])), rest, state=tmp_path / "state.json")
+    assert out.getvalue() + "".join(rest.getvalue().splitlines(keepends=True)[1:]) == whole.getvalue()
+
+
 def test_warm_up_is_until_the_start_is_forgotten():
     """The error of two runs with different starts shrinks to 2 % where the status turns to ok."""
     other = obsynth.descriptor_kalman(PLANT, Q=Q, R=1e-2, initial_state=[1.0, -1.0, 0.5])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -161,7 +162,9 @@ def run_on_data(
     if isinstance(chunk_rows, bool) or not isinstance(chunk_rows, int) or chunk_rows < 1:
         raise SpecError(f"chunk_rows is {chunk_rows!r}: give a whole number, 1 or more.", path="chunk_rows")
     engine = engine_of(design, gap=gap, warm_up=warm_up)
-    job = Job(engine, Signals.of(engine, columns, scales), design.recovery, thresholds or {}, monitor)
+    # The monitor is not used up: a second run may begin with it.
+    watched = None if monitor is None else copy.deepcopy(monitor)
+    job = Job(engine, Signals.of(engine, columns, scales), design.recovery, thresholds or {}, watched)
     digest = digest_of_gains(design)
     if state is not None and Path(state).exists():
         resume_state(Path(state), job, digest)

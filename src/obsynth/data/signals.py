@@ -97,7 +97,7 @@ class Signals:
         if missing:
             raise SpecError(
                 f"The data have no column {', '.join(map(repr, missing))}; they have "
-                f"{', '.join(map(repr, header)) or 'none'}. Map signals to columns where their names differ.",
+                f"{', '.join(map(repr, header)) or 'none'}. {_advice(header)}",
                 path="data",
             )
         repeated = sorted({name for name in self.columns if header.count(name) > 1})
@@ -110,3 +110,9 @@ class Signals:
         named = engine.state_names + engine.fault_names
         values = [self.point.get(name, 0.0) for name in named]
         return np.array(values + [0.0] * (len(engine.columns) - len(named)))
+
+
+def _advice(header: tuple[str, ...]) -> str:
+    if len(header) == 1 and any(mark in header[0] for mark in ";\t|"):
+        return "Separate columns by commas."
+    return "Map signals to columns where their names differ."

@@ -161,7 +161,9 @@ def _number(text: str | None, row: int, column: str) -> float:
     try:
         return float(text)
     except ValueError:
-        raise SpecError(f"Row {row}, column {column!r}: {text!r} is no number.", path=f"row {row}") from None
+        # What looks like a date is most likely the time.
+        advice = " Give the time in seconds." if ":" in text else ""
+        raise SpecError(f"Row {row}, column {column!r}: {text!r} is no number.{advice}", path=f"row {row}") from None
 
 
 def _stream(stream: TextIO, signals: Signals) -> Iterator[FloatArray]:

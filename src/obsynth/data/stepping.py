@@ -92,6 +92,16 @@ class SteppingEngine(ABC, Generic[Found]):
         ObsynthError
             The time stamp is refused, or the row cannot be taken even without its outputs; the row is named.
         """
+        before, stamps = carried(self.running), (self.clock.last, self.clock.longest)
+        try:
+            return self._step(time, values, row)
+        except ObsynthError:
+            # A row that is refused leaves nothing behind: a run may go on after it.
+            resume(self.running, before)
+            self.clock.last, self.clock.longest = stamps
+            raise
+
+    def _step(self, time: float, values: FloatArray, row: int) -> Row:
         _, missing = self.clock.advance(time, row)
         nu, fresh = len(self.input_names), self.u is None
         known = np.isfinite(values)

@@ -85,13 +85,14 @@ def endless_bound(
     aged = float(np.sum(np.linalg.norm(last @ inputs.B, axis=0))) * sum(shown) / (1.0 - left)
     bare = pointwise_threshold(model, inputs, 0.0)
     pointwise = float(bare[-1]) + shown[-1] * float(np.sum(np.linalg.norm(inputs.B, axis=0))) + aged
-    start = max(shown) * left * initial_error
+    begins = initial_error + float(np.sum(np.linalg.norm(inputs.start, axis=0)))
+    start = max(shown) * left * begins
     if kind == "pointwise":
         return EndlessBound(_start_added(model, bare, initial_error), pointwise + start)
     table = window_threshold(model, inputs, initial_error, window)
     # No window has more energy than its samples one by one; for a sampled plant its own bound may be smaller.
     # Such a window may begin in the table, where more is left of the start.
-    start = max(max(shown[-window:]), max(shown) * left) * initial_error
+    start = max(max(shown[-window:]), max(shown) * left) * begins
     limit = float(np.sqrt(window)) * (pointwise + start)
     if model.flow is None:
         limit = min(limit, _window_limit(model, inputs, (initial_error, left, last), window))

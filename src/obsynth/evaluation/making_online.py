@@ -26,6 +26,7 @@ from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario
 
 _FORGOTTEN = ", once the error at the start, which is not stated, is forgotten (else give a longer warm-up)"
+_AFTER_A_GAP = " (after a gap, too, while the error there is no larger than stated for the start)"
 _ANY_LENGTH = " (the run may have any length)"
 _PARAMETER_STATEMENTS = {
     "chi-square": "distance of the parameters from their nominal values in the metric of their covariance: passed in a "
@@ -124,7 +125,7 @@ def online_monitor(
                 path="noise_bound",
             )  # fmt: skip
         rule = NormRule(table, limit, window=window if kind == "window" else 1, dt=dt)
-        ending = _FORGOTTEN if initial_error is None else ""
+        ending = _FORGOTTEN if initial_error is None else _AFTER_A_GAP
     else:
         rule = _whitened(kind, model, bounds if scenario is None else None, window, change, false_alarms, dt)
         ending = _ANY_LENGTH

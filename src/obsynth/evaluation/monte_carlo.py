@@ -17,6 +17,7 @@ from obsynth.evaluation.monitors import Monitor
 from obsynth.evaluation.simulating import aligned_errors, warm_up_ends
 from obsynth.models.arguments import is_number, require_kind
 from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.linear import LinearObserver
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario
 
@@ -121,6 +122,11 @@ def evaluate(
     """
     require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
     require_kind(scenario, Scenario, "scenario", "an obsynth.Scenario")
+    if not isinstance(design.observer, LinearObserver):
+        raise SpecError(
+            f"evaluate is for linear designs, and {design.name!r} is none: simulate it with other seeds "
+            "(obsynth.simulate), or use obsynth.run_batch and obsynth.decide.", path="design",
+        )  # fmt: skip
     if isinstance(runs, bool) or not isinstance(runs, int) or runs < 1:
         raise SpecError(f"runs is {runs!r}: give a whole number, 1 or more.", path="runs")
     if not (is_number(confidence) and 0.0 < confidence < 1.0):

@@ -74,7 +74,7 @@ class Rule(Protocol):
 
 
 class OnlineMonitor:
-    """A monitor for data of any length; made by `obsynth.online_monitor`, used by one run at a time.
+    """A monitor for data of any length; made by `obsynth.online_monitor`.  Each run begins with a copy.
 
     Parameters
     ----------

@@ -39,6 +39,8 @@ class ResidualModel:
         Whether each disturbance has no part but random ones over the whole record.
     flow : tuple of FloatArray, optional
         Of a continuous design: A and Bd in continuous time.
+    start_noise : FloatArray, optional
+        Of a continuous design, ``(n, any)``: what the noise w of the first sample (its first signals) adds to e there.
     """
 
     A: FloatArray
@@ -57,6 +59,7 @@ class ResidualModel:
     deviations: FloatArray
     steady: tuple[bool, ...]
     flow: tuple[FloatArray, FloatArray] | None = None
+    start_noise: FloatArray | None = None
 
     @property
     def initial_error(self) -> float:
@@ -126,14 +129,14 @@ def residual_model(design: ObserverDesign, scenario: Scenario) -> ResidualModel:
     shown, _, direct_d, direct_w = errors.residual_output
     faults, _, faults_d, faults_w = errors.fault_output
     bounds, means, deviations, steady = _disturbances(scenario, plant.disturbance_names, drive.steps, drive.dt)
-    a, driven, noise, flow = errors.Az, errors.disturbance, errors.noise, None
+    a, driven, noise, flow, start_noise = errors.Az, errors.disturbance, errors.noise, None, None
     if not plant.is_discrete:
         held, flow = sampled_errors(noisy, observer, found, drive.dt), (errors.Az, errors.disturbance)
-        a, driven, noise = held.A, held.Bd, held.Bw
+        a, driven, noise, start_noise = held.A, held.Bd, held.Bw, held.start
         direct_w, faults_w = held.direct(observer.residual_rows), held.direct(observer.fault_rows)
     return ResidualModel(
         a, -shown, driven, direct_d, noise, direct_w, -faults, faults_d, faults_w,
-        drive.steps, initial, bounds, means, deviations, steady, flow,
+        drive.steps, initial, bounds, means, deviations, steady, flow, start_noise,
     )  # fmt: skip
 
 

@@ -6,6 +6,9 @@ the sampled observer.  With ``e = V E x - z``, held disturbances d, process nois
 noise n,
 
     e+ = Phi e + Gamma d + w - By_h n,   r = -C e + Dd d + Dy_h n
+
+and the noise of the first sample is in the start as well, ``e(0) = V E x(0) - z(0) + Gamma_1 n(0)``, as the state that
+is kept is ``z - Gamma_1 v``.
 """
 
 from __future__ import annotations
@@ -83,6 +86,8 @@ class SampledErrors:
         Of the error.
     sensor_outputs : FloatArray
         ``Dy_h Dw``: what the noise of a sample adds to states, faults and residuals at once.
+    start : FloatArray
+        ``(n, sensors)``: what the noise of the first sample adds to the start.
     gathered : int
         How many noise signals come after those of the sensors.
     """
@@ -91,6 +96,7 @@ class SampledErrors:
     Bd: FloatArray
     Bw: FloatArray
     sensor_outputs: FloatArray
+    start: FloatArray
     gathered: int
 
     def direct(self, rows: slice) -> FloatArray:
@@ -128,6 +134,8 @@ def sampled_errors(plant: DescriptorSystem, observer: LinearObserver, found: Tra
     whole = DescriptorSystem(None, observer.Az, C=np.eye(observer.order), Bw=driven)
     gathered = discretise(whole, dt).plant.Bw
     heard = plant.Dw[:, sensors]
+    ramp = first_order_hold(observer.Az, observer.By, dt)[2]
     return SampledErrors(
-        transition, gathered_d, np.hstack([-held.By @ heard, gathered]), held.Dy @ heard, gathered.shape[1]
-    )
+        transition, gathered_d, np.hstack([-held.By @ heard, gathered]), held.Dy @ heard, ramp @ heard,
+        gathered.shape[1],
+    )  # fmt: skip

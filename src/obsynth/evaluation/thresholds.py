@@ -22,11 +22,14 @@ class ScaledInputs(NamedTuple):
         Inputs that change from sample to sample, ``(n, m)`` and ``(nr, m)``.
     constant : float
         What disturbances of any shape in continuous time add to the norm of the residual, at most.
+    start : FloatArray
+        ``(n, any)``: inputs of the first sample alone, straight to the error.
     """
 
     B: FloatArray
     D: FloatArray
     constant: float
+    start: FloatArray
 
 
 def scaled_inputs(model: ResidualModel, bounds: FloatArray, noise_bound: float | None) -> ScaledInputs:
@@ -61,11 +64,13 @@ def scaled_inputs(model: ResidualModel, bounds: FloatArray, noise_bound: float |
     factor = 0.0 if noise_bound is None else noise_bound
     if model.flow is None:
         return ScaledInputs(
-            np.hstack([model.Bd * sizes, factor * model.Bw]), np.hstack([model.Dd * sizes, factor * model.Dw]), 0.0
-        )
+            np.hstack([model.Bd * sizes, factor * model.Bw]), np.hstack([model.Dd * sizes, factor * model.Dw]), 0.0,
+            np.zeros((len(model.A), 0)),
+        )  # fmt: skip
     a, driven = model.flow
     peaks = peak_gain(a, driven * sizes, model.C) + np.linalg.norm(model.Dd * sizes, axis=0)
-    return ScaledInputs(factor * model.Bw, factor * model.Dw, float(np.sum(peaks)))
+    noisy = np.zeros((len(a), 0)) if model.start_noise is None else factor * model.start_noise
+    return ScaledInputs(factor * model.Bw, factor * model.Dw, float(np.sum(peaks)), noisy)
 
 
 def paper_threshold(model: ResidualModel, bounds: FloatArray, initial_error: float, gamma: float | None) -> FloatArray:
@@ -111,6 +116,7 @@ def pointwise_threshold(model: ResidualModel, inputs: ScaledInputs, initial_erro
     """
     powers = model.powers()
     start = np.array([np.linalg.norm(model.C @ power, 2) for power in powers]) * initial_error
+    start += np.array([np.sum(np.linalg.norm(model.C @ power @ inputs.start, axis=0)) for power in powers])
     gathered = np.array([np.sum(np.linalg.norm(model.C @ power @ inputs.B, axis=0)) for power in powers])
     earlier = np.concatenate([[0.0], np.cumsum(gathered)[:-1]])
     return np.asarray(start + earlier + np.sum(np.linalg.norm(inputs.D, axis=0)) + inputs.constant)
