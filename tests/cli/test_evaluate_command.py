@@ -77,6 +77,15 @@ def test_bad_options_are_refused(gains, capsys, more, message):
     assert message in capsys.readouterr().err
 
 
+def test_decisions_on_parameters_are_counted(capsys):
+    spec = str(ROOT / "designs" / "moussaali2013_ltv" / "spec.yaml")
+    assert main(["evaluate", "--system", spec, "--runs", "3", "--monitor", "nis", "--quiet"]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "moussaali2013_ltv: 3 runs" in printed
+    assert "Monitor nis" in printed
+    assert "theta" in printed
+
+
 def test_a_spec_without_a_scenario_has_nothing_to_evaluate(capsys):
     spec = str(ROOT / "designs" / "smib" / "pd_observer.yaml")
     assert main(["evaluate", "--system", spec, "--quiet"]) == 2

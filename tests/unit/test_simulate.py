@@ -319,66 +319,6 @@ def test_a_continuous_plant_needs_a_sample_time(sharepasand) -> None:
         obsynth.simulate(sharepasand[0], obsynth.Scenario(horizon=1))
 
 
-@pytest.fixture(scope="module")
-def varying() -> obsynth.ObserverDesign:
-    plant = obsynth.TimeVaryingDescriptorSystem(
-        E=[[1, 0], [0, 0]], A=[[0.9, "0.1 * sin(0.2 * k)"], [0.5, -1]], B=[[1], [0.2]], C=[[1, 0.2], [0, 1]],
-        Phi=[["1 + 0.5 * cos(0.1 * k)"], [0.1]], dt=0.5, horizon=300, parameter_names=["leak"],
-    )  # fmt: skip
-    return obsynth.adaptive_observer(plant, Q=np.diag([1e-4, 4e-4]), R=1e-2, forgetting=0.95)
-
-
-def test_a_time_varying_plant_keeps_its_equations(varying) -> None:
-    scenario = obsynth.Scenario(
-        horizon=100, inputs={"u1": obsynth.Sine(amplitude=1, frequency=0.3)}, initial_state={"x1": 2.0},
-        faults={"leak": [obsynth.Step(size=0.4, start=10), obsynth.Ramp(rate=0.01, start=50)]},
-    )  # fmt: skip
-    run, plant = obsynth.simulate(varying, scenario), varying.plant
-    for k in range(200):
-        right = plant.A.at(k) @ run.states[k] + plant.B.at(k) @ run.inputs[k] + plant.Phi.at(k) @ run.faults[k]
-        np.testing.assert_allclose(plant.E.at(k + 1) @ run.states[k + 1], right, atol=1e-12)
-    np.testing.assert_allclose(run.outputs[1:], run.states[1:] @ plant.C.at(1).T, atol=1e-12)
-    assert np.isnan(run.outputs[0]).all()
-    assert run.faults[150, 0] == pytest.approx(0.4 + 0.01 * 25)
-    assert "begins with y(1)" in run.notes[0]
-    own = varying.observer.run(run.outputs, run.inputs)
-    np.testing.assert_array_equal(run.estimates.states, own.states)
-    np.testing.assert_array_equal(run.estimates.faults, own.parameters)
-    assert np.abs(run.fault_errors[90:100]).max() < 0.02
-
-
-def test_noise_of_a_time_varying_plant_is_that_of_its_design(varying) -> None:
-    scenario = obsynth.Scenario(horizon=149.5, noise=2.0, seed=3, sensor_noise={"y2": 0.3})
-    calm, loud = obsynth.simulate(varying, scenario.replace(noise=0.0, sensor_noise={})), []
-    plant = varying.plant
-    for seed in range(15):
-        run = obsynth.simulate(varying, scenario.replace(seed=seed))
-        loud.append(run.outputs[1:] - run.states[1:] @ plant.C.at(1).T)
-    spread = np.std(np.concatenate(loud), axis=0)
-    assert spread == pytest.approx([0.2, np.hypot(0.2, 0.3)], rel=0.05)
-    assert not calm.states.any()
-    again = obsynth.simulate(varying, scenario.replace(seed=14))
-    np.testing.assert_array_equal(again.outputs[1:], run.outputs[1:])
-
-
-def test_sensors_of_a_time_varying_plant_fail_as_others_do(varying) -> None:
-    scenario = obsynth.Scenario(
-        horizon=50, faults={"leak": obsynth.Step(size=1)},
-        sensors={"y1": obsynth.Step(size=5.0, start=20), "y2": obsynth.Stuck(start=30)},
-    )  # fmt: skip
-    run = obsynth.simulate(varying, scenario)
-    clean = obsynth.simulate(varying, scenario.replace(sensors={}))
-    np.testing.assert_allclose(run.outputs[41:, 0] - clean.outputs[41:, 0], 5.0)
-    assert set(run.outputs[60:, 1]) == {clean.outputs[60, 1]}
-
-
-def test_a_nonlinear_design_is_refused() -> None:
-    spec = load_spec(DESIGNS / "diode_circuit" / "spec.yaml")
-    design = obsynth.design(spec.plant, spec.method, **dict(spec.options))
-    with pytest.raises(SpecError, match=r"obsynth\.simulate_dae"):
-        obsynth.simulate(design, obsynth.Scenario(horizon=1))
-
-
 def test_the_file_holds_every_signal_to_the_last_bit(wang, tmp_path: Path) -> None:
     design, scenario = wang
     found = obsynth.simulate(design, scenario)

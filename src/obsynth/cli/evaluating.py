@@ -8,11 +8,15 @@ from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import contextmanager
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from obsynth.cli.data_arguments import add_monitor_arguments
 from obsynth.cli.output import print_json, progress, stdout_console
 from obsynth.errors import SpecError
+
+if TYPE_CHECKING:
+    from obsynth.evaluation.monitors import Monitor
+    from obsynth.evaluation.recursive_monte_carlo import ParameterMonitor
 
 _EVALUATE = "Design an observer from a spec, run the spec's scenario many times, and count alarms, delays and errors."
 
@@ -74,26 +78,30 @@ def run_evaluate(options: argparse.Namespace) -> int:
         design = designed_or_loaded(spec, options.gains, report_stage)
         report_stage("running")
         from obsynth.evaluation.monte_carlo import evaluate
+        from obsynth.evaluation.recursive_monte_carlo import ParameterMonitor
         from obsynth.evaluation.watching import monitor
+        from obsynth.observers.linear import LinearObserver
 
-        watched = None
-        if options.monitor is not None:
+        watched: Monitor | ParameterMonitor | None = None
+        if options.monitor is not None and isinstance(design.observer, LinearObserver):
             watched = monitor(
                 design, spec.scenario, options.monitor, disturbance_bounds=numbers_of(options.disturbance),
                 noise_bound=options.noise_bound, initial_error=options.initial_error, window=options.window,
                 false_alarms=options.false_alarms, change=options.change,
             )  # fmt: skip
+        elif options.monitor is not None:
+            watched = ParameterMonitor(options.monitor, false_alarms=options.false_alarms, change=options.change)
         with _executor(options.jobs) as executor:
             found = evaluate(
                 design, spec.scenario, runs=options.runs, monitor=watched, executor=executor,
                 progress=lambda done, total: report_stage(f"{done} of {total} runs"), confidence=options.confidence,
             )  # fmt: skip
+    from obsynth.report.evaluation import described, evaluation_report
+
     if options.json:
-        told = None if watched is None else {"kind": watched.kind, "statement": watched.statement}
+        told = None if watched is None else dict(zip(("kind", "statement"), described(watched), strict=True))
         print_json({"command": "evaluate", "spec": str(spec.path), "monitor": told, **found.as_dict()})
         return 0
-    from obsynth.report.evaluation import evaluation_report
-
     evaluation_report(design.name, found, monitor=watched, console=stdout_console(), units=design.plant.units)
     return 0
 

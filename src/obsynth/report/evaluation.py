@@ -11,6 +11,7 @@ from rich.text import Text
 from obsynth.evaluation.intervals import Interval
 from obsynth.evaluation.monitors import Monitor
 from obsynth.evaluation.monte_carlo import Evaluation
+from obsynth.evaluation.recursive_monte_carlo import ParameterMonitor
 from obsynth.report.layout import headed_table, number, print_section
 
 #: Rows of a table; of a large plant the worst estimates are shown.
@@ -24,7 +25,12 @@ _DECISIONS = {
 
 
 def evaluation_report(
-    name: str, found: Evaluation, *, monitor: Monitor | None, console: Console, units: Mapping[str, str]
+    name: str,
+    found: Evaluation,
+    *,
+    monitor: Monitor | ParameterMonitor | None,
+    console: Console,
+    units: Mapping[str, str],
 ) -> None:
     """Print rates, delays and errors over many runs.
 
@@ -34,7 +40,7 @@ def evaluation_report(
         Of the design.
     found : Evaluation
         The evaluation.
-    monitor : Monitor or None
+    monitor : Monitor, ParameterMonitor or None
         What decided.
     console : Console
         Where to.
@@ -50,8 +56,9 @@ def evaluation_report(
             item: Interval = getattr(found, key)
             if item.count:
                 table.add_row(Text(title), number(item.value), _interval(item), str(item.count), Text(unit))
-        print_section(console, f"Monitor {monitor.kind}", table)
-        console.print(Text(f"Its threshold: {monitor.statement}."))
+        kind, statement = described(monitor)
+        print_section(console, f"Monitor {kind}", table)
+        console.print(Text(f"Its threshold: {statement}."))
         console.print()
     for title, errors in (("Fault estimates", found.fault_rmse), ("State estimates", found.state_rmse)):
         if not errors:
@@ -63,6 +70,16 @@ def evaluation_report(
         for signal, item in rows[:SHOWN]:
             table.add_row(Text(signal), number(item.value), _interval(item), Text(units.get(signal, "")))
         print_section(console, f"{title} (mean over runs)", table)
+
+
+def described(monitor: Monitor | ParameterMonitor) -> tuple[str, str]:
+    """Return which monitor it is, and what its threshold means."""
+    if isinstance(monitor, Monitor):
+        return monitor.kind, monitor.statement
+    return monitor.statistic, (
+        "of a decision on parameters, passed in a run without a change with about the stated probability "
+        f"({monitor.false_alarms:g})"
+    )
 
 
 def _interval(item: Interval) -> str:

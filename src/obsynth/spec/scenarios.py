@@ -12,8 +12,8 @@ from obsynth.models.descriptor import DescriptorSystem
 from obsynth.models.time_varying import TimeVaryingDescriptorSystem
 from obsynth.simulation.failures import KINDS
 from obsynth.simulation.profiles import Profile
+from obsynth.simulation.recursive_drive import check_recursive
 from obsynth.simulation.scenario import Scenario
-from obsynth.simulation.time_varying import signals_of
 from obsynth.spec.checking import DocumentProblems
 
 if TYPE_CHECKING:
@@ -44,10 +44,6 @@ def built_scenario(
     if section is None:
         return None
     problems = DocumentProblems(source, what="spec")
-    if not isinstance(plant, (DescriptorSystem, TimeVaryingDescriptorSystem)):
-        problems.add("scenario", "scenarios are for linear plants; this one is nonlinear (see obsynth.simulate_dae).")
-        problems.raise_if_any()
-        return None
     given: dict[str, Any] = {name: getattr(section, name) for name in section.model_fields_set}
     for group in _GROUPS:
         given[group] = {
@@ -57,9 +53,11 @@ def built_scenario(
     problems.raise_if_any()
     try:
         scenario = Scenario(**given)
-        named = plant if isinstance(plant, DescriptorSystem) else signals_of(plant)
-        scenario.check_names(named)
-        scenario.step_of(named)
+        if isinstance(plant, DescriptorSystem):
+            scenario.check_names(plant)
+            scenario.step_of(plant)
+        else:
+            check_recursive(plant, scenario)
     except SpecError as error:
         problems.add(f"scenario.{error.path}", str(error))
         problems.raise_if_any()
