@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping
 from functools import partial
 from typing import Any, TypeVar
 
@@ -14,6 +13,7 @@ from obsynth.data.bridge import Bridge
 from obsynth.data.clock import Clock
 from obsynth.data.engine import GAP, LONGEST_BRIDGE, OK, RECOVERING, WARM_UP, Row, estimate_columns
 from obsynth.data.holds import KeptHolds, checked_warm_up, transient
+from obsynth.data.linear_signals import LinearSignals
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.models.arguments import is_number
 from obsynth.numerics.arrays import FloatArray
@@ -36,7 +36,7 @@ def _running(part: _Part | None) -> _Part:
     return part
 
 
-class DataObserver:
+class DataObserver(LinearSignals):
     """A linear observer in motion on measured data.
 
     Parameters
@@ -56,7 +56,7 @@ class DataObserver:
     """
 
     def __init__(self, design: ObserverDesign, *, gap: float | None = None, warm_up: float | None = None) -> None:
-        self.plant, self.observer = design.linear
+        super().__init__(design)
         if gap is not None and not (is_number(gap) and gap > 0.0):
             raise SpecError(f"gap is {gap!r}: give seconds, a positive number.", path="gap")
         if gap is not None and self.observer.dt > 0.0:
@@ -84,51 +84,6 @@ class DataObserver:
         self.measured = self.v
         self.settled_at, self.phase = math.inf, WARM_UP
         self.inputs: deque[FloatArray] = deque(maxlen=max(lags) + 1)
-
-    @property
-    def input_names(self) -> tuple[str, ...]:
-        """Known inputs."""
-        return self.observer.input_names
-
-    @property
-    def output_names(self) -> tuple[str, ...]:
-        """Outputs of the plant."""
-        return self.observer.output_names
-
-    @property
-    def state_names(self) -> tuple[str, ...]:
-        """States that are estimated."""
-        return self.observer.state_names
-
-    @property
-    def fault_names(self) -> tuple[str, ...]:
-        """Faults that are estimated."""
-        return self.observer.fault_names
-
-    @property
-    def state_delays(self) -> tuple[int, ...]:
-        """Samples by which each state estimate lags."""
-        return self.observer.state_delays
-
-    @property
-    def fault_delays(self) -> tuple[int, ...]:
-        """Samples by which each fault estimate lags."""
-        return self.observer.fault_delays
-
-    @property
-    def dt(self) -> float:
-        """Seconds between samples; 0 for continuous time."""
-        return self.observer.dt
-
-    @property
-    def scales(self) -> Mapping[str, float]:
-        """Factor of inputs and outputs by name."""
-        return self.plant.scales
-
-    @property
-    def point(self) -> Mapping[str, float]:
-        """Operating point by name of the signal."""
-        return self.plant.operating_point
 
     def step(self, time: float, values: FloatArray, row: int) -> Row:
         """Take one row of data.

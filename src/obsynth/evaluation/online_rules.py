@@ -15,6 +15,8 @@ from obsynth.numerics.arrays import FloatArray
 
 #: Share of an interval by which the data's sampling may differ from the one that a threshold is for.
 FITTING_SHARE = 0.01
+#: What rounding may take from a number of samples, as a share of it.
+ROUNDING = 1e-9
 
 
 class NormRule:
@@ -48,7 +50,7 @@ class NormRule:
             # A window is a number of samples at the sampling that its bound is for.
             self._squares.clear()
         self._begin, self._last = (time if self._begin is None else self._begin), time
-        k = math.floor((time - self._begin) / self._dt * (1.0 + 1e-9))
+        k = math.floor((time - self._begin) / self._dt * (1.0 + ROUNDING))
         threshold = float(self._table[k]) if k < len(self._table) else self._limit
         if not deciding:
             return math.nan, threshold, None
