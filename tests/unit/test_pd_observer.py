@@ -471,6 +471,27 @@ class TestRefusals:
             obsynth.pd_observer(PLANT, disk=[5.0, 4.5], delta=10.0)
         assert not caught.value.necessary
 
+    def test_outputs_that_show_nothing_end_in_the_mode_that_they_hide(self) -> None:
+        """In rates of many sizes too, where the zeros of [A - s I; C] computed another way are too few."""
+        with pytest.raises(obsynth.PreconditionError) as caught:
+            obsynth.pd_observer(PLANT.replace(C=np.zeros_like(PLANT.C)))
+        assert caught.value.condition == "detectability"
+        assert caught.value.mode == pytest.approx(np.max(np.linalg.eigvals(PLANT.A).real))
+        for seed in range(60):
+            rng = np.random.default_rng([7, seed])
+            n = int(rng.integers(1, 9))
+            a = rng.normal(size=(n, n)) * 10.0 ** rng.uniform(-8, 8, (n, n))
+            values = np.linalg.eigvals(a)
+            if not np.max(values.real) > 1e-6 * np.max(np.abs(values)):
+                continue
+            for c in (np.zeros((2, n)), np.eye(1, n)):
+                plant = obsynth.DescriptorSystem(None, a, C=c, Bf=np.ones((n, 1)))
+                failed = pd_observer_conditions(plant)[-1]
+                if not np.any(c) or failed.name == "detectability":
+                    assert failed.name == "detectability"
+                    assert failed.mode.real >= -1e-9 * abs(failed.mode)
+                    assert failed.signals
+
     def test_conditions_are_listed_for_check(self) -> None:
         names = [condition.name for condition in pd_observer_conditions(PLANT)]
         assert names[-1] == "rank [A F; C Df]"

@@ -44,6 +44,8 @@ def _is_singular(E: FloatArray, A: FloatArray, value: complex, normal_rank: int,
     point, best = value, np.inf
     for _ in range(NEWTON_STEPS):
         left, sizes, right = np.linalg.svd(pencil.A - point * pencil.E)
+        if sizes[0] == 0.0:
+            return True
         best = min(best, sizes[normal_rank - 1] / sizes[0])
         u, v = left[:, normal_rank - 1].conj(), right[normal_rank - 1].conj()
         slope = u @ pencil.E @ v
