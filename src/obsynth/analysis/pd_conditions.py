@@ -151,7 +151,7 @@ def _hidden_direction(plant: DescriptorSystem, mode: complex) -> FloatArray:
     still = np.vstack([plant.E, np.zeros_like(plant.C)])
     pencil = equilibrated_at(still, np.vstack([plant.A, plant.C]), mode, nx=plant.nx)
     point = mode if mode.imag else mode.real
-    return np.abs(pencil.columns * np.linalg.svd(pencil.A - point * pencil.E)[2][-1])
+    return np.asarray(np.abs(pencil.columns * np.linalg.svd(pencil.A - point * pencil.E)[2][-1]))
 
 
 def _null_vector(matrix: FloatArray) -> FloatArray:
