@@ -81,6 +81,11 @@ class DefinitenessProof:
     reason: str = ""
 
     @property
+    def in_double_precision(self) -> bool:
+        """Whether it is proved without python-flint: a certificate to prefer, since everybody can check it."""
+        return self.proved and self.means != "ball arithmetic"
+
+    @property
     def text(self) -> str:
         """How it was proved, or why not, for reports."""
         if self.means == "ball arithmetic":

@@ -101,6 +101,7 @@ def gain_certificate(a: FloatArray, b: Ball, c: FloatArray, gain: float) -> Floa
     balanced, (units, _) = matrix_balance(a, permute=False, separate=True)
     entering, shown = b.midpoint / units[:, None], c * units
     weight = max(float(np.linalg.norm(shown, 2)) ** 2, np.finfo(np.float64).tiny)
+    spare = None
     for slack in SLACKS:
         try:
             p = np.asarray(
@@ -113,9 +114,13 @@ def gain_certificate(a: FloatArray, b: Ball, c: FloatArray, gain: float) -> Floa
             continue
         found = 0.5 * (p + p.T) / units[:, None] / units
         found = np.asarray(0.5 * (found + found.T))
-        if np.all(np.isfinite(found)) and prove_gain(a, b, c, found, gain).proved:
+        if not np.all(np.isfinite(found)):
+            continue
+        proof = prove_gain(a, b, c, found, gain)
+        if proof.in_double_precision:
             return found
-    return None
+        spare = found if proof.proved and spare is None else spare
+    return spare
 
 
 def _gram(a: FloatArray) -> FloatArray:
