@@ -52,6 +52,8 @@ class PdGains:
         Of the solver run.
     proved_in_double_precision : bool
         Whether that took no more digits.
+    engine : str
+        The engine that found the gains.
     """
 
     J: FloatArray
@@ -68,6 +70,7 @@ class PdGains:
     proved: bool
     record: Mapping[str, Any]
     proved_in_double_precision: bool = False
+    engine: str = ""
 
     @property
     def abscissa(self) -> float:

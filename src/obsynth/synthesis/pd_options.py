@@ -17,6 +17,14 @@ from obsynth.numerics.ranks import NEGLIGIBLE_MODE, decide_rank
 from obsynth.numerics.scaling import equilibrate_pencil
 from obsynth.synthesis.lmi import SOLVER_SETTINGS
 
+#: How gains are found: from the whole inequality, from the smaller one without the gains, or in closed form.
+ENGINES = ("auto", "lmi", "reduced-lmi", "riccati")
+ENGINES_OF_STABILITY = ("reduced-lmi", "riccati")
+#: Up to so many unknown states "auto" takes the first (a second or two); up to so many it tries the second where the
+#: third does not serve.
+MOST_STATES_FOR_LMI = 20
+MOST_STATES_FOR_REDUCED_LMI = 50
+
 
 @dataclass(frozen=True)
 class PdOptions:
@@ -32,6 +40,7 @@ class PdOptions:
     adaptation_gain: Any = None
     adaptation_range: Any = None
     delta_scan: Any = None
+    engine: str = "auto"
     solver: str = "CLARABEL"
     problems: list[str] = field(default_factory=list, init=False, repr=False, compare=False)
 
@@ -44,6 +53,13 @@ class PdOptions:
             self.problems.append(f"decay is {self.decay}: give 0 or a positive number in 1/seconds.")
         if self.solver not in SOLVER_SETTINGS:
             self.problems.append(f"solver is {self.solver!r}: use one of {', '.join(SOLVER_SETTINGS)}.")
+        if self.engine not in ENGINES:
+            self.problems.append(f"engine is {self.engine!r}: use one of {', '.join(ENGINES)}.")
+        elif self.engine in ENGINES_OF_STABILITY and self.further:
+            self.problems.append(
+                f"engine {self.engine!r} gives stability and a decay rate alone: take engine 'lmi', or leave out "
+                f"{', '.join(self.further)}."
+            )
         disk = self._numbers("disk", 2)
         if disk is not None and not disk[1] > max(-disk[0], 0.0):
             self.problems.append(
@@ -82,6 +98,20 @@ class PdOptions:
             self.problems.append(f"{name} is {value!r}: give a list of {wanted}.")
             return None
         return tuple(map(float, row[0]))
+
+    @property
+    def further(self) -> tuple[str, ...]:
+        """What is asked besides stability and a decay rate: the whole inequality alone can give it."""
+        names = ("disk", "gain_bound", "fault_rate_gain", "noise_gain", "adaptation_range")
+        return tuple(name for name in names if getattr(self, name) is not None)
+
+    def engines_for(self, states: int) -> tuple[str, ...]:
+        """Return the engine for this many unknown states (of plant and faults), and those to take if it fails."""
+        if self.further or self.engine == "lmi" or (self.engine == "auto" and states <= MOST_STATES_FOR_LMI):
+            return ("lmi",) if self.further else ("lmi", "riccati")
+        if self.engine == "auto":
+            return ("riccati", "reduced-lmi") if states <= MOST_STATES_FOR_REDUCED_LMI else ("riccati",)
+        return (self.engine,) if self.engine == "riccati" else (self.engine, "riccati")
 
     @property
     def disk_numbers(self) -> tuple[float, float] | None:
