@@ -7,11 +7,38 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 
 
-def test_the_fault_filter_benchmark_runs():
-    script = ROOT / "benchmarks" / "fault_estimation_filter.py"
+def small_table(name):
+    """Return the rows that the small instance of a benchmark prints, cell by cell."""
+    script = ROOT / "benchmarks" / f"{name}.py"
     done = subprocess.run([sys.executable, script, "--small"], capture_output=True, text=True, check=True)
-    rows = [line.strip("| ").split(" | ") for line in done.stdout.splitlines()[2:]]
+    return [line.strip("| ").split(" | ") for line in done.stdout.splitlines()[2:]]
+
+
+def test_the_fault_filter_benchmark_runs():
+    rows = small_table("fault_estimation_filter")
     assert [row[0] for row in rows] == ["6"]
     gains = [float(cell.split(", ")[1]) for cell in rows[0][1:]]
     # The bisection ends within 1e-4 of the least gain, the others much closer.
     assert max(gains) <= min(gains) * (1.0 + 2e-4)
+
+
+def test_the_pd_observer_benchmark_runs():
+    rows = small_table("pd_observer")
+    assert [row[0] for row in rows] == ["6"]
+    # Time, gain and slowest mode of each engine, which ran itself.
+    for cell in rows[0][1:]:
+        seconds, gain, slowest = cell.split(", ")
+        assert seconds.endswith(" s")
+        assert float(gain) > 0.0
+        assert float(slowest) >= 0.1
+
+
+def test_the_definiteness_benchmark_proves_every_row():
+    rows = small_table("definiteness")
+    assert len(rows) == 6
+    assert all(" ms" in row[1] for row in rows)
+    assert sum("ball arithmetic" in row[1] for row in rows) == 1
+
+
+def test_the_benchmark_of_threads_runs():
+    assert [row[0] for row in small_table("blas_threads")] == ["6"]
