@@ -21,7 +21,7 @@ from obsynth.synthesis.pd_certificate import (
     gain_certificate,
     symmetric_certificate,
 )
-from obsynth.synthesis.pd_options import least_noise_gain
+from obsynth.synthesis.pd_limits import least_noise_gain
 from obsynth.verification.pd_inequality import (
     error_inputs,
     prove_gain,

@@ -14,7 +14,8 @@ from obsynth.errors import InfeasibleError, SolverError
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray
 from obsynth.synthesis.pd_gains import PdGains, certified
-from obsynth.synthesis.pd_options import PdOptions, default_delta, fastest_mode, require_possible
+from obsynth.synthesis.pd_limits import default_delta, fastest_mode, require_possible
+from obsynth.synthesis.pd_options import PdOptions
 from obsynth.synthesis.pd_problem import PdSolution, PdTask, solve
 from obsynth.synthesis.pd_reduced import closed_form, reduced_lmi
 
