@@ -46,7 +46,8 @@ def pd_observer(
         larger gains.
     delta : float, optional, seconds
         Parameter of the theorem.  It decides which gains are found, not whether there are any (Theorem 1).  By default
-        the inverse of the plant's fastest mode, well-damped ones far beyond all others left aside.
+        the inverse of the plant's fastest mode, well-damped ones far beyond all others left aside; the engine
+        ``"riccati"`` may take less.
     decay : float, optional, 1/seconds
         Errors die out at least like ``exp(-decay t)``.  By default nothing is imposed when the smallest gains give a
         tenth of the plant's fastest mode, else that rate, or as much of it as moderate gains allow; 0 imposes nothing.

@@ -15,6 +15,8 @@ Our deviations
     7. What is shipped never differentiates the outputs (see `obsynth.synthesis.pd_realisation`).
     8. The inequality is proved for the shipped realisation; where the solver's certificate does not do, one is
        computed from the gains.
+    9. For hundreds of states the gains come from a smaller inequality or in closed form (see
+       `obsynth.synthesis.pd_reduced`), with L = 0.
 """
 
 from __future__ import annotations
