@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.linalg
 
 import obsynth
 from obsynth.analysis.pd_augmentation import with_faults_as_states
@@ -110,6 +111,20 @@ class TestClosedForm:
         assert design.certificate.claims["delta"] == 10.0
         with pytest.raises(obsynth.SolverError, match="smaller delta"):
             obsynth.pd_observer(PLANT, engine="riccati", theorem=2, delta=10.0, decay=0.0)
+
+    def test_two_algorithms_for_the_riccati_equation_and_an_error(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        task = task_of(PLANT, theorem=1, delta=0.1, decay=0.0)
+        expected = pd_reduced.closed_form(task, free_delta=True)[0].J
+
+        def failing(*_: object, **__: object) -> None:
+            raise np.linalg.LinAlgError("broken")
+
+        monkeypatch.setattr(scipy.linalg, "schur", failing)
+        np.testing.assert_allclose(pd_reduced.closed_form(task, free_delta=True)[0].J, expected, rtol=1e-9, atol=1e-12)
+        monkeypatch.setattr(scipy.linalg, "solve_continuous_are", failing)
+        with pytest.raises(obsynth.SolverError, match="not solved") as caught:
+            pd_reduced.closed_form(task, free_delta=True)
+        assert caught.value.record["what"]
 
 
 class TestChoice:
