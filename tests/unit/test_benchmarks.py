@@ -4,6 +4,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[2]
 
 
@@ -42,3 +44,14 @@ def test_the_definiteness_benchmark_proves_every_row():
 
 def test_the_benchmark_of_threads_runs():
     assert [row[0] for row in small_table("blas_threads")] == ["6"]
+
+
+@pytest.mark.parametrize("name", ["evaluate", "run_on_data"])
+def test_the_benchmarks_of_running_run(name):
+    """Their own comparisons with python-control hold, and every rate is a number."""
+    script = ROOT / "benchmarks" / f"{name}.py"
+    done = subprocess.run([sys.executable, script, "--small"], capture_output=True, text=True, check=True)
+    row = done.stdout.splitlines()[-1].strip("| ").split(" | ")
+    assert row[0] == "4"
+    assert len(row) == 5
+    assert all(float(cell.replace(",", "")) > 0.0 for cell in row[1:])
