@@ -48,7 +48,7 @@ def cell(plant: obsynth.DescriptorSystem, engine: str) -> str:
 def main(arguments: list[str]) -> None:
     """Print the table."""
     small = "--small" in arguments
-    sizes = [int(item) for item in arguments if item.isdigit()] or ([6] if small else [8, 16, 32, 48, 100, 200, 400])
+    sizes = [int(item) for item in arguments if item.isdigit()] or ([6] if small else [8, 16, 32, 48, 100, 200])
     print("| unknown states | " + " | ".join(MOST_STATES) + " |")
     print("| --- |" + " --- |" * len(MOST_STATES))
     # What is loaded at the first design is not a design's time.
