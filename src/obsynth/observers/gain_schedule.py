@@ -17,7 +17,7 @@ from obsynth.observers.literal_form import posterior_residual
 from obsynth.observers.records import require_horizon
 from obsynth.observers.recursive import RecursiveObserver
 from obsynth.observers.recursive_running import RunningRecursiveObserver
-from obsynth.observers.step_model import EarlySteps, StepMatrices
+from obsynth.observers.step_model import EarlySteps, StepMatrices, require_in_range
 
 
 class GainStep(NamedTuple):
@@ -70,11 +70,12 @@ def gain_steps(observer: RecursiveObserver, steps: int) -> Iterator[GainStep]:
     factor, Upsilon, parameters = start.factor, start.Upsilon, start.parameters
     adaptation, model = observer.adaptation, start.model
     first = [model.first()] if isinstance(model, EarlySteps) else []
-    for step in (*first, *(model.at(k) for k in range(steps))):
+    for k, step in enumerate((*first, *(model.at(k) for k in range(steps))), 1 - len(first)):
         ne, rows, nq = len(step.A), len(step.H), Upsilon.shape[1]
         S = np.zeros((rows, max(factor.shape[1] + step.noise.shape[1], rows)))
         S[:ne, : factor.shape[1]] = step.A @ factor
         S[:, factor.shape[1] : factor.shape[1] + step.noise.shape[1]] = step.noise
+        require_in_range(S, factor, k, observer.state_names)
         right = np.eye(rows)
         if nq:
             right = np.hstack([right, np.vstack([step.A @ Upsilon + step.Phi, -step.Psi])])

@@ -31,6 +31,7 @@ from obsynth.observers.step_model import (
     StepMatrices,
     StepModel,
     WalkingSteps,
+    require_in_range,
 )
 
 
@@ -214,6 +215,7 @@ class RunningRecursiveObserver:
         S = np.zeros((len(H), max(width + step.noise.shape[1], len(H))))
         S[:ne, :width] = step.A @ self.factor
         S[:, width : width + step.noise.shape[1]] = step.noise
+        require_in_range(S, self.factor, self.k, self.observer.state_names)
         unknown = np.zeros((len(H), self.diffuse.shape[1]))
         unknown[:ne] = step.A @ self.diffuse
         kept = ~np.isnan(right[:, 0])

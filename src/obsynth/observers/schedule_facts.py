@@ -15,6 +15,8 @@ from obsynth.observers.recursive_estimates import excitation_levels
 
 #: Errors that shrank below this are gone; the product starts anew from there, so that it does not underflow.
 UNDERFLOW = 1e-200
+#: On shorter horizons an error need not have shrunk yet, so that the contraction only informs.
+STEPS_TO_CONTRACT = 50
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +31,8 @@ class ScheduleFacts:
         ``norm(product of L_k A_k)^(1 / steps)``: the mean factor by which an error shrinks in a step.
     growth : float
         The largest norm of the product on the way: how much an error may grow before it dies out.
+    survivors : FloatArray
+        ``(nx,)``: size of the product in each state after the last step, relative to its largest: where errors last.
     excitation : float
         The least eigenvalue of the information on the parameters in any window, (26); NaN without parameters.
     excitation_k : int
@@ -44,6 +48,7 @@ class ScheduleFacts:
     steps: int
     contraction: float
     growth: float
+    survivors: FloatArray
     excitation: float
     excitation_k: int
     L: FloatArray
@@ -82,7 +87,7 @@ def schedule_facts(observer: RecursiveObserver) -> ScheduleFacts:
     schedule = list(gain_steps(plain, steps))
     last = schedule[-1]
     ne = len(last.step.A)
-    contraction, growth = _contraction(schedule, observer.plant.nx)
+    contraction, growth, survivors = _contraction(schedule, observer.plant.nx)
     window = observer.adaptation.window if observer.adaptation is not None else 1
     levels = excitation_levels([found.G for found in schedule], window)[window - 1 :]
     deviations, state_deviations = _lengths(last.spread), _lengths(last.factor)
@@ -94,6 +99,7 @@ def schedule_facts(observer: RecursiveObserver) -> ScheduleFacts:
         steps=len(schedule),
         contraction=contraction,
         growth=growth,
+        survivors=survivors,
         excitation=float(levels.min()) if learning and levels.size else float("nan"),
         excitation_k=int(levels.argmin()) + window if learning and levels.size else 0,
         L=last.gain[:, :ne],
@@ -107,16 +113,22 @@ def _lengths(factor: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(np.einsum("ij,ij->i", factor, factor)))
 
 
-def _contraction(schedule: Sequence[GainStep], nx: int) -> tuple[float, float]:
+def _contraction(schedule: Sequence[GainStep], nx: int) -> tuple[float, float, FloatArray]:
     product, logarithm, growth = np.eye(nx), 0.0, 1.0
     for found in schedule:
         product = found.gain[:, : len(found.step.A)] @ found.step.A @ product
         size = float(np.linalg.norm(product, 2))
         growth = max(growth, size * float(np.exp(min(logarithm, 0.0))))
         if not size < 1.0 / UNDERFLOW:
-            return float("inf"), float("inf")
+            return float("inf"), float("inf"), _shares(product)
         if size == 0.0:
-            return 0.0, growth
+            return 0.0, growth, _shares(product)
         if size < UNDERFLOW:
             product, logarithm = product / size, logarithm + float(np.log(size))
-    return float(np.exp((logarithm + np.log(np.linalg.norm(product, 2))) / len(schedule))), growth
+    mean = float(np.exp((logarithm + np.log(np.linalg.norm(product, 2))) / len(schedule)))
+    return mean, growth, _shares(product)
+
+
+def _shares(product: FloatArray) -> FloatArray:
+    sizes = np.max(np.abs(product), axis=1)
+    return np.asarray(sizes / max(float(sizes.max()), np.finfo(np.float64).tiny))

@@ -6,17 +6,20 @@ Random walk: the parameters become states, of the equations that led to x(k + 1)
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from obsynth.analysis.time_varying import IntArray
-from obsynth.errors import SpecError
+from obsynth.analysis.zeros import leading_names
+from obsynth.errors import PreconditionError, SpecError
 from obsynth.models.sequences import MatrixSequence
 from obsynth.models.time_varying import TimeVaryingDescriptorSystem
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.covariances import covariance_factor
+from obsynth.numerics.ranks import OUTGROWN
 
 
 class StepMatrices(NamedTuple):
@@ -58,6 +61,31 @@ def stacked_noise(first: FloatArray, second: FloatArray) -> FloatArray:
     noise = np.zeros((len(first) + len(second), first.shape[1] + second.shape[1]))
     noise[: len(first), : first.shape[1]], noise[len(first) :, first.shape[1] :] = first, second
     return noise
+
+
+def require_in_range(S: FloatArray, factor: FloatArray, k: int, state_names: Sequence[str]) -> None:
+    """Raise `PreconditionError` when deviations outgrow double precision on the way to sample ``k``.
+
+    Parameters
+    ----------
+    S : FloatArray
+        Square root of the covariance of the data of a step.
+    factor : FloatArray
+        ``(nx or more, any)``: that of the state before it.
+    k : int
+        The sample that the step leads to.
+    state_names : sequence of str
+        Names of the first rows of ``factor``.
+    """
+    if float(np.max(np.abs(S), initial=0.0)) < OUTGROWN:
+        return
+    sizes = np.max(np.abs(np.nan_to_num(factor[: len(state_names)])), axis=1, initial=0.0)
+    names = leading_names(sizes, state_names)
+    raise PreconditionError(
+        f"The errors outgrow double precision at k = {k}: the outputs do not show, or not often enough, what grows in "
+        f"{', '.join(map(repr, names))}. Measure more, shorten the horizon, or leave out what grows unseen.",
+        condition="bounded errors", signals=names,
+    )  # fmt: skip
 
 
 @dataclass

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.analysis.conditions import require_all
-from obsynth.analysis.time_varying import as_time_varying, recursive_conditions
+from obsynth.analysis.recursive_conditions import recursive_conditions
+from obsynth.analysis.time_varying import as_time_varying
 from obsynth.errors import SolverError, SpecError
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.models.time_varying import TimeVaryingDescriptorSystem

@@ -19,7 +19,8 @@ from collections.abc import Callable
 from typing import Any
 
 from obsynth.analysis.conditions import Condition, require_all
-from obsynth.analysis.time_varying import as_time_varying, recursive_conditions
+from obsynth.analysis.recursive_conditions import recursive_conditions
+from obsynth.analysis.time_varying import as_time_varying
 from obsynth.errors import SpecError
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.models.time_varying import TimeVaryingDescriptorSystem
@@ -28,10 +29,10 @@ from obsynth.synthesis.result import Synthesis
 
 
 def conditions(
-    plant: DescriptorSystem | TimeVaryingDescriptorSystem, *, form: str = "innovation"
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem, *, form: str = "innovation", early_constraints: bool = False
 ) -> tuple[Condition, ...]:
     """Return the existence conditions; the list ends at the first failure."""
-    return tuple(recursive_conditions(plant, parameters=True, literal=form == "literal"))
+    return tuple(recursive_conditions(plant, parameters=True, literal=form == "literal", early=early_constraints))
 
 
 def synthesise(
@@ -60,7 +61,7 @@ def synthesise(
         raise SpecError("random_walk belongs to form 'random-walk': the other forms forget instead.",
                         path="method.options.random_walk")  # fmt: skip
     progress("checking the existence conditions along the horizon")
-    require_all(conditions(plant, form=form))
+    require_all(conditions(plant, form=form, early_constraints=early_constraints))
     options = with_stated_noise(plant, {
         "Q": Q, "R": R, "initial_state": initial_state, "initial_covariance": initial_covariance,
         "early_constraints": early_constraints, "form": form, "forgetting": forgetting,

@@ -18,16 +18,19 @@ from collections.abc import Callable
 from typing import Any
 
 from obsynth.analysis.conditions import Condition, require_all
-from obsynth.analysis.time_varying import as_time_varying, recursive_conditions
+from obsynth.analysis.recursive_conditions import recursive_conditions
+from obsynth.analysis.time_varying import as_time_varying
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.models.time_varying import TimeVaryingDescriptorSystem
 from obsynth.synthesis.recursive_design import recursive_synthesis, with_stated_noise
 from obsynth.synthesis.result import Synthesis
 
 
-def conditions(plant: DescriptorSystem | TimeVaryingDescriptorSystem) -> tuple[Condition, ...]:
+def conditions(
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem, *, early_constraints: bool = False
+) -> tuple[Condition, ...]:
     """Return the existence conditions; the list ends at the first failure."""
-    return tuple(recursive_conditions(plant, parameters=False))
+    return tuple(recursive_conditions(plant, parameters=False, early=early_constraints))
 
 
 def synthesise(
@@ -42,7 +45,7 @@ def synthesise(
 ) -> Synthesis:
     """Put the filter together; see `obsynth.descriptor_kalman` for the options, results and errors."""
     progress("checking the existence conditions along the horizon")
-    require_all(conditions(plant))
+    require_all(conditions(plant, early_constraints=early_constraints))
     options = with_stated_noise(plant, {
         "Q": Q, "R": R, "initial_state": initial_state, "initial_covariance": initial_covariance,
         "early_constraints": early_constraints,
