@@ -156,11 +156,14 @@ def as_time_varying(plant: DescriptorSystem | TimeVaryingDescriptorSystem) -> Ti
     Raises
     ------
     SpecError
-        It is continuous in time, or has feedthrough or disturbances.
+        It is no linear plant, continuous in time, or has feedthrough or disturbances.
     """
-    return (
-        plant if isinstance(plant, TimeVaryingDescriptorSystem) else TimeVaryingDescriptorSystem.from_descriptor(plant)
-    )
+    if isinstance(plant, TimeVaryingDescriptorSystem):
+        return plant
+    if not isinstance(plant, DescriptorSystem):
+        raise SpecError(f"The plant is a {type(plant).__name__}: give an obsynth.DescriptorSystem or "
+                        "TimeVaryingDescriptorSystem.", path="plant")  # fmt: skip
+    return TimeVaryingDescriptorSystem.from_descriptor(plant)
 
 
 def algebraic_rows(plant: TimeVaryingDescriptorSystem, steps: int) -> IntArray:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
+from obsynth.numerics.arguments import chosen, real_array, real_number, real_vector
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.gain_schedule import gain_steps
 from obsynth.observers.recursive import RecursiveObserver
@@ -114,19 +115,18 @@ def decide(
     adaptation = observer.adaptation
     if adaptation is None:
         raise SpecError("A decision on parameters needs an observer that estimates them.", path="observer")
-    if statistic not in STATISTICS:
-        raise SpecError(f"statistic is {statistic!r}: use one of {', '.join(STATISTICS)}.", path="statistic")
+    chosen(statistic, "statistic", STATISTICS)
+    false_alarms = real_number(false_alarms, "false_alarms", "a probability between 0 and 1")
     if not 0.0 < false_alarms < 1.0:
         raise SpecError(f"false_alarms is {false_alarms}: give a probability between 0 and 1.", path="false_alarms")
     if adaptation.form == "random-walk" and statistic in ("cusum", "glr"):
         raise SpecError(f"{statistic} needs regressors, which the random walk does not have: use form 'innovation'.",
                         path="statistic")  # fmt: skip
     nq = len(adaptation.initial_parameters)
-    theta = adaptation.initial_parameters if nominal is None else np.atleast_1d(np.asarray(nominal, dtype=np.float64))
-    size = np.broadcast_to(np.asarray(change, dtype=np.float64), (nq,)) if np.ndim(change) == 0 else np.asarray(change)
-    if theta.shape != (nq,) or not np.isfinite(theta).all():
-        raise SpecError(f"nominal must be {nq} finite number(s).", path="nominal")
-    if size.shape != (nq,) or not (size > 0.0).all():
+    theta = adaptation.initial_parameters if nominal is None else real_vector(nominal, nq, "nominal")
+    size = real_array(change, "change")
+    size = np.broadcast_to(size, (nq,)) if size.ndim == 0 else size
+    if size.shape != (nq,) or not ((size > 0.0) & (size < np.inf)).all():
         raise SpecError(f"change must be one positive number, or {nq}.", path="change")
     if statistic == "chi-square":
         return _chi_square(estimates, theta, false_alarms)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
+from obsynth.numerics.arguments import real_array
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.least_squares_step import least_squares_step, rank_revealing_step
 from obsynth.numerics.recursive_least_squares import update
@@ -140,11 +141,11 @@ def run_batch(observer: RecursiveObserver, y: ArrayLike, u: ArrayLike | None = N
     """
     if observer.adaptation is not None and observer.adaptation.reset:
         raise SpecError("Resets depend on the data of each trial: run them one by one, or without reset.", path="reset")
-    outputs = np.asarray(y, dtype=np.float64)
+    outputs = real_array(y, "y")
     if outputs.ndim != 3 or outputs.shape[2] != observer.plant.ny:
         raise SpecError(f"y has shape {outputs.shape}, but (trials, samples, {observer.plant.ny}) is needed.", path="y")
     trials, samples = outputs.shape[:2]
-    known = np.zeros((samples, 0)) if u is None and not observer.plant.nu else np.asarray(u, dtype=np.float64)
+    known = np.zeros((samples, 0)) if u is None and not observer.plant.nu else real_array(u, "u")
     if known.ndim not in (2, 3) or known.shape[-2:] != (samples, observer.plant.nu):
         raise SpecError(f"u has shape {known.shape}, but (trials, samples, {observer.plant.nu}) is needed.", path="u")
     if not (np.isfinite(outputs[:, 1:]).all() and np.isfinite(known).all()):

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.analysis.time_varying import STEPS_WITHOUT_HORIZON, algebraic_rows
-from obsynth.errors import PreconditionError, SpecError
+from obsynth.errors import PreconditionError
+from obsynth.numerics.arguments import real_array, real_vector
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.covariances import covariance_factor
 from obsynth.numerics.least_squares_step import (
@@ -144,10 +145,8 @@ class RunningRecursiveObserver:
             Rank H_k is lost at this k although no sample is missing.
         """
         plant = self.observer.plant
-        outputs = measured_record(np.atleast_2d(np.asarray(y)), plant.ny)[0]
-        inputs = np.asarray(u, dtype=np.float64)
-        if inputs.shape != (plant.nu,) or not np.isfinite(inputs).all():
-            raise SpecError(f"u must be {plant.nu} finite number(s).", path="u")
+        outputs = measured_record(np.atleast_2d(real_array(y, "y")), plant.ny)[0]
+        inputs = real_vector(u, plant.nu, "u")
         require_horizon(plant.horizon, self.k + 1, early=self.observer.early_constraints)
         return RecursiveEstimates.of(self.observer, [self.raw_step(outputs, inputs)], window=list(self.window))
 

@@ -24,6 +24,8 @@ from obsynth.analysis.time_varying import as_time_varying
 from obsynth.errors import SpecError
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.models.time_varying import TimeVaryingDescriptorSystem
+from obsynth.numerics.arguments import chosen, truth
+from obsynth.observers.recursive import FORMS
 from obsynth.synthesis.recursive_design import recursive_synthesis, with_stated_noise
 from obsynth.synthesis.result import Synthesis
 
@@ -54,6 +56,7 @@ def synthesise(
     reset: float = 0.0,
 ) -> Synthesis:
     """Put the observer together; see `obsynth.adaptive_observer` for the options, results and errors."""
+    literal = chosen(form, "form", FORMS) == "literal"
     if form == "random-walk" and random_walk is None:
         raise SpecError("form 'random-walk' needs random_walk, the variance of one step of each parameter.",
                         path="method.options.random_walk")  # fmt: skip
@@ -61,11 +64,11 @@ def synthesise(
         raise SpecError("random_walk belongs to form 'random-walk': the other forms forget instead.",
                         path="method.options.random_walk")  # fmt: skip
     progress("checking the existence conditions along the horizon")
-    require_all(conditions(plant, form=form, early_constraints=early_constraints))
+    require_all(conditions(plant, form=form, early_constraints=truth(early_constraints, "early_constraints")))
     options = with_stated_noise(plant, {
         "Q": Q, "R": R, "initial_state": initial_state, "initial_covariance": initial_covariance,
         "early_constraints": early_constraints, "form": form, "forgetting": forgetting,
-        "guard": guard or ("none" if form == "literal" else "regularise"),
+        "guard": ("none" if literal else "regularise") if guard is None else guard,
         "initial_parameters": initial_parameters, "initial_parameter_covariance": initial_parameter_covariance,
         "random_walk": random_walk, "window": window, "reset": reset,
     })  # fmt: skip

@@ -22,6 +22,7 @@ from obsynth.analysis.recursive_conditions import recursive_conditions
 from obsynth.analysis.time_varying import as_time_varying
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.models.time_varying import TimeVaryingDescriptorSystem
+from obsynth.numerics.arguments import truth
 from obsynth.synthesis.recursive_design import recursive_synthesis, with_stated_noise
 from obsynth.synthesis.result import Synthesis
 
@@ -45,7 +46,7 @@ def synthesise(
 ) -> Synthesis:
     """Put the filter together; see `obsynth.descriptor_kalman` for the options, results and errors."""
     progress("checking the existence conditions along the horizon")
-    require_all(conditions(plant, early_constraints=early_constraints))
+    require_all(conditions(plant, early_constraints=truth(early_constraints, "early_constraints")))
     options = with_stated_noise(plant, {
         "Q": Q, "R": R, "initial_state": initial_state, "initial_covariance": initial_covariance,
         "early_constraints": early_constraints,
