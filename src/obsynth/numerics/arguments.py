@@ -33,10 +33,13 @@ def truth(value: Any, name: str) -> bool:
 
 def real_vector(value: Any, size: int, name: str) -> FloatArray:
     """Return ``(size,)`` finite real numbers; a single one may be given as such."""
-    vector = real_array(value, name)
-    vector = np.atleast_1d(vector)
+    wanted = SpecError(f"{name} must be {size} finite number(s).", path=name)
+    try:
+        vector = np.atleast_1d(real_array(value, name))
+    except SpecError:
+        raise wanted from None
     if vector.shape != (size,) or not np.isfinite(vector).all():
-        raise SpecError(f"{name} must be {size} finite number(s).", path=name)
+        raise wanted
     return vector
 
 
