@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import real_array
@@ -57,7 +57,9 @@ class GainStep(NamedTuple):
     spread: FloatArray
 
 
-def gain_steps(observer: RecursiveObserver, steps: int) -> Iterator[GainStep]:
+def gain_steps(
+    observer: RecursiveObserver, steps: int, *, received: NDArray[np.bool_] | None = None
+) -> Iterator[GainStep]:
     """Yield the gains of the first steps.
 
     Parameters
@@ -66,9 +68,12 @@ def gain_steps(observer: RecursiveObserver, steps: int) -> Iterator[GainStep]:
         At rest.
     steps : int
         How many; with early constraints the correction of x(0) comes before them.
+    received : numpy.ndarray, optional
+        ``(samples, ny)``, of bool: which outputs of a record were there; all by default.  The gains are those of that
+        record, with zero columns for what was missing.
     """
     start = RunningRecursiveObserver(observer)
-    factor, Upsilon, parameters = start.factor, start.Upsilon, start.parameters
+    factor, Upsilon, parameters, diffuse = start.factor, start.Upsilon, start.parameters, start.diffuse
     adaptation, model = observer.adaptation, start.model
     first = [model.first()] if isinstance(model, EarlySteps) else []
     for k, step in enumerate((*first, *(model.at(k) for k in range(steps))), 1 - len(first)):
@@ -80,16 +85,21 @@ def gain_steps(observer: RecursiveObserver, steps: int) -> Iterator[GainStep]:
         right = np.eye(rows)
         if nq:
             right = np.hstack([right, np.vstack([step.A @ Upsilon + step.Phi, -step.Psi])])
-        found = least_squares_step(step.H, S, right) or rank_revealing_step(
-            step.H, S, right, np.zeros((rows, 0)), mapped=rows
-        )
+        unknown = np.vstack([step.A @ diffuse, np.zeros((rows - ne, diffuse.shape[1]))])
+        H = step.H
+        if received is not None and k and not received[k].all():
+            kept = np.concatenate([np.ones(ne, dtype=bool), received[k], np.ones(len(step.Dn), dtype=bool)])
+            H, S, right, unknown = H[kept], S[kept], right[kept], unknown[kept]
+        found = None if unknown.shape[1] else least_squares_step(H, S, right)
+        found = found or rank_revealing_step(H, S, right, unknown, mapped=rows)
+        diffuse = found.diffuse
         gain, Upsilon, factor = found.estimate[:, :rows], found.estimate[:, rows:], found.factor
         parity, G = found.innovation[:, :rows], -found.innovation[:, rows:]
         learn, forget = np.zeros((nq, rows)), np.eye(nq)
         if adaptation is not None and nq:
             seen, regressor, noise = parity, G, None
-            if start.literal and rows > ne:
-                seen, regressor, noise = posterior_residual(found, step.H, S, right, ne, columns=rows)
+            if start.literal and len(H) > ne:
+                seen, regressor, noise = posterior_residual(found, H, S, right, ne, unknown=unknown, columns=rows)
             parameters, theta_gain = update(
                 parameters, np.zeros(len(regressor)), regressor, forgetting=adaptation.forgetting,
                 regular=start.regular, directional=start.directional, noise=noise,

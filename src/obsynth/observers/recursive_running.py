@@ -57,6 +57,8 @@ class RawEstimate(NamedTuple):
         ``(m, nq)``.
     nis : float
         Squared length of the innovation at the parameters estimated one sample before.
+    y : FloatArray
+        ``(ny,)``: the outputs that were given, NaN where one was missing.
     """
 
     k: int
@@ -67,6 +69,7 @@ class RawEstimate(NamedTuple):
     innovation: FloatArray
     regressor: FloatArray
     nis: float
+    y: FloatArray
 
 
 def step_model_of(observer: RecursiveObserver) -> StepModel:
@@ -168,7 +171,7 @@ class RunningRecursiveObserver:
         self.window.append(found[1])
         self.u = u
         gap = found[0] - found[1] @ before if len(before) else found[0]
-        estimate = self._estimate(*found, float(gap @ gap))
+        estimate = self._estimate(*found, float(gap @ gap), y)
         self.k += 1
         return estimate
 
@@ -231,22 +234,22 @@ class RunningRecursiveObserver:
                 )  # fmt: skip
         self.lesson = None
         if self.literal and len(H) > ne:
-            seen, regressor, noise = posterior_residual(found, H, S, right, ne)
+            seen, regressor, noise = posterior_residual(found, H, S, right, ne, unknown=unknown)
             self.lesson = seen[:, 0], regressor, noise
         return found
 
-    def _estimate(self, innovation: FloatArray, regressor: FloatArray, nis: float) -> RawEstimate:
+    def _estimate(self, innovation: FloatArray, regressor: FloatArray, nis: float, y: FloatArray) -> RawEstimate:
         if self.walking:
             nx = self.observer.plant.nx
             nq = len(self.x) - nx
             spread = self.factor[nx:]
             known = ParameterState(self.x[nx:], np.zeros((nq, nq)), spread)
             return RawEstimate(
-                self.k, self.x[:nx], self.factor[:nx], self.diffuse[:nx], known, innovation, np.zeros((0, nq)), nis
+                self.k, self.x[:nx], self.factor[:nx], self.diffuse[:nx], known, innovation, np.zeros((0, nq)), nis, y
             )
         known = self.parameters
         x, factor = self.x, self.factor
         if len(known.theta):
             x = x + self.Upsilon @ known.theta
             factor = np.hstack((factor, self.Upsilon @ known.spread))
-        return RawEstimate(self.k, x, factor, self.diffuse, known, innovation, regressor, nis)
+        return RawEstimate(self.k, x, factor, self.diffuse, known, innovation, regressor, nis, y)
