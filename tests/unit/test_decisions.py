@@ -1,4 +1,4 @@
-"""Decisions on parameters, the steady state, and consistent simulation."""
+"""Decisions on parameters, and consistent simulation."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from time_varying_plants import observer_for, printed, textbook, varying
 from obsynth import DescriptorSystem, PreconditionError, SpecError, TimeVaryingDescriptorSystem
 from obsynth.observers.decisions import STATISTICS, decide
 from obsynth.simulation.time_varying import simulate_time_varying
-from obsynth.synthesis.steady_filter import steady_state_filter
 
 SAMPLES, CHANGE = 160, 90
 PLANT = varying(horizon=SAMPLES)
@@ -106,48 +105,6 @@ def test_bad_options() -> None:
             decide(observer, found, **options)
     with pytest.raises(SpecError, match="needs an observer that estimates"):
         decide(observer_for(PLANT), found)
-
-
-class TestSteadyState:
-    PLANT = TimeVaryingDescriptorSystem(
-        np.diag([1.0, 1, 0]), [[0.9, 0.1, 0.3], [0.0, 0.7, 0.2], [1.0, 0.4, -1.0]], C=[[1, 0, 0.3], [0, 1, 1]], dt=1.0
-    )
-    Q, R = np.diag([0.1, 0.2, 0.3]), np.array([[20.0, 5.0], [5.0, 40.0]])
-
-    def covariances(self, steps: int) -> list[np.ndarray]:
-        running = observer_for(self.PLANT, Q=self.Q, R=self.R).start()
-        rows = [running.raw_step(np.zeros(2), np.zeros(0)) for _ in range(steps)]
-        return [row.factor @ row.factor.T for row in rows]
-
-    def test_the_recursion_converges_to_it_at_its_rate(self) -> None:
-        steady = steady_state_filter(self.PLANT, Q=self.Q, R=self.R)
-        found = self.covariances(200)
-        np.testing.assert_allclose(found[-1], steady.P, rtol=0, atol=1e-13)
-        np.testing.assert_allclose(steady.L @ self.PLANT.E.at(1) + steady.K @ self.PLANT.C.at(1), np.eye(3), atol=1e-12)
-        A = self.PLANT.A.at(0)
-        np.testing.assert_allclose(steady.P_predicted, A @ steady.P @ A.T + self.Q, atol=1e-15)
-        gaps = [np.linalg.norm(P - steady.P) for P in found]
-        assert (gaps[30] / gaps[20]) ** (1 / 10) == pytest.approx(steady.rate, rel=0.01)
-        assert 0.05 < steady.rate < 0.9
-
-    def test_the_printed_equation_has_it_for_a_solution(self) -> None:
-        """(16), with E and A as printed."""
-        steady = steady_state_filter(self.PLANT, Q=self.Q, R=self.R)
-        E, A, C, P = self.PLANT.E.at(1), self.PLANT.A.at(0), self.PLANT.C.at(1), steady.P_predicted
-        inner = E.T @ np.linalg.inv(P) @ E + C.T @ np.linalg.inv(self.R) @ C
-        np.testing.assert_allclose(A @ np.linalg.inv(inner) @ A.T + self.Q, P, atol=1e-12)
-
-    def test_refusals(self) -> None:
-        with pytest.raises(SpecError, match="changes with k"):
-            steady_state_filter(varying(), Q=np.eye(3), R=np.eye(2))
-        with pytest.raises(SpecError, match="Q is singular"):
-            steady_state_filter(self.PLANT, Q=np.diag([1.0, 1, 0]), R=self.R)
-        with pytest.raises(SpecError, match=r"R is \(1, 1\)"):
-            steady_state_filter(self.PLANT, Q=self.Q, R=[[1.0]])
-        with pytest.raises(PreconditionError, match="rank"):
-            steady_state_filter(self.PLANT.replace(C=[[1, 0, 0], [0, 1, 0]]), Q=self.Q, R=self.R)
-        discrete = DescriptorSystem(np.eye(2), 0.5 * np.eye(2), C=np.eye(2), dt=1.0)
-        assert steady_state_filter(discrete, Q=np.eye(2), R=np.eye(2)).rate < 0.25
 
 
 class TestSimulation:

@@ -16,7 +16,7 @@ from obsynth.models.descriptor import DescriptorSystem
 from obsynth.models.time_varying import TimeVaryingDescriptorSystem
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.pencils import finite_zeros
-from obsynth.numerics.ranks import RANK_TOLERANCE
+from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, RANK_TOLERANCE
 from obsynth.numerics.scaling import equilibrate_pencil
 
 _SOURCE = "Moussa Ali, Zhang 2013"
@@ -119,9 +119,9 @@ def detectability_condition(plant: TimeVaryingDescriptorSystem) -> Condition:
         return Condition("detectability", claim, True, 0.0, 0.0, source, rest)
     mode = hidden[0]
     names = _open_states(tall_e, tall_a, mode, plant)
-    others = [_number(z) for z in hidden[1:] if z.imag >= 0.0 and z != mode]
+    others = [described_mode(z) for z in hidden[1:] if z.imag >= 0.0 and z != mode]
     detail = (
-        f"the mode z = {_number(mode)} of {_listed(names)} shows in no output"
+        f"the mode z = {described_mode(mode)} of {_listed(names)} shows in no output"
         + (f" (as the modes {', '.join(others)})" if others else "")
         + f", so that an error in it {'grows' if abs(mode) > 1.0 + RANK_TOLERANCE else 'stays'} for ever. Measure "
         "something that it moves, or leave it out of the model."
@@ -155,8 +155,10 @@ def _open_states(E: FloatArray, A: FloatArray, point: complex, plant: TimeVaryin
     return leading_names(np.linalg.norm(kernel, axis=0), plant.state_names)
 
 
-def _number(value: complex) -> str:
-    return f"{value.real:.6g}" if value.imag == 0.0 else f"{value.real:.6g} +/- {abs(value.imag):.6g}j"
+def described_mode(value: complex) -> str:
+    """Return an eigenvalue as a text, a pair as one."""
+    real = 0.0 if abs(value.real) <= CANCELLATION_TOLERANCE * abs(value) else value.real
+    return f"{real:.6g}" if value.imag == 0.0 else f"{real:.6g} +/- {abs(value.imag):.6g}j"
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -12,11 +12,13 @@ from obsynth.analysis.zeros import leading_names
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.models.time_varying import TimeVaryingDescriptorSystem
+from obsynth.numerics.covariances import covariance_factor
 from obsynth.observers.building import observer_from_options, plain_options
 from obsynth.observers.recursive import RecursiveObserver
 from obsynth.observers.schedule_facts import STEPS_TO_CONTRACT, ScheduleFacts, schedule_facts
 from obsynth.results.design import Certificate
 from obsynth.synthesis.result import Synthesis
+from obsynth.synthesis.steady_filter import reached_condition
 
 #: Information on the parameters in a window below this share of their prior's is as good as none.
 LOST_EXCITATION = 1.0
@@ -116,6 +118,11 @@ def _notes(
             f"H_k has the condition number {ranks.condition:.3g} at k = {ranks.condition_k}: about "
             f"{np.log10(ranks.condition):.0f} digits of the estimate are lost there."
         )
+    if observer.plant.is_time_invariant and observer.Q.is_constant and observer.R.is_constant:
+        roots = covariance_factor(observer.Q.at(0), "Q"), covariance_factor(observer.R.at(0), "R")
+        reached = reached_condition(observer.plant, *roots)
+        if not reached.holds:
+            yield f"The filter has no steady state: {reached.detail}"
     adaptation = observer.adaptation
     if adaptation is None:
         return
