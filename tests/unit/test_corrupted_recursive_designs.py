@@ -184,12 +184,7 @@ def test_claims_alone_fail_alone() -> None:
 
 def test_every_row_that_decides_has_a_corruption() -> None:
     broken = set().union(*(expected for _, _, expected in TABLE.values()))
-    produced = {
-        check.name
-        for name in GOOD
-        for check in good(name).report.checks
-        if check.kind != "information"
-    }
+    produced = {check.name for name in GOOD for check in good(name).report.checks if check.kind != "information"}
     assert produced <= broken
     assert broken - produced == {RUNS}
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from time_varying_plants import observer_for, printed, textbook, varying
 
-from obsynth import DescriptorSystem, PreconditionError, SpecError, TimeVaryingDescriptorSystem
+from obsynth import PreconditionError, SpecError, TimeVaryingDescriptorSystem
 from obsynth.observers.decisions import STATISTICS, decide
 from obsynth.simulation.time_varying import simulate_time_varying
 

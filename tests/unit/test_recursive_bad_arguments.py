@@ -94,7 +94,7 @@ def test_a_spec_error_names_the_argument(name: str) -> None:
 
 @pytest.mark.parametrize("value", ["a", None, 1, 0.0, [], object()])
 def test_what_is_yes_or_no(value: Any) -> None:
-    with pytest.raises(SpecError, match="early_constraints is .*: give True or False"):
+    with pytest.raises(SpecError, match=r"early_constraints is .*: give True or False"):
         obsynth.descriptor_kalman(varying(horizon=12), Q=0.1, R=0.2, early_constraints=value)
 
 

@@ -65,7 +65,7 @@ class TestDetectability:
         observer = obsynth.descriptor_kalman(
             TimeVaryingDescriptorSystem(None, late, C=[[1, 0]], dt=1.0), **NOISE
         ).observer  # fmt: skip
-        with pytest.raises(PreconditionError, match="outgrow double precision at k = 12[0-9][0-9]: .* in 'x2'"):
+        with pytest.raises(PreconditionError, match=r"outgrow double precision at k = 12[0-9][0-9]: .* in 'x2'"):
             observer.run(np.zeros((1400, 1)))
 
     def test_nothing_forgets_what_is_claimed_to_be_known(self) -> None:
@@ -140,7 +140,7 @@ class TestParameters:
         assert obsynth.adaptive_observer(sampled(A, C, Bf=Phi[:, :2], Df=Psi[:, :2]), **NOISE).report.passed
 
     def test_of_plants_that_change(self) -> None:
-        def plant(Phi, C=np.eye(2)) -> TimeVaryingDescriptorSystem:
+        def plant(Phi, C=((1.0, 0.0), (0.0, 1.0))) -> TimeVaryingDescriptorSystem:
             A = [["0.5 + 0.1 * sin(k)", 0], [0, 0.7]]
             return TimeVaryingDescriptorSystem(None, A, C=C, Phi=Phi, dt=1.0, horizon=100)
 

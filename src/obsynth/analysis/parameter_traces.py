@@ -140,5 +140,3 @@ def _scaled(blocks: StepBlocks, rows: FloatArray, columns: FloatArray) -> StepBl
     return StepBlocks(
         up * blocks.E * columns, up * blocks.A * columns, up * blocks.Phi, down * blocks.C * columns, down * blocks.Psi
     )
-
-

@@ -86,13 +86,12 @@ def _rank_of_steps(plant: TimeVaryingDescriptorSystem, ranks: HorizonRanks, *, e
         if late.size and horizon_ranks(plant, early=True).worst.full:
             remedies.append("use the algebraic equations one step earlier (early_constraints: true)")
         if late.size:
-            remedies.append("eliminate the algebraic states (transform: {eliminate_algebraic_states: true} in continuous "
-                            "time, before sampling)")  # fmt: skip
+            remedies.append("eliminate the algebraic states (transform: {eliminate_algebraic_states: true} in "
+                            "continuous time, before sampling)")  # fmt: skip
     remedies.append("leave out states that nothing depends on")
     at = "" if ranks.steps == 1 else f"at k = {ranks.worst_k} "
     detail = (
-        f"{ranks.worst.describe()}: {at}equations and outputs do not determine {_listed(names)}. "
-        f"{_sentence(remedies)}"
+        f"{ranks.worst.describe()}: {at}equations and outputs do not determine {_listed(names)}. {_sentence(remedies)}"
     )
     return replace(condition, detail=detail, signals=names)
 

@@ -99,7 +99,9 @@ def read_matrices(path: Path, *, variable: str | None = None, count: int | None 
     if count is not None and len(stack) != count:
         raise SpecError(f"{path.name} holds a stack of {len(stack)} matrices, not {count}.", path=where)
     return read_only(
-        np.array([_checked(matrix, f"{path.name}, matrix {k + 1} of the stack,", where) for k, matrix in enumerate(stack)])
+        np.array(
+            [_checked(matrix, f"{path.name}, matrix {k + 1} of the stack,", where) for k, matrix in enumerate(stack)]
+        )
     )
 
 

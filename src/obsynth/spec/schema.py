@@ -160,7 +160,9 @@ class VaryingFile(MatrixFile):
 def _kind_of_varying(value: Any) -> str:
     if isinstance(value, dict):
         return _FILE
-    deep = isinstance(value, list) and value and isinstance(value[0], list) and value[0] and isinstance(value[0][0], list)
+    deep = (
+        isinstance(value, list) and value and isinstance(value[0], list) and value[0] and isinstance(value[0][0], list)
+    )
     return _STACK if deep else _ROWS
 
 
