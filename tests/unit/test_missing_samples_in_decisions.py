@@ -55,7 +55,7 @@ def test_gains_reproduce_a_run_with_gaps(form: str, early: bool) -> None:
 
 @pytest.mark.parametrize("early", [False, True])
 def test_the_glr_is_the_likelihood_ratio_of_the_record(early: bool) -> None:
-    """Against a jump that is put into the data: for every onset, the innovations of the difference are the signature."""
+    """Against a jump that is put into the data: the innovations of the difference are the signature."""
     plant, onset, theta = varying(horizon=SAMPLES), 9, np.array([0.7, -1.2])
     shipped = observer(early)
     y, u = gappy(plant)

@@ -195,9 +195,8 @@ def _explained(item: Any, model: type[BaseModel], prefix: str) -> tuple[str, str
         wanted = "a list of numbers" if in_rows and kind in ("list_type", "too_short") else _wanted(kind, context)
         wanted = "a list of rows, such as [[1, 0], [0, 1]]" if in_rows and not numbers else wanted
         text = f"must be {wanted}, not {_found(kind, value)}."
-    place = _position(
-        numbers, ("matrix", "row", "column") if in_stack else ("row", "column") if in_rows else ("entry",)
-    )
+    words = ("matrix", "row", "column") if in_stack else ("row", "column") if in_rows else ("entry",)
+    place = _position(numbers, words)
     return ".".join([*([prefix] if prefix else []), *names]), f"{place}{text}"
 
 

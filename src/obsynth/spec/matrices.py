@@ -98,11 +98,8 @@ def read_matrices(path: Path, *, variable: str | None = None, count: int | None 
         raise SpecError(f"{path.name} holds an empty stack of matrices.", path=where)
     if count is not None and len(stack) != count:
         raise SpecError(f"{path.name} holds a stack of {len(stack)} matrices, not {count}.", path=where)
-    return read_only(
-        np.array(
-            [_checked(matrix, f"{path.name}, matrix {k + 1} of the stack,", where) for k, matrix in enumerate(stack)]
-        )
-    )
+    named = ((f"{path.name}, matrix {k} of the stack,", matrix) for k, matrix in enumerate(stack, 1))
+    return read_only(np.array([_checked(matrix, name, where) for name, matrix in named]))
 
 
 def _read_array(path: Path, *, variable: str | None, where: str) -> Any:

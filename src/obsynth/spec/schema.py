@@ -160,10 +160,8 @@ class VaryingFile(MatrixFile):
 def _kind_of_varying(value: Any) -> str:
     if isinstance(value, dict):
         return _FILE
-    deep = (
-        isinstance(value, list) and value and isinstance(value[0], list) and value[0] and isinstance(value[0][0], list)
-    )
-    return _STACK if deep else _ROWS
+    first = value[0] if isinstance(value, list) and value else None
+    return _STACK if isinstance(first, list) and first and isinstance(first[0], list) else _ROWS
 
 
 VaryingMatrix = Annotated[VaryingRows | Stack | Annotated[VaryingFile, Tag(_FILE)], Discriminator(_kind_of_varying)]

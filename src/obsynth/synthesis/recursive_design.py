@@ -128,8 +128,8 @@ def _notes(
         return
     if adaptation.window > facts.steps:
         yield (
-            f"The window of {adaptation.window} samples is longer than the {facts.steps} steps of the horizon: excitation "
-            "is not watched."
+            f"The window of {adaptation.window} samples is longer than the {facts.steps} steps of the horizon: "
+            "excitation is not watched."
         )
     prior = float(np.linalg.eigvalsh(np.linalg.inv(adaptation.initial_covariance))[0])
     if facts.excitation < LOST_EXCITATION * prior:
