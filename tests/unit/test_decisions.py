@@ -139,3 +139,28 @@ class TestSimulation:
             )
         with pytest.raises(SpecError, match="parameters has shape"):
             simulate_time_varying(printed(), samples=5, parameters=np.zeros((4, 1)))
+
+
+@pytest.mark.parametrize("adapt", [{}, {"form": "literal"}, {"form": "random-walk", "walk": 1e-4 * np.eye(2)}])
+def test_a_start_far_from_nominal_is_no_alarm(adapt: dict) -> None:
+    """The parameters are nominal, and the observer starts elsewhere: what it has not yet forgotten says nothing."""
+    for missing in (False, True):
+        observer, found = run(1, missing=missing, adapt={**adapt, "initial_parameters": np.array([8.0, -9.0])})
+        assert np.abs(found.parameters[0]).max() == 9.0
+        decision = decide(observer, found, nominal=[0.0, 0.0], false_alarms=0.05)
+        assert decision.values[0] == 0.0
+        assert decision.alarm is None
+        # With the same data, an observer that starts at the nominal values gives the same statistic.
+        other, same = run(1, missing=missing, adapt={**adapt, "initial_parameters": np.zeros(2)})
+        np.testing.assert_allclose(decision.values, decide(other, same).values, rtol=1e-7, atol=1e-9)
+    observer, found = run(1, jump=3.0, adapt={**adapt, "initial_parameters": np.array([8.0, -9.0])})
+    alarm = decide(observer, found, nominal=[0.0, 0.0]).alarm
+    assert alarm is not None
+    assert (alarm.parameter, 0 <= alarm.k - CHANGE <= 15) == ("theta2", True)
+
+
+def test_a_reset_forgets_the_start_at_times_that_data_choose() -> None:
+    observer, found = run(1, adapt={"reset": 1e-6, "initial_parameters": np.array([8.0, -9.0])})
+    with pytest.raises(SpecError, match="chi-square with reset"):
+        decide(observer, found, nominal=[0.0, 0.0])
+    assert decide(observer, found, nominal=[0.0, 0.0], statistic="glr", false_alarms=0.05).alarm is None

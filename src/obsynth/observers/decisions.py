@@ -129,7 +129,7 @@ def decide(
     if size.shape != (nq,) or not ((size > 0.0) & (size < np.inf)).all():
         raise SpecError(f"change must be one positive number, or {nq}.", path="change")
     if statistic == "chi-square":
-        return _chi_square(estimates, theta, false_alarms)
+        return _chi_square(observer, estimates, theta, false_alarms)
     gaps = estimates.innovations
     if adaptation.form != "random-walk":
         gaps = gaps - estimates.regressors @ theta
@@ -154,8 +154,33 @@ def _quantile(degrees: FloatArray, probability: float) -> FloatArray:
     return np.where(degrees > 0.0, chdtri(np.maximum(degrees, 1.0), probability), np.inf)
 
 
-def _chi_square(estimates: RecursiveEstimates, nominal: FloatArray, false_alarms: float) -> Decision:
+def _pull_of_the_start(
+    observer: RecursiveObserver, estimates: RecursiveEstimates, error: FloatArray
+) -> FloatArray:
+    """Return what is left, in the estimates at each sample, of an error of the initial parameters, ``(samples, nq)``."""
+    adaptation, nx = observer.adaptation, observer.plant.nx
+    if adaptation is not None and adaptation.reset:
+        raise SpecError("chi-square with reset needs nominal parameters that are the observer's initial ones: what a "
+                        "reset forgets of the start is not known. Use glr or cusum, or design with "
+                        "initial_parameters at their nominal values.", path="nominal")  # fmt: skip
+    walking = adaptation is not None and adaptation.form == "random-walk"
+    left = np.concatenate([np.zeros(nx if walking else 0), error])
+    pulls = np.tile(error, (len(estimates.parameters), 1))
+    begin = 0 if observer.early_constraints else 1
+    for k, gains in enumerate(gain_steps(observer, len(pulls) - 1, received=estimates.received), begin):
+        left = gains.gain[:, : len(gains.step.A)] @ gains.step.A @ left if walking else gains.forget @ left
+        pulls[k] = left[-len(error) :]
+    return pulls
+
+
+def _chi_square(
+    observer: RecursiveObserver, estimates: RecursiveEstimates, nominal: FloatArray, false_alarms: float
+) -> Decision:
     gaps, nq = estimates.parameters - nominal, len(nominal)
+    start = np.zeros(nq) if observer.adaptation is None else observer.adaptation.initial_parameters - nominal
+    if start.any() and len(gaps):
+        # Where the observer starts is no evidence: only what data have said since may raise an alarm.
+        gaps = gaps - _pull_of_the_start(observer, estimates, start)
     values = np.array([
         gap @ np.linalg.pinv(covariance, hermitian=True) @ gap
         for gap, covariance in zip(gaps, estimates.parameter_covariances, strict=True)
