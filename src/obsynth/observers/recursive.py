@@ -139,11 +139,6 @@ class RecursiveObserver:
         object.__setattr__(self, "initial_covariance", covariance)
         if self.adaptation is not None and len(self.adaptation.initial_parameters) != plant.nq:
             raise SpecError(f"initial_parameters must be {plant.nq} numbers.", path="initial_parameters")
-        if self.adaptation is not None and self.adaptation.form == "random-walk" and self.early_constraints:
-            raise SpecError(
-                "early_constraints and the random walk do not go together: the early equation holds for the parameters "
-                "of the next step. Use form 'innovation'.", path="early_constraints",
-            )  # fmt: skip
 
     @property
     def dt(self) -> float:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.analysis.time_varying import STEPS_WITHOUT_HORIZON, algebraic_rows
+from obsynth.analysis.time_varying import early_rows
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arguments import real_array, real_vector
 from obsynth.numerics.arrays import FloatArray
@@ -31,6 +31,7 @@ from obsynth.observers.step_model import (
     PlantSteps,
     StepMatrices,
     StepModel,
+    WalkingEarlySteps,
     WalkingSteps,
     require_in_range,
 )
@@ -80,14 +81,14 @@ def step_model_of(observer: RecursiveObserver) -> StepModel:
     observer : RecursiveObserver
         The observer.
     """
-    model: StepModel = PlantSteps(observer.plant, observer.Q, observer.R)
-    if observer.early_constraints:
-        rows = algebraic_rows(observer.plant, observer.plant.horizon or STEPS_WITHOUT_HORIZON)
-        model = EarlySteps(observer.plant, observer.Q, observer.R, rows)
-    adaptation = observer.adaptation
+    parts, adaptation = (observer.plant, observer.Q, observer.R), observer.adaptation
+    walk = None
     if adaptation is not None and adaptation.form == "random-walk":
-        model = WalkingSteps(model, covariance_factor(adaptation.walk, "walk"))
-    return model
+        walk = covariance_factor(adaptation.walk, "walk")
+    if observer.early_constraints:
+        rows = early_rows(observer.plant, early=True)
+        return EarlySteps(*parts, rows) if walk is None else WalkingEarlySteps(*parts, rows, walk)
+    return PlantSteps(*parts) if walk is None else WalkingSteps(PlantSteps(*parts), walk)
 
 
 class RunningRecursiveObserver:

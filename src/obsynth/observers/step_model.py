@@ -1,7 +1,8 @@
 """The matrices of one step as the recursion needs them, with the two ways to rewrite a plant.
 
 Early constraints: an equation of step k + 1 without x(k + 2) is an output of x(k + 1) already.
-Random walk: the parameters become states, of the equations that led to x(k + 1).
+Random walk: the parameters become states, of the equations that led to x(k + 1), or of x(k + 1) itself with early
+constraints.
 """
 
 from __future__ import annotations
@@ -240,6 +241,53 @@ class WalkingSteps:
             Time index.
         """
         return with_walking_parameters(self.model.at(k), self.walk)
+
+
+@dataclass
+class WalkingEarlySteps(EarlySteps):
+    """Both at once: early constraints, and parameters that walk.
+
+    An early equation of k + 1 holds for the parameters of k + 1, so the state at k + 1 is ``[x(k+1); theta(k+1)]``.  The
+    outputs still hold theta(k), which is theta(k + 1) without its last increment: that noise they share.
+
+    Parameters
+    ----------
+    walk : FloatArray
+        ``(nq, nq)``: square root of the covariance of one step of the walk.
+    """
+
+    walk: FloatArray
+
+    def at(self, k: int) -> StepMatrices:
+        """Return the matrices of the step from k to k + 1.
+
+        Parameters
+        ----------
+        k : int
+            Time index.
+        """
+        return self._augmented(super().at(k), self.walk)
+
+    def first(self) -> StepMatrices:
+        """Return the correction of x(0) and theta(0) by the algebraic equations of step 0."""
+        return self._augmented(super().first(), np.zeros_like(self.walk))
+
+    def _augmented(self, step: StepMatrices, walk: FloatArray) -> StepMatrices:
+        ne, nq = len(step.A), len(walk)
+        measured = len(step.Psi) - len(step.Dn)
+        H = np.block([
+            [step.H[:ne], np.zeros((ne, nq))], [np.zeros((nq, step.H.shape[1])), np.eye(nq)], [step.H[ne:], step.Psi],
+        ])  # fmt: skip
+        A = np.block([[step.A, step.Phi], [np.zeros((nq, step.A.shape[1])), np.eye(nq)]])
+        width = step.noise.shape[1]
+        noise = np.zeros((len(H), width + nq))
+        noise[:ne, :width], noise[ne + nq :, :width] = step.noise[:ne], step.noise[ne:]
+        noise[ne : ne + nq, width:] = walk
+        noise[ne + nq : ne + nq + measured, width:] = step.Psi[:measured] @ walk
+        return StepMatrices(
+            np.asfortranarray(H), A, np.vstack([step.B, np.zeros((nq, step.B.shape[1]))]), np.zeros((len(A), 0)),
+            np.zeros((len(step.Psi), 0)), step.Dn, noise,
+        )  # fmt: skip
 
 
 def with_walking_parameters(step: StepMatrices, walk: FloatArray) -> StepMatrices:
