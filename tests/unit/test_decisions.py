@@ -92,6 +92,16 @@ def test_missing_samples_and_the_random_walk() -> None:
         decide(walking, walked, statistic="cusum")
 
 
+@pytest.mark.parametrize("statistic", STATISTICS)
+@pytest.mark.parametrize("samples", [0, 1, 2])
+def test_short_records(statistic: str, samples: int) -> None:
+    observer = observer_for(PLANT, adapt={})
+    found = observer.run(np.zeros((samples, 2)), np.zeros((samples, 1)))
+    decision = decide(observer, found, statistic=statistic, nominal=[0.1, 0.0])
+    assert decision.alarm is None
+    assert decision.values.shape == decision.thresholds.shape == (samples,)
+
+
 def test_bad_options() -> None:
     observer, found = run(0)
     for options, part in (

@@ -226,7 +226,7 @@ def test_data_come_back() -> None:
 
 
 def walking_likelihood(observer: RecursiveObserver, y: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Estimate and covariance of ``[x(N); theta(N)]``: all states and all parameters of a record, early rows of N too."""
+    """Estimate and covariance of ``[x(N); theta(N)]``: all states and parameters of a record, early rows too."""
     plant, adapt, steps = observer.plant, observer.adaptation, len(y) - 1
     nx, nq = plant.nx, plant.nq
     size = (nx + nq) * (steps + 1)

@@ -6,73 +6,22 @@ that a run of N samples raises a false alarm with at most about the stated proba
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import chosen, real_array, real_number, real_vector
 from obsynth.numerics.arrays import FloatArray, read_only
-from obsynth.observers.gain_schedule import gain_steps
+from obsynth.observers.alarms import Alarm, Decision, alone, quantile, tail
+from obsynth.observers.likelihood_ratio import likelihood_ratio, pull_of_the_start
 from obsynth.observers.recursive import RecursiveObserver
 from obsynth.observers.recursive_estimates import RecursiveEstimates
 
 STATISTICS = ("chi-square", "cusum", "glr", "nis")
-#: Onsets that the GLR considers, and samples that the NIS sums up: the choices that the thresholds were tried with.
-GLR_WINDOW = 40
+#: Samples that the NIS sums up: the choice that its threshold was tried with.
 NIS_WINDOW = 20
 #: Correlated looks count as this share of independent ones: measured false-alarm rates stay below what is asked.
-GLR_LOOKS = 1.0 / 4.0
 NIS_LOOKS = 1.0 / 2.0
-
-
-@dataclass(frozen=True)
-class Alarm:
-    """The first sample at which a statistic passes its threshold.
-
-    Parameters
-    ----------
-    k : int
-        The sample.
-    parameter : str
-        The parameter whose change alone explains it best; empty for the NIS, which knows no parameters.
-    onset : int
-        Estimate of the sample at which the change began.
-    confidence : float
-        One minus the probability that a whole run without a change reaches this value (at the first alarm, at least one
-        minus what was asked).
-    value : float
-        The statistic there.
-    """
-
-    k: int
-    parameter: str
-    onset: int
-    confidence: float
-    value: float
-
-
-@dataclass(frozen=True, eq=False)
-class Decision:
-    """A statistic along a run, its threshold, and the alarm if there is one.
-
-    Parameters
-    ----------
-    statistic : str
-        Its name.
-    values : FloatArray
-        ``(samples,)``.
-    thresholds : FloatArray
-        ``(samples,)``; they differ where samples are missing.
-    alarm : Alarm or None
-        The first one.
-    """
-
-    statistic: str
-    values: FloatArray
-    thresholds: FloatArray
-    alarm: Alarm | None
 
 
 def decide(
@@ -128,6 +77,8 @@ def decide(
     size = np.broadcast_to(size, (nq,)) if size.ndim == 0 else size
     if size.shape != (nq,) or not ((size > 0.0) & (size < np.inf)).all():
         raise SpecError(f"change must be one positive number, or {nq}.", path="change")
+    if not len(estimates.states):
+        return Decision(statistic, read_only(np.zeros(0)), read_only(np.zeros(0)), None)
     if statistic == "chi-square":
         return _chi_square(observer, estimates, theta, false_alarms)
     gaps = estimates.innovations
@@ -137,40 +88,7 @@ def decide(
         return _nis(estimates, gaps, false_alarms)
     if statistic == "cusum":
         return _cusum(estimates, gaps, size, false_alarms)
-    return _glr(observer, estimates, gaps, false_alarms)
-
-
-def _tail(degrees: FloatArray, value: FloatArray) -> FloatArray:
-    """Return the probability that chi-square with these degrees of freedom passes ``value``."""
-    from scipy.special import chdtrc
-
-    return np.asarray(chdtrc(degrees, value))
-
-
-def _quantile(degrees: FloatArray, probability: float) -> FloatArray:
-    """Return what chi-square passes with this probability; infinite where there are no degrees of freedom."""
-    from scipy.special import chdtri
-
-    return np.where(degrees > 0.0, chdtri(np.maximum(degrees, 1.0), probability), np.inf)
-
-
-def _pull_of_the_start(
-    observer: RecursiveObserver, estimates: RecursiveEstimates, error: FloatArray
-) -> FloatArray:
-    """Return what is left, in the estimates at each sample, of an error of the initial parameters, ``(samples, nq)``."""
-    adaptation, nx = observer.adaptation, observer.plant.nx
-    if adaptation is not None and adaptation.reset:
-        raise SpecError("chi-square with reset needs nominal parameters that are the observer's initial ones: what a "
-                        "reset forgets of the start is not known. Use glr or cusum, or design with "
-                        "initial_parameters at their nominal values.", path="nominal")  # fmt: skip
-    walking = adaptation is not None and adaptation.form == "random-walk"
-    left = np.concatenate([np.zeros(nx if walking else 0), error])
-    pulls = np.tile(error, (len(estimates.parameters), 1))
-    begin = 0 if observer.early_constraints else 1
-    for k, gains in enumerate(gain_steps(observer, len(pulls) - 1, received=estimates.received), begin):
-        left = gains.gain[:, : len(gains.step.A)] @ gains.step.A @ left if walking else gains.forget @ left
-        pulls[k] = left[-len(error) :]
-    return pulls
+    return likelihood_ratio(observer, estimates, gaps, false_alarms)
 
 
 def _chi_square(
@@ -178,15 +96,15 @@ def _chi_square(
 ) -> Decision:
     gaps, nq = estimates.parameters - nominal, len(nominal)
     start = np.zeros(nq) if observer.adaptation is None else observer.adaptation.initial_parameters - nominal
-    if start.any() and len(gaps):
+    if start.any():
         # Where the observer starts is no evidence: only what data have said since may raise an alarm.
-        gaps = gaps - _pull_of_the_start(observer, estimates, start)
+        gaps = gaps - pull_of_the_start(observer, estimates, start)
     values = np.array([
         gap @ np.linalg.pinv(covariance, hermitian=True) @ gap
         for gap, covariance in zip(gaps, estimates.parameter_covariances, strict=True)
     ])  # fmt: skip
     looks = len(values)
-    thresholds = np.full(looks, float(_quantile(np.array(float(nq)), false_alarms / looks)))
+    thresholds = np.full(looks, float(quantile(np.array(float(nq)), false_alarms / looks)))
     hits = np.flatnonzero(values > thresholds)
     if not hits.size:
         return Decision("chi-square", read_only(values), read_only(thresholds), None)
@@ -195,9 +113,9 @@ def _chi_square(
     # The last sample at which the statistic was what it is without a change, on average or less.
     quiet = np.flatnonzero(values[:k] <= nq)
     onset = int(quiet[-1]) + 1 if quiet.size else 0
-    confidence = 1.0 - min(1.0, looks * float(_tail(np.array(float(nq)), values[k])))
+    confidence = 1.0 - min(1.0, looks * float(tail(np.array(float(nq)), values[k])))
     alarm = Alarm(
-        k, estimates.parameter_names[_alone(weights @ gaps[k], np.diag(weights))], onset, confidence, float(values[k])
+        k, estimates.parameter_names[alone(weights @ gaps[k], np.diag(weights))], onset, confidence, float(values[k])
     )
     return Decision("chi-square", read_only(values), read_only(thresholds), alarm)
 
@@ -209,12 +127,12 @@ def _nis(estimates: RecursiveEstimates, gaps: FloatArray, false_alarms: float) -
     values = np.convolve(squares, window)[:samples]
     degrees = np.convolve(estimates.nis_degrees, window)[:samples]
     looks = max(samples * NIS_LOOKS, 1.0)
-    thresholds = _quantile(degrees, min(false_alarms / looks, 1.0))
+    thresholds = quantile(degrees, min(false_alarms / looks, 1.0))
     hits = np.flatnonzero(values > thresholds)
     alarm = None
     if hits.size:
         k = int(hits[0])
-        confidence = 1.0 - min(1.0, looks * float(_tail(degrees[k], values[k])))
+        confidence = 1.0 - min(1.0, looks * float(tail(degrees[k], values[k])))
         first = max(k - NIS_WINDOW + 1, 0)
         # The split of the window after which the squares are largest against their degrees of freedom.
         excess = np.cumsum((squares - estimates.nis_degrees)[first : k + 1][::-1])[::-1]
@@ -239,43 +157,6 @@ def _cusum(estimates: RecursiveEstimates, gaps: FloatArray, change: FloatArray, 
             which = int(np.argmax(level))
             confidence = 1.0 - min(1.0, 2.0 * nq * samples * float(np.exp(-values[k])))
             since = slice(int(started[which]), k + 1)
-            name = estimates.parameter_names[_alone(along[since].sum(axis=0), squares[since].sum(axis=0))]
+            name = estimates.parameter_names[alone(along[since].sum(axis=0), squares[since].sum(axis=0))]
             alarm = Alarm(k, name, int(started[which]), confidence, float(values[k]))
     return Decision("cusum", read_only(values), read_only(np.full(samples, threshold)), alarm)
-
-
-def _glr(observer: RecursiveObserver, estimates: RecursiveEstimates, gaps: FloatArray, false_alarms: float) -> Decision:
-    samples, nq = gaps.shape[0], estimates.parameters.shape[1]
-    begin = 0 if observer.early_constraints else 1
-    looks = max(samples * GLR_WINDOW * GLR_LOOKS, 1.0)
-    threshold = float(_quantile(np.array(float(nq)), min(false_alarms / looks, 1.0)))
-    values, alarm = np.zeros(samples), None
-    # Of a change at each onset in the window: the regressor that starts at zero there, and the sums it has gathered.
-    signatures = np.zeros((0, observer.plant.nx, nq))
-    information, scores = np.zeros((0, nq, nq)), np.zeros((0, nq))
-    for k, gains in enumerate(gain_steps(observer, samples - 1, received=estimates.received), begin):
-        step = gains.step
-        signatures = np.concatenate([signatures, np.zeros((1, observer.plant.nx, nq))])[-GLR_WINDOW:]
-        outputs = np.broadcast_to(-step.Psi, (len(signatures), *step.Psi.shape))
-        right = np.concatenate([step.A @ signatures + step.Phi, outputs], axis=1)
-        if observer.early_constraints:
-            # theta(k) acts on x(k) by the early equations alone, and on the others from k + 1 on.
-            right[-1, : right.shape[1] - len(step.Dn)] = 0.0
-        G = -gains.parity @ right
-        information = np.concatenate([information, np.zeros((1, nq, nq))])[-GLR_WINDOW:] + G.transpose(0, 2, 1) @ G
-        scores = np.concatenate([scores, np.zeros((1, nq))])[-GLR_WINDOW:] + gaps[k][: G.shape[1]] @ G
-        signatures = gains.gain @ right
-        jumps = (np.linalg.pinv(information, hermitian=True) @ scores[:, :, None])[:, :, 0]
-        found = np.einsum("oq,oq->o", scores, jumps)
-        best = int(np.argmax(found))
-        values[k] = found[best]
-        if alarm is None and values[k] > threshold:
-            confidence = 1.0 - min(1.0, looks * float(_tail(np.array(float(nq)), values[k])))
-            name = estimates.parameter_names[_alone(scores[best], np.diag(information[best]))]
-            alarm = Alarm(k, name, max(k + 1 - len(found), begin) + best, confidence, float(values[k]))
-    return Decision("glr", read_only(values), read_only(np.full(samples, threshold)), alarm)
-
-
-def _alone(scores: FloatArray, information: FloatArray) -> int:
-    """Return the parameter whose change alone explains most."""
-    return int(np.argmax(scores**2 / np.maximum(information, np.finfo(np.float64).tiny)))

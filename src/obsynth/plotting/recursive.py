@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, as_matrix
+from obsynth.observers.alarms import Decision
 from obsynth.observers.dae_estimates import DAEEstimates
-from obsynth.observers.decisions import Decision
 from obsynth.observers.recursive_estimates import RecursiveEstimates
 from obsynth.plotting.faults import ESTIMATE_STYLE, PANEL_HEIGHT, TRUE_STYLE, WIDTH
 
