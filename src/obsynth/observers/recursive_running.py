@@ -31,10 +31,9 @@ from obsynth.observers.step_model import (
     PlantSteps,
     StepMatrices,
     StepModel,
-    WalkingEarlySteps,
-    WalkingSteps,
     require_in_range,
 )
+from obsynth.observers.walking_steps import WalkingEarlySteps, WalkingSteps
 
 
 class RawEstimate(NamedTuple):

@@ -94,7 +94,7 @@ def _dynamic_rows(design: ObserverDesign, observer: RecursiveObserver, stated: R
 
 def _contraction_rows(facts: ScheduleFacts) -> Iterator[Check]:
     claim = "mean factor per step of the product of L_k A_k"
-    detail = f"{facts.steps} steps; an error grows at most by {facts.growth:.3g} on the way"
+    detail = f"{facts.steps} steps, {facts.span}; an error grows at most by {facts.growth:.3g} on the way"
     if facts.steps < STEPS_TO_CONTRACT:
         yield information("contraction", claim, facts.contraction, source=f"{_SOURCE}, (13)", detail=detail)
     else:
