@@ -33,19 +33,20 @@ class _Kernel(NamedTuple):
 def identifiability_condition(plant: TimeVaryingDescriptorSystem, *, early: bool = False) -> Condition:
     """Return the condition that outputs tell the parameters from each other and from the state.
 
-    Of a time-invariant plant, parameters and state may stay constant together without a trace exactly where
+    Where these matrices are constant, parameters and state may stay constant together without a trace exactly where
     ``[A - E, Phi; C, Psi]`` loses rank.  Of others, the outputs that each parameter alone leads to are compared along
     the horizon.
 
     Parameters
     ----------
     plant : TimeVaryingDescriptorSystem
-        With parameters, and detectable where it is time-invariant.
+        With parameters, and detectable where E, A and C are constant.
     early : bool, optional
         Whether the algebraic equations are used one step early.
     """
-    decision, kernel = _steady(plant) if plant.is_time_invariant else _along(plant, early=early)
-    wanted = "rank [A - E, Phi; C, Psi]" if plant.is_time_invariant else "rank of the traces of all parameters"
+    still = all(matrix.is_constant for matrix in (plant.E, plant.A, plant.C, plant.Phi, plant.Psi))
+    decision, kernel = _steady(plant) if still else _along(plant, early=early)
+    wanted = "rank [A - E, Phi; C, Psi]" if still else "rank of the traces of all parameters"
     claim = f"{wanted} = {decision.expected}"
     value, bound = float(decision.rank), float(decision.expected)
     if decision.full:

@@ -11,6 +11,7 @@ Deviations:
 4. The covariance of theta is carried besides S, which is none (4.8 times too large in the audit's example).
 5. S is a triangle; a term ``(1 - lambda) M_reg`` or directional forgetting bounds it where excitation ends.
 6. Parameters may walk randomly instead (the augmented Kalman filter).
+7. Parameters that leave no trace, or none of their own, are refused: (26) cannot hold for them.
 """
 
 from __future__ import annotations

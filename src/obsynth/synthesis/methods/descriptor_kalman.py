@@ -9,7 +9,8 @@ Deviations:
 1. Square-root covariance step instead of (9)-(11): nothing is inverted but triangles, so Q, R and P_0 may be singular.
 2. The algebraic equations of step k + 1 may be used one step earlier (``early_constraints``).
 3. Missing samples; states that they leave undetermined are said to be so.
-4. (14) and (15) have misprints (indexes, a transpose); we need neither.
+4. Detectability is asked for before any gain: the paper's Lemma 3.1 takes a stable product of L_k A_k for granted.
+5. (14) and (15) have misprints (indexes, a transpose); we need neither.
 """
 
 from __future__ import annotations
