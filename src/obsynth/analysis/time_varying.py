@@ -128,8 +128,10 @@ def horizon_ranks(plant: TimeVaryingDescriptorSystem, *, early: bool = False) ->
         steps = max(steps - 1, 1)
     worst, worst_k, condition, condition_k, directions, directions_k = None, 1, 0.0, 1, None, 1
     for k in range(1, steps + 1):
-        blocks = step_blocks(plant, k - 1, late)
-        H = np.vstack([blocks.E, blocks.C])
+        E, C = plant.E.at(k), plant.C.at(k)
+        if late.size:
+            E, _, _, C, _ = step_blocks(plant, k - 1, late)
+        H = np.vstack([E, C])
         decision = decide_rank(H, expected=plant.nx)
         if worst is None or (decision.rank, decision.smallest_kept) < (worst.rank, worst.smallest_kept):
             worst, worst_k = decision, k
@@ -137,7 +139,7 @@ def horizon_ranks(plant: TimeVaryingDescriptorSystem, *, early: bool = False) ->
         found = float(values[0] / values[-1]) if len(H) >= plant.nx and values[-1] > 0.0 else float("inf")
         if found > condition:
             condition, condition_k = found, k
-        here = decide_rank(blocks.E).rank + len(blocks.C) - plant.nx
+        here = decide_rank(E).rank + len(C) - plant.nx
         if directions is None or here < directions:
             directions, directions_k = here, k
     if worst is None or directions is None:
