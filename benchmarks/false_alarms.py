@@ -35,8 +35,8 @@ PLANTS = {
     ),
     "four outputs, three parameters": obsynth.TimeVaryingDescriptorSystem(
         None, 0.9 * np.linalg.qr(np.random.default_rng(1).standard_normal((6, 6)))[0],
-        C=np.random.default_rng(2).standard_normal((4, 6)), Phi=np.random.default_rng(3).standard_normal((6, 3)), dt=1.0,
-        horizon=SAMPLES + 1,
+        C=np.random.default_rng(2).standard_normal((4, 6)), Phi=np.random.default_rng(3).standard_normal((6, 3)),
+        dt=1.0, horizon=SAMPLES + 1,
     ),
 }  # fmt: skip
 

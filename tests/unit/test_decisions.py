@@ -117,6 +117,24 @@ def test_bad_options() -> None:
         decide(observer_for(PLANT), found)
 
 
+def test_a_filter_without_parameters_has_the_nis() -> None:
+    """A change of a parameter that the filter does not know is something that its model does not explain."""
+    for jump, expected in ((0.0, False), (4.0, True)):
+        observer = observer_for(PLANT, Q=np.diag([0.1, 0.2, 0.3]))
+        rng = np.random.default_rng(2)
+        theta = np.zeros((SAMPLES, 2))
+        theta[CHANGE:, 1] = jump
+        y = simulate_time_varying(
+            PLANT, samples=SAMPLES, parameters=theta,
+            equation_noise=rng.standard_normal((SAMPLES, 3)) * np.sqrt([0.1, 0.2, 0.3]),
+            output_noise=rng.standard_normal((SAMPLES - 1, 2)) * np.sqrt([0.2, 0.4]),
+        ).outputs  # fmt: skip
+        decision = decide(observer, observer.run(y, np.zeros((SAMPLES, 1))), statistic="nis")
+        assert (decision.alarm is not None) is expected
+    assert decision.alarm.parameter == ""
+    assert 0 <= decision.alarm.k - CHANGE <= 15
+
+
 class TestSimulation:
     def test_every_equation_holds(self) -> None:
         rng = np.random.default_rng(4)

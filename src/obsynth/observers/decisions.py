@@ -38,7 +38,7 @@ def decide(
     Parameters
     ----------
     observer : RecursiveObserver
-        That gave the estimates, with parameters.
+        That gave the estimates, with parameters (a filter without any knows the ``nis`` alone).
     estimates : RecursiveEstimates
         Of a whole run.
     statistic : {"chi-square", "cusum", "glr", "nis"}, optional
@@ -62,17 +62,20 @@ def decide(
         The statistic is unknown or does not go with the observer's form, or an option is out of range.
     """
     adaptation = observer.adaptation
-    if adaptation is None:
-        raise SpecError("A decision on parameters needs an observer that estimates them.", path="observer")
     chosen(statistic, "statistic", STATISTICS)
+    if adaptation is None and statistic != "nis":
+        raise SpecError("A decision on parameters needs an observer that estimates them; of a filter alone, statistic "
+                        "'nis' tells whether the model still explains the data.", path="observer")  # fmt: skip
     false_alarms = real_number(false_alarms, "false_alarms", "a probability between 0 and 1")
     if not 0.0 < false_alarms < 1.0:
         raise SpecError(f"false_alarms is {false_alarms}: give a probability between 0 and 1.", path="false_alarms")
-    if adaptation.form == "random-walk" and statistic in ("cusum", "glr"):
+    form = "" if adaptation is None else adaptation.form
+    if form == "random-walk" and statistic in ("cusum", "glr"):
         raise SpecError(f"{statistic} needs regressors, which the random walk does not have: use form 'innovation'.",
                         path="statistic")  # fmt: skip
-    nq = len(adaptation.initial_parameters)
-    theta = adaptation.initial_parameters if nominal is None else real_vector(nominal, nq, "nominal")
+    nq = 0 if adaptation is None else len(adaptation.initial_parameters)
+    start = np.zeros(0) if adaptation is None else adaptation.initial_parameters
+    theta = start if nominal is None else real_vector(nominal, nq, "nominal")
     size = real_array(change, "change")
     size = np.broadcast_to(size, (nq,)) if size.ndim == 0 else size
     if size.shape != (nq,) or not ((size > 0.0) & (size < np.inf)).all():
@@ -82,7 +85,7 @@ def decide(
     if statistic == "chi-square":
         return _chi_square(observer, estimates, theta, false_alarms)
     gaps = estimates.innovations
-    if adaptation.form != "random-walk":
+    if nq and form != "random-walk":
         gaps = gaps - estimates.regressors @ theta
     if statistic == "nis":
         return _nis(estimates, gaps, false_alarms)
