@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from obsynth.analysis.conditions import Condition
-from obsynth.analysis.time_varying import STEPS_WITHOUT_HORIZON, StepBlocks, early_rows, step_blocks
+from obsynth.analysis.time_varying import STEPS_WITHOUT_HORIZON, IntArray, StepBlocks, early_rows, step_blocks
 from obsynth.analysis.zeros import leading_names
 from obsynth.models.time_varying import TimeVaryingDescriptorSystem
 from obsynth.numerics.arrays import FloatArray
@@ -90,17 +90,20 @@ def _along(plant: TimeVaryingDescriptorSystem, *, early: bool) -> tuple[RankDeci
     late = early_rows(plant, early=early)
     steps = plant.horizon or STEPS_WITHOUT_HORIZON
     steps = max(steps - 1, 1) if late.size else steps
-    listed = [step_blocks(plant, k, late) for k in range(steps)]
-    scales = _scales(listed)
-    listed = [_scaled(blocks, *scales) for blocks in listed]
-    direct = np.max([np.linalg.norm(np.vstack([blocks.Phi, blocks.Psi]), axis=0) for blocks in listed], axis=0)
+    largest = _largest(plant, steps, late)
+    ne = len(largest.E)
+    pencil = equilibrate_pencil(np.vstack([largest.E, np.zeros_like(largest.C)]), np.vstack([largest.A, largest.C]))
+    rows, columns = pencil.rows[:, None], pencil.columns
+    direct = np.linalg.norm(rows * np.vstack([largest.Phi, largest.Psi]), axis=0)
     direct[direct == 0.0] = 1.0
     nx, nq = plant.nx, plant.nq
     factor, regressor, gathered, sizes = np.eye(nx), np.zeros((nx, nq)), np.zeros((0, nq)), np.zeros(nq)
-    for E, A, Phi, C, Psi in listed:
-        H, ne = np.vstack([E, C]), len(E)
-        noise = np.zeros((len(H), max(nx + len(H), len(H))))
-        noise[:ne, :nx], noise[:, nx : nx + len(H)] = A @ factor, np.eye(len(H))
+    for k in range(steps):
+        blocks = step_blocks(plant, k, late)
+        H, A = rows * np.vstack([blocks.E, blocks.C]) * columns, rows[:ne] * blocks.A * columns
+        Phi, Psi = rows[:ne] * blocks.Phi, rows[ne:] * blocks.Psi
+        noise = np.hstack([np.zeros((len(H), nx)), np.eye(len(H))])
+        noise[:ne, :nx] = A @ factor
         right = np.vstack([A @ regressor + Phi, -Psi])
         found = least_squares_step(H, noise, right) or rank_revealing_step(H, noise, right, np.zeros((len(H), 0)))
         regressor, factor = found.estimate, found.factor
@@ -128,16 +131,10 @@ def _kernel_of(parameters: FloatArray, columns: FloatArray, states: tuple[str, .
     return _Kernel(strongest * columns, np.linalg.norm(parameters, axis=0), states)
 
 
-def _scales(listed: list[StepBlocks]) -> tuple[FloatArray, FloatArray]:
-    """Return scales of the rows of H and of the states that make the largest entries of a horizon comparable."""
-    E, A, _, C, _ = (np.max(np.abs(np.array(matrices)), axis=0) for matrices in zip(*listed, strict=True))
-    pencil = equilibrate_pencil(np.vstack([E, np.zeros_like(C)]), np.vstack([A, C]))
-    return pencil.rows, pencil.columns
-
-
-def _scaled(blocks: StepBlocks, rows: FloatArray, columns: FloatArray) -> StepBlocks:
-    ne = len(blocks.E)
-    up, down = rows[:ne, None], rows[ne:, None]
-    return StepBlocks(
-        up * blocks.E * columns, up * blocks.A * columns, up * blocks.Phi, down * blocks.C * columns, down * blocks.Psi
-    )
+def _largest(plant: TimeVaryingDescriptorSystem, steps: int, late: IntArray) -> StepBlocks:
+    """Return the largest absolute value of each entry along the horizon: it tells what rows and states are like."""
+    found = [np.abs(matrix) for matrix in step_blocks(plant, 0, late)]
+    for k in range(1, steps):
+        for matrix, here in zip(found, step_blocks(plant, k, late), strict=True):
+            np.maximum(matrix, np.abs(here), out=matrix)
+    return StepBlocks(*found)
