@@ -4,6 +4,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[2]
 
 
@@ -29,3 +31,14 @@ def test_the_false_alarm_benchmark_runs():
             # One run: an alarm or none, and none at a small probability without one at a larger.
             assert set(shares) <= {0.0, 100.0}
             assert shares == sorted(shares)
+
+
+@pytest.mark.parametrize("name", ["evaluate", "run_on_data"])
+def test_the_benchmarks_of_running_run(name):
+    """Their own comparisons with python-control hold, and every rate is a number."""
+    script = ROOT / "benchmarks" / f"{name}.py"
+    done = subprocess.run([sys.executable, script, "--small"], capture_output=True, text=True, check=True)
+    row = done.stdout.splitlines()[-1].strip("| ").split(" | ")
+    assert row[0] == "4"
+    assert len(row) == 5
+    assert all(float(cell.replace(",", "")) > 0.0 for cell in row[1:])
