@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -76,7 +77,7 @@ def gain_steps(
     factor, Upsilon, parameters, diffuse = start.factor, start.Upsilon, start.parameters, start.diffuse
     adaptation, model = observer.adaptation, start.model
     first = [model.first()] if isinstance(model, EarlySteps) else []
-    for k, step in enumerate((*first, *(model.at(k) for k in range(steps))), 1 - len(first)):
+    for k, step in enumerate(chain(first, (model.at(k) for k in range(steps))), 1 - len(first)):
         ne, rows, nq = len(step.A), len(step.H), Upsilon.shape[1]
         S = np.zeros((rows, max(factor.shape[1] + step.noise.shape[1], rows)))
         S[:ne, : factor.shape[1]] = step.A @ factor
