@@ -24,6 +24,20 @@ def test_the_fault_filter_benchmark_runs():
     assert max(gains) <= min(gains) * (1.0 + 2e-4)
 
 
+def test_the_false_alarm_benchmark_runs():
+    script = ROOT / "benchmarks" / "false_alarms.py"
+    done = subprocess.run([sys.executable, script, "1"], capture_output=True, text=True, check=True)
+    rows = [line.strip("| ").split(" | ") for line in done.stdout.splitlines()[3:]]
+    assert len(rows) == 6
+    for _, *cells in rows:
+        for cell in cells:
+            shares = [float(share) for share in cell.split(" / ")]
+            assert len(shares) == 3
+            # One run: an alarm or none, and none at a small probability without one at a larger.
+            assert set(shares) <= {0.0, 100.0}
+            assert shares == sorted(shares)
+
+
 def test_the_unknown_input_observer_benchmark_runs():
     (row,) = small_table("ui_pi_observer")
     rates = [float(cell.split(", ")[1].split()[0]) for cell in row[1:]]
