@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import TypeAlias
 
 from obsynth.errors import SpecError
-from obsynth.models.arguments import is_number
+from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.spectra import abscissa
 from obsynth.observers.linear import LinearObserver
@@ -82,6 +82,6 @@ def checked_warm_up(asked: float | None, default: float) -> float:
     """
     if asked is None:
         return default
-    if not (is_number(asked) and asked >= 0.0):
+    if not (is_finite_number(asked) and asked >= 0.0):
         raise SpecError(f"warm_up is {asked!r}: give seconds, 0 or more.", path="warm_up")
     return float(asked)

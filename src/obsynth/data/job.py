@@ -15,7 +15,7 @@ from obsynth.data.recovered import LATE, RecoveredStates
 from obsynth.data.signals import TIME, Signals
 from obsynth.errors import SpecError
 from obsynth.evaluation.online import OnlineMonitor
-from obsynth.models.arguments import is_number
+from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray
 
 
@@ -53,7 +53,7 @@ class Job:
             if name not in names:
                 raise SpecError(f"There is no column {name!r} to watch: there are {', '.join(names)}.",
                                 path="thresholds")  # fmt: skip
-            if not (is_number(level) and level > 0.0):
+            if not (is_finite_number(level) and level > 0.0):
                 raise SpecError(f"The threshold of {name!r} is {level!r}: give a positive number.", path="thresholds")
         self._levels = tuple((name, names.index(name), level) for name, level in thresholds.items())
         lags = list(delayed(engine))

@@ -17,7 +17,7 @@ from obsynth.data.starting import engine_of
 from obsynth.data.states import digest_of_gains, resume_state, save_state
 from obsynth.errors import SpecError
 from obsynth.evaluation.online import OnlineMonitor
-from obsynth.models.arguments import require_kind, require_mapping
+from obsynth.numerics.arguments import require_kind, require_mapping
 from obsynth.results.design import ObserverDesign
 
 if TYPE_CHECKING:

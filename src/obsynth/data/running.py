@@ -15,7 +15,7 @@ from obsynth.data.engine import GAP, LONGEST_BRIDGE, OK, RECOVERING, WARM_UP, Ro
 from obsynth.data.holds import KeptHolds, checked_warm_up, transient
 from obsynth.data.linear_signals import LinearSignals
 from obsynth.errors import ObsynthError, SpecError
-from obsynth.models.arguments import is_number
+from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.sampling import first_order_hold
 from obsynth.results.design import ObserverDesign
@@ -57,7 +57,7 @@ class DataObserver(LinearSignals):
 
     def __init__(self, design: ObserverDesign, *, gap: float | None = None, warm_up: float | None = None) -> None:
         super().__init__(design)
-        if gap is not None and not (is_number(gap) and gap > 0.0):
+        if gap is not None and not (is_finite_number(gap) and gap > 0.0):
             raise SpecError(f"gap is {gap!r}: give seconds, a positive number.", path="gap")
         if gap is not None and self.observer.dt > 0.0:
             raise SpecError(

@@ -9,7 +9,7 @@ import numpy as np
 
 from obsynth.data.engine import Engine
 from obsynth.errors import SpecError
-from obsynth.models.arguments import is_number
+from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray, read_only
 
 #: The column of time stamps, in seconds.
@@ -70,7 +70,7 @@ class Signals:
                 f"{unknown[0]!r} is no signal that this observer reads: it reads {', '.join(names)}.", path="columns"
             )
         for name, factor in factors.items():
-            if not is_number(factor) or factor == 0.0:
+            if not is_finite_number(factor) or factor == 0.0:
                 raise SpecError(f"The scale of {name!r} is {factor!r}: give a finite number, not zero.", path="scales")
         return cls(
             names,

@@ -13,7 +13,7 @@ import numpy as np
 
 from obsynth.data.signals import Signals
 from obsynth.errors import SpecError
-from obsynth.models.arguments import require_kind
+from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray
 
 if TYPE_CHECKING:

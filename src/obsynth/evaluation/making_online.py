@@ -16,8 +16,8 @@ from obsynth.evaluation.residual_model import ResidualModel, residual_model
 from obsynth.evaluation.thresholds import scaled_inputs
 from obsynth.evaluation.watching import bounds_of, require_options
 from obsynth.evaluation.whitening import innovation_whitener, steady_mean, whitener_of, window_covariance
-from obsynth.models.arguments import is_number, require_kind, require_mapping
 from obsynth.models.names import index_of
+from obsynth.numerics.arguments import is_finite_number, require_kind, require_mapping
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae import DAEObserver
 from obsynth.observers.recursive import RecursiveObserver
@@ -145,7 +145,7 @@ def _endless_model(
         raise SpecError("sample_time is for continuous designs: this one is sampled already.", path="sample_time")
     asked = sample_time if sample_time is not None or scenario is None else scenario.sample_time
     dt = plant.dt if plant.is_discrete else asked
-    if dt is None or not (is_number(dt) and dt > 0.0):
+    if dt is None or not (is_finite_number(dt) and dt > 0.0):
         raise SpecError("A continuous design needs the sample_time of its data, in seconds, for a threshold.",
                         path="sample_time")  # fmt: skip
     transition = observer.Az if plant.is_discrete else first_order_hold(observer.Az, observer.By, dt)[0]
@@ -195,7 +195,7 @@ def _of_parameters(
     theta = np.array(start, dtype=np.float64)
     for name, value in nominal.items():
         place = index_of(name, names, what="nominal")
-        if not is_number(value):
+        if not is_finite_number(value):
             raise SpecError(f"The nominal value of {name!r} is {value!r}: give a finite number.", path="nominal")
         theta[place] = float(value)
     if kind != "nis" and not len(theta):

@@ -10,7 +10,7 @@ import numpy as np
 
 from obsynth.evaluation.bench import Bench, make_bench
 from obsynth.evaluation.columns import named_columns, write_columns
-from obsynth.models.arguments import require_kind
+from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.linear import Estimates, LinearObserver
 from obsynth.results.design import ObserverDesign

@@ -13,8 +13,8 @@ from obsynth.evaluation.monitors import KINDS, Monitor, statement_of
 from obsynth.evaluation.residual_model import ResidualModel, residual_model
 from obsynth.evaluation.thresholds import paper_threshold, pointwise_threshold, scaled_inputs, window_threshold
 from obsynth.evaluation.whitening import innovation_whitener, settled, steady_mean, whitener_of, window_covariance
-from obsynth.models.arguments import is_number, require_kind, require_mapping
 from obsynth.models.names import index_of
+from obsynth.numerics.arguments import is_finite_number, require_kind, require_mapping
 from obsynth.numerics.arrays import FloatArray
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario
@@ -127,14 +127,14 @@ def require_options(
 ) -> None:  # fmt: skip
     """Raise `SpecError` where an option of a monitor is out of range."""
     for name, value in (("noise_bound", noise_bound), ("initial_error", initial_error), ("gamma", gamma)):
-        if value is not None and not (is_number(value) and value >= 0.0):
+        if value is not None and not (is_finite_number(value) and value >= 0.0):
             raise SpecError(f"{name} is {value!r}: give a number, 0 or more.", path=name)
     for name, count, least in (("window", window, 1), ("isolation_delay", isolation_delay, 0)):
         if isinstance(count, bool) or not isinstance(count, int) or count < least:
             raise SpecError(f"{name} is {count!r}: give a whole number of samples, {least} or more.", path=name)
-    if not (is_number(false_alarms) and 0.0 < false_alarms < 1.0):
+    if not (is_finite_number(false_alarms) and 0.0 < false_alarms < 1.0):
         raise SpecError(f"false_alarms is {false_alarms!r}: give a probability between 0 and 1.", path="false_alarms")
-    if not (is_number(change) and change > 0.0):
+    if not (is_finite_number(change) and change > 0.0):
         raise SpecError(f"change is {change!r}: give a positive number of deviations.", path="change")
 
 
@@ -149,7 +149,7 @@ def bounds_of(design: ObserverDesign, model: ResidualModel, given: Mapping[str, 
     bounds = model.bounds.copy()
     for name, value in (given or {}).items():
         place = index_of(name, design.linear[0].disturbance_names, what="disturbance_bounds")
-        if not (is_number(value) and value >= 0.0):
+        if not (is_finite_number(value) and value >= 0.0):
             raise SpecError(f"The bound of {name!r} is {value!r}: give a number, 0 or more.", path="disturbance_bounds")
         bounds[place] = float(value)
     return bounds

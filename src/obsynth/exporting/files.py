@@ -10,7 +10,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.exporting.c_source import c_identifier, header_text, source_text
 from obsynth.exporting.realisation import Realisation
-from obsynth.models.arguments import require_kind
+from obsynth.numerics.arguments import require_kind
 from obsynth.results.design import ObserverDesign
 from obsynth.results.serialise import write_atomically
 

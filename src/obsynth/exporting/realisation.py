@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.models.arguments import require_kind
 from obsynth.models.dae import DAEModel
+from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae import DAEObserver
 from obsynth.observers.linear import LinearObserver

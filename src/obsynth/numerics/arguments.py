@@ -1,7 +1,8 @@
-"""Single numbers and vectors that a caller gives, checked: never a raw TypeError, always the name of the argument."""
+"""What a caller gives, checked: never a raw TypeError, always the name of the argument."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -64,6 +65,53 @@ def chosen(value: Any, name: str, choices: tuple[str, ...]) -> str:
 def is_number(value: Any) -> bool:
     """Whether ``value`` is a single real number, of Python or numpy."""
     return isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
+
+
+def require_kind(value: Any, kinds: type | tuple[type, ...], name: str, wanted: str) -> None:
+    """Raise `SpecError` unless an argument is of some kind.
+
+    Parameters
+    ----------
+    value : object
+        The argument.
+    kinds : type or tuple of type
+        What it may be.
+    name : str
+        Of the argument.
+    wanted : str
+        What to give, in words.
+
+    Raises
+    ------
+    SpecError
+        It is something else.
+    """
+    if not isinstance(value, kinds):
+        raise SpecError(f"{name} is a {type(value).__name__}: give {wanted}.", path=name)
+
+
+def require_mapping(value: Any, name: str) -> None:
+    """Raise `SpecError` unless an optional argument is a mapping from names.
+
+    Parameters
+    ----------
+    value : object
+        The argument.
+    name : str
+        Of the argument.
+
+    Raises
+    ------
+    SpecError
+        It is something else.
+    """
+    if value is not None:
+        require_kind(value, Mapping, name, "a mapping from names, such as {'speed': 1.0}")
+
+
+def is_finite_number(value: Any) -> bool:
+    """Whether ``value`` is a single finite real number."""
+    return is_number(value) and bool(np.isfinite(value))
 
 
 def _shown(value: Any) -> str:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.models.arguments import is_number, require_kind
+from obsynth.numerics.arguments import is_finite_number, require_kind
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear import LinearObserver
 
@@ -42,7 +42,7 @@ def sample_observer(observer: LinearObserver, dt: float) -> LinearObserver:
     require_kind(observer, LinearObserver, "observer", "the LinearObserver of a continuous design")
     if observer.dt > 0.0:
         raise SpecError(f"The observer is discrete in time already (dt = {observer.dt:g} s).", path="dt")
-    if not (is_number(dt) and dt > 0.0):
+    if not (is_finite_number(dt) and dt > 0.0):
         raise SpecError(f"dt is {dt!r}: give the seconds between two samples, a positive number.", path="dt")
     inputs = len(observer.input_names)
     b, d = np.hstack([observer.Bu, observer.By]), np.hstack([observer.Du, observer.Dy])
