@@ -19,8 +19,10 @@ if TYPE_CHECKING:
         VerificationError,
     )
     from obsynth.evaluation.intervals import Interval
+    from obsynth.evaluation.making_online import online_monitor
     from obsynth.evaluation.monitors import Detection, Monitor
     from obsynth.evaluation.monte_carlo import Evaluation, evaluate
+    from obsynth.evaluation.online import OnlineMonitor
     from obsynth.evaluation.recursive_monte_carlo import ParameterMonitor
     from obsynth.evaluation.recursive_simulating import RecursiveSimulation
     from obsynth.evaluation.simulating import Simulation, simulate
@@ -30,10 +32,11 @@ if TYPE_CHECKING:
     from obsynth.models.descriptor import DescriptorSystem
     from obsynth.models.fault_models import FaultModel, fault_model
     from obsynth.models.time_varying import TimeVaryingDescriptorSystem
+    from obsynth.observers.alarms import Alarm, Decision
     from obsynth.observers.dae import DAEObserver
     from obsynth.observers.dae_estimates import DAEEstimates
     from obsynth.observers.dae_running import RunningDAEObserver
-    from obsynth.observers.decisions import Alarm, Decision, decide
+    from obsynth.observers.decisions import decide
     from obsynth.observers.gain_schedule import BatchEstimates, run_batch
     from obsynth.observers.linear import Estimates, LinearObserver, RunningObserver
     from obsynth.observers.recursive import Adaptation, RecursiveObserver
@@ -80,12 +83,12 @@ _HOMES = {
     "identifiability": "obsynth.analysis.dae_identifiability",
     "DAEModel": "obsynth.models.dae",
     "Adaptation": "obsynth.observers.recursive",
-    "Alarm": "obsynth.observers.decisions",
+    "Alarm": "obsynth.observers.alarms",
     "BatchEstimates": "obsynth.observers.gain_schedule",
     "Certificate": "obsynth.results.design",
     "Check": "obsynth.results.report",
     "DataRun": "obsynth.data.run",
-    "Decision": "obsynth.observers.decisions",
+    "Decision": "obsynth.observers.alarms",
     "DeltaScan": "obsynth.results.delta_scan",
     "DescriptorSystem": "obsynth.models.descriptor",
     "Detection": "obsynth.evaluation.monitors",
@@ -101,6 +104,7 @@ _HOMES = {
     "LostEffectiveness": "obsynth.simulation.failures",
     "Monitor": "obsynth.evaluation.monitors",
     "ObserverDesign": "obsynth.results.design",
+    "OnlineMonitor": "obsynth.evaluation.online",
     "ObsynthError": "obsynth.errors",
     "ParameterMonitor": "obsynth.evaluation.recursive_monte_carlo",
     "PreconditionError": "obsynth.errors",
@@ -139,6 +143,7 @@ _HOMES = {
     "html_report": "obsynth.report.page",
     "load": "obsynth.results.serialise",
     "monitor": "obsynth.evaluation.watching",
+    "online_monitor": "obsynth.evaluation.making_online",
     "pd_delta_scan": "obsynth.pipeline.pd_observer",
     "pd_observer": "obsynth.pipeline.pd_observer",
     "pd_observer_from_gains": "obsynth.pipeline.pd_observer",
@@ -182,6 +187,7 @@ __all__ = [
     "Monitor",
     "ObserverDesign",
     "ObsynthError",
+    "OnlineMonitor",
     "ParameterMonitor",
     "PreconditionError",
     "Ramp",
@@ -222,6 +228,7 @@ __all__ = [
     "identifiability",
     "load",
     "monitor",
+    "online_monitor",
     "pd_delta_scan",
     "pd_observer",
     "pd_observer_from_gains",

@@ -92,7 +92,7 @@ def hinf_norm(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> Hin
     poles = np.linalg.eigvals(a) if a.size else np.zeros(0, dtype=complex)
     if np.any(np.abs(poles) >= 1.0):
         return HinfNorm(np.inf, np.inf, np.nan, 0.0)
-    a, b, c = _balanced(a, b, c)
+    a, b, c = balanced_realisation(a, b, c)
     if a.shape[0] >= MANY_STATES:
         found = _norm_of_many_states(a, b, c, d)
         if found is not None:
@@ -133,7 +133,7 @@ def norm_is_at_most(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, 
         return hinf_norm(a, b, c, d).upper <= level
     if not all(np.all(np.isfinite(part)) for part in (a, b, c, d)) or spectral_radius(a) >= 1.0:
         return False
-    scaled = _balanced(a, b, c)
+    scaled = balanced_realisation(a, b, c)
     verdict = compared_gain(*scaled, d, level)
     if verdict is not None:
         return verdict
@@ -152,7 +152,7 @@ def highest_gain_found(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArra
         return hinf_norm(a, b, c, d).upper
     if spectral_radius(a) >= 1.0:
         return float("inf")
-    best, _ = _modal_peak(*_balanced(a, b, c), d)
+    best, _ = _modal_peak(*balanced_realisation(a, b, c), d)
     return best if np.isfinite(best) else hinf_norm(a, b, c, d).upper
 
 
@@ -208,15 +208,21 @@ def _modal_peak_angle(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray
     return float(centres[-1])
 
 
-def _balanced(a: FloatArray, b: FloatArray, c: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def balanced_realisation(a: FloatArray, b: FloatArray, c: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the realisation with its states scaled by powers of two, which is exact: units must not cost digits."""
-    from scipy.linalg.lapack import dgebal
-
     n, inputs, outputs = a.shape[0], b.shape[1], c.shape[0]
     system = np.zeros((n + inputs + outputs, n + inputs + outputs))
     system[:n, :n], system[:n, n : n + inputs], system[n + inputs :, :n] = a, b, c
-    scale = dgebal(system, scale=1, permute=0)[3][:n]
+    scale = balancing_factors(system)[:n]
     return a * scale / scale[:, None], b / scale[:, None], c * scale
+
+
+def balancing_factors(matrix: FloatArray) -> FloatArray:
+    """Return powers of two ``(n,)`` that balance a matrix ``(n, n)``: ``matrix * s / s[:, None]`` is balanced."""
+    # Not by scipy's matrix_balance, which casts the factors to integers and warns where they are too large for that.
+    from scipy.linalg.lapack import dgebal
+
+    return np.asarray(dgebal(matrix, scale=1, permute=0)[3], dtype=np.float64)
 
 
 def _peak(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, angles: FloatArray) -> tuple[float, float]:

@@ -8,6 +8,7 @@ from itertools import product
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.norms import balancing_factors
 from obsynth.numerics.spectra import abscissa
 from obsynth.verification.lyapunov import prove_stable
 
@@ -29,7 +30,7 @@ def lyapunov_factor(a: FloatArray, dt: float) -> FloatArray:
         Seconds between samples, 0 for continuous time.
     """
     n = a.shape[0]
-    best = np.eye(n)
+    best, spare = np.eye(n), None
     edge = abscissa(a, dt)
     if n == 0 or not edge < (1.0 if dt > 0.0 else 0.0):
         return best
@@ -38,17 +39,18 @@ def lyapunov_factor(a: FloatArray, dt: float) -> FloatArray:
         if found is None:
             continue
         best = found
-        if prove_stable(a, best, dt).proved:
-            break
-    return best
+        proof = prove_stable(a, best, dt)
+        if proof.in_double_precision:
+            return best
+        spare = best if proof.proved and spare is None else spare
+    return best if spare is None else spare
 
 
 def _factor(a: FloatArray, dt: float, share: float, rounds: int, edge: float) -> FloatArray | None:
-    from scipy.linalg import matrix_balance, solve_continuous_lyapunov, solve_discrete_lyapunov
+    from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov
 
     n = a.shape[0]
-    scale = matrix_balance(a, permute=False, separate=True)[1][0]
-    change = np.diag(scale)
+    change = np.diag(balancing_factors(a))
     for _ in range(rounds):
         moved = np.linalg.solve(change, a @ change)
         try:
