@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from obsynth.numerics.covariances import covariance_factor
 from obsynth.observers.records import checked_record, measured_record
 
 if TYPE_CHECKING:
+    from obsynth.observers.dae_algebra import ObserverGraph
     from obsynth.observers.dae_estimates import DAEEstimates
     from obsynth.observers.dae_running import RunningDAEObserver
 
@@ -168,7 +170,17 @@ class DAEObserver:
 
         return RunningDAEObserver(self)
 
-    def run(self, y: ArrayLike, u: ArrayLike | None = None) -> DAEEstimates:
+    @cached_property
+    def graph(self) -> ObserverGraph:
+        """The steps of each sample as CasADi functions, built when they are first needed."""
+        from obsynth.observers.dae_algebra import observer_graph
+
+        return observer_graph(self)
+
+    def run(
+        self, y: ArrayLike, u: ArrayLike | None = None, *, compiled: bool | None = None,
+        progress: bool | Callable[[int], None] | None = None,
+    ) -> DAEEstimates:  # fmt: skip
         """Run over a whole record.
 
         Parameters
@@ -178,6 +190,12 @@ class DAEObserver:
         u : array_like, optional
             Known inputs ``(samples, nu)``; ``u(k)`` holds during the step that ends at k, and ``u(0)`` puts the
             initial state onto its constraint.  May be left out when there are none.
+        compiled : bool, optional
+            ``None`` runs whole stretches inside CasADi, ``False`` each sample by itself, and ``True`` the observer as C
+            (a compiler is needed, which takes about a second once for each observer).  The numbers are the same.
+        progress : bool or callable, optional
+            ``None`` shows a bar on a terminal in runs of more than two seconds, ``True`` everywhere, ``False`` never; a
+            function is called with the number of samples that are done.
 
         Returns
         -------
@@ -187,22 +205,42 @@ class DAEObserver:
         Raises
         ------
         SpecError
-            Shapes do not fit, or an input is not finite (k is named).
+            Shapes do not fit, or an input is not finite (k is named); there is no compiler, but one is needed.
         SolverError
             A step has no solution; k, iteration and worst equation are named.
         """
-        from obsynth.observers.dae_estimates import DAEEstimates
+        from obsynth.observers.dae_records import run_record
 
-        outputs = measured_record(y, self.model.ny)
-        given = np.zeros((len(outputs), 0)) if u is None and not self.model.nu else np.asarray(u)
-        if given.dtype.kind == "f" and given.ndim == 2 and not np.isfinite(given).all():
-            k, i = np.argwhere(~np.isfinite(given))[0]
-            raise SpecError(
-                f"The input {self.model.input_names[i]!r} is {given[k, i]} at k = {k}: inputs must be known. Fill the "
-                "gap, or make the signal a state with a sensor.", path="u",
-            )  # fmt: skip
-        inputs = checked_record(given, self.model.nu, "u")
-        if len(inputs) != len(outputs):
-            raise SpecError(f"u has {len(inputs)} samples and y has {len(outputs)}: give the same number.", path="u")
-        running = self.start()
-        return DAEEstimates.of(self, [running.raw_step(outputs[k], inputs[k]) for k in range(len(outputs))])
+        outputs, inputs = dae_record(self.model, y, u)
+        return run_record(self, outputs, inputs, compiled=compiled, progress=progress)
+
+
+def dae_record(model: DAEModel, y: ArrayLike, u: ArrayLike | None) -> tuple[FloatArray, FloatArray]:
+    """Return outputs ``(samples, ny)`` and known inputs ``(samples, nu)`` of a record.
+
+    Parameters
+    ----------
+    model : DAEModel
+        Whose.
+    y, u : array_like
+        As given to `DAEObserver.run`.
+
+    Raises
+    ------
+    SpecError
+        Shapes do not fit, or an input is not finite (k is named).
+    """
+    outputs = measured_record(y, model.ny)
+    given = np.zeros((len(outputs), 0)) if u is None and not model.nu else np.asarray(u)
+    if given.ndim == 1 and model.nu == 1:
+        given = given[:, None]
+    if given.dtype.kind == "f" and given.ndim == 2 and given.shape[1] == model.nu and not np.isfinite(given).all():
+        k, i = np.argwhere(~np.isfinite(given))[0]
+        raise SpecError(
+            f"The input {model.input_names[i]!r} is {given[k, i]} at k = {k}: inputs must be known. Fill the gap, or "
+            "make the signal a state with a sensor.", path="u",
+        )  # fmt: skip
+    inputs = checked_record(None if u is None and model.nu else given, model.nu, "u")
+    if len(inputs) != len(outputs):
+        raise SpecError(f"u has {len(inputs)} samples and y has {len(outputs)}: give the same number.", path="u")
+    return outputs, inputs

@@ -12,43 +12,68 @@ from obsynth.numerics.arrays import FloatArray, read_only
 
 if TYPE_CHECKING:
     from obsynth.observers.dae import DAEObserver
+    from obsynth.observers.dae_algebra import ObserverGraph
 
 
 @dataclass(frozen=True, eq=False)
 class DAERow:
-    """The estimates at one sample.
+    """What the graph of an observer gave at one sample, or (with a leading axis) at several in a row.
 
     Parameters
     ----------
-    x, theta : FloatArray
-        State after the measurement ``(nx,)`` and parameters ``(nq,)``.
-    covariance, parameter_covariance : FloatArray
-        Of their errors, ``(nx, nx)`` and ``(nq, nq)``.
-    innovation : FloatArray
-        ``(ny,)``, NaN where a sample is missing.
-    nis, degrees : float
-        Its square in units of its covariance, and degrees of freedom.
-    information : FloatArray
-        ``(nq, nq)``: what the sample says of the parameters.
-    residual, condition, contraction : float
-        Newton's scaled residual, the condition of (7), and the spectral radius of F (I - K H); zero, one and zero
-        at k = 0, where no step was taken.
+    graph : ObserverGraph
+        Which laid it out.
+    k : int
+        Number of the (first) sample.
+    memory, said : FloatArray
+        What is carried on, and what is said besides.
+    seen : BoolArray
+        ``(ny,)``: which outputs were there.
     moved : FloatArray
         ``(nx,)``: how far the state was put onto its constraint; zeros but at k = 0.
     """
 
-    x: FloatArray
-    theta: FloatArray
-    covariance: FloatArray
-    parameter_covariance: FloatArray
-    innovation: FloatArray
-    nis: float
-    degrees: int
-    information: FloatArray
-    residual: float
-    condition: float
-    contraction: float
+    graph: ObserverGraph
+    k: int
+    memory: FloatArray
+    said: FloatArray
+    seen: FloatArray
     moved: FloatArray
+
+    def part(self, name: str) -> FloatArray:
+        """Return one array by its name in the layouts `obsynth.observers.dae_layout`.
+
+        Parameters
+        ----------
+        name : str
+            Such as ``theta``, ``spread``, ``F``.
+        """
+        layout, values = (self.graph.memory, self.memory) if name in self.graph.memory.shapes else (
+            self.graph.row, self.said)  # fmt: skip
+        return layout.part(values, name)
+
+    @property
+    def several(self) -> DAERow:
+        """The same with a leading axis of samples."""
+        if self.memory.ndim == 2:
+            return self
+        return DAERow(self.graph, self.k, self.memory[None], self.said[None], self.seen[None], self.moved)
+
+    @property
+    def conditions(self) -> FloatArray:
+        """Condition number of the equilibrated matrix of (7) at each sample; one at k = 0, where no step was taken."""
+        rows = self.several
+        matrices, found = rows.part("scaled"), np.ones(len(rows.memory))
+        stepped = np.arange(self.k, self.k + len(matrices)) > 0
+        values = np.linalg.svd(matrices[stepped], compute_uv=False)
+        with np.errstate(divide="ignore"):
+            found[stepped] = values[:, 0] / values[:, -1]
+        return found
+
+    @property
+    def contractions(self) -> FloatArray:
+        """Spectral radius of F (I - K H) at each sample; zero at k = 0."""
+        return np.asarray(np.abs(np.linalg.eigvals(self.several.part("kept"))).max(axis=1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +129,7 @@ class DAEEstimates:
 
     @classmethod
     def of(
-        cls, observer: DAEObserver, rows: Sequence[DAERow], *, informations: Sequence[FloatArray] | None = None
+        cls, observer: DAEObserver, rows: Sequence[DAERow], *, informations: FloatArray | None = None
     ) -> DAEEstimates:
         """Return the estimates in what a running observer gave.
 
@@ -114,32 +139,38 @@ class DAEEstimates:
             Whose rows they are.
         rows : sequence of DAERow
             At least one.
-        informations : sequence of FloatArray, optional
-            Of the latest samples, when only the last row is given.
+        informations : FloatArray, optional
+            ``(any, nq, nq)``: of the latest samples, when only the last row is given.
         """
-        seen = [row.information for row in rows] if informations is None else list(informations)
-        levels = _excitation(observer, seen)[-len(rows) :]
-        variances = np.array([np.diag(row.covariance) for row in rows])
-        nq = observer.model.nq
+        parts = [_columns(row.several) for row in rows]
+        whole = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        seen = whole.pop("information") if informations is None else informations
+        whole.pop("information", None)
+        whole["excitation"] = _excitation(observer, seen)[-len(whole["nis"]) :]
         return cls(
-            read_only(np.array([row.x for row in rows])), read_only(np.sqrt(np.maximum(variances, 0.0))),
-            read_only(np.array([row.theta for row in rows]).reshape(-1, nq)),
-            read_only(np.array([row.parameter_covariance for row in rows]).reshape(-1, nq, nq)),
-            read_only(np.array([row.innovation for row in rows])), read_only(np.array([row.nis for row in rows])),
-            read_only(np.array([float(row.degrees) for row in rows])), read_only(levels),
-            read_only(np.array([row.residual for row in rows])), read_only(np.array([row.condition for row in rows])),
-            read_only(np.array([row.contraction for row in rows])), read_only(rows[0].moved),
-            observer.state_names, observer.fault_names,
+            **{name: read_only(value) for name, value in whole.items()}, projection=read_only(rows[0].moved),
+            state_names=observer.state_names, parameter_names=observer.fault_names,
         )  # fmt: skip
 
 
-def _excitation(observer: DAEObserver, informations: Sequence[FloatArray]) -> FloatArray:
-    levels = np.zeros(len(informations))
-    if not observer.model.nq:
+def _columns(rows: DAERow) -> dict[str, FloatArray]:
+    """Return what `DAEEstimates` keeps of some samples."""
+    variances = np.einsum("kii->ki", rows.part("covariance"))
+    return {
+        "states": rows.part("posterior"), "state_deviations": np.sqrt(np.maximum(variances, 0.0)),
+        "parameters": rows.part("theta"), "parameter_covariances": rows.part("spread"),
+        "innovations": np.where(rows.seen, rows.part("innovation"), np.nan), "nis": rows.part("nis")[:, 0],
+        "nis_degrees": rows.seen.sum(axis=1).astype(np.float64), "residuals": rows.part("residual")[:, 0],
+        "conditions": rows.conditions, "contraction": rows.contractions, "information": rows.part("information"),
+    }  # fmt: skip
+
+
+def _excitation(observer: DAEObserver, informations: FloatArray) -> FloatArray:
+    levels, window = np.zeros(len(informations)), observer.window
+    if not observer.model.nq or len(informations) < window:
         return levels
     root = np.linalg.cholesky(observer.initial_parameter_covariance)
-    total = np.cumsum([root.T @ information @ root for information in informations], axis=0)
-    for k in range(observer.window - 1, len(informations)):
-        before = total[k - observer.window] if k >= observer.window else 0.0
-        levels[k] = max(float(np.linalg.eigvalsh(total[k] - before)[0]), 0.0)
+    total = np.cumsum(root.T @ informations @ root, axis=0)
+    total[window:] -= total[:-window].copy()
+    levels[window - 1 :] = np.maximum(np.linalg.eigvalsh(total[window - 1 :])[:, 0], 0.0)
     return levels

@@ -12,8 +12,6 @@ import numpy as np
 from obsynth.analysis.dae_conditions import dae_conditions
 from obsynth.analysis.dae_index import SINGULAR_CONDITION
 from obsynth.errors import ObsynthError
-from obsynth.models.dae_functions import DAEFunctions
-from obsynth.models.dae_step import ImplicitStep
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.covariances import covariance_factor
 from obsynth.numerics.newton import LARGEST_RESIDUAL
@@ -127,23 +125,23 @@ def _model_rows(observer: DAEObserver, facts: DAEFacts) -> Iterator[Check]:
 
 def _derivative_gap(observer: DAEObserver) -> float:
     """Return the largest gap between derivatives and differences, in sizes of the signals."""
-    model = observer.model
-    functions = DAEFunctions(model, observer.integration)
-    step = ImplicitStep(functions, observer.dt)
-    u, theta = np.array(model.nominal_input), np.array(observer.initial_parameters)
-    x = step.solve(np.array(observer.initial_state), u, theta).x
-    found = step.solve(x, u, theta)
-    local = step.sensitivities(found, x, u, theta)
-    _, H, L = functions.outputs(x, theta)
-    exact = np.vstack([np.hstack([local.F, local.G]), np.hstack([H, L])])
+    model, running = observer.model, observer.start()
+    u, nothing = np.array(model.nominal_input), np.full(model.ny, np.nan)
+    x, theta = running.raw_step(nothing, u).part("posterior"), np.array(observer.initial_parameters)
+    found = running.raw_step(nothing, u)
+    H, L = found.part("H"), found.part("L")
+    exact = np.vstack([np.hstack([found.part("F"), found.part("G")]), np.hstack([H, L])])
     priors = np.sqrt(np.diag(observer.initial_parameter_covariance))
     sizes = np.concatenate([model.state_scales, priors])
     seen = np.abs(H) @ model.state_scales + np.abs(L) @ priors
     rows = np.concatenate([model.state_scales, np.where(seen > 0.0, seen, 1.0)])
+    step, end = running.implicit, found.part("posterior") - x
 
     def both(point: FloatArray) -> FloatArray:
+        """Return the end of a step from a point, and the outputs of the point moved to where the step ends."""
         x_moved, theta_moved = point[: model.nx], point[model.nx :]
-        return np.concatenate([step.solve(x_moved, u, theta_moved).x, functions.outputs(x_moved, theta_moved)[0]])
+        reached = step.solve_carefully(x_moved, u, theta_moved).x
+        return np.concatenate([reached, step.functions.outputs(x_moved + end, theta_moved)[0]])
 
     centre, worst = np.concatenate([x, theta]), 0.0
     for j, size in enumerate(sizes):
