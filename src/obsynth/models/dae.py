@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from types import MappingProxyType
 from typing import Any
 
@@ -196,6 +196,11 @@ class DAEModel:
     def is_data(self) -> bool:
         """Whether the model is given as texts, so that it can be saved."""
         return not callable(self.equations)
+
+    @cached_property
+    def graphs(self) -> dict[tuple[Any, ...], Any]:
+        """CasADi functions that were made of the model, by what they were made for, so that each is made once."""
+        return {}
 
     def as_dict(self) -> dict[str, Any]:
         """Return every field as data, as the constructor takes it.

@@ -81,24 +81,13 @@ class DAEFunctions:
     """
 
     def __init__(self, model: DAEModel, method: str = "backward-euler") -> None:
-        import casadi as ca
-
         if method not in BUTCHER:
             raise SpecError(f"The method of integration is {method!r}: use one of {', '.join(BUTCHER)}.", path="method")
         self.model, self.method, self.stages = model, method, len(BUTCHER[method])
-        symbols = symbols_of(model)
-        stages, start, dt = ca.SX.sym("X", model.nx, self.stages), ca.SX.sym("start", model.nx), ca.SX.sym("dt")
-        residual = _stage_equations(
-            symbols, stages, start, dt, np.asarray(np.linalg.inv(BUTCHER[method]), dtype=np.float64)
-        )
-        X = ca.vec(stages)
-        inputs = [X, start, symbols.u, symbols.theta, dt]
-        jacobians = [ca.jacobian(residual, X), ca.jacobian(residual, start), ca.jacobian(residual, symbols.theta)]
-        seen = [symbols.outputs, ca.jacobian(symbols.outputs, symbols.x),
-                ca.jacobian(symbols.outputs, symbols.theta)]  # fmt: skip
-        self.residual_function = _dense("residual", inputs, [residual, jacobians[0]])
-        self.derivative_function = _dense("derivatives", inputs, jacobians)
-        self.output_function = _dense("outputs", [symbols.x, symbols.theta], seen)
+        if (method,) not in model.graphs:
+            model.graphs[(method,)] = _graphs(model, method)
+        self.residual_function, self.derivative_function, self.output_function = model.graphs[(method,)]
+        # Buffers belong to one user each, functions to all.
         self.residual, self._outputs = Compiled(self.residual_function), Compiled(self.output_function)
 
     def outputs(self, x: FloatArray, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -111,6 +100,23 @@ class DAEFunctions:
         """
         y, H, L = self._outputs(x, theta)
         return y[:, 0], H, L
+
+
+def _graphs(model: DAEModel, method: str) -> tuple[Any, Any, Any]:
+    import casadi as ca
+
+    symbols = symbols_of(model)
+    stages = ca.SX.sym("X", model.nx, len(BUTCHER[method]))
+    start, dt = ca.SX.sym("start", model.nx), ca.SX.sym("dt")
+    weights = np.asarray(np.linalg.inv(BUTCHER[method]), dtype=np.float64)
+    residual, X = _stage_equations(symbols, stages, start, dt, weights), ca.vec(stages)
+    inputs = [X, start, symbols.u, symbols.theta, dt]
+    jacobians = [ca.jacobian(residual, X), ca.jacobian(residual, start), ca.jacobian(residual, symbols.theta)]
+    seen = [symbols.outputs, ca.jacobian(symbols.outputs, symbols.x), ca.jacobian(symbols.outputs, symbols.theta)]
+    return (
+        _dense("residual", inputs, [residual, jacobians[0]]), _dense("derivatives", inputs, jacobians),
+        _dense("outputs", [symbols.x, symbols.theta], seen),
+    )  # fmt: skip
 
 
 def _dense(name: str, inputs: list[Any], outputs: list[Any]) -> Any:

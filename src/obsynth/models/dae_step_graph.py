@@ -44,7 +44,7 @@ class StepGraph:
     small: bool
 
 
-def step_graph(functions: DAEFunctions, dt: float, largest_move: float = np.inf) -> StepGraph:
+def step_graph(functions: DAEFunctions, dt: float, largest_move: float) -> StepGraph:
     """Return the functions of one implicit step.
 
     Parameters
@@ -53,9 +53,17 @@ def step_graph(functions: DAEFunctions, dt: float, largest_move: float = np.inf)
         The model with its method of integration.
     dt : float
         Seconds.
-    largest_move : float, optional
+    largest_move : float
         In sizes of the states: longer steps are not to be trusted.
     """
+    graphs, key = functions.model.graphs, (functions.method, dt, largest_move)
+    if key not in graphs:
+        graphs[key] = _graph(functions, dt, largest_move)
+    found: StepGraph = graphs[key]
+    return found
+
+
+def _graph(functions: DAEFunctions, dt: float, largest_move: float) -> StepGraph:
     import casadi as ca
 
     model, stages = functions.model, functions.stages

@@ -88,8 +88,7 @@ def dae_facts(observer: DAEObserver) -> DAEFacts:
     model, running = observer.model, observer.start()
     u = np.array(model.nominal_input)
     truth = _nominal_outputs(observer, u)
-    rows = list(advanced(running, truth, np.tile(u, (len(truth), 1)), lambda done: None))
-    found = DAEEstimates.of(observer, rows)
+    found = DAEEstimates.of(observer, advanced(running, truth, np.tile(u, (len(truth), 1))))
     covariance = found.parameter_covariances[-1]
     deviations = np.sqrt(np.diag(covariance))
     safe = np.where(deviations > 0.0, deviations, 1.0)
