@@ -50,6 +50,9 @@ class Compiled:
         for argument, size, value in zip(self._arguments, self._sizes, values, strict=True):
             argument[:size] = value
         self._run()
+        if self._buffer.ret():
+            # A factorisation inside met a singular matrix; what is in the buffers belongs to another call.
+            return tuple(np.full(shape, np.nan) for shape in self._shapes)
         return tuple(
             np.array(result[: shape[0] * shape[1]]).reshape(shape, order="F")
             for result, shape in zip(self._results, self._shapes, strict=True)

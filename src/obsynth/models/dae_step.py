@@ -119,7 +119,7 @@ class ImplicitStep:
             There is no solution within reach; k, iteration and worst equation are named.
         """
         stages, residual, trusted = self._fast(x, u, theta)
-        if trusted[0, 0]:
+        if trusted[0, 0] == 1.0:
             return Solution(stages[-self.functions.model.nx :, 0], stages[:, 0], float(residual[0, 0]), 1)
         return self.solve_carefully(x, u, theta, before=before, k=k)
 

@@ -1,7 +1,7 @@
 """Linear equations inside CasADi graphs, with pivots: CasADi's own ``solve`` of scalar expressions takes none.
 
 Without row scaling and pivots it was measured to be 75 % wrong, silently.  Up to `SMALL` unknowns elimination is
-unrolled into scalar operations, which run fastest and become plain C; above, a sparse QR factorisation is called.
+unrolled into scalar operations, which run fastest; above, a sparse QR factorisation is called.
 """
 
 from __future__ import annotations
@@ -11,8 +11,11 @@ from typing import Any
 
 from obsynth.numerics.arrays import FloatArray
 
-#: Unknowns up to which elimination is unrolled: twenty make some twenty thousand scalar operations.
-SMALL = 20
+#: Unknowns up to which elimination is unrolled.  Above, the pivots make so many scalar operations that the sparse
+#: factorisation is faster, and C compilers take ten times as long.
+SMALL = 8
+#: A pivot below this ends the factorisation, and the function with it; the caller is told and has no result.
+SINGULAR = 1e-16
 
 
 def equilibrated(matrix: Any, columns: FloatArray) -> tuple[Any, Any]:
@@ -85,7 +88,7 @@ def _solution(matrix: Any, right: Any, *, pivots: bool = False) -> Any:
     if not n or not m:
         return ca.MX(n, m)
     if n > SMALL:
-        return ca.solve(ca.densify(matrix), ca.densify(right), "qr")
+        return ca.solve(ca.densify(matrix), ca.densify(right), "qr", {"eps": SINGULAR})
     A, B = ca.SX.sym("A", n, n), ca.SX.sym("B", n, m)
     whole = ca.horzcat(A, B)
     function = ca.Function("solve", [A, B], [_eliminated([whole[i, :] for i in range(n)], pivots=pivots)])

@@ -21,6 +21,7 @@ from obsynth.observers.records import checked_record, measured_record
 if TYPE_CHECKING:
     from obsynth.observers.dae_algebra import ObserverGraph
     from obsynth.observers.dae_estimates import DAEEstimates
+    from obsynth.observers.dae_library import DAELibrary
     from obsynth.observers.dae_running import RunningDAEObserver
 
 FORMS = ("forgetting", "random-walk", "augmented-kalman")
@@ -176,6 +177,19 @@ class DAEObserver:
         from obsynth.observers.dae_algebra import observer_graph
 
         return observer_graph(self)
+
+    @cached_property
+    def library(self) -> DAELibrary:
+        """The observer in C, compiled when it is first needed.
+
+        Raises
+        ------
+        SpecError
+            There is no compiler, or it fails.
+        """
+        from obsynth.observers.dae_library import DAELibrary
+
+        return DAELibrary(self)
 
     def run(
         self, y: ArrayLike, u: ArrayLike | None = None, *, compiled: bool | None = None,

@@ -52,8 +52,19 @@ class Layout:
         name : str
             Which; columns come as ``(..., rows)``, matrices as ``(..., rows, columns)``.
         """
+        return self.shaped(vectors[..., self.slices[name]], name)
+
+    def shaped(self, flat: FloatArray, name: str) -> FloatArray:
+        """Return one array of each of many parts of vectors.
+
+        Parameters
+        ----------
+        flat : FloatArray
+            ``(..., entries)``.
+        name : str
+            Which; columns come as ``(..., rows)``, matrices as ``(..., rows, columns)``.
+        """
         rows, columns = self.shapes[name]
-        flat = vectors[..., self.slices[name]]
         if columns == 1 and name not in MATRICES:
             return flat
         return np.swapaxes(flat.reshape(*flat.shape[:-1], columns, rows), -1, -2)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
+
 from obsynth.models.dae_functions import Compiled
 from obsynth.models.dae_stretches import take_samples
 from obsynth.numerics.arrays import FloatArray
@@ -11,6 +13,7 @@ from obsynth.observers.dae import DAEObserver
 from obsynth.observers.dae_estimates import DAEEstimates, DAERow
 from obsynth.observers.dae_running import RunningDAEObserver
 from obsynth.observers.progress import shown_progress
+
 
 def run_record(
     observer: DAEObserver, y: FloatArray, u: FloatArray, *, compiled: bool | None,
@@ -28,6 +31,10 @@ def run_record(
         See `DAEObserver.run`.
     """
     running = observer.start()
+    if not len(y):
+        graph, nx = observer.graph, observer.model.nx
+        memory, said = np.zeros((0, graph.memory.size)), np.zeros((0, graph.row.size))
+        return DAEEstimates.of(observer, [DAERow(graph, 0, memory, said, ~np.isnan(y), np.zeros(nx))])
     with shown_progress(progress, len(y), "samples") as note:
         if compiled is False:
             rows = []
@@ -35,7 +42,17 @@ def run_record(
                 rows.append(running.raw_step(y[k], u[k]))
                 note(k + 1)
             return DAEEstimates.of(observer, rows)
-        return DAEEstimates.of(observer, advanced(running, y, u, note))
+        rows = _in_c(observer, y, u, running) if compiled else advanced(running, y, u, note)
+        return DAEEstimates.of(observer, rows)
+
+
+def _in_c(observer: DAEObserver, y: FloatArray, u: FloatArray, running: RunningDAEObserver) -> list[DAERow]:
+    """Run as C: a million steps take seconds, so that there is no progress to show."""
+    after, said = observer.library.record(y, u)
+    if len(after) < len(y):
+        # The message is written there.
+        return advanced(running, y, u)
+    return [DAERow(observer.graph, 0, after, said, ~np.isnan(y), running.projected(u[0])[1])]
 
 
 def advanced(
@@ -65,7 +82,6 @@ def advanced(
         found.append(rows)
         return len(rows.memory)
 
-    if len(y):
-        alone(0)
+    alone(0)
     take_samples(1, len(y), together, alone, note)
     return found

@@ -94,11 +94,11 @@ class RunningDAEObserver:
         seen = ~np.isnan(y)
         heard, moved = np.where(seen, y, 0.0), np.zeros(self.observer.model.nx)
         if self.k == 0:
-            memory, moved = self._projected(u)
+            memory, moved = self.projected(u)
             after, said = self._first(memory, heard, seen)
         else:
             after, said = self._whole(self.memory, np.concatenate([u, heard, seen]))
-            if not said[-1, 0]:
+            if said[-1, 0] != 1.0:
                 after, said = self._carefully(heard, seen, u)
         if not np.isfinite(after).all():
             raise SolverError(
@@ -123,7 +123,7 @@ class RunningDAEObserver:
         seen = ~np.isnan(y)
         arriving = np.hstack([u, np.where(seen, y, 0.0), seen])
         after, said = (found.T for found in run(self.memory, arriving.ravel()))
-        good = (said[:, -1] != 0.0) & np.isfinite(after).all(axis=1)
+        good = (said[:, -1] == 1.0) & np.isfinite(after).all(axis=1)
         taken = len(y) if good.all() else int(np.argmin(good))
         rows = DAERow(self.graph, self.k, after[:taken], said[:taken], seen[:taken], np.zeros(0))
         if taken:
@@ -131,8 +131,14 @@ class RunningDAEObserver:
             self.informations.extend(rows.part("information"))
         return rows
 
-    def _projected(self, u: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Put the initial state onto the algebraic equations; return the memory and how far it moved."""
+    def projected(self, u: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Put the initial state onto the algebraic equations; return the memory and how far it moved.
+
+        Parameters
+        ----------
+        u : FloatArray
+            ``(nu,)`` at k = 0.
+        """
         model, start = self.observer.model, self.x
         short = ImplicitStep(DAEFunctions(model), PROJECTION_SHARE * self.observer.dt)
         found = short.solve_carefully(start, u, self.theta).x

@@ -127,7 +127,7 @@ class _Run:
         kept = slice(k, k + length)
         arriving = np.hstack([self.inputs[kept], self.theta[kept], self.pushed[kept]])
         after, said = (found.T for found in self.calls[length](self.states[k - 1], arriving.ravel()))
-        good = (said[:, 1] != 0.0) & np.isfinite(after).all(axis=1)
+        good = (said[:, 1] == 1.0) & np.isfinite(after).all(axis=1)
         taken = length if good.all() else int(np.argmin(good))
         self._note(slice(k, k + taken), after[:taken], said[:taken, 0])
         return taken
