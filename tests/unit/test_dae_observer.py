@@ -168,11 +168,11 @@ def test_missing_channels_and_samples() -> None:
         row = running.raw_step(y[k], u[k])
         if k == 50:
             assert np.array_equal(running.S, before)
-            assert not row.seen.any()
-            assert row.part("nis") == 0.0
+            assert row.degrees == 0
+            assert row.nis == 0.0
         if k in (100, 139):
-            assert row.seen.tolist() == [False, True]
-            assert row.part("innovation")[0] == 0.0
+            assert row.degrees == 1
+            assert np.isnan(row.innovation[0])
     assert np.isfinite(running.posterior).all()
     assert running.theta == pytest.approx([0.9, 2e3], abs=250.0)
 

@@ -4,11 +4,13 @@
 ADVANCE = r"""
 typedef int (*generated)(const double **arg, double **res, int *iw, double *w, int mem);
 
+#ifndef OBSERVER_IS_DECLARED
 struct observer {
     double memory[MEMORY];
     double u[LENGTH(NU)];
     int started;
 };
+#endif
 
 static void copy(double *to, const double *from, int n)
 {

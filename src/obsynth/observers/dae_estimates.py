@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from obsynth.numerics.arrays import FloatArray, read_only
 
@@ -27,8 +28,8 @@ class DAERow:
         Number of the (first) sample.
     memory, said : FloatArray
         What is carried on, and what is said besides.
-    seen : BoolArray
-        ``(ny,)``: which outputs were there.
+    seen : numpy.ndarray
+        ``(ny,)``, of bool: which outputs were there.
     moved : FloatArray
         ``(nx,)``: how far the state was put onto its constraint; zeros but at k = 0.
     """
@@ -37,7 +38,7 @@ class DAERow:
     k: int
     memory: FloatArray
     said: FloatArray
-    seen: FloatArray
+    seen: NDArray[np.bool_]
     moved: FloatArray
 
     def part(self, name: str) -> FloatArray:
@@ -51,6 +52,41 @@ class DAERow:
         layout, values = (self.graph.memory, self.memory) if name in self.graph.memory.shapes else (
             self.graph.row, self.said)  # fmt: skip
         return layout.part(values, name)
+
+    @property
+    def x(self) -> FloatArray:
+        """The state after the measurement ``(nx,)``."""
+        return self.part("posterior")
+
+    @property
+    def theta(self) -> FloatArray:
+        """The parameters ``(nq,)``."""
+        return self.part("theta")
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance of `x` ``(nx, nx)``."""
+        return self.part("covariance")
+
+    @property
+    def parameter_covariance(self) -> FloatArray:
+        """Covariance of `theta` ``(nq, nq)``."""
+        return self.part("spread")
+
+    @property
+    def innovation(self) -> FloatArray:
+        """Outputs without what was predicted of them ``(ny,)``; NaN where a sample is missing."""
+        return np.where(self.seen, self.part("innovation"), np.nan)
+
+    @property
+    def nis(self) -> FloatArray:
+        """Square of the innovation in units of its covariance, a number."""
+        return self.part("nis")[..., 0]
+
+    @property
+    def degrees(self) -> int:
+        """Number of outputs that are there, of one sample."""
+        return int(self.seen.sum())
 
     @property
     def several(self) -> DAERow:
@@ -157,9 +193,9 @@ def _columns(rows: DAERow) -> dict[str, FloatArray]:
     """Return what `DAEEstimates` keeps of some samples."""
     variances = np.einsum("kii->ki", rows.part("covariance"))
     return {
-        "states": rows.part("posterior"), "state_deviations": np.sqrt(np.maximum(variances, 0.0)),
-        "parameters": rows.part("theta"), "parameter_covariances": rows.part("spread"),
-        "innovations": np.where(rows.seen, rows.part("innovation"), np.nan), "nis": rows.part("nis")[:, 0],
+        "states": rows.x, "state_deviations": np.sqrt(np.maximum(variances, 0.0)),
+        "parameters": rows.theta, "parameter_covariances": rows.parameter_covariance,
+        "innovations": rows.innovation, "nis": rows.nis,
         "nis_degrees": rows.seen.sum(axis=1).astype(np.float64), "residuals": rows.part("residual")[:, 0],
         "conditions": rows.conditions, "contraction": rows.contractions, "information": rows.part("information"),
     }  # fmt: skip
