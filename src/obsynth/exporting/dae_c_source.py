@@ -76,7 +76,7 @@ def write_dae_c(design: ObserverDesign, target: Path, sample_time: float | None)
                         path="sample_time")  # fmt: skip
     digest, prefix, header = str(design_as_dict(design)["sha256"]), c_identifier(target.stem), target.with_suffix(".h")
     source = "\n".join([
-        _comment(f"sha256 of the gain set: {digest}"), f'#include "{header.name}"', "",
+        _comment(f"sha256 of the gain set: {digest}"), f'#include "{_include(header.name)}"', "",
         "#define OBSERVER_IS_DECLARED", f"#define observer {prefix}_observer", "", observer_code(observer),
         _step_text(prefix, design.nonlinear[0]),
     ])  # fmt: skip
@@ -104,7 +104,7 @@ def _header(design: ObserverDesign, prefix: str, digest: str) -> Iterator[str]:
     yield from (f"#define {upper}_DT {observer.dt!r}", "", f"struct {prefix}_observer {{")
     yield from (f"    double memory[{observer.graph.memory.size}];", f"    double u[{max(model.nu, 1)}];")
     yield from ("    int started;", "};", f"typedef struct {prefix}_observer {prefix}_state;", "")
-    yield _comment("States after the measurement, parameters, standard deviations of both; innovations, NaN where y is;")
+    yield _comment("States after the measurement, parameters, their standard deviations; innovations (NaN where y is);")
     yield _comment("their square in units of their covariance; the residual of the step in sizes of the states.")
     yield "typedef struct {"
     yield from (f"    double {name}[{max(size, 1)}];" for name, size in sizes.items())
@@ -117,6 +117,7 @@ def _header(design: ObserverDesign, prefix: str, digest: str) -> Iterator[str]:
                          ("parameters", model.parameter_names)):  # fmt: skip
         yield from (_comment(f"{array}[{i}]: {_quoted(name)}, {_quoted(model.units[name])}") for i, name in
                     enumerate(names))  # fmt: skip
-    inputs = f"const double u[{model.nu}], " if model.nu else ""
-    yield f"int {prefix}_step({prefix}_state *state, {inputs}const double y[{model.ny}], {prefix}_estimates *estimates);"
+    taken = [f"{prefix}_state *state", f"const double y[{model.ny}]", f"{prefix}_estimates *estimates"]
+    taken[1:1] = [f"const double u[{model.nu}]"] if model.nu else []
+    yield f"int {prefix}_step({', '.join(taken)});"
     yield from ("", "#endif")
