@@ -12,13 +12,13 @@ from obsynth.errors import SpecError
 from obsynth.models.dae_symbols import DAESymbols, symbols_of
 from obsynth.models.names import checked_names
 from obsynth.models.validation import Problems
-from obsynth.numerics.expressions import CONSTANTS, FUNCTIONS, FUNCTIONS_OF_TWO
+from obsynth.numerics.expressions import CONSTANTS, DECIDING_WORDS, FUNCTIONS, FUNCTIONS_OF_TWO
 
 if TYPE_CHECKING:
     from obsynth.models.dae import DAEModel
 
 #: Names that mean something else in the language.
-RESERVED = frozenset({*CONSTANTS, *FUNCTIONS, *FUNCTIONS_OF_TWO, "der"})
+RESERVED = frozenset({*CONSTANTS, *FUNCTIONS, *FUNCTIONS_OF_TWO, *DECIDING_WORDS, "der", "where"})
 
 
 def checked_signals(values: Mapping[str, float] | None, what: str) -> dict[str, float]:

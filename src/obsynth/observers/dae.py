@@ -107,6 +107,10 @@ class DAEObserver:
             raise SpecError(f"largest_move is {self.largest_move}: give a positive number.", path="largest_move")
         self._check_arrays()
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what makes it again in another process: its functions and its library are made there anew."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
     def _check_arrays(self) -> None:
         nx, ny, nq = self.model.nx, self.model.ny, self.model.nq
         sizes = {"Q": nx, "R": ny, "initial_covariance": nx, "initial_parameter_covariance": nq, "random_walk": nq}

@@ -120,7 +120,8 @@ def _generated(functions: dict[str, Any]) -> str:
         "#if defined(__GNUC__)", "#pragma GCC diagnostic push",
         *(f'#pragma GCC diagnostic ignored "-W{name}"' for name in ("unused-parameter", "unused-function",
                                                                      "unused-const-variable")),
-        "#endif", "#define CASADI_SYMBOL_EXPORT static", generator.dump().rstrip(),
+        "#if !defined(__clang__)", '#pragma GCC diagnostic ignored "-Wmaybe-uninitialized"', "#endif", "#endif",
+        "#define CASADI_SYMBOL_EXPORT static", generator.dump().rstrip(),
         "#if defined(__GNUC__)", "#pragma GCC diagnostic pop", "#endif",
     ])  # fmt: skip
 
