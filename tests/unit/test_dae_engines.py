@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import subprocess
+import sys
 
 import numpy as np
 import pytest
-from dae_plants import diode, exchanger, linear
+from dae_plants import DESIGNS, diode, exchanger, linear
 from test_dae_observer import BALANCES, drive, linear_observer, observer, record
 
 import obsynth
@@ -299,3 +301,11 @@ def test_functions_of_python_run_as_c_as_well() -> None:
     shipped = linear_observer()
     assert not linear(dict(zip("EABGCD", [np.eye(1)] * 6, strict=True))).is_data
     assert shipped.run(y, u, compiled=True).states == pytest.approx(shipped.run(y, u).states, abs=1e-12)
+
+
+def test_the_benchmark_runs() -> None:
+    script = DESIGNS.parent / "benchmarks" / "dae_adaptive_observer.py"
+    done = subprocess.run([sys.executable, script, "--small"], capture_output=True, text=True, check=True)
+    rows = [line.strip("| ").split(" | ") for line in done.stdout.splitlines()[3:]]
+    assert len(rows) == 7
+    assert all(len(row) == 3 for row in rows)
