@@ -1,7 +1,7 @@
 """Steps per second of the observer of a nonlinear DAE on the heat exchanger, with every engine, and the EKF beside it.
 
-Usage: ``python benchmarks/dae_adaptive_observer.py [--small]``.  One thread, processor time (of the C compiler, which is
-a process of its own, wall time), best of several; the engines are compared first, so that nothing is timed that
+Usage: ``python benchmarks/dae_adaptive_observer.py [--small]``.  One thread, processor time (of the C compiler, which
+is a process of its own, wall time), best of several; the engines are compared first, so that nothing is timed that
 computes something else.
 """
 

@@ -46,6 +46,10 @@ def small(**changes) -> DAEModel:
          ["equations.moves", "where(a > b, c, d)"]),
         ({"equations": {"moves": "der(a) = -c * a", "holds": "b <= go"}}, ["equations.holds", "where(a > b, c, d)"]),
         ({"states": {"a": 1.0, "where": 1.0}}, ["'where'"]),
+        ({"units": {**UNITS, "c": ""}}, ["units", "'c'"]),
+        ({"outputs": {"seen": "2.0"}}, ["'seen'", "neither a state nor a parameter"]),
+        ({"equations": {"moves": "der(c) = -c * a + b", "holds": "b = go + 0.1 * a"}}, ["der(...)", "'moves'", "zero"]),
+        ({"equations": {"moves": "der(a) = -c * a + k", "holds": "b = go"}}, ["'der(a) = -c * a + k' uses 'k'"]),
     ],
 )  # fmt: skip
 def test_what_is_wrong_is_named(changes, words) -> None:
@@ -231,3 +235,18 @@ def test_corrected_with_the_papers_inputs_the_bias_is_stored_energy() -> None:
     assert "psi" in found.unidentifiable
     assert any({"psi", "Energy"} <= set(direction) for direction in found.unseen)
     assert "phi" not in found.unidentifiable
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"dt": 0.0}, "dt is 0.0"), ({"R": [[0.0]]}, "R must be positive definite"),
+        ({"R": np.eye(2)}, r"R is \(2, 2\)"),
+        ({"parameter_scales": [0.0]}, "must be positive"), ({"u": np.ones((1, 1))}, "at least 2"),
+        ({"u": np.ones((9, 2))}, r"\(samples, 1\)"), ({"initial_state": [1.0, np.inf]}, r"initial_state\.b is inf"),
+    ],
+)  # fmt: skip
+def test_bad_questions_of_identifiability_are_named(arguments, words) -> None:
+    given = {"u": np.ones((9, 1)), "dt": 0.5, "R": [[1.0]], **arguments}
+    with pytest.raises(SpecError, match=words):
+        identifiability(small(), given.pop("u"), **given)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from dae_plants import exchanger, linear
@@ -253,3 +255,57 @@ def test_saved_as_data_it_is_the_same() -> None:
     first = observer(integration="radau")
     second = DAEObserver.from_dict(first.as_dict())
     assert np.array_equal(first.run(y, u).states, second.run(y, u).states)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"dt": -1.0}, "dt is -1.0: give the seconds"), ({"dt": "1"}, "dt is '1'"), ({"window": 2.5}, "window is 2.5"),
+        ({"forgetting": "x"}, "forgetting is 'x'"), ({"largest_move": "x"}, "largest_move is 'x'"),
+        ({"R": np.diag([1e4, 0.0])}, "variance of 'temperature' is 0"),
+        ({"R": np.array([[1e4, 50.0], [50.0, 0.25]])}, "R must be positive definite, but it is singular"),
+        ({"upper": np.array([0.5, 1e3])}, r"bounds\.phi: the lower bound \(-inf\).*upper one \(0.5\)"),
+        ({"initial_state": np.array([np.nan, 1.0, 1.0, 1.0])}, r"initial_state\.p1 is nan"),
+        ({"initial_state": np.ones(3)}, "4 finite number.*p1, p2, T1, T2"),
+    ],
+)  # fmt: skip
+def test_bad_fields_are_named_with_their_signals(changes, words) -> None:
+    with pytest.raises(SpecError, match=words):
+        observer(**changes)
+
+
+def test_units_do_not_decide_whether_a_covariance_is_definite() -> None:
+    assert observer(initial_parameter_covariance=np.diag([1e-20, 1e14])).order == 6
+
+
+def test_bad_arguments_of_a_run_are_named() -> None:
+    y, u = record(samples=5)
+    for options, words in (({"compiled": "x"}, "compiled is 'x'"), ({"progress": 3}, "progress is 3")):
+        with pytest.raises(SpecError, match=words):
+            observer().run(y, u, **options)
+    with pytest.raises(SpecError, match="'m1' is nan at k = 0"):
+        observer().start().step(y[0], [np.nan, 450.0, 15150.0, 1.0])
+    with pytest.raises(SpecError, match="u must be 4 finite"):
+        observer().start().step(y[0], ["x", 450.0, 15150.0, 1.0])
+
+
+def test_an_observer_travels_to_another_process_after_it_has_run() -> None:
+    shipped = observer()
+    shipped.run(*record(samples=3))
+    assert set(shipped.__getstate__()) == {field.name for field in dataclasses.fields(shipped)}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"dt": 0.0}, "dt is 0.0: give the seconds"), ({"parameters": [np.nan, 0.0]}, r"parameters\.phi is nan"),
+        ({"parameters": np.ones((3, 2))}, r"parameters is \(3, 2\)"), ({"seed": -1}, "seed is -1"),
+        ({"initial_state": ["a", 1, 1, 1]}, "initial_state must be 4"), ({"Q": [[1.0]]}, "Q must be"),
+        ({"u": np.full((5, 4), np.nan)}, "'m1' is nan at k = 0"), ({"u": None}, "u is missing"),
+        ({"integration": "rk4"}, "'rk4'"),
+    ],
+)  # fmt: skip
+def test_bad_simulations_are_named(arguments, words) -> None:
+    given = {"u": np.tile(exchanger().nominal_input, (5, 1)), "dt": 1.0, **arguments}
+    with pytest.raises(SpecError, match=words):
+        simulate_dae(exchanger(), given.pop("u"), **given)

@@ -129,7 +129,7 @@ class DAEModel:
         problems.raise_if_any()
         check_structure(self, problems)
         required = [*self.state_names, *self.input_names, *self.parameter_names, *self.output_names]
-        missing = [name for name in required if name not in units]
+        missing = [name for name in required if units.get(name, "") == ""]
         if missing:
             problems.collect(partial(_units_missing, missing))
         known = {*required, *self.constants, *self.definitions}

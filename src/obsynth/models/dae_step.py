@@ -211,9 +211,10 @@ class ImplicitStep:
     def _error(self, found: NewtonResult, k: int, where: str) -> SolverError:
         model = self.functions.model
         name = model.equation_names[found.worst % model.nx]
+        defined = np.isfinite(found.residual)
+        worst = f"residual {found.residual:.3g} in sizes of the states" if defined else "which is not defined there"
         return SolverError(
             f"No solution at k = {k}{where}: Newton stopped after iteration {found.iterations}, and the worst equation "
-            f"is {name!r} (residual {found.residual:.3g} in sizes of the states). Check that input and state at this "
-            "k are possible, or take smaller steps.",
+            f"is {name!r} ({worst}). Check that input and state at this k are possible, or take smaller steps.",
             record={"k": k, "iteration": found.iterations, "equation": name, "residual": found.residual},
         )  # fmt: skip

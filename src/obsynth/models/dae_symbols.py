@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -113,7 +113,8 @@ def _equation(text: str, path: str) -> Expression:
     sides = _EQUALS.split(text, maxsplit=1)
     for side in sides:
         _parsed(side.strip(), path, rates=True)
-    return _parsed(f"({sides[0]}) - ({sides[1]})" if len(sides) > 1 else text, path, rates=True)
+    whole = _parsed(f"({sides[0]}) - ({sides[1]})" if len(sides) > 1 else text, path, rates=True)
+    return replace(whole, text=text)
 
 
 def _value(expression: Expression, known: Mapping[str, Any], path: str) -> Any:

@@ -111,12 +111,12 @@ class NewtonResult:
     @property
     def residual(self) -> float:
         """Largest scaled residual; infinite where there is no value."""
-        return float(np.nan_to_num(np.abs(self.residuals), nan=np.inf).max())
+        return float(np.where(np.isnan(self.residuals), np.inf, np.abs(self.residuals)).max())
 
     @property
     def worst(self) -> int:
         """Index of the equation with the largest residual."""
-        return int(np.argmax(np.nan_to_num(np.abs(self.residuals), nan=np.inf)))
+        return int(np.argmax(np.where(np.isnan(self.residuals), np.inf, np.abs(self.residuals))))
 
 
 def newton(

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SolverError, SpecError
+from obsynth.models.dae_checks import require_known
 from obsynth.models.dae_functions import Compiled, DAEFunctions
 from obsynth.models.dae_step import ImplicitStep
 from obsynth.numerics.arrays import FloatArray
@@ -77,9 +78,13 @@ class RunningDAEObserver:
         """
         model = self.observer.model
         outputs = measured_record(np.atleast_2d(np.asarray(y)), model.ny)[0]
-        inputs = np.asarray(u, dtype=np.float64)
-        if inputs.shape != (model.nu,) or not np.isfinite(inputs).all():
+        try:
+            inputs = np.atleast_1d(np.asarray(u, dtype=np.float64))
+        except (TypeError, ValueError):
+            inputs = np.zeros((0, 0))
+        if inputs.shape != (model.nu,):
             raise SpecError(f"u must be {model.nu} finite number(s) at k = {self.k}.", path="u")
+        require_known(model, inputs[None], self.k)
         row = self.raw_step(outputs, inputs)
         return DAEEstimates.of(self.observer, [row], informations=np.array(self.informations))
 

@@ -8,6 +8,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
+from obsynth.errors import SpecError
+
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
@@ -35,10 +37,17 @@ def shown_progress(
     ------
     callable
         To be called with the number of what is done.
+
+    Raises
+    ------
+    SpecError
+        ``progress`` is something else.
     """
     if callable(progress):
         yield progress
         return
+    if progress not in (None, True, False):
+        raise SpecError(f"progress is {progress!r}: give True, False, None, or a function.", path="progress")
     if progress is False or (progress is None and not sys.stderr.isatty()):
         yield _nothing
         return

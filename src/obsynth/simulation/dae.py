@@ -10,10 +10,10 @@ from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
 from obsynth.models.dae import DAEModel
+from obsynth.models.dae_checks import checked_inputs, finite_vector, step_length
 from obsynth.models.dae_functions import Compiled, DAEFunctions
 from obsynth.models.dae_step import ImplicitStep
 from obsynth.models.dae_stretches import take_samples
-from obsynth.models.time_varying_checks import positive_dt
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.covariances import covariance_factor
 
@@ -84,22 +84,30 @@ def simulate_dae(
     SolverError
         A step has no solution; k, iteration and worst equation are named.
     """
-    inputs = as_matrix(u, "u") if model.nu else np.zeros((len(np.asarray(u)), 0))
-    theta = model.nominal_parameters if parameters is None else np.asarray(parameters, dtype=np.float64)
-    theta = np.tile(theta, (len(inputs), 1)) if theta.ndim == 1 else theta
-    x = np.array(model.nominal_state if initial_state is None else initial_state, dtype=np.float64)
-    if inputs.shape[1] != model.nu or theta.shape != (len(inputs), model.nq) or x.shape != (model.nx,):
-        raise SpecError(
-            f"u must be (samples, {model.nu}), parameters ({model.nq},) or (samples, {model.nq}), and initial_state "
-            f"({model.nx},).", path="u",
-        )  # fmt: skip
+    inputs, length = checked_inputs(model, u), step_length(dt)
+    theta = _parameters(model, parameters, len(inputs))
+    x = finite_vector(initial_state, model.state_names, model.nominal_state, "initial_state")
+    if not isinstance(seed, (int, np.integer)) or isinstance(seed, bool) or seed < 0:
+        raise SpecError(f"seed is {seed!r}: give a whole number, not negative.", path="seed")
     rng = np.random.default_rng(seed)
     pushed = _noise(Q, model.nx, "Q", rng, len(inputs))
     heard = _noise(R, model.ny, "R", rng, len(inputs))
-    run = _Run(ImplicitStep(DAEFunctions(model, integration), positive_dt(dt)), inputs, theta, pushed)
+    run = _Run(ImplicitStep(DAEFunctions(model, integration), length), inputs, theta, pushed)
     run.start(x)
     take_samples(1, len(inputs), run.together, run.alone)
     return DAETrajectory(read_only(run.states), read_only(run.outputs + heard), read_only(run.residuals))
+
+
+def _parameters(model: DAEModel, value: ArrayLike | None, samples: int) -> FloatArray:
+    """Return the parameters at each sample ``(samples, nq)``."""
+    if value is None or np.ndim(value) < 2:
+        theta = finite_vector(value, model.parameter_names, model.nominal_parameters, "parameters")
+        return np.tile(theta, (samples, 1))
+    theta = as_matrix(value, "parameters")
+    if theta.shape != (samples, model.nq):
+        raise SpecError(f"parameters is {theta.shape}, but ({model.nq},) or ({samples}, {model.nq}) is needed.",
+                        path="parameters")  # fmt: skip
+    return theta
 
 
 class _Run:
