@@ -309,3 +309,32 @@ def test_the_benchmark_runs() -> None:
     rows = [line.strip("| ").split(" | ") for line in done.stdout.splitlines()[3:]]
     assert len(rows) == 7
     assert all(len(row) == 3 for row in rows)
+
+
+@pytest.mark.parametrize("compiled", [None, False, True])
+def test_a_step_that_becomes_singular_along_the_run_is_named(compiled) -> None:
+    """The gain of a sensor falls to nothing: what it shows no longer determines the state behind it."""
+    model = DAEModel(
+        {"moves": "der(a) = -c * a", "holds": "gain * z = a"}, {"seen": "a"}, states={"a": 1.0, "z": 1.0},
+        inputs={"gain": 1.0}, parameters={"c": 0.5}, units=dict.fromkeys(["a", "z", "gain", "c", "seen"], "1"),
+    )  # fmt: skip
+    shipped = observer(
+        model, dt=0.1, Q=1e-6 * np.eye(2), R=[[1e-4]], initial_covariance=1e-4 * np.eye(2),
+        initial_parameter_covariance=[[1e-2]], random_walk=np.zeros((1, 1)), lower=np.array([-np.inf]),
+        upper=np.array([np.inf]),
+    )  # fmt: skip
+    u = np.ones((40, 1))
+    u[23] = 1e-14
+    y = np.exp(-0.05 * np.arange(40))[:, None]
+    assert shipped.run(y[:23], u[:23], compiled=compiled).conditions.max() < 100.0
+    with pytest.raises(SolverError, match=r"singular at k = 23 .*'holds' do not determine 'z'"):
+        shipped.run(y, u, compiled=compiled)
+    running = shipped.start()
+    for k in range(23):
+        running.step(y[k], u[k])
+    memory = running.memory
+    with pytest.raises(SolverError, match="singular at k = 23"):
+        running.step(y[23], u[23])
+    assert running.k == 23
+    assert running.memory is memory
+    running.step(y[23], u[22])

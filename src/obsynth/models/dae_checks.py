@@ -201,7 +201,7 @@ def require_known(model: DAEModel, u: FloatArray, first: int = 0) -> None:
 
 
 def finite_vector(value: Any, names: Sequence[str], default: FloatArray, what: str) -> FloatArray:
-    """Return ``(len(names),)`` finite numbers, the default for ``None``; raise `SpecError` naming an entry otherwise."""
+    """Return ``(len(names),)`` finite numbers, the default for ``None``; raise `SpecError` naming what is wrong."""
     if value is None:
         return np.array(default)
     try:

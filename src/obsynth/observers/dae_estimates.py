@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from obsynth.analysis.dae_index import SINGULAR_CONDITION, involved
+from obsynth.errors import SolverError
 from obsynth.numerics.arrays import FloatArray, read_only
 
 if TYPE_CHECKING:
@@ -187,6 +189,36 @@ class DAEEstimates:
             **{name: read_only(value) for name, value in whole.items()}, projection=read_only(rows[0].moved),
             state_names=observer.state_names, parameter_names=observer.fault_names,
         )  # fmt: skip
+
+
+def require_regular(observer: DAEObserver, estimates: DAEEstimates, rows: Sequence[DAERow]) -> DAEEstimates:
+    """Return the estimates, unless the matrix of (7) was singular to working precision at some k.
+
+    Parameters
+    ----------
+    observer : DAEObserver
+        Whose they are.
+    estimates : DAEEstimates
+        Of `rows`.
+    rows : sequence of DAERow
+        In which the matrices are.
+
+    Raises
+    ------
+    SolverError
+        It was; k, equations and states are named.
+    """
+    worst = int(np.argmax(estimates.conditions)) if len(estimates.conditions) else 0
+    if not len(estimates.conditions) or estimates.conditions[worst] <= SINGULAR_CONDITION:
+        return estimates
+    matrices = np.concatenate([row.several.part("scaled") for row in rows])
+    equations, states = involved(observer.model, matrices[worst])
+    k, condition = rows[0].k + worst, float(estimates.conditions[worst])
+    raise SolverError(
+        f"The matrix of (7), dF/dx' / dt + dF/dx, is singular at k = {k} (condition {condition:.3g}): the equations "
+        f"{', '.join(map(repr, equations))} do not determine {', '.join(map(repr, states))} there.",
+        record={"k": k, "condition": condition},
+    )
 
 
 def _columns(rows: DAERow) -> dict[str, FloatArray]:

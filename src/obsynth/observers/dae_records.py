@@ -10,7 +10,7 @@ from obsynth.models.dae_functions import Compiled
 from obsynth.models.dae_stretches import take_samples
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae import DAEObserver
-from obsynth.observers.dae_estimates import DAEEstimates, DAERow
+from obsynth.observers.dae_estimates import DAEEstimates, DAERow, require_regular
 from obsynth.observers.dae_running import RunningDAEObserver
 from obsynth.observers.progress import shown_progress
 
@@ -41,9 +41,9 @@ def run_record(
             for k in range(len(y)):
                 rows.append(running.raw_step(y[k], u[k]))
                 note(k + 1)
-            return DAEEstimates.of(observer, rows)
-        rows = _in_c(observer, y, u, running) if compiled else advanced(running, y, u, note)
-        return DAEEstimates.of(observer, rows)
+        else:
+            rows = _in_c(observer, y, u, running) if compiled else advanced(running, y, u, note)
+    return require_regular(observer, DAEEstimates.of(observer, rows), rows)
 
 
 def _in_c(observer: DAEObserver, y: FloatArray, u: FloatArray, running: RunningDAEObserver) -> list[DAERow]:

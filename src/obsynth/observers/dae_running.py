@@ -15,7 +15,7 @@ from obsynth.models.dae_functions import Compiled, DAEFunctions
 from obsynth.models.dae_step import ImplicitStep
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae import DAEObserver
-from obsynth.observers.dae_estimates import DAEEstimates, DAERow
+from obsynth.observers.dae_estimates import DAEEstimates, DAERow, require_regular
 from obsynth.observers.dae_layout import initial_memory
 from obsynth.observers.records import measured_record
 
@@ -85,8 +85,14 @@ class RunningDAEObserver:
         if inputs.shape != (model.nu,):
             raise SpecError(f"u must be {model.nu} finite number(s) at k = {self.k}.", path="u")
         require_known(model, inputs[None], self.k)
+        before = self.memory, self.u, self.k, self.informations.copy()
         row = self.raw_step(outputs, inputs)
-        return DAEEstimates.of(self.observer, [row], informations=np.array(self.informations))
+        found = DAEEstimates.of(self.observer, [row], informations=np.array(self.informations))
+        try:
+            return require_regular(self.observer, found, [row])
+        except SolverError:
+            self.memory, self.u, self.k, self.informations = before
+            raise
 
     def raw_step(self, y: FloatArray, u: FloatArray) -> DAERow:
         """Advance without checking the sample.
