@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from dae_plants import exchanger, linear
 
-from obsynth import DAEObserver, SolverError, SpecError, simulate_dae
+from obsynth import DAEObserver, SolverError, SpecError, run_batch, simulate_dae
 from obsynth.models.dae_functions import DAEFunctions
 from obsynth.models.dae_step import ImplicitStep
 
@@ -138,23 +138,25 @@ def test_sample_by_sample_is_the_whole_record(form) -> None:
 @pytest.mark.parametrize("form", ["forgetting", "random-walk", "augmented-kalman"])
 def test_the_spreads_are_honest(form) -> None:
     """40 runs with errors drawn from P_0 and S_0: squared errors in units of the covariance are one on average."""
-    shipped = observer(form=form, forgetting=0.95, guard="none")
-    model, start, u = shipped.model, steady(), np.tile(exchanger().nominal_input, (80, 1))
-    squares = []
+    start, u = steady(), np.tile(exchanger().nominal_input, (80, 1))
+    shipped = observer(
+        form=form, forgetting=0.95, guard="none", initial_state=start,
+        initial_parameter_covariance=np.diag([0.02**2, 500.0**2]),
+    )  # fmt: skip
+    outputs, thetas = [], []
     for seed in range(40):
         rng = np.random.default_rng(100 + seed)
-        theta = np.array([1.0, 0.0]) + rng.standard_normal(2) * [0.02, 500.0]
-        truth = simulate_dae(model, u, dt=1.0, parameters=theta, initial_state=start, Q=shipped.Q, R=shipped.R,
-                             seed=seed, integration="backward-euler")  # fmt: skip
+        thetas.append(np.array([1.0, 0.0]) + rng.standard_normal(2) * [0.02, 500.0])
         off = start + rng.standard_normal(4) * [2e3, 2e3, 5.0, 5.0]
-        begun = observer(
-            form=form, forgetting=0.95, guard="none", initial_state=off,
-            initial_parameter_covariance=np.diag([0.02**2, 500.0**2]),
-        )  # fmt: skip
-        found = begun.run(truth.outputs, u)
+        truth = simulate_dae(shipped.model, u, dt=1.0, parameters=thetas[-1], initial_state=off, Q=shipped.Q,
+                             R=shipped.R, seed=seed, integration="backward-euler")  # fmt: skip
+        outputs.append(truth.outputs)
+    found = run_batch(shipped, outputs, u)
+    squares = []
+    for i, theta in enumerate(thetas):
         for k in (40, 79):
-            e = found.parameters[k] - theta
-            squares.append(e @ np.linalg.solve(found.parameter_covariances[k], e) / 2)
+            e = found.parameters[i, k] - theta
+            squares.append(e @ np.linalg.solve(found.parameter_covariances[i, k], e) / 2)
     # 160 squares of standard normal numbers: the mean is one within 5 sqrt(2 / 160).
     assert abs(np.mean(squares) - 1.0) < 5 * np.sqrt(2 / 160)
 
