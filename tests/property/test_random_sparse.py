@@ -52,3 +52,18 @@ def test_every_sparse_plant_is_solved_or_refused_with_its_condition():
         solved += 1
     assert failures == []
     assert solved >= 60, (solved, refused)
+
+
+def test_plants_of_algebraic_equations_alone():
+    solved = 0
+    for seed in range(100):
+        rng = np.random.default_rng([53, seed])
+        nx = int(rng.integers(1, 4))
+        ny = int(rng.integers(1, nx + 2))
+        a, c = rng.integers(-3, 4, (nx, nx)) / 2.0, rng.integers(-1, 2, (ny, nx)).astype(float)
+        df = rng.integers(-2, 3, (ny, 1)).astype(float)
+        plant = obsynth.DescriptorSystem(np.zeros((nx, nx)), a, None, c, Df=df, dt=0.1)
+        if check(plant)["fault-estimation-filter"].passed:
+            assert obsynth.fault_estimation_filter(plant).report.passed, seed
+            solved += 1
+    assert solved >= 20, solved

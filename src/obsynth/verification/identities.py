@@ -179,10 +179,14 @@ def tracking_identities(
     ve = tracking @ lagged.E
     states, cz, dy, du = observer.state_rows, observer.Cz, observer.Dy, observer.Du
     # A state in small units must not hide behind one in large units.
-    units = np.tile(balance_by_least_squares(plant.E, plant.A, outputs=[plant.C]).states, lag + 1)
+    scaling = balance_by_least_squares(plant.E, plant.A, outputs=[plant.C])
+    units = np.tile(scaling.states, lag + 1)
 
     # An observer state that tracks nothing but a sensor fault cancels what it is formed of down to rounding.
     formed = np.abs(tracking) @ np.abs(lagged.A) + np.abs(observer.By) @ np.abs(lagged.C)
+    # Outputs that see no state may be all it takes; the others are then rounding errors of those.
+    taken = np.max(np.abs(observer.By) / scaling.outputs, axis=1, keepdims=True)
+    seen = np.sum(scaling.outputs[:, None] * np.abs(lagged.C), axis=0, keepdims=True)
 
     def unseen(rows: slice) -> Identity:
         factors = ((cz[rows], tracking, lagged.E), (dy[rows], lagged.C), (cz[rows], formed))
@@ -191,7 +195,7 @@ def tracking_identities(
     return {
         "dynamics": Identity(
             (observer.Az @ ve, observer.By @ lagged.C, -tracking @ lagged.A),
-            ((observer.Az, tracking, lagged.E), (observer.By, lagged.C), (tracking, lagged.A)),
+            ((observer.Az, tracking, lagged.E), (taken, seen), (tracking, lagged.A)),
             units,
         ),
         "inputs": Identity(
