@@ -12,6 +12,7 @@ from obsynth import DAEModel, SpecError, identifiability
 from obsynth.analysis.dae_index import index_report
 from obsynth.models.dae_functions import DAEFunctions
 from obsynth.models.dae_step import ImplicitStep
+from obsynth.pipeline.designing import check
 
 UNITS = dict.fromkeys(["a", "b", "go", "c", "seen"], "1")
 
@@ -250,3 +251,19 @@ def test_bad_questions_of_identifiability_are_named(arguments, words) -> None:
     given = {"u": np.ones((9, 1)), "dt": 0.5, "R": [[1.0]], **arguments}
     with pytest.raises(SpecError, match=words):
         identifiability(small(), given.pop("u"), **given)
+
+
+@pytest.mark.parametrize(
+    ("model", "words"),
+    [
+        (exchanger(), ["tell every direction"]),
+        (printed(f"{FLUX} = 0"), ["do not tell", "phi (", "psi ("]),
+        (printed(f"{FLUX} + A ** 2 / R * (p1 - p2) = 0"), ["do not tell", "Energy (", "psi ("]),
+    ],
+)  # fmt: skip
+def test_the_check_before_any_design_says_what_the_outputs_do_not_tell(model, words) -> None:
+    report = check(model)["dae-adaptive-observer"]
+    assert report.passed
+    detail = report["exists: parameters"].detail
+    assert [word for word in words if word not in detail] == []
+    assert ("phi (" in detail) == ("phi (" in words)
