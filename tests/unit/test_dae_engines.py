@@ -338,3 +338,23 @@ def test_a_step_that_becomes_singular_along_the_run_is_named(compiled) -> None:
     assert running.k == 23
     assert running.memory is memory
     running.step(y[23], u[22])
+
+
+@pytest.mark.parametrize("form", ["forgetting", "augmented-kalman"])
+def test_without_parameters_it_is_a_kalman_filter_of_the_states(form) -> None:
+    tank = DAEModel(
+        {"balance": "2 * der(level) = inflow - outflow", "valve": "outflow = 0.5 * sqrt(level)"}, {"flow": "outflow"},
+        states={"level": 1.0, "outflow": 0.5}, inputs={"inflow": 0.5},
+        units=dict.fromkeys(["level", "outflow", "inflow", "flow"], "1"),
+    )  # fmt: skip
+    none = np.zeros(0)
+    shipped = observer(
+        tank, dt=0.5, Q=np.diag([1e-4, 0.0]), R=[[1e-4]], initial_covariance=1e-2 * np.eye(2), form=form,
+        initial_parameters=none, initial_parameter_covariance=np.zeros((0, 0)), random_walk=np.zeros((0, 0)),
+        lower=none, upper=none,
+    )  # fmt: skip
+    y = simulate_dae(tank, np.full((60, 1), 0.5), dt=0.5, initial_state=[1.5, 0.6], seed=1).outputs
+    for compiled in (None, True):
+        found = shipped.run(y, np.full((60, 1), 0.5), compiled=compiled)
+        assert found.parameters.shape == (60, 0)
+        assert found.states[-1, 1] == pytest.approx(y[-1, 0], rel=1e-3)
