@@ -16,7 +16,7 @@ from obsynth import DAEModel, DAEObserver, SolverError, SpecError, run_batch, si
 from obsynth.models.dae_functions import Compiled, DAEFunctions
 from obsynth.models.dae_step import ImplicitStep
 from obsynth.numerics.symbolic_solve import SMALL, solved
-from obsynth.observers import dae_batch, dae_library, progress
+from obsynth.observers import dae_batch, dae_library, dae_records, progress
 
 SIZES = np.array([2e3, 2e3, 5.0, 5.0, 0.1, 1e3])
 
@@ -81,7 +81,8 @@ FORMS = {
 
 
 @pytest.mark.parametrize("name", FORMS)
-def test_stretches_steps_and_c_agree(name) -> None:
+def test_stretches_steps_and_c_agree(name, monkeypatch) -> None:
+    monkeypatch.setattr(dae_records, "SAMPLES_PER_CALL", 50)
     y, u = record(samples=120)
     y = np.array(y)
     y[50], y[70:90, 0] = np.nan, np.nan

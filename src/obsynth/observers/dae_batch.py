@@ -12,6 +12,7 @@ from obsynth.errors import SolverError, SpecError
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.dae import DAEObserver
 from obsynth.observers.dae_c_code import BATCH_PARTS
+from obsynth.observers.dae_estimates import DAERow
 from obsynth.observers.dae_library import compiler
 from obsynth.observers.dae_records import advanced
 from obsynth.observers.progress import shown_progress
@@ -147,8 +148,9 @@ def _in_casadi(
 
 
 def _one(observer: DAEObserver, y: FloatArray, u: FloatArray, trial: int) -> dict[str, FloatArray]:
+    rows: list[DAERow] = []
     try:
-        rows = advanced(observer.start(), y[trial], _of_trial(u, trial))
+        advanced(observer.start(), y[trial], _of_trial(u, trial), rows.append)
     except SolverError as error:
         raise SolverError(f"Trial {trial}: {error}", record={**error.record, "trial": trial}) from error
     return {name: np.concatenate([row.several.part(name) for row in rows]) for name in BATCH_PARTS}

@@ -269,14 +269,22 @@ static int advance(struct observer *state, const double *u, const double *y, dou
 
 #: Whole records and batches, for a shared library.
 RECORD = r"""
-/* Run over a record; returns the number of samples that were taken. */
-int record(int samples, const double *u, const double *y, double *after, double *said)
+long state_bytes(void)
 {
-    struct observer state;
+    return (long)sizeof(struct observer);
+}
+
+void begin(struct observer *state)
+{
+    reset(state);
+}
+
+/* Go on over some samples; returns the number of those that were taken. */
+int record(struct observer *state, int samples, const double *u, const double *y, double *after, double *said)
+{
     int k;
-    reset(&state);
     for (k = 0; k < samples; k++) {
-        if (advance(&state, u + k * NU, y + k * NY, after + (long)k * MEMORY, said + (long)k * ROW) != 0) {
+        if (advance(state, u + k * NU, y + k * NY, after + (long)k * MEMORY, said + (long)k * ROW) != 0) {
             return k;
         }
     }

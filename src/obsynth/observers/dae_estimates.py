@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -165,56 +164,74 @@ class DAEEstimates:
         """Standard deviations of the parameters ``(samples, nq)``."""
         return np.asarray(np.sqrt(np.einsum("kii->ki", self.parameter_covariances)))
 
-    @classmethod
-    def of(
-        cls, observer: DAEObserver, rows: Sequence[DAERow], *, informations: FloatArray | None = None
-    ) -> DAEEstimates:
-        """Return the estimates in what a running observer gave.
 
-        Parameters
-        ----------
-        observer : DAEObserver
-            Whose rows they are.
-        rows : sequence of DAERow
-            At least one.
-        informations : FloatArray, optional
-            ``(any, nq, nq)``: of the latest samples, when only the last row is given.
-        """
-        parts = [_columns(row.several) for row in rows]
-        whole = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-        seen = whole.pop("information") if informations is None else informations
-        whole.pop("information", None)
-        whole["excitation"] = _excitation(observer, seen)[-len(whole["nis"]) :]
-        return cls(
-            **{name: read_only(value) for name, value in whole.items()}, projection=read_only(rows[0].moved),
-            state_names=observer.state_names, parameter_names=observer.fault_names,
-        )  # fmt: skip
-
-
-def require_regular(observer: DAEObserver, estimates: DAEEstimates, rows: Sequence[DAERow]) -> DAEEstimates:
-    """Return the estimates, unless the matrix of (7) was singular to working precision at some k.
+class GatheredRows:
+    """What `DAEEstimates` keeps of the rows of a record, while it is being run.
 
     Parameters
     ----------
     observer : DAEObserver
-        Whose they are.
-    estimates : DAEEstimates
-        Of `rows`.
-    rows : sequence of DAERow
-        In which the matrices are.
-
-    Raises
-    ------
-    SolverError
-        It was; k, equations and states are named.
+        Whose rows they are.
     """
-    worst = int(np.argmax(estimates.conditions)) if len(estimates.conditions) else 0
-    if not len(estimates.conditions) or estimates.conditions[worst] <= SINGULAR_CONDITION:
-        return estimates
-    matrices = np.concatenate([row.several.part("scaled") for row in rows])
-    equations, states = involved(observer.model, matrices[worst])
-    k, condition = rows[0].k + worst, float(estimates.conditions[worst])
-    raise SolverError(
+
+    def __init__(self, observer: DAEObserver) -> None:
+        self.observer = observer
+        self.parts: list[dict[str, FloatArray]] = []
+        self.projection = np.zeros(observer.model.nx)
+
+    def add(self, rows: DAERow) -> None:
+        """Keep some rows.
+
+        Parameters
+        ----------
+        rows : DAERow
+            Of one sample or of several.
+        """
+        if rows.k == 0:
+            self.projection = rows.moved
+        # Copies, so that what is not kept can go.
+        self.parts.append({name: np.array(value) for name, value in _columns(rows.several).items()})
+
+    def add_regular(self, rows: DAERow) -> None:
+        """Keep some rows, unless the matrix of (7) was singular to working precision in one of them.
+
+        Parameters
+        ----------
+        rows : DAERow
+            Of one sample or of several.
+
+        Raises
+        ------
+        SolverError
+            It was; k, equations and states are named.
+        """
+        self.add(rows)
+        conditions = self.parts[-1]["conditions"]
+        if len(conditions) and conditions.max() > SINGULAR_CONDITION:
+            raise _singular(self.observer, rows.several, int(np.argmax(conditions > SINGULAR_CONDITION)))
+
+    def estimates(self, informations: FloatArray | None = None) -> DAEEstimates:
+        """Return what was gathered.
+
+        Parameters
+        ----------
+        informations : FloatArray, optional
+            ``(any, nq, nq)``: of the latest samples, when only the last row was.
+        """
+        whole = {name: np.concatenate([part[name] for part in self.parts]) for name in self.parts[0]}
+        seen = whole.pop("information")
+        levels = _excitation(self.observer, seen if informations is None else informations)
+        whole["excitation"] = levels[len(levels) - len(whole["nis"]) :]
+        return DAEEstimates(
+            **{name: read_only(value) for name, value in whole.items()}, projection=read_only(self.projection),
+            state_names=self.observer.state_names, parameter_names=self.observer.fault_names,
+        )  # fmt: skip
+
+
+def _singular(observer: DAEObserver, rows: DAERow, i: int) -> SolverError:
+    equations, states = involved(observer.model, rows.part("scaled")[i])
+    k, condition = rows.k + i, float(rows.conditions[i])
+    return SolverError(
         f"The matrix of (7), dF/dx' / dt + dF/dx, is singular at k = {k} (condition {condition:.3g}): the equations "
         f"{', '.join(map(repr, equations))} do not determine {', '.join(map(repr, states))} there.",
         record={"k": k, "condition": condition},

@@ -10,7 +10,7 @@ from obsynth.analysis.dae_identifiability import Identifiability, identifiabilit
 from obsynth.analysis.dae_index import IndexReport, index_report
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.dae import DAEObserver
-from obsynth.observers.dae_estimates import DAEEstimates
+from obsynth.observers.dae_estimates import GatheredRows
 from obsynth.observers.dae_records import advanced
 
 #: Steps of the nominal run.
@@ -88,7 +88,9 @@ def dae_facts(observer: DAEObserver) -> DAEFacts:
     model, running = observer.model, observer.start()
     u = np.array(model.nominal_input)
     truth = _nominal_outputs(observer, u)
-    found = DAEEstimates.of(observer, advanced(running, truth, np.tile(u, (len(truth), 1))))
+    gathered = GatheredRows(observer)
+    advanced(running, truth, np.tile(u, (len(truth), 1)), gathered.add)
+    found = gathered.estimates()
     covariance = found.parameter_covariances[-1]
     deviations = np.sqrt(np.diag(covariance))
     safe = np.where(deviations > 0.0, deviations, 1.0)

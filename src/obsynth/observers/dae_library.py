@@ -69,20 +69,30 @@ class DAELibrary:
             # It stays loaded when the file is gone.
             self._library = ctypes.CDLL(str(library))
         pointer = ctypes.POINTER(ctypes.c_double)
-        self._library.record.argtypes = [ctypes.c_int, *[pointer] * 4]
+        self._library.state_bytes.restype = ctypes.c_long
+        self._library.begin.argtypes = [ctypes.c_char_p]
+        self._library.record.argtypes = [ctypes.c_char_p, ctypes.c_int, *[pointer] * 4]
         self._library.batch.argtypes = [ctypes.c_int, ctypes.c_int, ctypes.c_long, *[pointer] * 3]
 
-    def record(self, y: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Run over a record; return memory and row of each sample that could be taken.
+    def started(self) -> ctypes.Array[ctypes.c_char]:
+        """Return the memory of an observer at k = 0, for `record`."""
+        state = ctypes.create_string_buffer(self._library.state_bytes())
+        self._library.begin(state)
+        return state
+
+    def record(self, state: ctypes.Array[ctypes.c_char], y: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Go on over some samples; return memory and row of each that could be taken.
 
         Parameters
         ----------
+        state : ctypes.Array
+            From `started`; changed.
         y, u : FloatArray
             ``(samples, ny)`` and ``(samples, nu)``.
         """
         graph = self.observer.graph
         after, said = np.zeros((len(y), graph.memory.size)), np.zeros((len(y), graph.row.size))
-        taken = self._library.record(len(y), *map(_pointer, (_plain(u), _plain(y), after, said)))
+        taken = self._library.record(state, len(y), *map(_pointer, (_plain(u), _plain(y), after, said)))
         return after[:taken], said[:taken]
 
     def batch(self, y: FloatArray, u: FloatArray) -> tuple[int, dict[str, FloatArray]]:

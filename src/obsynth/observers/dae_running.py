@@ -15,7 +15,7 @@ from obsynth.models.dae_functions import Compiled, DAEFunctions
 from obsynth.models.dae_step import ImplicitStep
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae import DAEObserver
-from obsynth.observers.dae_estimates import DAEEstimates, DAERow, require_regular
+from obsynth.observers.dae_estimates import DAEEstimates, DAERow, GatheredRows
 from obsynth.observers.dae_layout import initial_memory
 from obsynth.observers.records import measured_record
 
@@ -87,12 +87,13 @@ class RunningDAEObserver:
         require_known(model, inputs[None], self.k)
         before = self.memory, self.u, self.k, self.informations.copy()
         row = self.raw_step(outputs, inputs)
-        found = DAEEstimates.of(self.observer, [row], informations=np.array(self.informations))
+        found = GatheredRows(self.observer)
         try:
-            return require_regular(self.observer, found, [row])
+            found.add_regular(row)
         except SolverError:
             self.memory, self.u, self.k, self.informations = before
             raise
+        return found.estimates(np.array(self.informations))
 
     def raw_step(self, y: FloatArray, u: FloatArray) -> DAERow:
         """Advance without checking the sample.
