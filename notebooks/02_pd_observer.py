@@ -236,7 +236,7 @@ figure, axes = plt.subplots(2, 2, sharex=True, sharey=True, layout="constrained"
 for column, label in enumerate(("printed gains", "printed gains, printed G")):
     noisy = estimate(designs[label].observer, run.outputs + noise)
     plot_faults(noisy, faults=faults, dt=step, axes=axes[:, column])
-    axes[0, column].set_title(label)
+    axes[0, column].set_title(label, pad=18)
 
 # %% [markdown]
 # Our own designs need no $G$: the decay rate does the same, with a proof.
@@ -246,7 +246,7 @@ figure, axes = plt.subplots(2, 2, sharex=True, sharey=True, layout="constrained"
 for column, label in enumerate(("ours", "ours, decay 2")):
     noisy = estimate(designs[label].observer, run.outputs + noise)
     plot_faults(noisy, faults=faults, dt=step, axes=axes[:, column])
-    axes[0, column].set_title(label)
+    axes[0, column].set_title(label, pad=18)
 
 # %% [markdown]
 # Without noise, every design ends at the true faults: $G$ does not set their size.

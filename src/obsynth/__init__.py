@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from obsynth.evaluation.intervals import Interval
     from obsynth.evaluation.monitors import Detection, Monitor
     from obsynth.evaluation.monte_carlo import Evaluation, evaluate
+    from obsynth.evaluation.recursive_monte_carlo import ParameterMonitor
+    from obsynth.evaluation.recursive_simulating import RecursiveSimulation
     from obsynth.evaluation.simulating import Simulation, simulate
     from obsynth.evaluation.watching import monitor
     from obsynth.exporting.files import export
@@ -103,10 +105,12 @@ _HOMES = {
     "Monitor": "obsynth.evaluation.monitors",
     "ObserverDesign": "obsynth.results.design",
     "ObsynthError": "obsynth.errors",
+    "ParameterMonitor": "obsynth.evaluation.recursive_monte_carlo",
     "PreconditionError": "obsynth.errors",
     "Ramp": "obsynth.simulation.profiles",
     "RecursiveEstimates": "obsynth.observers.recursive_estimates",
     "RecursiveObserver": "obsynth.observers.recursive",
+    "RecursiveSimulation": "obsynth.evaluation.recursive_simulating",
     "RunningObserver": "obsynth.observers.linear",
     "RunningRecursiveObserver": "obsynth.observers.recursive_running",
     "Scenario": "obsynth.simulation.scenario",
@@ -182,10 +186,12 @@ __all__ = [
     "Monitor",
     "ObserverDesign",
     "ObsynthError",
+    "ParameterMonitor",
     "PreconditionError",
     "Ramp",
     "RecursiveEstimates",
     "RecursiveObserver",
+    "RecursiveSimulation",
     "RunningDAEObserver",
     "RunningObserver",
     "RunningRecursiveObserver",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -89,3 +90,23 @@ def test_report_refuses(folder, capsys):
     assert main(["report", "--gains", "missing.json", "--out", "report.html"]) == 2
     assert list(Path().iterdir()) == []
     assert json.loads(Path(gains).read_text())["kind"] == "obsynth gain set"
+
+
+def test_report_shows_the_design_on_the_scenario_of_a_spec(folder, capsys):
+    spec = ROOT / "designs" / "wang2015" / "spec.yaml"
+    gains = str(folder / "wang2015.json")
+    assert main(["report", "--gains", gains, "--out", "page.html", "--system", str(spec)]) == 0
+    page = Path("page.html").read_text(encoding="utf-8")
+    assert "On the scenario: 300 s, seed 2015." in page
+    assert f"--system {spec}" in page
+    Path("none.yaml").write_text(re.sub(r"(?ms)^scenario:.*?(?=^\w|\Z)", "", spec.read_text()).replace(
+        "plant.yaml", str(spec.with_name("plant.yaml"))))  # fmt: skip
+    capsys.readouterr()
+    assert main(["report", "--gains", gains, "--out", "other.html", "--system", "none.yaml"]) == 2
+    assert "has no scenario" in capsys.readouterr().err
+    assert not Path("other.html").exists()
+    # The scenario of another plant.
+    other = ROOT / "designs" / "smib" / "spec.yaml"
+    assert main(["report", "--gains", gains, "--out", "other.html", "--system", str(other)]) == 2
+    assert "tm GENCLS 1" in capsys.readouterr().err
+    assert not Path("other.html").exists()

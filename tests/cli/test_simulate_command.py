@@ -113,10 +113,12 @@ def test_what_cannot_be_simulated_or_written(
     assert [item.name for item in tmp_path.iterdir()] == ["spec.yaml"]
 
 
-def test_a_scenario_for_a_plant_that_changes_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_scenario_that_does_not_fit_a_plant_that_changes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     source = (ROOT / "designs" / "moussaali2013_ltv" / "spec.yaml").read_text(encoding="utf-8")
     plant = (ROOT / "designs" / "moussaali2013_ltv" / "plant.yaml").read_text(encoding="utf-8")
     (tmp_path / "plant.yaml").write_text(plant, encoding="utf-8")
-    (tmp_path / "spec.yaml").write_text(source + "scenario: {horizon: 5}\n", encoding="utf-8")
+    (tmp_path / "spec.yaml").write_text(source + "scenario: {horizon: 5, stabilise: true}\n", encoding="utf-8")
     assert main(["simulate", "--system", str(tmp_path / "spec.yaml"), "--quiet"]) == 2
-    assert "changes with k" in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert "scenario.stabilise" in error
+    assert "No feedback" in error

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import re
+from functools import cache
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -16,10 +17,11 @@ mpl.use("Agg")
 
 import obsynth
 from obsynth.errors import SpecError
-from obsynth.plotting.frequency import fault_estimate_gains, plot_continuous_poles, plot_gains
+from obsynth.plotting import estimate_gains, plot_gains, plot_poles
 from obsynth.report.page import html_report
 from obsynth.results.report import VerificationReport
 from obsynth.spec import load_spec
+from obsynth.verification import verify
 
 ROOT = Path(__file__).parents[2]
 VOID = {"meta", "img", "br", "link"}
@@ -76,6 +78,22 @@ def recursive() -> obsynth.ObserverDesign:
     return designed("moussaali2013_ltv/spec.yaml")
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _drawn_once():
+    """The pictures of a design are drawn once: most tests are about what stands around them."""
+    from obsynth.report import page, pictures
+
+    patch = pytest.MonkeyPatch()
+    drawn = cache(lambda design: list(pictures.pictures_of(design)))
+
+    def pictures_once(design, *, scenario=None):
+        return drawn(design) if scenario is None else pictures.pictures_of(design, scenario=scenario)
+
+    patch.setattr(page, "pictures_of", pictures_once)
+    yield
+    patch.undo()
+
+
 def page_of(design, tmp_path, **more) -> tuple[str, Page]:
     text = html_report(design, tmp_path / "report.html", **more).read_text(encoding="utf-8")
     return text, Page(text)
@@ -87,10 +105,14 @@ def test_the_page_needs_nothing_else(request, tmp_path, which):
     assert {tag for tag, _ in page.tags} & {"script", "link", "iframe", "object", "base", "form"} == set()
     sources = [attributes["src"] for _, attributes in page.tags if "src" in attributes]
     assert all(source.startswith("data:image/png;base64,") for source in sources)
-    assert len(sources) == (0 if which == "recursive" else 2)
+    # The design at work and its states; of linear ones the spectrum, and gains to faults and states.
+    assert len(sources) == (2 if which == "recursive" else 5)
     for source in sources:
         assert base64.b64decode(source.partition(",")[2]).startswith(b"\x89PNG\r\n\x1a\n")
-    assert not any("href" in attributes or "srcset" in attributes for _, attributes in page.tags)
+    links = [attributes["href"] for _, attributes in page.tags if "href" in attributes]
+    anchors = {attributes["id"] for _, attributes in page.tags if "id" in attributes}
+    assert {link.removeprefix("#") for link in links} == anchors
+    assert not any("srcset" in attributes for _, attributes in page.tags)
     assert "url(" not in text
     assert "@import" not in text
     assert "http" not in re.sub(r"base64,[^\"]*", "", text)
@@ -130,6 +152,39 @@ def test_everything_is_there(request, tmp_path, which):
     assert f"{gain.ravel()[0]:.6g}" in page.texts
 
 
+def test_an_observer_that_does_not_fit_or_is_unstable_has_a_page_too(continuous, tmp_path):
+    _, observer = continuous.linear
+    short = type(observer)(**{**observer.as_dict(), "By": observer.By[:, :1], "Dy": observer.Dy[:, :1],
+                              "output_names": observer.output_names[:1]})  # fmt: skip
+    wrong = continuous.replace(observer=short)
+    _, page = page_of(wrong, tmp_path, report=verify(wrong))
+    assert page.texts[2].startswith("FAILS")
+    assert "None: the observer does not fit its plant." in page.texts
+    unstable = continuous.replace(observer=type(observer)(**{**observer.as_dict(), "Az": -observer.Az}))
+    _, page = page_of(unstable, tmp_path, report=verify(unstable))
+    assert page.texts[2].startswith("FAILS")
+    assert "What fails" in page.texts
+
+
+def test_a_kalman_filter_shows_its_states(tmp_path):
+    plant = obsynth.TimeVaryingDescriptorSystem(
+        E=None, A=[["0.9 + 0.05 * sin(k)", 0.1], [0, 0.5]], C=[[1, 0]], dt=1.0, horizon=100
+    )
+    _, page = page_of(obsynth.descriptor_kalman(plant, Q=1e-4, R=1e-2), tmp_path)
+    assert sum(tag == "img" for tag, _ in page.tags) == 1
+    assert "States in a run with the stated noise, and their estimates, with 95 % bands." in page.texts
+
+
+def test_a_scenario_is_shown_with_its_alarm(tmp_path):
+    spec = load_spec(ROOT / "designs" / "wang2015" / "spec.yaml")
+    design = obsynth.fault_estimation_filter(spec.plant)
+    _, page = page_of(design, tmp_path, scenario=spec.scenario, system_file="my spec.yaml", gains_file="g.json")
+    assert "On the scenario: 300 s, seed 2015." in page.texts
+    assert "obsynth report --gains g.json --out report.html --system 'my spec.yaml'" in page.text
+    with pytest.raises(SpecError, match="nothing"):
+        page_of(design, tmp_path, scenario=spec.scenario.replace(faults={"nothing": obsynth.Step(size=1)}))
+
+
 def test_every_text_is_escaped(continuous, tmp_path):
     plant, observer = continuous.linear
     changed = continuous.replace(
@@ -156,7 +211,7 @@ def test_the_page_fits_a_narrow_screen(network, tmp_path):
     assert ("meta", {"name": "viewport", "content": "width=device-width, initial-scale=1"}) in page.tags
     assert "@media (max-width" in text
     tables = sum(tag == "table" for tag, _ in page.tags)
-    assert tables == sum(attributes.get("class") == "scroll" for _, attributes in page.tags)
+    assert tables == sum(str(attributes.get("class")).startswith("scroll") for _, attributes in page.tags)
     labels = [attributes["data-label"] for _, attributes in page.tags if "data-label" in attributes]
     for label in ("value", "bound", "margin", "verdict"):
         assert labels.count(label) == len(network.report.checks)
@@ -165,29 +220,27 @@ def test_the_page_fits_a_narrow_screen(network, tmp_path):
 class TestPictures:
     def test_the_gain_from_disturbances_peaks_at_the_verified_norm(self, network):
         """The norm is recomputed on a pencil by `verify`, the curve from plant and realisation: two routes."""
-        peak = fault_estimate_gains(network).gains["disturbances"].max()
+        peak = estimate_gains(network).gains["disturbances"].max()
         norm = network.report["H-infinity norm"].value
         assert 0.98 * norm <= peak <= norm * (1.0 + 1e-9)
 
     def test_a_filter_that_only_delays_faults_has_gain_one(self, network):
-        assert np.allclose(fault_estimate_gains(network).gains["faults"], 1.0, rtol=0.0, atol=1e-6)
+        assert np.allclose(estimate_gains(network).gains["faults"], 1.0, rtol=0.0, atol=1e-6)
 
     def test_faults_are_those_of_the_tracking_analysis(self, continuous):
-        found = fault_estimate_gains(continuous)
+        found = estimate_gains(continuous)
         wanted = np.abs(obsynth.fault_response(continuous, found.frequencies)[:, 0, 0])
         assert np.allclose(found.gains["faults"], wanted, rtol=1e-6)
 
     def test_decoupled_disturbances_are_said_not_to_get_through(self, continuous):
-        assert not fault_estimate_gains(continuous).gains["disturbances"].any()
+        assert not estimate_gains(continuous).gains["disturbances"].any()
         labels = [text.get_text() for text in plot_gains(continuous).get_legend().get_texts()]
         assert labels == ["faults to fault estimates", "disturbances: nothing gets through"]
 
-    def test_poles_are_those_of_the_observer(self, continuous, network):
-        (points,) = [line for line in plot_continuous_poles(continuous).get_lines() if line.get_marker() == "x"]
+    def test_poles_are_those_of_the_observer(self, continuous):
+        (points,) = [line for line in plot_poles(continuous).get_lines() if line.get_marker() == "x"]
         wanted = np.linalg.eigvals(continuous.observer.Az)
         assert np.allclose(np.sort(points.get_xdata()), np.sort(wanted.real))
-        with pytest.raises(SpecError, match="sampled: use plot_poles"):
-            plot_continuous_poles(network)
 
     def test_a_recursive_design_has_none(self, recursive):
         with pytest.raises(SpecError, match="no linear time-invariant observer"):

@@ -170,7 +170,7 @@ def test_bounds_hold_for_bounded_noise_whatever_it_is(kind: str, noisy) -> None:
     signals[:, :, -1:] = 0.3 * signs
     noise = 2.0 * rng.choice([-1.0, 1.0], (steps, runs, 2))
     _, outputs, _ = bench.stepper.run(signals, np.zeros_like(signals), noise)
-    rows = bench._observed(outputs, np.zeros((steps, runs, 0)))
+    rows = bench.observed(outputs, np.zeros((steps, runs, 0)))
     statistic = watched.statistic(rows[:, :, design.observer.residual_rows])
     assert np.all(statistic <= watched.threshold[:, None] * (1 + 1e-12))
     assert np.max(statistic / watched.threshold[:, None]) > 0.5

@@ -17,7 +17,16 @@ import matplotlib.pyplot as plt
 import obsynth
 from obsynth.errors import SpecError
 from obsynth.observers.linear import Estimates
-from obsynth.plotting import plot_faults, plot_poles, plot_residuals
+from obsynth.plotting import (
+    estimate_gains,
+    plot_faults,
+    plot_gains,
+    plot_poles,
+    plot_residuals,
+    plot_states,
+    plot_trade_off,
+)
+from obsynth.plotting.spectra import region_asked_for
 from obsynth.spec import load_spec
 
 DESIGNS = Path(__file__).parents[2] / "designs"
@@ -146,6 +155,116 @@ def test_poles_zeros_and_the_unit_circle() -> None:
     np.testing.assert_allclose(np.hypot(circle.get_xdata(), circle.get_ydata()), 1.0)
     assert axes.get_aspect() == 1.0
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("real part", "imaginary part")
+
+
+@pytest.fixture(scope="module")
+def slow() -> obsynth.ObserverDesign:
+    """A continuous design with a region that was asked for."""
+    spec = load_spec(DESIGNS / "sharepasand" / "spec.yaml")
+    return obsynth.ui_pi_observer(spec.plant, fault_model="step", region={"decay": 1.0, "radius": 8.0, "damping": 0.5})
+
+
+def test_continuous_poles_have_an_axis_and_no_circle(slow) -> None:
+    lines = lines_of(axes := plot_poles(slow))
+    assert "unit circle" not in lines
+    np.testing.assert_array_equal(lines["limit of stability"].get_xdata(), [0.0, 0.0])
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("real part (1/s)", "imaginary part (1/s)")
+    poles = next(line for name, line in lines.items() if name.startswith("observer eigenvalues"))
+    assert max(poles.get_xdata()) < 0.0
+
+
+def test_the_region_asked_for_is_shaded_where_it_is(slow) -> None:
+    axes = plot_poles(slow)
+    assert "region asked for" in legend_of(axes)
+    (shade,) = [item for item in axes.collections if item.get_zorder() == -1]
+    corners = np.concatenate([path.vertices for path in shade.get_paths()])
+    left, right = axes.get_xlim()
+    assert corners[:, 0].min() == pytest.approx(max(left, -8.0), abs=0.02 * (right - left))
+    assert corners[:, 0].max() == pytest.approx(-1.0, abs=0.02 * (right - left))
+    parts = region_asked_for(slow)
+    # Slower than the decay, faster than the radius, less damped than the cone; and one that is none of it.
+    points = np.array([-0.9, -8.1, -2 + 4j, -2 + 3j])
+    assert list(np.max([part(points) for part in parts], axis=0) < 0.0) == [False, False, False, True]
+    unasked = obsynth.fault_estimation_filter(load_spec(DESIGNS / "wang2015" / "spec.yaml").plant)
+    assert "region asked for" not in legend_of(plot_poles(unasked))
+
+
+def test_a_disk_that_was_proved_is_a_region() -> None:
+    spec = load_spec(DESIGNS / "filasova" / "spec.yaml")
+    design = obsynth.pd_observer(spec.plant)
+    claims = {**design.certificate.claims, "disk_centre": 6.0, "disk_radius": 5.0}
+    disk = design.replace(certificate=obsynth.Certificate(design.certificate.matrices, claims))
+    axes = plot_poles(disk)
+    (shade,) = [item for item in axes.collections if item.get_zorder() == -1]
+    corners = np.concatenate([path.vertices for path in shade.get_paths()])
+    assert (np.hypot(corners[:, 0] + 6.0, corners[:, 1]) < 5.0 * 1.02).all()
+
+
+def test_widely_spread_poles_are_logarithmic(slow) -> None:
+    _, observer = slow.linear
+    fast = observer.Az.copy()
+    fast[0, 0] -= 5000.0
+    stretched = slow.replace(observer=type(observer)(**{**observer.as_dict(), "Az": fast}))
+    assert plot_poles(stretched).get_xscale() == "symlog"
+    assert plot_poles(slow).get_xscale() == "linear"
+
+
+def test_states_of_a_linear_observer_lag_as_it_does() -> None:
+    estimates = made_estimates()
+    (panel,) = plot_states(estimates, states=np.arange(STEPS, dtype=float), dt=0.5, units={"x": "m"})
+    true = lines_of(panel)["true, delayed by 2 samples"]
+    np.testing.assert_allclose(true.get_xdata(), 0.5 * np.arange(2, STEPS))
+    np.testing.assert_array_equal(true.get_ydata(), np.arange(STEPS - 2))
+    assert panel.get_ylabel() == "x (m)"
+    assert plot_states(estimates, names=[]) == []
+    with pytest.raises(SpecError, match="'y'"):
+        plot_states(estimates, names=["y"])
+
+
+def test_gains_to_the_states_are_errors_and_peak_at_their_norm() -> None:
+    design = obsynth.fault_estimation_filter(load_spec(DESIGNS / "wang2015" / "spec.yaml").plant)
+    found = estimate_gains(design, to="states")
+    wanted = design.report["disturbance in the state estimate"].value
+    assert wanted * (1.0 - 1e-3) <= found.gains["disturbances"].max() <= wanted * (1.0 + 1e-9)
+    assert not found.gains["faults"].any()
+    gamma = design.certificate.claims["gamma"]
+    bound = lines_of(plot_gains(design))[f"proved for disturbances: {gamma:.4g}"]
+    assert set(bound.get_ydata()) == {gamma}
+    assert estimate_gains(design).gains["disturbances"].max() <= gamma
+    with pytest.raises(SpecError, match="faults, states, residuals"):
+        plot_gains(design, to="moon")
+
+
+def test_a_trade_off_is_sorted_and_says_what_is_missing(slow) -> None:
+    spec = load_spec(DESIGNS / "sharepasand" / "spec.yaml")
+    designs = [obsynth.ui_pi_observer(spec.plant, fault_model="step", region={"decay": d}) for d in (4.0, 0.5, 1.0)]
+    (panel,) = plot_trade_off(designs, "decay", "noise_amplification")
+    (line,) = panel.get_lines()
+    assert list(line.get_xdata()) == sorted(design.certificate.claims["decay"] for design in designs)
+    assert list(line.get_ydata()) == sorted(design.certificate.claims["noise_amplification"] for design in designs)
+    assert (panel.get_xlabel(), panel.get_ylabel(), panel.get_yscale()) == ("decay", "noise_amplification", "log")
+    with pytest.raises(SpecError, match="its claims are decay, noise_amplification"):
+        plot_trade_off(designs, "decay", "gamma")
+    with pytest.raises(SpecError, match="at least one"):
+        plot_trade_off([], "decay", "gamma")
+
+
+def test_legends_hide_nothing() -> None:
+    """They stand above their panels."""
+    estimates = made_estimates()
+    for panel in (*plot_faults(estimates, faults=FAULTS), plot_residuals(estimates, threshold=1.0)):
+        panel.figure.canvas.draw()
+        assert panel.get_legend().get_window_extent().y0 >= panel.get_window_extent().y1 - 1.0
+
+
+def test_long_legends_leave_their_panels_as_they_are() -> None:
+    curves = {"a threshold with quite a long name and a remark": 0.1, "and another one, which is rigorous": 0.2}
+    panel = plot_residuals(made_estimates(), threshold=curves)
+    panel.figure.canvas.draw()
+    assert panel.get_position().width > 0.75
+    legend = panel.get_legend().get_window_extent()
+    assert legend.x1 <= panel.figure.bbox.x1
+    assert legend.y0 >= panel.get_window_extent().y1 - 1.0
 
 
 def test_axes_given_for_residuals_and_poles_are_used() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import matplotlib as mpl
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ from time_varying_plants import observer_for, record, varying
 from obsynth import SpecError
 from obsynth.observers.decisions import decide
 from obsynth.plotting import plot_decision, plot_parameters, plot_states
-from obsynth.plotting.recursive import BAND_WIDTH
+from obsynth.plotting.panels import BAND_WIDTH
 
 mpl.use("Agg")
 
@@ -66,3 +68,31 @@ def test_decisions(run) -> None:
     assert f"onset at {2 * decision.alarm.onset} s" in labels
     quiet = plot_decision(decide(observer, found, nominal=found.parameters[-1]), axes=axes)
     assert quiet is axes
+
+
+def test_axes_may_be_given_and_states_chosen(run) -> None:
+    import matplotlib.pyplot as plt
+
+    _, found = run
+    _, grid = plt.subplots(1, 2)
+    assert plot_parameters(found, axes=grid) == list(grid)
+    (panel,) = plot_states(found, names=["x2"])
+    assert panel.get_ylabel() == "x2"
+    three = plt.subplots(1, 3)[1]
+    with pytest.raises(SpecError, match="3 axes were given"):
+        plot_parameters(found, axes=three)
+
+
+def test_a_wide_band_at_the_start_does_not_hide_what_moves(run) -> None:
+    """The prior is 1000 times as wide as the estimates in the end: the picture is of these."""
+    _, found = run
+    steps = len(found.parameters)
+    fading = np.where(np.arange(steps) < 3, 1.0, 1e-6)
+    quiet = replace(
+        found, parameters=np.tile([0.1, 0.2], (steps, 1)) + 0.01 * np.sin(np.arange(steps))[:, None],
+        parameter_covariances=fading[:, None, None] * np.eye(2),
+    )  # fmt: skip
+    for panel, centre in zip(plot_parameters(quiet), (0.1, 0.2), strict=True):
+        low, high = panel.get_ylim()
+        assert centre - 0.03 < low < centre - 0.01
+        assert centre + 0.01 < high < centre + 0.03

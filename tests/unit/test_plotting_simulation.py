@@ -65,3 +65,19 @@ def test_the_papers_threshold_says_what_it_is_not(wang) -> None:
     design, scenario, simulation = wang
     panel = plot_detection(obsynth.monitor(design, scenario, "paper").watch(simulation.estimates), dt=1.0)
     assert any("not a pointwise bound" in text.get_text() for text in panel.get_legend().get_texts())
+
+
+def test_a_recursive_simulation_with_its_decision() -> None:
+    spec = load_spec(DESIGNS / "moussaali2013_ltv" / "two_outputs.yaml")
+    design = obsynth.design(spec.plant, spec.method, **dict(spec.options))
+    simulation = obsynth.simulate(design, spec.scenario.replace(horizon=260))
+    decision = obsynth.decide(design.observer, simulation.estimates)
+    panels = plot_simulation(simulation, detections=[decision])
+    assert [panel.get_ylabel() for panel in panels] == ["theta", "chi-square of theta"]
+    np.testing.assert_array_equal(line(panels[0], "true").get_ydata(), simulation.parameters[:, 0])
+    assert len(panels[0].collections) == 1
+    np.testing.assert_array_equal(line(panels[1], "threshold").get_ydata(), decision.thresholds)
+    assert decision.alarm is not None
+    assert line(panels[1], f"alarm at {decision.alarm.k} s: theta").get_ydata()[0] == decision.alarm.value
+    _, grid = plt.subplots(1, 1)
+    assert plot_simulation(simulation, axes=[grid]) == [grid]

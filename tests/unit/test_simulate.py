@@ -319,13 +319,6 @@ def test_a_continuous_plant_needs_a_sample_time(sharepasand) -> None:
         obsynth.simulate(sharepasand[0], obsynth.Scenario(horizon=1))
 
 
-def test_a_recursive_design_is_refused() -> None:
-    spec = load_spec(DESIGNS / "moussaali2013_ltv" / "spec.yaml")
-    design = obsynth.design(spec.plant, spec.method, **dict(spec.options))
-    with pytest.raises(SpecError, match="no linear time-invariant observer"):
-        obsynth.simulate(design, obsynth.Scenario(horizon=1))
-
-
 def test_the_file_holds_every_signal_to_the_last_bit(wang, tmp_path: Path) -> None:
     design, scenario = wang
     found = obsynth.simulate(design, scenario)

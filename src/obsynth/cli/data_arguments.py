@@ -69,6 +69,7 @@ def add_data_verbs(verbs: Any) -> None:
     report = verbs.add_parser("report", help=_REPORT, description=_REPORT)
     _add_gains(report)
     report.add_argument("--out", type=Path, required=True, metavar="FILE", help="the page (HTML)")
+    report.add_argument("--system", type=Path, metavar="SPEC", help="show the design on the scenario of this spec")
     _add_json(report)
     report.set_defaults(verb="report")
 

@@ -97,7 +97,7 @@ def run_report(options: argparse.Namespace) -> int:
     Parameters
     ----------
     options : argparse.Namespace
-        ``gains``, ``out``, ``json``.
+        ``gains``, ``out``, ``system``, ``json``.
 
     Returns
     -------
@@ -107,7 +107,7 @@ def run_report(options: argparse.Namespace) -> int:
     Raises
     ------
     SpecError
-        The gain set is malformed, or the page cannot be written.
+        The gain set or the spec is malformed, the scenario does not fit the plant, or the page cannot be written.
     """
     from obsynth.results.serialise import load
     from obsynth.verification import verify
@@ -116,9 +116,15 @@ def run_report(options: argparse.Namespace) -> int:
         raise SpecError(f"--out and --gains are the same file {options.out}: give another one.", path=str(options.out))
     design = load(options.gains)
     report = verify(design)
+    from obsynth.cli.simulating import required_scenario
     from obsynth.report.page import html_report
+    from obsynth.spec import load_spec
 
-    file = html_report(design, options.out, report=report, gains_file=options.gains.name)
+    scenario = None if options.system is None else required_scenario(load_spec(options.system))
+    system = None if options.system is None else str(options.system)
+    file = html_report(
+        design, options.out, report=report, gains_file=options.gains.name, scenario=scenario, system_file=system
+    )
     if options.json:
         print_json({"command": "report", "gains": str(options.gains), "file": str(file), "passed": report.passed})
     else:

@@ -3,9 +3,29 @@
 from __future__ import annotations
 
 import argparse
+from typing import TYPE_CHECKING
 
 from obsynth.cli.output import print_json, progress, stdout_console
 from obsynth.errors import SpecError
+
+if TYPE_CHECKING:
+    from obsynth.simulation.scenario import Scenario
+    from obsynth.spec import Spec
+
+
+def required_scenario(spec: Spec) -> Scenario:
+    """Return the scenario of a spec.
+
+    Raises
+    ------
+    SpecError
+        It has none.
+    """
+    if spec.scenario is None:
+        raise SpecError(
+            f"{spec.path} has no scenario: add one, for example scenario: {{horizon: 100}}.", path="scenario"
+        )
+    return spec.scenario
 
 
 def run_simulate(options: argparse.Namespace) -> int:
@@ -32,20 +52,18 @@ def run_simulate(options: argparse.Namespace) -> int:
     with progress(quiet=options.quiet) as report_stage:
         report_stage(f"reading {options.system}")
         spec = load_spec(options.system)
-        if spec.scenario is None:
-            raise SpecError(f"{spec.path} has no scenario: add one, for example scenario: {{horizon: 100}}.",
-                            path="scenario")  # fmt: skip
+        scenario = required_scenario(spec)
         target = None if options.out is None else output_file(options.out, spec, option="--out")
         design = designed(spec, report_stage)
         report_stage("simulating")
         from obsynth.evaluation.simulating import simulate
 
-        found = simulate(design, spec.scenario)
+        found = simulate(design, scenario)
         written = None if target is None else str(found.write_csv(target))
     if options.json:
         print_json({"command": "simulate", "spec": str(spec.path), "file": written, **found.summary()})
         return 0
     from obsynth.report.simulation import simulation_report
 
-    simulation_report(design.name, found, console=stdout_console(), units=design.linear[0].units, file=written)
+    simulation_report(design.name, found, console=stdout_console(), units=design.plant.units, file=written)
     return 0

@@ -89,9 +89,16 @@ class Bench:
         if fed.shape[2]:
             inputs = inputs + fed
         outputs = self.drive.measured(clean + sensor_noise)
-        return Runs(states, outputs, inputs, faults, disturbances, self._observed(outputs, inputs))
+        return Runs(states, outputs, inputs, faults, disturbances, self.observed(outputs, inputs))
 
-    def _observed(self, outputs: FloatArray, inputs: FloatArray) -> FloatArray:
+    def observed(self, outputs: FloatArray, inputs: FloatArray) -> FloatArray:
+        """Return what the observer says to records, ``(steps, runs, nx + nf + nr)``.
+
+        Parameters
+        ----------
+        outputs, inputs : FloatArray
+            ``(steps, runs, ny)`` and ``(steps, runs, nu)``.
+        """
         system = self.observer
         drive = inputs @ system.Bu.T + outputs @ system.By.T
         z = np.empty((*outputs.shape[:2], system.order))

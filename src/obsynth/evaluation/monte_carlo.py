@@ -14,8 +14,12 @@ from obsynth.errors import SpecError
 from obsynth.evaluation.bench import Bench, Runs, make_bench
 from obsynth.evaluation.intervals import Interval, mean, share
 from obsynth.evaluation.monitors import Monitor
+from obsynth.evaluation.progress import Progress, shown_progress
+from obsynth.evaluation.recursive_bench import make_recursive_bench
+from obsynth.evaluation.recursive_monte_carlo import ParameterMonitor, RecursiveTask, recursive_tasks
 from obsynth.evaluation.simulating import aligned_errors, warm_up_ends
 from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.linear import LinearObserver
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario
 
@@ -43,7 +47,8 @@ class Evaluation:
         Share of the detections that name a fault which did not act until then; of no runs where no fault of the plant
         acts.
     fault_rmse, state_rmse : mapping of str to Interval
-        Root mean square error after warm-up of each estimate, mean over runs.
+        Root mean square error after warm-up of each estimate, mean over runs; of recursive designs, which state how
+        uncertain they are from the start, over the whole record but its first row.
     """
 
     runs: int
@@ -76,15 +81,18 @@ class _Task:
     warm_ups: tuple[int, int]
     seeds: tuple[int, ...]
 
+    def __call__(self) -> dict[str, FloatArray]:
+        return _trial(self)
+
 
 def evaluate(
     design: ObserverDesign,
     scenario: Scenario,
     *,
     runs: int = 100,
-    monitor: Monitor | None = None,
+    monitor: Monitor | ParameterMonitor | None = None,
     executor: Executor | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | bool | None = None,
     confidence: float = 0.95,
 ) -> Evaluation:
     """Run a scenario many times, with the seeds ``scenario.seed``, ``scenario.seed + 1``, ...
@@ -92,17 +100,18 @@ def evaluate(
     Parameters
     ----------
     design : ObserverDesign
-        Of a linear method.
+        Of any method.
     scenario : Scenario
-        With random disturbances or noise.
+        With random disturbances or noise; as `simulate` takes it.
     runs : int, optional
         How many.
-    monitor : Monitor, optional
-        From `obsynth.monitor`; without one only errors of the estimates are counted.
+    monitor : Monitor or ParameterMonitor, optional
+        From `obsynth.monitor`, or how a recursive design decides on its parameters; without one only errors of the
+        estimates are counted.
     executor : concurrent.futures.Executor, optional
         Where batches of runs go; by default they run here.  The result does not depend on it.
-    progress : callable, optional
-        Called with the number of runs done and their total after each batch.
+    progress : callable or bool, optional
+        Called with the number of runs done and their total after each batch; `True` shows a bar on standard error.
     confidence : float, optional
         Of every interval: Clopper-Pearson for shares, Student for means.
 
@@ -122,32 +131,51 @@ def evaluate(
         raise SpecError(f"runs is {runs!r}: give a whole number, 1 or more.", path="runs")
     if not 0.0 < confidence < 1.0:
         raise SpecError(f"confidence is {confidence}: give a number between 0 and 1.", path="confidence")
+    seeds = range(scenario.seed, scenario.seed + runs)
+    tasks: Sequence[_Task] | Sequence[RecursiveTask]
+    if isinstance(design.observer, LinearObserver):
+        tasks, onset, dt = _linear_tasks(design, scenario, monitor, seeds)
+    else:
+        bench = make_recursive_bench(design, scenario)
+        onset, dt = bench.onset, bench.drive.dt
+        tasks = recursive_tasks(bench, monitor, seeds, max(1, BATCH_SAMPLES // bench.drive.steps))
+    with shown_progress(progress) as told:
+        parts = _done(tasks, executor, told, runs)
+    return _summed(parts, design, onset, dt, watched=monitor is not None, level=confidence)
+
+
+def _linear_tasks(
+    design: ObserverDesign, scenario: Scenario, monitor: Monitor | ParameterMonitor | None, seeds: Sequence[int]
+) -> tuple[list[_Task], int | None, float]:
+    """Return batches of runs, the first sample at which something is wrong, and the seconds between samples."""
+    if isinstance(monitor, ParameterMonitor):
+        raise SpecError("This design is linear: give monitor=obsynth.monitor(design, scenario).", path="monitor")
     bench = make_bench(design, scenario)
     nu, nf, _ = bench.sizes
     onset = bench.drive.first_fault(slice(nu, nu + nf))
-    warm_ups = tuple(end or 0 for end in warm_up_ends(bench))
+    states, faults = (end or 0 for end in warm_up_ends(bench))
     size = max(1, BATCH_SAMPLES // bench.drive.steps)
-    seeds = range(scenario.seed, scenario.seed + runs)
     tasks = [
-        _Task(bench, monitor, onset, (warm_ups[0], warm_ups[1]), tuple(seeds[i : i + size]))
-        for i in range(0, runs, size)
+        _Task(bench, monitor, onset, (states, faults), tuple(seeds[i : i + size])) for i in range(0, len(seeds), size)
     ]
-    parts = _done(tasks, executor, progress, runs)
-    return _summed(parts, design, onset, monitor, confidence)
+    return tasks, onset, bench.drive.dt
 
 
 def _done(
-    tasks: Sequence[_Task], executor: Executor | None, progress: Callable[[int, int], None] | None, runs: int
+    tasks: Sequence[Callable[[], dict[str, FloatArray]]],
+    executor: Executor | None,
+    progress: Progress | None,
+    runs: int,
 ) -> dict[str, FloatArray]:
     """Return the numbers of all runs in the order of their seeds."""
     results: list[dict[str, FloatArray]] = [{} for _ in tasks]
-    waiting = {} if executor is None else {executor.submit(_trial, task): i for i, task in enumerate(tasks)}
+    waiting = {} if executor is None else {executor.submit(task): i for i, task in enumerate(tasks)}
     finished = 0
     order = as_completed(waiting) if executor is not None else iter(range(len(tasks)))
     for item in order:
         i = item if isinstance(item, int) else waiting[item]
-        results[i] = _trial(tasks[i]) if isinstance(item, int) else item.result()
-        finished += len(tasks[i].seeds)
+        results[i] = tasks[i]() if isinstance(item, int) else item.result()
+        finished += len(results[i]["false"])
         if progress is not None:
             progress(finished, runs)
     return {name: np.concatenate([part[name] for part in results]) for name in results[0]}
@@ -186,13 +214,19 @@ def _blames_another(watched: Monitor, runs: Runs, rows: slice, run: int, k: int)
 
 
 def _summed(
-    parts: Mapping[str, FloatArray], design: ObserverDesign, onset: int | None, watched: Monitor | None, level: float
+    parts: Mapping[str, FloatArray],
+    design: ObserverDesign,
+    onset: int | None,
+    dt: float,
+    *,
+    watched: bool,
+    level: float,
 ) -> Evaluation:
-    runs, (_, observer) = len(parts["false"]), design.linear
+    runs, observer = len(parts["false"]), design.observer
     detected, judged = ~np.isnan(parts["found"]), ~np.isnan(parts["wrong"])
-    counted = runs if watched is not None else 0
+    counted = runs if watched else 0
     faulty = counted if onset is not None else 0
-    delays = np.array([]) if watched is None or onset is None else (parts["found"] - onset) * watched.dt
+    delays = np.array([]) if not watched or onset is None else (parts["found"] - onset) * dt
 
     def errors(name: str, signals: tuple[str, ...]) -> Mapping[str, Interval]:
         return MappingProxyType({signal: mean(parts[name][:, i], level) for i, signal in enumerate(signals)})

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from obsynth.evaluation.bench import Bench, make_bench
+from obsynth.evaluation.columns import named_columns, write_columns
 from obsynth.numerics.arrays import FloatArray, read_only
-from obsynth.observers.linear import Estimates
+from obsynth.observers.linear import Estimates, LinearObserver
 from obsynth.results.design import ObserverDesign
-from obsynth.results.serialise import write_atomically
 from obsynth.simulation.scenario import Scenario
+
+if TYPE_CHECKING:
+    from obsynth.evaluation.recursive_simulating import RecursiveSimulation
 
 #: Warm-up ends when the effect of an error at the start has shrunk to this share of its largest, for good.
 WARM_UP_SHARE = 0.01
@@ -103,13 +106,7 @@ class Simulation:
             ("d[{}]", self.disturbance_names, self.disturbances), ("xhat[{}]", shown.state_names, shown.states),
             ("fhat[{}]", shown.fault_names, shown.faults), ("r[{}]", shown.residual_names, shown.residuals),
         )  # fmt: skip
-        found = {"time": self.time}
-        for form, names, values in groups:
-            for i, name in enumerate(names):
-                # Inputs and outputs go by their own names, unless those are taken.
-                plain = form[0] in "uy" and name not in found
-                found[name if plain else form.format(name)] = values[:, i]
-        return found
+        return named_columns(self.time, groups)
 
     def write_csv(self, path: str | Path) -> Path:
         """Write `columns` as comma-separated text, atomically, floats with all their digits.
@@ -124,46 +121,49 @@ class Simulation:
         SpecError
             The file cannot be written.
         """
-        import csv
-        import io
-
-        table = self.columns()
-        text = io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(table)
-        writer.writerows(np.column_stack(list(table.values())).tolist())
-        return write_atomically(path, text.getvalue())
+        return write_columns(self.columns(), path)
 
 
-def simulate(design: ObserverDesign, scenario: Scenario) -> Simulation:
+def simulate(design: ObserverDesign, scenario: Scenario) -> Simulation | RecursiveSimulation:
     """Simulate a design's plant over a scenario, with its observer beside it.
 
     Parameters
     ----------
     design : ObserverDesign
-        Of a linear method, either time; plant of index 0 or 1.
+        Of any method; the plant of a linear one has index 0 or 1.
     scenario : Scenario
-        What happens.
+        What happens.  For a time-varying plant or a DAE, ``inputs`` and ``faults`` are added to the nominal inputs and
+        parameters, ``noise`` multiplies the deviations that the design states, and states without a value start where
+        the observer does (those of a DAE at their nominal values).
 
     Returns
     -------
-    Simulation
-        Signals, estimates, and how well they agree.
+    Simulation or RecursiveSimulation
+        Signals, estimates, and how well they agree; the second for recursive designs, with standard deviations.
 
     Raises
     ------
     SpecError
-        A recursive design, an unknown name, a missing sample time, or states that outgrow double precision.
+        An unknown name, a missing sample time, something that such a plant does not have, or states that outgrow double
+        precision.
     PreconditionError
         The plant is not regular, has index 2 or more (its states then depend on derivatives of the signals, which a
-        scenario does not have), or cannot be stabilised.
+        scenario does not have), or cannot be stabilised; the equations of a time-varying one do not determine its
+        state at some k.
+    SolverError
+        A step of a DAE has no solution.
 
     Notes
     -----
     Discrete plants step by their own equations.  Continuous ones step by the matrix exponential, exactly for signals
     that are constant between samples (steps, intermittent ones, random ones) or linear (ramps); sines and drifts are
-    taken as linear between samples.  The continuous observer runs on the samples, by a first-order hold.
+    taken as linear between samples.  The continuous observer runs on the samples, by a first-order hold.  A DAE is
+    integrated by Radau IIA (fifth order) with inputs that are constant during each step, whatever its observer uses.
     """
+    if not isinstance(design.observer, LinearObserver):
+        from obsynth.evaluation.recursive_simulating import simulate_recursive
+
+        return simulate_recursive(design, scenario)
     bench = make_bench(design, scenario)
     runs = bench.run([scenario.seed])
     plant, _ = design.linear

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from dataclasses import fields as fields_of
 from functools import cached_property, partial
 from types import MappingProxyType
 from typing import Any
@@ -218,6 +219,13 @@ class DAEModel:
         names = ("equations", "outputs", "states", "inputs", "parameters", "constants", "definitions", "units")
         return {name: dict(getattr(self, name)) for name in names}
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return what makes it again in another process: read-only mappings do not travel, functions by their names."""
+        given: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields_of(self)}
+        if self.is_data:
+            del given["equation_names"], given["output_names"]
+        return _made, ({name: dict(value) if isinstance(value, Mapping) else value for name, value in given.items()},)
+
     def replace(self, **changes: Any) -> DAEModel:
         """Return a model with some fields changed, checked again as a whole.
 
@@ -235,6 +243,10 @@ class DAEModel:
 
     def __repr__(self) -> str:
         return f"DAEModel(nx={self.nx}, nu={self.nu}, ny={self.ny}, nq={self.nq}, states={list(self.states)})"
+
+
+def _made(given: dict[str, Any]) -> DAEModel:
+    return DAEModel(**given)
 
 
 def _units_missing(names: Sequence[str]) -> None:

@@ -72,6 +72,10 @@ class Expression:
     _evaluator: Evaluator = field(repr=False, compare=False)
     rates: Mapping[str, Expression] = field(default_factory=dict, compare=False)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return what makes it again in another process: its text."""
+        return _parsed, (self.text, bool(self.rates))
+
     def __call__(self, values: Mapping[str, Any]) -> Any:
         """Return the value, NaN or infinite where there is none; ``values`` are numbers or arrays by name."""
         # What is not finite is found by the caller, who knows where it came from.
@@ -89,6 +93,10 @@ class Expression:
             From numpy's operation to the one for these values.
         """
         return self._evaluator(values, translation)
+
+
+def _parsed(text: str, rates: bool) -> Expression:
+    return parse_expression(text, rates=rates)
 
 
 def parse_expression(text: str, *, rates: bool = False) -> Expression:

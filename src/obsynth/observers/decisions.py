@@ -156,10 +156,7 @@ def _quantile(degrees: FloatArray, probability: float) -> FloatArray:
 
 def _chi_square(estimates: RecursiveEstimates, nominal: FloatArray, false_alarms: float) -> Decision:
     gaps, nq = estimates.parameters - nominal, len(nominal)
-    values = np.array([
-        gap @ np.linalg.pinv(covariance, hermitian=True) @ gap
-        for gap, covariance in zip(gaps, estimates.parameter_covariances, strict=True)
-    ])  # fmt: skip
+    values = np.einsum("ki,kij,kj->k", gaps, _inverses(estimates.parameter_covariances), gaps)
     looks = len(values)
     thresholds = np.full(looks, float(_quantile(np.array(float(nq)), false_alarms / looks)))
     hits = np.flatnonzero(values > thresholds)
@@ -175,6 +172,13 @@ def _chi_square(estimates: RecursiveEstimates, nominal: FloatArray, false_alarms
         k, estimates.parameter_names[_alone(weights @ gaps[k], np.diag(weights))], onset, confidence, float(values[k])
     )
     return Decision("chi-square", read_only(values), read_only(thresholds), alarm)
+
+
+def _inverses(covariances: FloatArray) -> FloatArray:
+    """Return pseudo-inverses ``(samples, nq, nq)``."""
+    if not covariances.shape[1]:
+        return covariances
+    return np.asarray(np.linalg.pinv(covariances, hermitian=True))
 
 
 def _nis(estimates: RecursiveEstimates, gaps: FloatArray, false_alarms: float) -> Decision:

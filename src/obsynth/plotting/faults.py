@@ -1,38 +1,31 @@
-"""Fault estimates against faults, residuals against thresholds, and the poles of an observer.
-
-Every line differs from its neighbours by more than its colour, so that the pictures can be printed.
-"""
+"""Fault estimates against faults, and residuals against thresholds."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.analysis.zeros import fault_zeros
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.observers.linear import Estimates
-from obsynth.results.design import ObserverDesign
+from obsynth.plotting.panels import (
+    ESTIMATE_STYLE,
+    MARK_STYLE,
+    RESIDUAL_STYLE,
+    THRESHOLD_STYLES,
+    TRUE_STYLE,
+    legend_above,
+    new_panels,
+    tidy,
+    with_unit,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-#: Inches: the width of every figure, and the height of one panel.
-WIDTH = 7.5
-PANEL_HEIGHT = 2.2
-#: The true signal lies under the estimate: wide, grey, solid.  The estimate on it: thin, dark, dashed.
-TRUE_STYLE: dict[str, Any] = {"color": "0.72", "linewidth": 4.0, "linestyle": "-", "solid_capstyle": "butt"}
-ESTIMATE_STYLE: dict[str, Any] = {"color": "black", "linewidth": 1.1, "linestyle": "--"}
-RESIDUAL_STYLE: dict[str, Any] = {"color": "black", "linewidth": 1.0, "linestyle": "-"}
-#: One line style for each threshold, in order.
-THRESHOLD_STYLES: tuple[dict[str, Any], ...] = (
-    {"color": "tab:red", "linewidth": 1.6, "linestyle": "--"},
-    {"color": "tab:blue", "linewidth": 1.6, "linestyle": "-."},
-    {"color": "tab:green", "linewidth": 1.6, "linestyle": ":"},
-)
 CROSSING_MARKERS = ("o", "s", "^")
 
 
@@ -78,9 +71,8 @@ def plot_faults(
             label = f"fault, delayed by {_samples(delay)}" if delay else "fault"
             panel.plot(time[delay:], truth[: steps - delay, i], label=label, **TRUE_STYLE)
         panel.plot(time, estimates.faults[:, i], label="estimate", **ESTIMATE_STYLE)
-        unit = (units or {}).get(name)
-        panel.set_ylabel(f"{name} ({unit})" if unit else name)
-        panel.legend(loc="best")
+        panel.set_ylabel(with_unit(name, units))
+        legend_above(panel)
         tidy(panel)
     if panels:
         panels[-1].set_xlabel("time (s)")
@@ -138,70 +130,14 @@ def plot_residuals(
         if crossed.size:
             first = int(crossed[0])
             panel.plot(
-                time[first], size[first], marker=marker, markersize=9, markerfacecolor="none", markeredgewidth=1.6,
-                color=style["color"], linestyle="none", label=f"first above it at k = {first} ({time[first]:g} s)",
+                time[first], size[first], marker=marker, color=style["color"],
+                label=f"first above it at k = {first} ({time[first]:g} s)", **MARK_STYLE,
             )  # fmt: skip
     panel.set_ylabel("norm of the residual")
     panel.set_xlabel("time (s)")
-    panel.legend(loc="best")
+    legend_above(panel)
     tidy(panel)
     return panel
-
-
-def plot_poles(design: ObserverDesign, *, axes: Axes | None = None) -> Axes:
-    """Plot the observer's eigenvalues and the plant's fault zeros, with the unit circle.
-
-    Parameters
-    ----------
-    design : ObserverDesign
-        A discrete-time design.
-    axes : Axes, optional
-        New ones by default.
-
-    Returns
-    -------
-    Axes
-        The complex plane.
-    """
-    if axes is None:
-        (axes,) = new_panels(None, 1, size=(5.0, 5.4))
-    plant, observer = design.linear
-    poles = np.linalg.eigvals(observer.Az)
-    zeros = np.array([zero.value for zero in fault_zeros(plant).zeros], dtype=complex)
-    circle = np.exp(2j * np.pi * np.linspace(0.0, 1.0, 361))
-    axes.plot(circle.real, circle.imag, color="0.5", linewidth=1.0, linestyle="--", label="unit circle")
-    axes.axhline(0.0, color="0.85", linewidth=0.8, zorder=0)
-    axes.axvline(0.0, color="0.85", linewidth=0.8, zorder=0)
-    axes.plot(poles.real, poles.imag, marker="x", markersize=9, markeredgewidth=1.6, linestyle="none", color="black",
-              label=f"observer eigenvalues ({len(poles)})")  # fmt: skip
-    axes.plot(zeros.real, zeros.imag, marker="o", markersize=9, markerfacecolor="none", markeredgewidth=1.6,
-              linestyle="none", color="tab:red", label=f"fault zeros ({len(zeros)})")  # fmt: skip
-    axes.set_aspect("equal")
-    reach = 1.1 * max(1.05, float(np.max(np.abs(np.concatenate([poles, zeros])), initial=0.0)))
-    axes.set_xlim(-reach, reach)
-    axes.set_ylim(-reach, reach)
-    axes.set_xlabel("real part")
-    axes.set_ylabel("imaginary part")
-    axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False)
-    return axes
-
-
-def new_panels(axes: Iterable[Axes] | None, count: int, *, size: tuple[float, float] | None = None) -> list[Axes]:
-    """Return ``count`` axes: the given ones, or new ones one above the other."""
-    if axes is not None:
-        given = list(np.ravel(np.asarray(axes, dtype=object)))
-        if len(given) != count:
-            raise SpecError(f"{len(given)} axes were given, but {count} are needed.", path="axes")
-        return given
-    if count == 0:
-        return []
-    import matplotlib.pyplot as plt
-
-    _, grid = plt.subplots(
-        count, 1, sharex=True, squeeze=False, layout="constrained",
-        figsize=size or (WIDTH, PANEL_HEIGHT * count + 0.8),
-    )  # fmt: skip
-    return list(grid[:, 0])
 
 
 def _matching(value: ArrayLike, name: str, shape: tuple[int, int]) -> FloatArray:
@@ -222,12 +158,3 @@ def _curve(value: ArrayLike, name: str, steps: int) -> FloatArray:
 
 def _samples(count: int) -> str:
     return f"{count} sample" if count == 1 else f"{count} samples"
-
-
-def tidy(panel: Axes) -> None:
-    """Give a panel a faint grid and no box."""
-    panel.grid(True, color="0.9", linewidth=0.6)
-    panel.set_axisbelow(True)
-    for side in ("top", "right"):
-        panel.spines[side].set_visible(False)
-    panel.margins(x=0.01)

@@ -1,4 +1,4 @@
-"""What reaches the fault estimates at each frequency, and the poles of a continuous-time observer."""
+"""What reaches the estimates of faults and states, and the residual, at each frequency."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import ComplexArray, FloatArray
-from obsynth.numerics.spectra import boundary_points, eigenvalues, response
+from obsynth.numerics.spectra import boundary_points, response
 from obsynth.observers.linear import LinearObserver
+from obsynth.plotting.panels import WIDTH, new_panels, plain_decades, tidy
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.decoupling import frequency_grid
 
@@ -20,150 +21,149 @@ if TYPE_CHECKING:
 
 #: A gain below this share of what is subtracted from one another in it is rounding: nothing gets through.
 ROUNDING_SHARE = 1e-9
+#: The least singular value is drawn where it is below this share of the largest one somewhere.
+VISIBLE_SHARE = 0.99
+TARGETS = {"faults": "fault estimates", "states": "errors of the states", "residuals": "residual"}
 _STYLES: dict[str, dict[str, Any]] = {
     "faults": {"color": "black", "linewidth": 1.8, "linestyle": "-"},
     "disturbances": {"color": "tab:red", "linewidth": 1.6, "linestyle": "--"},
     "noise": {"color": "tab:blue", "linewidth": 1.6, "linestyle": ":"},
 }
-#: Inches.
-_SIZE = (7.5, 4.0)
+_LEAST: dict[str, Any] = {"color": "black", "linewidth": 0.8, "linestyle": "-"}
+_BOUND: dict[str, Any] = {"color": "tab:green", "linewidth": 1.2, "linestyle": "-."}
 
 
 @dataclass(frozen=True, eq=False)
-class FaultEstimateGains:
-    """Largest singular values from what acts on a plant to the fault estimates.
+class EstimateGains:
+    """Singular values from what acts on a plant to what an observer says.
 
     Parameters
     ----------
     frequencies : FloatArray
         ``(k,)``, rad/s.
     gains : dict of str to FloatArray
-        ``faults``, ``disturbances``, ``noise`` as far as the plant has them: ``(k,)``, zero where only
-        rounding is left.
+        Largest ones from ``faults``, ``disturbances``, ``noise`` as far as the plant has them: ``(k,)``, zero where
+        only rounding is left.
+    least : FloatArray
+        ``(k,)``: the least ones from the faults.
     """
 
     frequencies: FloatArray
     gains: dict[str, FloatArray]
+    least: FloatArray
 
 
-def fault_estimate_gains(design: ObserverDesign) -> FaultEstimateGains:
+def estimate_gains(design: ObserverDesign, *, to: str = "faults") -> EstimateGains:
     """Return the singular values of the transfer functions that matter, from the plant and the shipped realisation.
 
     Parameters
     ----------
     design : ObserverDesign
-        Linear, with faults.
+        Linear.
+    to : {"faults", "states", "residuals"}, optional
+        The fault estimates, the errors of the state estimates (aligned with their delays), or the residual.
 
     Returns
     -------
-    FaultEstimateGains
+    EstimateGains
         Around the poles of the observer.
 
     Raises
     ------
     SpecError
-        The design is recursive or estimates no fault.
+        The design is recursive, or has no such output.
     """
     plant, observer = design.linear
-    if not observer.fault_names:
-        raise SpecError("The design estimates no faults.", path="observer")
+    if to not in TARGETS:
+        raise SpecError(f"to is {to!r}: use one of {', '.join(TARGETS)}.", path="to")
+    rows = {"faults": observer.fault_rows, "states": observer.state_rows, "residuals": observer.residual_rows}[to]
+    if rows.start == rows.stop:
+        what = "estimates no faults" if to == "faults" else f"has no {to}"
+        raise SpecError(f"The design {what}.", path="observer")
     frequencies = frequency_grid(observer)[1:]
     points = boundary_points(frequencies, observer.dt)
-    rows = observer.fault_rows
     to_estimate = response(observer.Az, observer.By, observer.Cz[rows], observer.Dy[rows], points)
     inputs = {"faults": (plant.Bf, plant.Df), "disturbances": (plant.Bd, plant.Dd), "noise": (plant.Bw, plant.Dw)}
-    gains = {}
+    gains, least = {}, np.zeros(len(points))
     for name, (b, d) in inputs.items():
         if not b.shape[1]:
             continue
-        to_output = _plant_response(plant, b, d, points)
-        sizes = np.linalg.norm(to_estimate @ to_output, 2, axis=(1, 2))
-        terms = np.linalg.norm(to_estimate, axis=(1, 2)) * np.linalg.norm(to_output, axis=(1, 2))
-        gains[name] = np.where(sizes > ROUNDING_SHARE * terms, sizes, 0.0)
-    return FaultEstimateGains(frequencies, gains)
+        states = _state_response(plant, b, points)
+        outputs = plant.C @ states + d
+        seen, terms = to_estimate @ outputs, _sizes(to_estimate) * _sizes(outputs)
+        if to == "states":
+            truth = _delayed(observer, points) * states
+            seen, terms = seen - truth, terms + _sizes(truth)
+        values = np.linalg.svd(seen, compute_uv=False)
+        gains[name] = np.where(values[:, 0] > ROUNDING_SHARE * terms, values[:, 0], 0.0)
+        if name == "faults":
+            least = np.where(values[:, -1] > ROUNDING_SHARE * terms, values[:, -1], 0.0)
+    return EstimateGains(frequencies, gains, least)
 
 
-def _plant_response(plant: DescriptorSystem, b: FloatArray, d: FloatArray, points: ComplexArray) -> ComplexArray:
+def _sizes(matrices: ComplexArray) -> FloatArray:
+    return np.asarray(np.linalg.norm(matrices, axis=(1, 2)))
+
+
+def _delayed(observer: LinearObserver, points: ComplexArray) -> ComplexArray:
+    """Return what a known delay makes of each state, ``(k, nx, 1)``."""
+    delays = np.array(observer.state_delays, dtype=float)
+    return np.asarray(points[:, None, None] ** -delays[None, :, None])
+
+
+def _state_response(plant: DescriptorSystem, b: FloatArray, points: ComplexArray) -> ComplexArray:
     pencils = points[:, None, None] * plant.E - plant.A
-    return np.asarray(
-        plant.C @ np.linalg.solve(pencils, np.broadcast_to(b.astype(complex), (len(points), *b.shape))) + d
-    )
+    return np.asarray(np.linalg.solve(pencils, np.broadcast_to(b.astype(complex), (len(points), *b.shape))))
 
 
-def plot_gains(design: ObserverDesign, *, axes: Axes | None = None) -> Axes:
-    """Plot what reaches the fault estimates: faults (should be 1), disturbances and noise (should be small).
+def plot_gains(design: ObserverDesign, *, to: str = "faults", axes: Axes | None = None) -> Axes:
+    """Plot what reaches the fault estimates (or the state errors, or the residual), from whatever acts on the plant.
+
+    A faithful fault estimate has singular values of 1 from the faults and small ones from disturbances and noise.
 
     Parameters
     ----------
     design : ObserverDesign
-        Linear, with faults.
+        Linear.
+    to : {"faults", "states", "residuals"}, optional
+        As for `estimate_gains`.
     axes : Axes, optional
         New ones by default.
 
     Returns
     -------
     Axes
-        Largest singular values over the frequency, both logarithmic.
+        Largest singular values over the frequency, both logarithmic; the least one from the faults too where it
+        differs, and the gain that was proved where there is one.
 
     Raises
     ------
     SpecError
-        The design is recursive or estimates no fault.
+        The design is recursive, or has no such output.
     """
-    found = fault_estimate_gains(design)
-    panel = _new_axes(_SIZE) if axes is None else axes
+    found, target = estimate_gains(design, to=to), TARGETS.get(to, "")
+    (panel,) = new_panels(None if axes is None else [axes], 1, size=(WIDTH, 4.0))
     panel.set_xscale("log")
-    panel.set_yscale("log")
-    panel.axhline(1.0, color="0.7", linewidth=0.8, zorder=0)
+    if to == "faults":
+        panel.axhline(1.0, color="0.7", linewidth=0.8, zorder=0)
     for name, gain in found.gains.items():
         if np.any(gain > 0.0):
-            shown = np.where(gain > 0.0, gain, np.nan)
-            panel.plot(found.frequencies, shown, label=f"{name} to fault estimates", **_STYLES[name])
+            panel.plot(found.frequencies, _positive(gain), label=f"{name} to {target}", **_STYLES[name])
         else:
             panel.plot([], [], label=f"{name}: nothing gets through", **_STYLES[name])
+    largest = found.gains.get("faults", found.least)
+    if to != "states" and np.any(found.least < VISIBLE_SHARE * largest):
+        panel.plot(found.frequencies, _positive(found.least), label="faults, least singular value", **_LEAST)
+    gamma = design.certificate.claims.get("gamma")
+    if to == "faults" and gamma is not None and "disturbances" in found.gains:
+        panel.plot(found.frequencies[[0, -1]], [gamma, gamma], label=f"proved for disturbances: {gamma:.4g}", **_BOUND)
+    plain_decades(panel)
     panel.set_xlabel("frequency (rad/s)")
-    panel.set_ylabel("largest singular value")
-    panel.legend(loc="best")
-    panel.grid(True, color="0.9", linewidth=0.6)
+    panel.set_ylabel("singular value")
+    panel.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False)
+    tidy(panel)
     return panel
 
 
-def plot_continuous_poles(design: ObserverDesign, *, axes: Axes | None = None) -> Axes:
-    """Plot the eigenvalues of a continuous-time observer; stable ones are left of the line.
-
-    Parameters
-    ----------
-    design : ObserverDesign
-        Linear, continuous time.
-    axes : Axes, optional
-        New ones by default.
-
-    Returns
-    -------
-    Axes
-        The complex plane, 1/s.
-
-    Raises
-    ------
-    SpecError
-        The design is recursive or sampled.
-    """
-    observer: LinearObserver = design.linear[1]
-    if observer.dt > 0.0:
-        raise SpecError("The design is sampled: use plot_poles.", path="dt")
-    panel = _new_axes(_SIZE) if axes is None else axes
-    poles = eigenvalues(observer.Az)
-    panel.axhline(0.0, color="0.85", linewidth=0.8, zorder=0)
-    panel.axvline(0.0, color="0.5", linewidth=1.0, linestyle="--", label="limit of stability")
-    panel.plot(poles.real, poles.imag, marker="x", markersize=9, markeredgewidth=1.6, linestyle="none", color="black",
-               label=f"observer eigenvalues ({len(poles)})")  # fmt: skip
-    panel.set_xlabel("real part (1/s)")
-    panel.set_ylabel("imaginary part (1/s)")
-    panel.legend(loc="best")
-    return panel
-
-
-def _new_axes(size: tuple[float, float]) -> Axes:
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=size, layout="constrained").subplots()
+def _positive(gain: FloatArray) -> FloatArray:
+    return np.where(gain > 0.0, gain, np.nan)

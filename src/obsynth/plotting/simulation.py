@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from obsynth.evaluation.monitors import Detection
+from obsynth.evaluation.recursive_simulating import RecursiveSimulation
 from obsynth.evaluation.simulating import Simulation
-from obsynth.plotting.faults import RESIDUAL_STYLE, THRESHOLD_STYLES, new_panels, plot_faults, tidy
+from obsynth.observers.decisions import Decision
+from obsynth.plotting.faults import plot_faults
+from obsynth.plotting.panels import MARK_STYLE, RESIDUAL_STYLE, THRESHOLD_STYLES, legend_above, new_panels, tidy
+from obsynth.plotting.recursive import plot_decision
+from obsynth.plotting.states import plot_parameters
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -39,18 +44,24 @@ DECADES_BELOW = 3
 
 
 def plot_simulation(
-    simulation: Simulation, *, detections: Sequence[Detection] = (), units: Mapping[str, str] | None = None
+    simulation: Simulation | RecursiveSimulation,
+    *,
+    detections: Sequence[Detection | Decision] = (),
+    units: Mapping[str, str] | None = None,
+    axes: Iterable[Axes] | None = None,
 ) -> list[Axes]:
-    """Plot each fault with its estimate, and below them one panel for each monitor.
+    """Plot each fault (or parameter, with its 95 % band) with its estimate, and below them one panel for each monitor.
 
     Parameters
     ----------
-    simulation : Simulation
+    simulation : Simulation or RecursiveSimulation
         From `obsynth.simulate`.
-    detections : sequence of Detection, optional
-        What monitors saw in it.
+    detections : sequence of Detection or Decision, optional
+        What monitors saw in it, from ``monitor.watch`` or `obsynth.decide`.
     units : mapping, optional
         Unit of each fault by name, such as ``plant.units``.
+    axes : iterable of Axes, optional
+        As many as faults and detections; new ones, one above the other, by default.
 
     Returns
     -------
@@ -60,23 +71,36 @@ def plot_simulation(
     Raises
     ------
     SpecError
-        Never for a simulation and detections of its own.
+        There are too few or too many axes.
     """
-    count = len(simulation.estimates.fault_names)
-    panels = new_panels(None, count + len(detections))
     dt = float(simulation.time[1]) if len(simulation.time) > 1 else 1.0
-    plot_faults(simulation.estimates, faults=simulation.faults, dt=dt, units=units, axes=panels[:count])
-    for panel, estimate in zip(panels[:count], simulation.estimates.faults.T, strict=True):
+    if isinstance(simulation, Simulation):
+        count = len(simulation.estimates.fault_names)
+        panels = new_panels(axes, count + len(detections))
+        _plot_linear(simulation, panels[:count], dt, units)
+    else:
+        count = len(simulation.estimates.parameter_names)
+        panels = new_panels(axes, count + len(detections))
+        true = simulation.parameters[:, list(simulation.parameter_columns)]
+        plot_parameters(simulation.estimates, parameters=true, dt=dt, units=units, axes=panels[:count])
+    for panel, detection in zip(panels[count:], detections, strict=True):
+        if isinstance(detection, Decision):
+            plot_decision(detection, dt=dt, axes=panel)
+        else:
+            plot_detection(detection, dt=dt, axes=panel)
+    for panel in panels[:-1]:
+        panel.set_xlabel("")
+    return panels
+
+
+def _plot_linear(simulation: Simulation, panels: list[Axes], dt: float, units: Mapping[str, str] | None) -> None:
+    plot_faults(simulation.estimates, faults=simulation.faults, dt=dt, units=units, axes=panels)
+    for panel, estimate in zip(panels, simulation.estimates.faults.T, strict=True):
         if np.median(np.abs(np.diff(estimate))) > NOISY_SHARE * np.ptp(estimate):
             truth, band = panel.get_lines()
             truth.set(**_TRUTH_ON_BAND)
             band.set(**_BAND)
-            panel.legend(loc="best")
-    for panel, detection in zip(panels[count:], detections, strict=True):
-        plot_detection(detection, dt=dt, axes=panel)
-    for panel in panels[:-1]:
-        panel.set_xlabel("")
-    return panels
+            legend_above(panel)
 
 
 def plot_detection(detection: Detection, *, dt: float, axes: Axes | None = None) -> Axes:
@@ -114,12 +138,11 @@ def plot_detection(detection: Detection, *, dt: float, axes: Axes | None = None)
             panel.set_ylim(bottom=float(np.min(detection.threshold[deciding])) * 10.0**-DECADES_BELOW)
     if detection.k is not None:
         panel.plot(
-            time[detection.k], detection.values[detection.k], marker="o", markersize=9, markerfacecolor="none",
-            markeredgewidth=1.6, color="black", linestyle="none",
-            label=f"alarm at {detection.time:g} s" + (f": {detection.fault}" if detection.fault else ""),
+            time[detection.k], detection.values[detection.k], marker="o", color="black",
+            label=f"alarm at {detection.time:g} s" + (f": {detection.fault}" if detection.fault else ""), **MARK_STYLE,
         )  # fmt: skip
     panel.set_ylabel(_LABELS[detection.kind])
     panel.set_xlabel("time (s)")
-    panel.legend(loc="best")
+    legend_above(panel)
     tidy(panel)
     return panel

@@ -50,6 +50,27 @@ _MEANINGS = {
     },
 }
 
+#: Method id -> paper whose letters the gains have.
+_SOURCES = {
+    "fault-estimation-filter": "Wang, Rodrigues, Theilliol, Shen 2015",
+    "pd-observer": "Filasova, Krokavec, Serbak",
+    "ui-pi-observer": "Share Pasand, Aliyari, Taghirad",
+    "descriptor-kalman": "Nikoukhah, Willsky, Levy 1992",
+    "adaptive-observer": "Moussa Ali, Zhang 2013",
+    "dae-adaptive-observer": "Moussa Ali, Zhang 2013 (differential-algebraic systems)",
+}
+
+
+def source_of(method: str) -> str:
+    """Return the paper that a method comes from; empty for an unknown one.
+
+    Parameters
+    ----------
+    method : str
+        Method id.
+    """
+    return _SOURCES.get(method, "")
+
 
 def meaning_of(method: str, claim: str) -> str:
     """Return what a claim means; empty when the method has no such claim.

@@ -89,14 +89,13 @@ def design_report(design: ObserverDesign, *, console: Console, file: Path | None
     print_section(console, f"Design '{design.name}' by {design.method}", facts_table(plant_facts(design.plant)))
     print_section(console, "What is promised", facts_table(promises(design)))
     if design.observer.fault_names:
-        heading = "Fault estimates" if isinstance(design.observer, LinearObserver) else "Parameter estimates"
-        print_section(console, heading, _fault_estimates(design))
+        print_section(console, *fault_estimates_table(design))
     if "delta_scan" in design.solver:
         print_section(
             console, "Other values of delta", delta_scan_table(DeltaScan.from_dict(design.solver["delta_scan"]))
         )
     if design.recovery is not None:
-        print_section(console, "States of the plant as written", facts_table(_recovered_states(design.recovery)))
+        print_section(console, "States of the plant as written", facts_table(recovered_states(design.recovery)))
     verification_report(design.report, console=console)
     for note in design.notes:
         console.print(Text(f"Note: {note}"))
@@ -120,8 +119,19 @@ def delta_scan_table(scan: DeltaScan) -> Table:
     return table
 
 
-def _recovered_states(recovery: StateRecovery) -> Iterator[tuple[str, str]]:
-    """Yield how good an estimate of each original state is, with the names, best first."""
+def recovered_states(recovery: StateRecovery) -> Iterator[tuple[str, str]]:
+    """Yield how good an estimate of each original state is, with the names, best first.
+
+    Parameters
+    ----------
+    recovery : StateRecovery
+        Of a design.
+
+    Yields
+    ------
+    tuple of str
+        How good, and which.
+    """
     names_by_flag: dict[str, list[str]] = {}
     for name, flag in zip(recovery.names, recovery.flags(), strict=True):
         names_by_flag.setdefault(flag, []).append(name)
@@ -150,7 +160,14 @@ def promises(design: ObserverDesign) -> Iterator[tuple[str, str, str]]:
     yield "observer order", str(design.observer.order), "states of the shipped realisation"
 
 
-def _fault_estimates(design: ObserverDesign) -> Table:
+def fault_estimates_table(design: ObserverDesign) -> tuple[str, Table]:
+    """Return heading and table of delays and deviations of the estimates of faults or parameters.
+
+    Parameters
+    ----------
+    design : ObserverDesign
+        With faults or parameters.
+    """
     observer, units = design.observer, design.plant.units
     deviations = {check.name: check.value for check in design.report.checks}
     if not isinstance(observer, LinearObserver):
@@ -160,7 +177,7 @@ def _fault_estimates(design: ObserverDesign) -> Table:
         )
         for name in observer.fault_names:
             table.add_row(Text(name), f"{number(deviations[f'noise in fhat[{name}]'])} {units.get(name, '')}".strip())
-        return table
+        return "Parameter estimates", table
     sampled = observer.dt > 0.0
     delays = ("delay in samples", "delay in s") if sampled else ()
     noise = "std under the stated noise" + ("" if sampled else ", 1 s between samples")
@@ -170,4 +187,4 @@ def _fault_estimates(design: ObserverDesign) -> Table:
         missing = "depends on the sampling" if design.linear[0].nw else "no noise stated"
         shown = missing if deviation is None else f"{number(deviation)} {units.get(name, '')}".strip()
         table.add_row(Text(name), *((str(delay), number(delay * observer.dt)) if sampled else ()), Text(shown))
-    return table
+    return "Fault estimates", table

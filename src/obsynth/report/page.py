@@ -2,28 +2,31 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from html import escape
 from pathlib import Path
 
-from obsynth.numerics.arrays import FloatArray
-from obsynth.report.designs import plant_facts, promises
-from obsynth.report.layout import number, verdict
+from obsynth.report.claims import source_of
+from obsynth.report.designs import fault_estimates_table, plant_facts, promises, recovered_states
 from obsynth.report.page_style import STYLE
+from obsynth.report.page_tables import check_rows, copied_table, fact_rows, matrix_rows, value_text
 from obsynth.report.pictures import pictures_of
 from obsynth.report.verification import verdict_line
 from obsynth.results.design import ObserverDesign
-from obsynth.results.report import Check, VerificationReport
-from obsynth.results.serialise import design_as_dict, plain, write_atomically
+from obsynth.results.report import VerificationReport
+from obsynth.results.serialise import design_as_dict, write_atomically
+from obsynth.simulation.scenario import Scenario
 
+#: The check without which observer and plant cannot be run together.
+FITS = "fits the plant"
 #: Gains with more entries are not printed: the gain set has them.
 MOST_ENTRIES = 900
 
 
 def html_report(
-    design: ObserverDesign, path: str | Path, *, report: VerificationReport | None = None, gains_file: str | None = None
-) -> Path:
+    design: ObserverDesign, path: str | Path, *, report: VerificationReport | None = None,
+    gains_file: str | None = None, scenario: Scenario | None = None, system_file: str | None = None,
+) -> Path:  # fmt: skip
     """Write one HTML page about a design, complete in itself: it needs no network and no other file.
 
     Parameters
@@ -36,6 +39,10 @@ def html_report(
         A new one, from `verify`; by default the one that the design holds.
     gains_file : str, optional
         Name of the gain set's file, for the command that reproduces the page.
+    scenario : Scenario, optional
+        What the design is shown on; by default each fault in turn.
+    system_file : str, optional
+        Name of the spec with that scenario, for the same command.
 
     Returns
     -------
@@ -45,75 +52,59 @@ def html_report(
     Raises
     ------
     SpecError
-        The file cannot be written.
+        The file cannot be written, or the scenario does not fit the plant.
+    PreconditionError
+        The plant cannot be simulated on the scenario.
     """
-    return write_atomically(path, page_text(design, design.report if report is None else report, gains_file=gains_file))
+    shown = design.report if report is None else report
+    return write_atomically(path, _page_text(design, shown, gains_file, scenario, system_file))
 
 
-def page_text(design: ObserverDesign, report: VerificationReport, *, gains_file: str | None = None) -> str:
-    """Return the page.
-
-    Parameters
-    ----------
-    design : ObserverDesign
-        Any design.
-    report : VerificationReport
-        Its verdict and its checks.
-    gains_file : str, optional
-        Name of the gain set's file.
-    """
+def _page_text(
+    design: ObserverDesign, report: VerificationReport, gains_file: str | None, scenario: Scenario | None,
+    system_file: str | None,
+) -> str:  # fmt: skip
     digest = str(design_as_dict(design)["sha256"])
     title = escape(f"{design.name}: {design.method}")
-    line = verdict_line(report).plain
     state = "holds" if report.passed else "fails"
+    sections = {
+        "What is promised": [*fact_rows(promises(design)), *_fault_estimates(design), *_recovered(design)],
+        "Notes": list(_notes(design.notes)),
+        "The plant": list(fact_rows(plant_facts(design.plant))),
+        "Checks": list(check_rows(report.checks)) if report.checks else [],
+        "Gains": list(_gains(design)),
+        "Pictures": list(_pictures(design, scenario, report)),
+        "How to reproduce this": list(_reproduction(design, digest, gains_file, system_file)),
+    }
+    shown = {heading: lines for heading, lines in sections.items() if lines}
+    links = "".join(f'<a href="#{_anchor(heading)}">{heading}</a>' for heading in shown)
     parts = [
         "<!DOCTYPE html>", '<html lang="en">', "<head>", '<meta charset="utf-8">',
         '<meta name="viewport" content="width=device-width, initial-scale=1">', f"<title>{title}</title>",
         f"<style>{STYLE}</style>", "</head>", "<body>", f"<h1>{title}</h1>",
-        f'<p class="verdict {state}">{escape(line)}</p>',
-        *_section("What is promised", _facts(promises(design))), *_section("Plant", _facts(plant_facts(design.plant))),
-        *_section("Checks", _checks(report.checks)), *_section("Notes", _notes(design.notes)),
-        *_section("Pictures", _pictures(design)), *_section("Gains", _gains(design)),
-        *_section("How to reproduce this", _reproduction(design, digest, gains_file)), "</body>", "</html>",
+        f'<p class="verdict {state}">{escape(verdict_line(report).plain)}</p>',
+        f"<nav>{links}</nav>",
     ]  # fmt: skip
-    return "\n".join(parts) + "\n"
+    for heading, lines in shown.items():
+        parts += [f'<section id="{_anchor(heading)}">', f"<h2>{heading}</h2>", *lines, "</section>"]
+    return "\n".join([*parts, "</body>", "</html>"]) + "\n"
 
 
-def _section(title: str, content: Iterable[str]) -> Iterator[str]:
-    lines = list(content)
-    if lines:
-        yield f"<section>\n<h2>{escape(title)}</h2>"
-        yield from lines
-        yield "</section>"
+def _anchor(heading: str) -> str:
+    return heading.lower().replace(" ", "-")
 
 
-def _facts(rows: Iterable[Sequence[str]]) -> Iterator[str]:
-    yield '<div class="scroll"><table class="facts"><tbody>'
-    for label, *values in rows:
-        cells = "".join(f"<td>{escape(value)}</td>" for value in values)
-        yield f'<tr><td class="soft">{escape(label)}</td>{cells}</tr>'
-    yield "</tbody></table></div>"
+def _fault_estimates(design: ObserverDesign) -> Iterator[str]:
+    if design.observer.fault_names:
+        heading, table = fault_estimates_table(design)
+        yield f"<h3>{heading}</h3>"
+        yield from copied_table(table)
 
 
-def _checks(checks: Sequence[Check]) -> Iterator[str]:
-    headings = ("check", "claim", "value", "bound", "margin", "verdict", "kind", "source")
-    yield '<div class="scroll"><table class="checks"><thead><tr>'
-    yield "".join(f"<th>{heading}</th>" for heading in headings)
-    yield "</tr></thead><tbody>"
-    for check in checks:
-        word = verdict(check).plain
-        claim = f"{check.claim}; {check.detail}" if check.detail else check.claim
-        numbers = "".join(
-            f'<td class="number" data-label="{label}">{number(value)}</td>'
-            for label, value in (("value", check.value), ("bound", check.bound), ("margin", check.margin))
-        )
-        yield (
-            f"<tr><td><strong>{escape(check.name)}</strong></td><td>{escape(claim)}</td>{numbers}"
-            f'<td class="{word.lower()}" data-label="verdict">{word}</td>'
-            f'<td data-label="kind">{escape(check.kind)}</td>'
-            f'<td class="soft" data-label="source">{escape(check.source)}</td></tr>'
-        )
-    yield "</tbody></table></div>"
+def _recovered(design: ObserverDesign) -> Iterator[str]:
+    if design.recovery is not None:
+        yield "<h3>States of the plant as written</h3>"
+        yield from fact_rows(recovered_states(design.recovery))
 
 
 def _notes(notes: Sequence[str]) -> Iterator[str]:
@@ -123,41 +114,56 @@ def _notes(notes: Sequence[str]) -> Iterator[str]:
         yield "</ul>"
 
 
-def _pictures(design: ObserverDesign) -> Iterator[str]:
-    for picture in pictures_of(design):
-        yield (
-            f'<figure><h3>{escape(picture.title)}</h3><img alt="{escape(picture.text)}" src="{picture.source}">'
-            f"<figcaption>{escape(picture.text)}</figcaption></figure>"
-        )
+def _pictures(design: ObserverDesign, scenario: Scenario | None, report: VerificationReport) -> Iterator[str]:
+    if any(check.name == FITS for check in report.failures):
+        yield "<p>None: the observer does not fit its plant.</p>"
+        return
+    figures = [
+        f'<figure class="{"wide" if picture.wide else "half"}"><h3>{escape(picture.title)}</h3>'
+        f'<img alt="{escape(picture.text)}" src="{picture.source}">'
+        f"<figcaption>{escape(picture.text)}</figcaption></figure>"
+        for picture in pictures_of(design, scenario=scenario)
+    ]
+    if figures:
+        yield '<div class="pictures">'
+        yield from figures
+        yield "</div>"
 
 
 def _gains(design: ObserverDesign) -> Iterator[str]:
+    source = source_of(design.method)
+    if not design.gains:
+        return
+    if source:
+        yield f'<p class="soft">Letters as in {escape(source)}. Six digits are shown: the gain set has all of them.</p>'
+    yield '<div class="gains">'
     for name, matrix in design.gains.items():
         shape = " by ".join(map(str, matrix.shape))
-        yield f'<h3>{escape(name)} <span class="soft">({shape})</span></h3>'
+        yield f'<div><h3>{escape(name)} <span class="soft">({shape})</span></h3>'
         if matrix.size > MOST_ENTRIES or matrix.ndim != 2:
             yield "<p>Too large to be printed: see the gain set.</p>"
         else:
-            yield from _matrix(matrix)
+            yield from matrix_rows(matrix)
+        yield "</div>"
+    yield "</div>"
 
 
-def _matrix(matrix: FloatArray) -> Iterator[str]:
-    yield '<div class="scroll"><table class="matrix"><tbody>'
-    for row in matrix.tolist():
-        yield "<tr>" + "".join(f'<td class="number">{number(value, digits=6)}</td>' for value in row) + "</tr>"
-    yield "</tbody></table></div>"
-
-
-def _reproduction(design: ObserverDesign, digest: str, gains_file: str | None) -> Iterator[str]:
+def _reproduction(
+    design: ObserverDesign, digest: str, gains_file: str | None, system_file: str | None
+) -> Iterator[str]:
     import shlex
 
     from obsynth import __version__
 
     file = shlex.quote(gains_file or f"{design.name}.gains.json")
     yield "<p>Every check again, from the gain set alone and without a solver; and this page:</p>"
-    yield f"<pre>{escape(f'obsynth verify {file}')}\n{escape(f'obsynth report --gains {file} --out report.html')}</pre>"
-    yield from _facts([("obsynth", __version__), ("sha256 of the gain set", digest)])
+    again = f"obsynth report --gains {file} --out report.html"
+    if system_file is not None:
+        again += f" --system {shlex.quote(system_file)}"
+    yield f"<pre>{escape(f'obsynth verify {file}')}\n{escape(again)}</pre>"
+    yield from fact_rows([("obsynth", __version__)])
+    yield f'<p class="soft">sha256 of the gain set</p><p class="digest">{digest}</p>'
     for title, data in (("Options", design.options), ("Solver", design.solver)):
         if data:
             yield f"<h3>{title}</h3>"
-            yield f"<pre>{escape(json.dumps(plain(data), indent=1, ensure_ascii=False))}</pre>"
+            yield from fact_rows((key, value_text(value)) for key, value in data.items())

@@ -1,32 +1,77 @@
-"""The style of the page: readable wide, narrow, printed, and in the dark; nothing is fetched."""
+"""The style of the page: dark on white, readable wide, narrow and printed; nothing is fetched."""
 
 from __future__ import annotations
 
 STYLE = """\
-:root { color-scheme: light dark; --ink: #1b1b1b; --paper: #fff; --soft: #666; --line: #ccc; --good: #176b2c;
-  --bad: #b00020; --shade: #f4f4f2; }
-@media (prefers-color-scheme: dark) { :root { --ink: #e8e8e6; --paper: #161616; --soft: #a0a0a0; --line: #444;
-  --good: #6fd08a; --bad: #ff8a80; --shade: #222; } img { background: #fff; } }
-body { font: 16px/1.5 system-ui, sans-serif; color: var(--ink); background: var(--paper); margin: 0 auto;
-  max-width: 72rem; padding: 1rem 1.25rem 4rem; overflow-wrap: anywhere; }
-h1 { font-size: 1.6rem; margin: 0.5rem 0; } h2 { font-size: 1.15rem; margin: 2.2rem 0 0.6rem; }
-h3 { font-size: 1rem; margin: 1.2rem 0 0.4rem; }
-.verdict { border-left: 0.5rem solid; padding: 0.6rem 1rem; font-size: 1.15rem; font-weight: 600;
-  background: var(--shade); }
-.holds { color: var(--good); } .fails { color: var(--bad); font-weight: 700; } .info, .soft { color: var(--soft); }
-table { border-collapse: collapse; }
-th, td { text-align: left; vertical-align: top; padding: 0.25rem 0.9rem 0.25rem 0; }
-thead th { border-bottom: 1px solid var(--line); } tbody tr + tr td { border-top: 1px solid var(--shade); }
-td.number { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; overflow-wrap: normal; }
-.scroll { overflow-x: auto; max-width: 100%; } .matrix td { padding-right: 1rem; }
-figure { margin: 1rem 0; } img { max-width: 100%; height: auto; } figcaption { color: var(--soft); }
-pre { background: var(--shade); padding: 0.8rem; overflow-x: auto; white-space: pre-wrap; }
-@media (max-width: 46rem) {
-  table.checks thead { display: none; }
-  table.checks, table.checks tbody, table.checks tr, table.checks td { display: block; }
-  table.checks tr { border-top: 1px solid var(--line); padding: 0.5rem 0; }
-  table.checks td { border: 0 !important; padding: 0; } table.checks td.number { text-align: left; }
-  table.checks td[data-label]::before { content: attr(data-label) ": "; color: var(--soft); }
+:root { --ink: #1a1c20; --soft: #5c626b; --line: #c9cdd3; --hair: #e7e9ec; --shade: #f6f7f8; --link: #1d4f91;
+  --good: #14682b; --good-shade: #e9f5ec; --bad: #a80d26; --bad-shade: #fdecee; }
+* { box-sizing: border-box; }
+html { -webkit-text-size-adjust: 100%; }
+body { font: 16px/1.5 system-ui, "Segoe UI", Roboto, "Liberation Sans", Arial, sans-serif; color: var(--ink);
+  background: #fff; margin: 0 auto; max-width: 74rem; padding: 2rem 2rem 5rem; overflow-wrap: break-word; }
+h1 { font-size: 1.75rem; line-height: 1.2; margin: 0; }
+h2 { font-size: 1.25rem; margin: 3rem 0 0.9rem; padding-bottom: 0.3rem; border-bottom: 2px solid var(--ink); }
+h3 { font-size: 1rem; margin: 1.6rem 0 0.5rem; }
+p { max-width: 46rem; margin: 0.5rem 0; } ul { max-width: 46rem; padding-left: 1.2rem; }
+.soft { color: var(--soft); font-weight: 400; }
+.under { margin: 0.2rem 0 1.2rem; color: var(--soft); }
+.verdict { max-width: none; border-left: 0.5rem solid; border-radius: 3px; padding: 0.9rem 1.2rem; margin: 1rem 0 0;
+  font-size: 1.25rem; font-weight: 600; }
+.verdict.holds { background: var(--good-shade); } .verdict.fails { background: var(--bad-shade); }
+.holds { color: var(--good); } .fails { color: var(--bad); font-weight: 700; } .info { color: var(--soft); }
+nav { margin: 1rem 0 0; display: flex; flex-wrap: wrap; gap: 0.2rem 1.3rem; } nav a { color: var(--link); }
+.scroll { overflow-x: auto; max-width: 100%; }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
+th, td { text-align: left; vertical-align: top; padding: 0.4rem 1.2rem 0.4rem 0; }
+th { font-weight: 600; white-space: nowrap; }
+thead th { border-bottom: 1px solid var(--ink); vertical-align: bottom; }
+tbody tr + tr > * { border-top: 1px solid var(--hair); }
+td.number, th.number { text-align: right; white-space: nowrap; }
+.copied td:first-child { white-space: nowrap; }
+.facts th { color: var(--soft); font-weight: 400; padding-right: 1.6rem; }
+.checks { width: 100%; } .checks td:last-child, .checks th:last-child { padding-right: 0; }
+.checks tbody th { background: var(--shade); padding: 0.45rem 0.6rem; border-top: 1px solid var(--line); }
+.checks .kind { display: block; color: var(--soft); font-size: 0.85rem; font-weight: 400; }
+.checks td > div { color: var(--soft); font-size: 0.92rem; } .checks .claim { color: var(--ink); }
+.checks td.source { color: var(--soft); font-size: 0.92rem; min-width: 9rem; }
+.checks td:nth-child(2) { min-width: 18rem; width: 52%; }
+.gains { display: flex; flex-wrap: wrap; gap: 0 3rem; } .gains > div { max-width: 100%; min-width: 0; }
+.tall { max-height: 26rem; overflow-y: auto; }
+.matrix { border-left: 2px solid var(--ink); border-right: 2px solid var(--ink); font-size: 0.92rem; }
+.matrix td { padding: 0.15rem 0.7rem; border: 0 !important; } .matrix .zero { color: #9aa0a8; }
+.pictures { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(30rem, 100%), 1fr)); gap: 1rem 2.5rem;
+  align-items: start; }
+figure { margin: 0; min-width: 0; } figure.wide { grid-column: 1 / -1; max-width: 50rem; }
+figure h3 { margin: 0.8rem 0 0.3rem; }
+img { display: block; width: 100%; height: auto; } figcaption { color: var(--soft); font-size: 0.95rem; }
+pre { background: var(--shade); border: 1px solid var(--hair); border-radius: 3px; padding: 0.8rem 1rem;
+  margin: 0.6rem 0; overflow-x: auto; font: 0.9rem/1.5 ui-monospace, "Liberation Mono", Menlo, Consolas, monospace; }
+.digest { font-family: ui-monospace, "Liberation Mono", Menlo, Consolas, monospace; overflow-wrap: anywhere; }
+@media (max-width: 56rem) {
+  body { padding: 1.1rem 1.1rem 3rem; } h1 { font-size: 1.4rem; } h2 { margin-top: 2.2rem; }
+  .verdict { font-size: 1.1rem; padding: 0.7rem 0.9rem; }
+  .checks thead { display: none; }
+  .checks, .checks tbody, .checks tr { display: block; }
+  .checks tbody th { display: block; white-space: normal; margin-top: 0.8rem; }
+  .checks tr { padding: 0.55rem 0; } .checks tr + tr { border-top: 1px solid var(--hair); }
+  .checks td, .checks tr > * { border: 0 !important; padding: 0; display: block; min-width: 0 !important;
+    width: auto !important;     overflow-wrap: anywhere; }
+  .checks td.word { float: right; margin-left: 0.8rem; text-align: right; }
+  .checks td.none { display: none; } .checks td.number:not(.none) { display: inline-block; text-align: left;
+    margin-right: 1rem; font-size: 0.92rem; }
+  .checks td[data-label]:not(.word)::before { content: attr(data-label) " "; color: var(--soft); }
+  .facts tr { display: grid; grid-template-columns: 8rem 1fr; padding: 0.3rem 0; }
+  .facts tr + tr { border-top: 1px solid var(--hair); }
+  .facts, .facts tbody { display: block; } .facts th, .facts td { border: 0 !important; padding: 0; }
+  .facts th { padding-right: 0.9rem; white-space: normal; } .facts td + td { grid-column: 1 / -1; color: var(--soft); }
+  .facts td { overflow-wrap: anywhere; }
 }
-@media print { body { max-width: none; } h2 { break-after: avoid; } tr, figure { break-inside: avoid; } }
+@media print {
+  @page { margin: 16mm 14mm; } body { max-width: none; padding: 0; font-size: 10pt; } nav { display: none; }
+  h2 { break-after: avoid; margin-top: 1.6rem; } h3 { break-after: avoid; } tr, figure { break-inside: avoid; }
+  .verdict, .checks tbody th, pre { print-color-adjust: exact; -webkit-print-color-adjust: exact; }
+  .scroll { overflow: visible; max-height: none; }
+  .matrix { font-size: 7.5pt; } pre { white-space: pre-wrap; overflow-wrap: anywhere; }
+  .checks td:nth-child(2) { min-width: 0; } .checks td.source { min-width: 0; }
+}
 """

@@ -4,16 +4,37 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Iterator
-from typing import NamedTuple
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
+from obsynth.errors import ObsynthError, SpecError
+from obsynth.evaluation.demonstration import demonstration_scenario
+from obsynth.evaluation.monitors import Detection
+from obsynth.evaluation.recursive_simulating import RecursiveSimulation
+from obsynth.evaluation.simulating import Simulation, simulate
+from obsynth.evaluation.watching import monitor
+from obsynth.observers.decisions import Decision, decide
 from obsynth.observers.linear import LinearObserver
-from obsynth.plotting.faults import plot_poles
-from obsynth.plotting.frequency import plot_continuous_poles, plot_gains
+from obsynth.observers.recursive import RecursiveObserver
+from obsynth.observers.recursive_estimates import RecursiveEstimates
+from obsynth.plotting.frequency import plot_gains
+from obsynth.plotting.simulation import plot_simulation
+from obsynth.plotting.spectra import plot_poles
+from obsynth.plotting.states import plot_states
 from obsynth.results.design import ObserverDesign
+from obsynth.simulation.scenario import Scenario
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 #: Dots per inch: sharp on a screen that shows two for each pixel.
 RESOLUTION = 160
+#: Inches: a picture beside another one, and one of a row of its own; small, so that texts stay readable on a phone.
+HALF, WIDE = 5.6, 6.6
+#: Inches: a panel of several, and what the axis of time takes.
+PANEL, MARGIN = 1.5, 0.6
+#: More states than this are not drawn.
+MOST_STATES = 6
 
 
 class Picture(NamedTuple):
@@ -27,48 +48,131 @@ class Picture(NamedTuple):
         The same for who cannot see it, and as a caption.
     source : str
         A data URL.
+    wide : bool, optional
+        Whether it takes a row of its own.
     """
 
     title: str
     text: str
     source: str
+    wide: bool = False
 
 
-def pictures_of(design: ObserverDesign) -> Iterator[Picture]:
-    """Yield the pictures of a linear design; a recursive one, whose dynamics change with k, has none.
+def pictures_of(design: ObserverDesign, *, scenario: Scenario | None = None) -> Iterator[Picture]:
+    """Yield the pictures of a design.
 
     Parameters
     ----------
     design : ObserverDesign
         Any design.
+    scenario : Scenario, optional
+        What the design is shown on, with what a monitor sees where there is one; by default each fault in turn.
 
     Yields
     ------
     Picture
-        Poles, and singular values over the frequency.
-    """
-    from matplotlib.figure import Figure
+        The design at work; of a linear one its poles, and singular values over the frequency.
 
+    Raises
+    ------
+    ObsynthError
+        A given scenario cannot be simulated.
+    """
+    yield from _at_work(design, scenario)
     if not isinstance(design.observer, LinearObserver):
         return
     sampled = design.observer.dt > 0.0
     if design.observer.order:
-        figure = Figure(figsize=(5.0, 5.4) if sampled else (7.5, 4.0), layout="constrained")
-        (plot_poles if sampled else plot_continuous_poles)(design, axes=figure.subplots())
         region = "inside the circle" if sampled else "left of the dashed line"
-        yield Picture("Poles", f"Eigenvalues of the observer: it forgets its start where all are {region}.",
-                      _data_url(figure))  # fmt: skip
-    if design.observer.fault_names:
-        figure = Figure(figsize=(7.5, 4.0), layout="constrained")
-        plot_gains(design, axes=figure.subplots())
         yield Picture(
-            "What reaches the fault estimates",
-            "Largest singular values over the frequency: from the faults, where 1 is faithful, and from disturbances "
-            "and noise, where less is better.", _data_url(figure),
+            "Spectrum", f"Eigenvalues of the observer: it forgets its start where all are {region}.",
+            _drawn((HALF, 5.4 if sampled else 4.2), 1, lambda axes: plot_poles(design, axes=axes[0])),
+        )  # fmt: skip
+    if design.observer.fault_names:
+        yield _gains(
+            design, "faults", "What reaches the fault estimates",
+            "Singular values over the frequency: from the faults, where 1 is faithful, and from disturbances and "
+            "noise, where less is better.",
+        )  # fmt: skip
+    if design.observer.state_names:
+        yield _gains(
+            design, "states", "What reaches the state estimates",
+            "Largest singular values over the frequency, to the errors of the states: less is better.",
         )  # fmt: skip
 
 
-def _data_url(figure: object) -> str:
+def _gains(design: ObserverDesign, to: str, title: str, text: str) -> Picture:
+    return Picture(title, text, _drawn((HALF, 4.2), 1, lambda axes: plot_gains(design, to=to, axes=axes[0])))
+
+
+def _at_work(design: ObserverDesign, scenario: Scenario | None) -> Iterator[Picture]:
+    """Yield faults and states beside their estimates; nothing where the plant has no demonstration."""
+    shown, given = scenario, scenario is not None
+    try:
+        shown = scenario if given else demonstration_scenario(design)
+        simulation = None if shown is None else simulate(design, shown)
+    except ObsynthError:
+        # Without a scenario of its own, a page is whole without this picture.
+        if given:
+            raise
+        return
+    if simulation is None or shown is None:
+        return
+    linear = isinstance(simulation, Simulation)
+    what = "On the scenario" if given else "Each fault in turn" if linear else "Each parameter in turn"
+    text = f"{what}: {_story(shown, given=given, linear=linear)}"
+    faults, states = len(design.observer.fault_names), simulation.estimates.state_names
+    units, dt = design.plant.units, float(simulation.time[1]) if len(simulation.time) > 1 else 1.0
+    seen = [*_watched(design, shown, simulation)] if given else []
+    panels = faults + len(seen)
+    if panels:
+        yield Picture("The design at work", text, _drawn(
+            (WIDE, PANEL * panels + MARGIN), panels,
+            lambda axes: plot_simulation(simulation, detections=seen, units=units, axes=axes),
+        ), wide=True)  # fmt: skip
+    if 0 < len(states) <= MOST_STATES:
+        run = "in the same run" if panels else "in a run with the stated noise"
+        bands = "" if linear else ", with 95 % bands"
+        yield Picture("States", f"States {run}, and their estimates{bands}.", _drawn(
+            (WIDE, PANEL * len(states) + MARGIN), len(states),
+            lambda axes: plot_states(simulation.estimates, states=simulation.states, dt=dt, units=units, axes=axes),
+        ), wide=True)  # fmt: skip
+
+
+def _watched(
+    design: ObserverDesign, scenario: Scenario, simulation: Simulation | RecursiveSimulation
+) -> Iterator[Detection | Decision]:
+    """Yield what the first monitor sees that this design and this scenario have; nothing where they have none."""
+    if isinstance(simulation, Simulation):
+        for kind in ("pointwise", "chi-square"):
+            try:
+                yield monitor(design, scenario, kind).watch(simulation.estimates)
+            except SpecError:
+                # A signal without a bound, or without a covariance; a continuous design has neither threshold.
+                continue
+            return
+    elif isinstance(simulation.estimates, RecursiveEstimates) and simulation.estimates.parameter_names:
+        yield decide(cast(RecursiveObserver, design.observer), simulation.estimates)
+
+
+def _story(scenario: Scenario, *, given: bool, linear: bool) -> str:
+    if given:
+        return f"{scenario.horizon:g} s, seed {scenario.seed}."
+    if not linear:
+        return "a step of one initial standard deviation, with the stated noise. Bands hold 95 % while parameters stay."
+    closed = " A stabilising state feedback was added, as the plant is unstable." if scenario.stabilise else ""
+    return (
+        "a unit step, from rest and without noise. It shows how fast each estimate answers, and how little of the "
+        f"other faults is in it.{closed}"
+    )
+
+
+def _drawn(size: tuple[float, float], panels: int, draw: Callable[[Sequence[Axes]], Any]) -> str:
+    """Return what ``draw`` puts on panels one above the other, as a data URL."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, layout="constrained")
+    draw(list(figure.subplots(panels, 1, sharex=True, squeeze=False)[:, 0]))
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=RESOLUTION)  # type: ignore[attr-defined]
+    figure.savefig(buffer, format="png", dpi=RESOLUTION)
     return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")

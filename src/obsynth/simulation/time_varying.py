@@ -77,18 +77,64 @@ def simulate_time_varying(
     theta = _record(np.broadcast_to(given, (samples, nq)) if given.ndim == 1 else given, (samples, nq), "parameters")
     inputs, mu = _record(u, (samples, plant.nu), "u"), _record(equation_noise, (samples, plant.ne), "equation_noise")
     nu = _record(output_noise, (samples - 1, plant.ny), "output_noise")
+    start = np.zeros(plant.nx) if initial_state is None else np.asarray(initial_state, dtype=np.float64)
+    states, outputs = varying_runs(
+        plant,
+        parameters=theta,
+        inputs=inputs,
+        initial_state=start,
+        equation_noise=mu[:, None],
+        output_noise=nu[:, None],
+    )
+    return VaryingTrajectory(read_only(states[:, 0]), read_only(outputs[:, 0]))
+
+
+def varying_runs(
+    plant: TimeVaryingDescriptorSystem, *, parameters: FloatArray, inputs: FloatArray, initial_state: FloatArray,
+    equation_noise: FloatArray, output_noise: FloatArray,
+) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+    """Simulate many runs at once, which differ in their noise: one factorisation a step serves all of them.
+
+    Parameters
+    ----------
+    plant : TimeVaryingDescriptorSystem
+        As for `simulate_time_varying`.
+    parameters, inputs : FloatArray
+        ``(samples, nq)`` and ``(samples, nu)``, of all runs.
+    initial_state : FloatArray
+        ``(nx,)``, of all runs, taken to the nearest state that satisfies the algebraic equations.
+    equation_noise, output_noise : FloatArray
+        ``(samples, runs, ne)`` and ``(samples - 1, runs, ny)``.
+
+    Returns
+    -------
+    tuple of FloatArray
+        States ``(samples, runs, nx)`` and outputs ``(samples, runs, ny)``, of which the first are NaN.
+
+    Raises
+    ------
+    SpecError
+        The equations do not determine the states.
+    PreconditionError
+        As for `simulate_time_varying`.
+    """
+    if plant.ne != plant.nx:
+        raise SpecError(f"{plant.ne} equations do not determine {plant.nx} states.", path="E")
+    samples, runs = equation_noise.shape[:2]
     late = algebraic_rows(plant, plant.horizon or samples)
     others = np.setdiff1d(np.arange(plant.ne), late)
 
     def drive(k: int) -> FloatArray:
-        return np.asarray(plant.B.at(k) @ inputs[k] + plant.Phi.at(k) @ theta[k] + mu[k])
+        """Return ``B u + Phi theta + mu``, ``(ne, runs)``."""
+        known = plant.B.at(k) @ inputs[k] + plant.Phi.at(k) @ parameters[k]
+        return np.asarray(known[:, None] + equation_noise[k].T)
 
-    x = np.zeros(plant.nx) if initial_state is None else np.asarray(initial_state, dtype=np.float64)
+    x = np.repeat(initial_state[:, None], runs, axis=1)
     if late.size:
         constraint = plant.A.at(0)[late]
         x = x - np.linalg.pinv(constraint) @ (constraint @ x + drive(0)[late])
-    states, outputs = np.empty((samples, plant.nx)), np.full((samples, plant.ny), np.nan)
-    states[0] = x
+    states, outputs = np.empty((samples, runs, plant.nx)), np.full((samples, runs, plant.ny), np.nan)
+    states[0] = x.T
     for k in range(samples - 1):
         matrix, value = plant.E.at(k + 1)[others], (plant.A.at(k) @ x + drive(k))[others]
         if late.size:
@@ -101,9 +147,10 @@ def simulate_time_varying(
                 f"({decision.describe()}), so its index is higher than one there.", condition="index one",
             )  # fmt: skip
         x = np.asarray(np.linalg.solve(matrix, value), dtype=np.float64)
-        states[k + 1] = x
-        outputs[k + 1] = plant.C.at(k + 1) @ x + plant.Psi.at(k) @ theta[k] + nu[k]
-    return VaryingTrajectory(read_only(states), read_only(outputs))
+        states[k + 1] = x.T
+        known = plant.Psi.at(k) @ parameters[k]
+        outputs[k + 1] = (plant.C.at(k + 1) @ x + known[:, None]).T + output_noise[k]
+    return states, outputs
 
 
 def _record(value: ArrayLike | None, shape: tuple[int, int], name: str) -> FloatArray:

@@ -101,10 +101,9 @@ def load_spec(path: str | Path) -> Spec:
     if hasattr(section, "kind"):
         make: Any = _nonlinear_plant if section.kind == "dae" else _varying_plant
         varying = make(section, plant_source, prefix)
-        built_scenario(checked.scenario, varying, source)
         return Spec(
             name=checked.name, description=checked.description or "", path=source, plant=varying, transformation=None,
-            method=checked.method.id, options=options,
+            method=checked.method.id, options=options, scenario=built_scenario(checked.scenario, varying, source),
         )  # fmt: skip
     as_written = _built_plant(section, plant_source, prefix)
     if reference is not None and reference.transform is not None:

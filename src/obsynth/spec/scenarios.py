@@ -7,10 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from obsynth.errors import SpecError
+from obsynth.models.dae import DAEModel
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.models.time_varying import TimeVaryingDescriptorSystem
 from obsynth.simulation.failures import KINDS
 from obsynth.simulation.profiles import Profile
+from obsynth.simulation.recursive_drive import check_recursive
 from obsynth.simulation.scenario import Scenario
 from obsynth.spec.checking import DocumentProblems
 
@@ -21,7 +23,7 @@ _GROUPS = ("inputs", "faults", "disturbances", "sensors")
 
 
 def built_scenario(
-    section: ScenarioSection | None, plant: DescriptorSystem | TimeVaryingDescriptorSystem, source: Path
+    section: ScenarioSection | None, plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel, source: Path
 ) -> Scenario | None:
     """Return the scenario of a spec; `None` if it has none.
 
@@ -29,7 +31,7 @@ def built_scenario(
     ----------
     section : ScenarioSection or None
         As checked by the schema.
-    plant : DescriptorSystem or TimeVaryingDescriptorSystem
+    plant : DescriptorSystem, TimeVaryingDescriptorSystem or DAEModel
         Whose signals it names, after the transformation.
     source : Path
         The spec, for messages.
@@ -42,12 +44,6 @@ def built_scenario(
     if section is None:
         return None
     problems = DocumentProblems(source, what="spec")
-    if not isinstance(plant, DescriptorSystem):
-        problems.add(
-            "scenario", "scenarios are for linear time-invariant plants; this one changes with k or is nonlinear."
-        )
-        problems.raise_if_any()
-        return None
     given: dict[str, Any] = {name: getattr(section, name) for name in section.model_fields_set}
     for group in _GROUPS:
         given[group] = {
@@ -57,8 +53,11 @@ def built_scenario(
     problems.raise_if_any()
     try:
         scenario = Scenario(**given)
-        scenario.check_names(plant)
-        scenario.step_of(plant)
+        if isinstance(plant, DescriptorSystem):
+            scenario.check_names(plant)
+            scenario.step_of(plant)
+        else:
+            check_recursive(plant, scenario)
     except SpecError as error:
         problems.add(f"scenario.{error.path}", str(error))
         problems.raise_if_any()

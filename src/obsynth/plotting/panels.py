@@ -1,0 +1,125 @@
+"""Panels one above the other, and styles that differ by more than their colour, so that pictures can be printed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from obsynth.errors import SpecError
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+#: Inches: the width of every figure, and the height of one panel.
+WIDTH = 7.5
+PANEL_HEIGHT = 2.2
+#: The true signal lies under the estimate: wide, grey, solid.  The estimate on it: thin, dark, dashed.
+TRUE_STYLE: dict[str, Any] = {"color": "0.72", "linewidth": 4.0, "linestyle": "-", "solid_capstyle": "butt"}
+ESTIMATE_STYLE: dict[str, Any] = {"color": "black", "linewidth": 1.1, "linestyle": "--"}
+RESIDUAL_STYLE: dict[str, Any] = {"color": "black", "linewidth": 1.0, "linestyle": "-"}
+#: Standard deviations on each side of a band: 95 % of a normal variable.
+BAND_WIDTH = 1.96
+BAND_STYLE: dict[str, Any] = {"color": "tab:blue", "alpha": 0.25, "linewidth": 0.0}
+#: One line style for each threshold, in order.
+THRESHOLD_STYLES: tuple[dict[str, Any], ...] = (
+    {"color": "tab:red", "linewidth": 1.6, "linestyle": "--"},
+    {"color": "tab:blue", "linewidth": 1.6, "linestyle": "-."},
+    {"color": "tab:green", "linewidth": 1.6, "linestyle": ":"},
+)
+#: A ring where something happens.
+MARK_STYLE: dict[str, Any] = {
+    "markersize": 9, "markerfacecolor": "none", "markeredgewidth": 1.6, "linestyle": "none",
+}  # fmt: skip
+
+#: Letters of small print that fit in an inch, and those that the sample of a line takes.
+LETTERS_PER_INCH, KEY_LETTERS = 12.5, 8
+
+
+def new_panels(axes: Iterable[Axes] | None, count: int, *, size: tuple[float, float] | None = None) -> list[Axes]:
+    """Return ``count`` axes: the given ones, or new ones one above the other."""
+    if axes is not None:
+        given = list(np.ravel(np.asarray(axes, dtype=object)))
+        if len(given) != count:
+            raise SpecError(f"{len(given)} axes were given, but {count} are needed.", path="axes")
+        return given
+    if count == 0:
+        return []
+    import matplotlib.pyplot as plt
+
+    _, grid = plt.subplots(
+        count, 1, sharex=True, squeeze=False, layout="constrained",
+        figsize=size or (WIDTH, PANEL_HEIGHT * count + 0.8),
+    )  # fmt: skip
+    return list(grid[:, 0])
+
+
+def tidy(panel: Axes) -> None:
+    """Give a panel a faint grid and no box."""
+    panel.grid(True, color="0.9", linewidth=0.6)
+    panel.set_axisbelow(True)
+    for side in ("top", "right"):
+        panel.spines[side].set_visible(False)
+    panel.margins(x=0.01)
+
+
+def legend_above(panel: Axes) -> None:
+    """Put the legend above a panel, where it hides nothing: in as few lines as fit its width.
+
+    A title has to stand higher then: ``panel.set_title(text, pad=20)``.
+    """
+    _, labels = panel.get_legend_handles_labels()
+    figure = panel.get_figure(root=True)
+    inches = panel.get_position().width * (WIDTH if figure is None else float(figure.get_figwidth()))
+    columns = max(len(labels), 1)
+    while columns > 1 and _letters(labels, columns) > inches * LETTERS_PER_INCH:
+        columns -= 1
+    panel.legend(
+        loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns, frameon=False, fontsize="small",
+        borderaxespad=0.1, columnspacing=1.4, handlelength=2.4,
+    )  # fmt: skip
+
+
+def _letters(labels: Sequence[str], columns: int) -> int:
+    """Return how wide a legend is: matplotlib fills it column by column, the first ones with one more."""
+    rows, longer = divmod(len(labels), columns)
+    widths, begin = 0, 0
+    for column in range(columns):
+        end = begin + rows + (column < longer)
+        widths += max(map(len, labels[begin:end]), default=0) + KEY_LETTERS
+        begin = end
+    return widths
+
+
+def with_unit(name: str, units: Mapping[str, str] | None) -> str:
+    """Return the name of a signal, with its unit where it has one; ``1`` is none."""
+    unit = (units or {}).get(name)
+    return f"{name} ({unit})" if unit and unit != "1" else name
+
+
+def plain_decades(panel: Axes) -> None:
+    """Give the vertical axis a logarithmic scale whose numbers stand plain at 1, 2 and 5 where it is short.
+
+    Parameters
+    ----------
+    panel : Axes
+        With its lines drawn.
+    """
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+
+    panel.set_yscale("log")
+    shown = np.concatenate([np.asarray(line.get_ydata(), dtype=np.float64) for line in panel.get_lines()])
+    shown = shown[np.isfinite(shown) & (shown > 0.0)]
+    if not shown.size or shown.max() > SHORT_SPREAD * shown.min():
+        return
+    steps = np.ravel(np.outer(10.0 ** np.arange(-15, 16), (1.0, 2.0, 5.0)))
+    below, above = steps[steps < shown.min()], steps[steps > shown.max()]
+    panel.set_ylim(below[-1] if below.size else None, above[0] if above.size else None)
+    panel.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    panel.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    panel.yaxis.set_minor_locator(NullLocator())
+
+
+#: Up to this ratio of largest to smallest, a logarithmic axis has plain numbers.
+SHORT_SPREAD = 300.0

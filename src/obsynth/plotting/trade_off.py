@@ -1,0 +1,81 @@
+"""Designs against one another: what one promise costs in another."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.plotting.panels import PANEL_HEIGHT, WIDTH, new_panels, tidy
+from obsynth.results.design import ObserverDesign
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+#: From this ratio of largest to smallest on, an axis is logarithmic.
+WIDE_SPREAD = 10.0
+
+
+def plot_trade_off(
+    designs: Sequence[ObserverDesign], along: str, against: str | Sequence[str], *, axes: Iterable[Axes] | None = None
+) -> list[Axes]:
+    """Plot what several designs claim (or what was found in their reports) against one of their claims.
+
+    Parameters
+    ----------
+    designs : sequence of ObserverDesign
+        Such as designs of one plant with several values of an option.
+    along : str
+        Claim, check or numeric option on the horizontal axis, such as ``"decay"``.
+    against : str or sequence of str
+        Claims, checks or numeric options, one panel each, such as ``"noise_amplification"`` or
+        ``"noise in fhat[valve]"``.
+    axes : iterable of Axes, optional
+        One for each of ``against``; new ones, one above the other, by default.
+
+    Returns
+    -------
+    list of Axes
+        One for each of ``against``; logarithmic where the values spread over more than a decade.
+
+    Raises
+    ------
+    SpecError
+        No design, or one that has no such number (the names that it has are listed).
+    """
+    if not designs:
+        raise SpecError("A trade-off needs designs: give at least one.", path="designs")
+    names = [against] if isinstance(against, str) else list(against)
+    panels = new_panels(axes, len(names), size=(WIDTH, PANEL_HEIGHT * len(names) + 1.2))
+    x = np.array([_number(design, along) for design in designs])
+    order = np.argsort(x, kind="stable")
+    for panel, name in zip(panels, names, strict=True):
+        y = np.array([_number(design, name) for design in designs])
+        panel.plot(x[order], y[order], color="black", linewidth=1.2, marker="o", markersize=5)
+        for values, scale in ((x, panel.set_xscale), (y, panel.set_yscale)):
+            if values.min() > 0.0 and values.max() > WIDE_SPREAD * values.min():
+                scale("log")
+        panel.set_ylabel(name)
+        tidy(panel)
+        panel.margins(x=0.03)
+    if panels:
+        panels[-1].set_xlabel(along)
+    return panels
+
+
+def _number(design: ObserverDesign, name: str) -> float:
+    claims, checks = design.certificate.claims, {check.name: check.value for check in design.report.checks}
+    options = {
+        key: float(value)
+        for key, value in design.options.items()
+        if isinstance(value, (int, float)) and not isinstance(value, bool)
+    }
+    for source in (claims, checks, options):
+        if name in source:
+            return float(source[name])
+    raise SpecError(
+        f"Design {design.name!r} has no {name!r}: its claims are {', '.join(claims) or 'none'}; names of checks and "
+        f"numeric options ({', '.join(options) or 'none'}) go too.", path=name,
+    )  # fmt: skip
