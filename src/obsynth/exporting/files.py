@@ -54,7 +54,7 @@ def export(design: ObserverDesign, path: str | Path, *, sample_time: float | Non
     suffix = target.suffix.lower()
     if suffix not in SUFFIXES:
         raise SpecError(f"{target} has an unknown suffix: use one of {', '.join(SUFFIXES)}.", path=str(target))
-    if isinstance(design.observer, DAEObserver):
+    if isinstance(design, ObserverDesign) and isinstance(design.observer, DAEObserver):
         return write_dae_c(design, target, sample_time)
     found = Realisation.of(design, sample_time)
     if suffix == ".c":
