@@ -252,24 +252,6 @@ class DAEObserver:
 
         if compiled not in (None, True, False):
             raise SpecError(f"compiled is {compiled!r}: give True, False or None.", path="compiled")
-        outputs, inputs = dae_record(self.model, y, u)
+        outputs = measured_record(y, self.model.ny)
+        inputs = checked_inputs(self.model, u, len(outputs))
         return run_record(self, outputs, inputs, compiled=compiled, progress=progress)
-
-
-def dae_record(model: DAEModel, y: ArrayLike, u: ArrayLike | None) -> tuple[FloatArray, FloatArray]:
-    """Return outputs ``(samples, ny)`` and known inputs ``(samples, nu)`` of a record.
-
-    Parameters
-    ----------
-    model : DAEModel
-        Whose.
-    y, u : array_like
-        As given to `DAEObserver.run`.
-
-    Raises
-    ------
-    SpecError
-        Shapes do not fit, or an input is not finite (k is named).
-    """
-    outputs = measured_record(y, model.ny)
-    return outputs, checked_inputs(model, u, len(outputs))
