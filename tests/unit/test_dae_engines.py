@@ -21,6 +21,12 @@ from obsynth.observers import dae_batch, dae_library, dae_records, progress
 SIZES = np.array([2e3, 2e3, 5.0, 5.0, 0.1, 1e3])
 
 
+@pytest.fixture(autouse=True)
+def a_quick_compiler(monkeypatch) -> None:
+    """Without optimisation, which takes most of the time; the benchmark and its test compile with it."""
+    monkeypatch.setattr(dae_library, "FLAGS", tuple("-O0" if flag == "-O2" else flag for flag in dae_library.FLAGS))
+
+
 def by_hand(shipped: DAEObserver, y: np.ndarray, u: np.ndarray, moved: np.ndarray | float = 0.0) -> np.ndarray:
     """The audit's eleven steps as they are listed there, one after the other, in NumPy: states and parameters."""
     step = ImplicitStep(DAEFunctions(shipped.model, shipped.integration), shipped.dt)
