@@ -19,8 +19,10 @@ if TYPE_CHECKING:
         VerificationError,
     )
     from obsynth.evaluation.intervals import Interval
+    from obsynth.evaluation.making_online import online_monitor
     from obsynth.evaluation.monitors import Detection, Monitor
     from obsynth.evaluation.monte_carlo import Evaluation, evaluate
+    from obsynth.evaluation.online import OnlineMonitor
     from obsynth.evaluation.recursive_monte_carlo import ParameterMonitor
     from obsynth.evaluation.recursive_simulating import RecursiveSimulation
     from obsynth.evaluation.simulating import Simulation, simulate
@@ -104,6 +106,7 @@ _HOMES = {
     "LostEffectiveness": "obsynth.simulation.failures",
     "Monitor": "obsynth.evaluation.monitors",
     "ObserverDesign": "obsynth.results.design",
+    "OnlineMonitor": "obsynth.evaluation.online",
     "ObsynthError": "obsynth.errors",
     "ParameterMonitor": "obsynth.evaluation.recursive_monte_carlo",
     "PreconditionError": "obsynth.errors",
@@ -142,6 +145,7 @@ _HOMES = {
     "html_report": "obsynth.report.page",
     "load": "obsynth.results.serialise",
     "monitor": "obsynth.evaluation.watching",
+    "online_monitor": "obsynth.evaluation.making_online",
     "pd_delta_scan": "obsynth.pipeline.pd_observer",
     "pd_observer": "obsynth.pipeline.pd_observer",
     "pd_observer_from_gains": "obsynth.pipeline.pd_observer",
@@ -186,6 +190,7 @@ __all__ = [
     "Monitor",
     "ObserverDesign",
     "ObsynthError",
+    "OnlineMonitor",
     "ParameterMonitor",
     "PreconditionError",
     "Ramp",
@@ -226,6 +231,7 @@ __all__ = [
     "identifiability",
     "load",
     "monitor",
+    "online_monitor",
     "pd_delta_scan",
     "pd_observer",
     "pd_observer_from_gains",

@@ -186,14 +186,37 @@ def test_files_that_are_not_there_or_not_right(gains, capsys):
     refused("log.csv is no UTF-8 text")
 
 
-def test_a_recursive_design_is_refused(capsys):
-    spec = ROOT / "designs/moussaali2013_ltv/spec.yaml"
-    assert main(["design", "--system", str(spec), "--output", "recursive.json", "--quiet"]) == 0
-    log(*ROWS)
-    capsys.readouterr()
-    assert run(Path("recursive.json")) == 2
-    assert "no linear time-invariant observer" in capsys.readouterr().err
-    assert not Path("estimates.csv").exists()
+def test_recursive_and_nonlinear_designs_run_as_well(capsys, monkeypatch):
+    """From files in chunks and from a stream, with bad rows named, going on from a saved state."""
+    import io
+
+    for design, columns in (("moussaali2013_ltv", "u1,u2,y1"), ("pendulum", "across,down")):
+        spec = ROOT / "designs" / design / "spec.yaml"
+        assert main(["design", "--system", str(spec), "--output", "recursive.json", "--quiet"]) == 0
+        step, width = (1.0, 3) if design == "moussaali2013_ltv" else (0.01, 2)
+        start = [0.6, -0.8] if width == 2 else [1.0, 1.0, 0.5]
+        rows = [",".join(map(repr, [step * k, *start])) for k in range(12)]
+        rows[5] = f"{step * 5}" + (",1.0,1.0," if width == 3 else ",,-0.8")
+        log(*rows, header=f"time,{columns}")
+        capsys.readouterr()
+        assert run(Path("recursive.json")) == 0
+        assert capsys.readouterr().out.startswith("12 rows: ")
+        whole = Path("estimates.csv").read_text().splitlines()
+        assert "sd xhat[" in whole[0]
+        answers = []
+        for part in (rows[:4], rows[4:]):
+            text = "\n".join([f"time,{columns}", *part])
+            monkeypatch.setattr("sys.stdin", io.StringIO(text))
+            assert run(Path("recursive.json"), "--quiet", "--state", "state.json", data="-", out="-") == 0
+            answers += capsys.readouterr().out.splitlines()[1:]
+        assert answers == whole[1:]
+        Path("state.json").unlink()
+        log(*rows[:3], rows[2], header=f"time,{columns}")
+        assert run(Path("recursive.json"), out="other.csv") == 2
+        assert "Row 4 repeats the time" in capsys.readouterr().err
+        assert run(Path("recursive.json"), "--gap", "3", out="other.csv") == 2
+        assert "gap is for continuous-time designs" in capsys.readouterr().err
+        assert not Path("other.csv").exists()
 
 
 def test_a_stream_that_breaks_off_saves_the_state_of_the_rows_that_were_answered(gains, monkeypatch, capsys):

@@ -114,7 +114,7 @@ def test_what_cannot_be_simulated_or_written(
 
 
 def test_a_scenario_that_does_not_fit_a_plant_that_changes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    source = (ROOT / "designs" / "moussaali2013_ltv" / "spec.yaml").read_text(encoding="utf-8")
+    source = (ROOT / "designs" / "moussaali2013_ltv" / "spec.yaml").read_text(encoding="utf-8").split("scenario:")[0]
     plant = (ROOT / "designs" / "moussaali2013_ltv" / "plant.yaml").read_text(encoding="utf-8")
     (tmp_path / "plant.yaml").write_text(plant, encoding="utf-8")
     (tmp_path / "spec.yaml").write_text(source + "scenario: {horizon: 5, stabilise: true}\n", encoding="utf-8")
@@ -122,3 +122,10 @@ def test_a_scenario_that_does_not_fit_a_plant_that_changes(tmp_path: Path, capsy
     error = capsys.readouterr().err
     assert "scenario.stabilise" in error
     assert "No feedback" in error
+
+
+def test_gains_of_another_plant_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    gains = str(tmp_path / "gains.json")
+    assert main(["design", "--system", str(ROOT / "designs/filasova/spec.yaml"), "--output", gains, "--quiet"]) == 0
+    assert main(["simulate", "--system", WANG, "--gains", gains, "--quiet"]) == 2
+    assert "is for a plant with other signals" in capsys.readouterr().err

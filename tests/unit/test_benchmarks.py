@@ -19,6 +19,15 @@ def test_the_fault_filter_benchmark_runs():
     assert max(gains) <= min(gains) * (1.0 + 2e-4)
 
 
+def test_the_unknown_input_observer_benchmark_runs():
+    script = ROOT / "benchmarks" / "ui_pi_observer.py"
+    done = subprocess.run([sys.executable, script, "--small"], capture_output=True, text=True, check=True)
+    (row,) = [line.strip("| ").split(" | ") for line in done.stdout.splitlines()[2:]]
+    rates = [float(cell.split(", ")[1].split()[0]) for cell in row[1:]]
+    assert row[0] == "16"
+    assert min(rates[:3]) > max(rates[3], 0.0)
+
+
 @pytest.mark.parametrize("name", ["evaluate", "run_on_data"])
 def test_the_benchmarks_of_running_run(name):
     """Their own comparisons with python-control hold, and every rate is a number."""

@@ -251,8 +251,8 @@ TABLE: dict[str, tuple[str, Callable[[ObserverDesign], ObserverDesign], tuple[st
     "unstable gain": ("paper", unstable, (STABILITY, POLES, DECAY, DIGITS, NOISE)),
     "unstable gain, discrete": ("direct", unstable,
         (INPUTS, IN_ERROR, STABILITY, POLES, DECAY, DIGITS, DECOUPLING, NOISE)),
-    "coordinates that cost digits": ("paper", lambda d: in_other_coordinates(d, 1e5), (POLES,)),
-    "coordinates that cost digits, discrete": ("direct", lambda d: in_other_coordinates(d, 1e6),
+    "coordinates that cost digits": ("paper", lambda d: in_other_coordinates(d, 3e4), (POLES, DIGITS)),
+    "coordinates that cost digits, discrete": ("direct", lambda d: in_other_coordinates(d, 5e5),
         (POLES, DECAY, DIGITS)),
     # The certificate.
     "tracking": ("paper", certificate("tracking", 1, 0, 0.4), (SYLVESTER, IN_ERROR, STATE, RESIDUAL)),
@@ -282,7 +282,7 @@ TABLE: dict[str, tuple[str, Callable[[ObserverDesign], ObserverDesign], tuple[st
     "By huge": ("direct", entry("By", 0, 0, 1e300), (SYLVESTER, INPUTS, IN_ERROR, DECOUPLING, NOISE)),
     # The plant is another one.
     "E": ("paper", plant_entry("E", 0, 0), (SYLVESTER, STATE, RESIDUAL, DECOUPLING)),
-    "A": ("paper", plant_entry("A", 0, 2), (SYLVESTER, DECOUPLING)),
+    "A": ("paper", plant_entry("A", 0, 2, 5e-5), (SYLVESTER, DECOUPLING)),
     "B": ("paper", plant_entry("B", 1, 0), (INPUTS,)),
     "C": ("paper", plant_entry("C", 0, 2), (SYLVESTER, STATE, RESIDUAL, DECOUPLING)),
     "D": ("direct", plant_entry("D", 1, 0), (INPUTS, FEEDTHROUGH)),

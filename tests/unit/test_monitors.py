@@ -302,13 +302,6 @@ def test_what_has_no_bound_or_no_covariance_is_refused(wang, noisy) -> None:
         watched.watch(obsynth.simulate(design, scenario.replace(horizon=10)).estimates)
 
 
-def test_continuous_designs_have_no_thresholds() -> None:
-    spec = load_spec(DESIGNS / "filasova" / "spec.yaml")
-    design = obsynth.design(spec.plant, spec.method, **dict(spec.options))
-    with pytest.raises(SpecError, match="for discrete designs"):
-        obsynth.monitor(design, spec.scenario)
-
-
 # Many runs
 
 

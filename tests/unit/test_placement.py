@@ -94,6 +94,12 @@ class TestSplit:
         closed = f - split.lift(found.K) @ c
         assert spectrum_error(closed, [-3, -4, -5, -6, *modes], 0.0) < 1e-4
 
+    def test_a_double_mode_that_rounding_has_split_into_a_pair(self) -> None:
+        f = np.diag([-2.0, -3.0, -1.0, -1.0, -1.0])
+        c = np.array([[1.0, 1.0, 0.0, 0.0, 0.0]])
+        split = observable_split(f, c, np.array([-1 + 1e-15j, -1 - 1e-15j, -1.0]))
+        assert split.order == 2
+
     def test_a_mode_that_the_pair_shows_is_refused(self) -> None:
         f, c = np.diag([-1.0, -2.0]), np.array([[1.0, 1.0]])
         with pytest.raises(PreconditionError, match="Rescale"):
@@ -124,7 +130,7 @@ class TestKalman:
         problem = noisy(PAIR, OUTPUTS)
         found = compromise(problem, 10.0)
         assert found is not None
-        assert 0.5 * NOISE_PRICE < found.deviation / found.quietest <= NOISE_PRICE
+        assert 0.5 * NOISE_PRICE < found.price <= NOISE_PRICE
         easy = compromise(problem, 0.1)
         assert easy is not None
         assert easy.decay == 0.1
@@ -160,6 +166,27 @@ class TestRegion:
         problem = noisy(np.eye(5) + 0.1 * PAIR, OUTPUTS, dt=0.1)
         gain, _ = region_gain(problem, Region(decay=1.0), solver="CLARABEL")
         assert np.max(np.abs(np.linalg.eigvals(problem.F - gain @ OUTPUTS))) < np.exp(-0.1)
+
+    def test_large_pairs_move_only_what_lies_outside(self) -> None:
+        rng = np.random.default_rng(3)
+        f = rng.standard_normal((30, 30))
+        problem = noisy(f, rng.standard_normal((4, 30)))
+        plain = problem.gain(0.5 * 1.001)
+        assert plain is not None
+        before = np.linalg.eigvals(f - plain @ problem.C)
+        ratios = np.sort(-before.real / np.abs(before))
+        # Between the four least damped poles and the others.
+        damping = float(np.mean(ratios[3:5]))
+        region = Region(decay=0.5, damping=damping)
+        assert ratios[4] > 1.01 * damping > 1.02 * ratios[3]
+        gain, record = region_gain(problem, region, solver="CLARABEL")
+        after = np.linalg.eigvals(f - gain @ problem.C)
+        assert np.all(-after.real >= damping * np.abs(after))
+        assert np.max(after.real) < -0.5
+        kept = before[-before.real > damping * np.abs(before)]
+        assert np.max(np.min(np.abs(after[:, None] - kept), axis=0)) < 1e-6
+        assert record["solver"] == "CLARABEL"
+        assert region_gain(problem, Region(decay=0.5), solver="CLARABEL")[1] == {}
 
     def test_bad_regions(self) -> None:
         for data in ({"decay": -1.0}, {"radius": 0.0}, {"damping": 1.0}, {"decay": True}, {"side": 1.0}, {}):

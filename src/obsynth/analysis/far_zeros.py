@@ -44,7 +44,11 @@ def _is_singular(E: FloatArray, A: FloatArray, value: complex, normal_rank: int,
     point, best = value, np.inf
     for _ in range(NEWTON_STEPS):
         left, sizes, right = np.linalg.svd(pencil.A - point * pencil.E)
+        if sizes[0] == 0.0:
+            return True
         best = min(best, sizes[normal_rank - 1] / sizes[0])
+        if best <= BOUNDARY_RANK_TOLERANCE:
+            return True
         u, v = left[:, normal_rank - 1].conj(), right[normal_rank - 1].conj()
         slope = u @ pencil.E @ v
         # A zero far out is known only to the rounding of the largest: Newton's method on u' (A - z E) v finds the rest.
@@ -52,7 +56,7 @@ def _is_singular(E: FloatArray, A: FloatArray, value: complex, normal_rank: int,
         if abs(point + step - value) > CLUSTER_TOLERANCE * abs(value):
             break
         point = point + step
-    return bool(best <= BOUNDARY_RANK_TOLERANCE)
+    return False
 
 
 def equilibrated_at(E: FloatArray, A: FloatArray, value: complex, *, nx: int) -> EquilibratedPencil:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.analysis.conditions import Condition
+from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.unknown_input_pencils import (
     MOST_NAMES,
     equilibrated,
@@ -30,18 +31,26 @@ from obsynth.numerics.pencils import finite_zeros
 from obsynth.numerics.ranks import RankDecision, decide_rank
 
 
-def model_conditions(plant: DescriptorSystem, model: Exosystem) -> list[Condition]:
-    """Test (D3) at each unstable eigenvalue of the fault model, upper half plane only."""
+def model_conditions(plant: DescriptorSystem, model: Exosystem, units: PlantUnits) -> list[Condition]:
+    """Test (D3) at each unstable eigenvalue of the fault model, upper half plane only.
+
+    Parameters
+    ----------
+    plant, model : DescriptorSystem, Exosystem
+        Both scaled.
+    units : PlantUnits
+        In which they are scaled.
+    """
     unstable = [complex(value) for value in model.eigenvalues if value.imag >= 0.0 and is_outside(value, plant.dt)]
     found = []
     for value in sorted(unstable, key=lambda value: (value.real, value.imag)):
-        found.append(_model_condition(plant, model, value))
+        found.append(_model_condition(plant, model, value, units))
         if not found[-1].holds:
             break
     return found
 
 
-def _model_condition(plant: DescriptorSystem, model: Exosystem, value: complex) -> Condition:
+def _model_condition(plant: DescriptorSystem, model: Exosystem, value: complex, units: PlantUnits) -> Condition:
     inputs, direct = independent_disturbances(plant)
     courses = model.Cw @ kernel(model.Phi - value * np.eye(model.order))
     width = courses.shape[1]
@@ -51,7 +60,8 @@ def _model_condition(plant: DescriptorSystem, model: Exosystem, value: complex) 
     ])  # fmt: skip
     scaled, columns = equilibrated(matrix)
     decision = decide_rank(scaled, expected=matrix.shape[1], equilibrated=False)
-    where = f"{'s' if plant.dt == 0.0 else 'z'} = {number(value)}"
+    own = units.eigenvalue(value)
+    where = f"{'s' if plant.dt == 0.0 else 'z'} = {number(own)}"
     signals: tuple[str, ...] = ()
     detail = decision.describe()
     if not decision.full:
@@ -66,23 +76,30 @@ def _model_condition(plant: DescriptorSystem, model: Exosystem, value: complex) 
             "output, so no observer can estimate it. Measure another signal, or leave one of them out."
         )
     return Condition(
-        f"(D3) fault model at {number(value)}",
+        f"(D3) fault model at {number(own)}",
         f"rank [lambda E - A, -Bf Cw V, -Bd; C, Df Cw V, Dd] full at {where}, an eigenvalue of Phi",
         decision.full,
         float(decision.rank),
         float(decision.expected),
         "in place of Share Pasand, Theorems 1 and 2, which are false",
         detail,
-        mode=None if decision.full else value,
+        mode=None if decision.full else own,
         signals=signals,
     )
 
 
-def order_conditions(plant: DescriptorSystem, model: Exosystem) -> list[Condition]:
+def order_conditions(plant: DescriptorSystem, model: Exosystem, units: PlantUnits) -> list[Condition]:
     """Test that the fault model is not lost in rounding, at the zeros where faults can hide longest.
 
     At a zero z0 of (f, d) -> y outside the region of stability, a polynomial model of order n is seen with a strength
     of about abs(z0)^(n + 1) only: a high order is observable on paper and lost in double precision.
+
+    Parameters
+    ----------
+    plant, model : DescriptorSystem, Exosystem
+        Both scaled.
+    units : PlantUnits
+        In which they are scaled.
     """
     inputs, direct = np.hstack([plant.Bf, plant.Bd]), np.hstack([plant.Df, plant.Dd])
     wide_e, wide_a = system_pencil(plant.E, plant.A, inputs, plant.C, direct)
@@ -102,7 +119,7 @@ def order_conditions(plant: DescriptorSystem, model: Exosystem) -> list[Conditio
             worst = (decision, point)
     if worst is None:
         return []
-    decision, point = worst
+    decision, point = worst[0], units.eigenvalue(worst[1])
     lost = (
         f": at the zero {number(point)} of (f, d) -> y the fault model (order {model.order}) cannot be told from "
         "nothing in double precision. Lower its order."

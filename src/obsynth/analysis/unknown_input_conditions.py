@@ -15,13 +15,15 @@ regularity nor index 1 is needed.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from obsynth.analysis.conditions import Condition
+from obsynth.analysis.decoupling_condition import SOURCE, decoupling_data, decoupling_rank, disturbance_rank
 from obsynth.analysis.fault_model_conditions import model_conditions, order_conditions
-from obsynth.analysis.transformations import Transformation, eliminate_algebraic_states
+from obsynth.analysis.plant_units import PlantUnits
+from obsynth.analysis.transformations import Transformation
 from obsynth.analysis.unknown_input_pencils import (
     MOST_NAMES,
     in_disturbances,
@@ -30,20 +32,14 @@ from obsynth.analysis.unknown_input_pencils import (
     number,
     system_pencil,
 )
-from obsynth.analysis.unknown_inputs import AugmentedPlant, balancing
+from obsynth.analysis.unknown_inputs import AugmentedPlant
 from obsynth.analysis.zeros import Zero, are_outside, invariant_zeros, leading_names
-from obsynth.errors import PreconditionError
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.models.exosystems import Exosystem
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.pencils import finite_zeros
-from obsynth.numerics.ranks import RANK_TOLERANCE, RankDecision, decide_rank
-from obsynth.numerics.scaling import equilibrate_pencil
 
-#: A direct effect on an output, relative to the effect on the states (both in balanced units), that elimination may
-#: leave by rounding.
-ELIMINATION_ROUNDING = 1e-13
-_SOURCE = "Share Pasand, Lemma 4 (9.1), in a form without E#"
+__all__ = ["Existence", "decoupling_rank", "existence"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +54,7 @@ class Existence:
         For which they were decided: the plant as given, or without its algebraic states.
     transformation : Transformation or None
         The elimination, where there was one.
-    fixed_modes : ComplexArray
+    fixed_modes : ComplexArray, 1/s (dimensionless for sampled plants)
         Poles that every such observer has; all stable when the conditions hold.
     """
 
@@ -82,41 +78,21 @@ def existence(plant: DescriptorSystem, model: Exosystem) -> Existence:
     enough = _enough_outputs(plant)
     if not enough.holds:
         return Existence((enough,), plant, None, nothing)
-    working, transformation, solvable = _decoupling_data(plant)
+    working, transformation, solvable = decoupling_data(plant)
+    # Powers of two: what is exact in the data, such as a zero at the origin, stays exact.
+    units = PlantUnits.of(working, model).rounded()
+    scaled, courses = units.scaled_plant(working), units.scaled_model(model)
     # (D1) and the others fail independently: a user wants to know both.
-    found = [enough, solvable, _zero_condition(working)]
+    found = [enough, solvable, _zero_condition(scaled, units)]
     if found[-1].holds:
-        found += model_conditions(working, model)
+        found += model_conditions(scaled, courses, units)
     if not all(condition.holds for condition in found):
         return Existence(tuple(found), working, transformation, nothing)
-    found += order_conditions(working, model)
+    found += order_conditions(scaled, courses, units)
     if not found[-1].holds:
         return Existence(tuple(found), working, transformation, nothing)
-    fixed, condition = _fixed_modes(working, model)
+    fixed, condition = _fixed_modes(scaled, courses, units)
     return Existence((*found, condition), working, transformation, fixed)
-
-
-def decoupling_rank(plant: DescriptorSystem) -> RankDecision:
-    """Decide (D1): ``rank [E 0 Bd; C Dd 0; 0 0 Dd]``, with what it must be."""
-    return decide_rank(_decoupling_matrix(plant), expected=plant.nx + _rank(plant.Dd) + disturbance_rank(plant))
-
-
-def _decoupling_matrix(plant: DescriptorSystem) -> FloatArray:
-    nx, ny, nd = plant.nx, plant.ny, plant.nd
-    matrix = np.zeros((nx + 2 * ny, nx + 2 * nd))
-    matrix[:nx, :nx], matrix[:nx, nx + nd :] = plant.E, plant.Bd
-    matrix[nx : nx + ny, :nx], matrix[nx : nx + ny, nx : nx + nd] = plant.C, plant.Dd
-    matrix[nx + ny :, nx + nd :] = plant.Dd
-    return matrix
-
-
-def disturbance_rank(plant: DescriptorSystem) -> int:
-    """Return ``rank [Bd; Dd]``: repeated disturbances count once."""
-    return _rank(np.vstack([plant.Bd, plant.Dd]))
-
-
-def _rank(matrix: FloatArray) -> int:
-    return decide_rank(matrix).rank
 
 
 def _enough_outputs(plant: DescriptorSystem) -> Condition:
@@ -128,82 +104,14 @@ def _enough_outputs(plant: DescriptorSystem) -> Condition:
         holds,
         float(rank),
         float(plant.ny),
-        _SOURCE,
+        SOURCE,
         f"{rank} unknown input(s), {plant.ny} output(s)"
         + ("" if holds else ". Measure more, or leave an unknown input out."),
         signals=() if holds else plant.disturbance_names,
     )
 
 
-def _decoupling_data(plant: DescriptorSystem) -> tuple[DescriptorSystem, Transformation | None, Condition]:
-    """Return the plant on which (D1) holds, if the algebraic states can be eliminated where it does not."""
-    written = decoupling_rank(plant)
-    said = f"rank {written.rank} of {written.expected}"
-    if written.full:
-        return plant, None, _decoupling_condition(plant, written, written.describe())
-    try:
-        transformation = _without_rounding(eliminate_algebraic_states(plant))
-    except PreconditionError as error:
-        reason = f"{written.describe()}, and the algebraic states cannot be eliminated: {error}"
-        return plant, None, _decoupling_condition(plant, written, reason)
-    if not transformation.description:
-        return plant, None, _decoupling_condition(plant, written, written.describe())
-    reduced = transformation.plant
-    again = decoupling_rank(reduced)
-    detail = f"{said} as written; {again.describe()} without the algebraic states"
-    return reduced, transformation, _decoupling_condition(reduced, again, detail)
-
-
-def _without_rounding(transformation: Transformation) -> Transformation:
-    """Set to zero what elimination left of a direct effect that is none: a rank decision would take it for one."""
-    plant = transformation.plant
-    scaling = balancing(plant)
-    changes = {}
-    for direct, entering in (("Dd", plant.Bd), ("Df", plant.Bf)):
-        matrix = getattr(plant, direct)
-        sizes = np.max(np.abs(scaling.scale_input(entering)), axis=0, initial=0.0)
-        negligible = np.abs(scaling.scale_feedthrough(matrix)) <= ELIMINATION_ROUNDING * sizes
-        changes[direct] = np.where(negligible, 0.0, matrix)
-    return replace(transformation, plant=plant.replace(**changes))
-
-
-def _decoupling_condition(plant: DescriptorSystem, decision: RankDecision, detail: str) -> Condition:
-    signals: tuple[str, ...] = ()
-    if not decision.full:
-        signals = _undecoupled(plant)
-        detail += ": " + (
-            f"the unknown input {', '.join(map(repr, signals))} moves states that no output shows at once, so nothing "
-            "but a derivative of the outputs could remove it. Measure such a state, or leave the input out."
-            if set(signals) & set(plant.disturbance_names)
-            else f"the states {', '.join(map(repr, signals))} are neither dynamic nor measured."
-        )
-    return Condition(
-        "(D1) decoupling",
-        "rank [E 0 Bd; C Dd 0; 0 0 Dd] = nx + rank Dd + rank [Bd; Dd]",
-        decision.full,
-        float(decision.rank),
-        float(decision.expected),
-        _SOURCE,
-        detail,
-        signals=signals,
-    )
-
-
-def _undecoupled(plant: DescriptorSystem) -> tuple[str, ...]:
-    """Return the unknown inputs that move what no output shows at once, or else the states in question."""
-    matrix = _decoupling_matrix(plant)
-    pencil = equilibrate_pencil(np.zeros_like(matrix), matrix)
-    hidden = np.linalg.svd(pencil.A)[2][decide_rank(matrix).rank :].T
-    # Of all null vectors the one that moves the states most: some are there only because disturbances repeat.
-    rotation = np.linalg.svd(hidden[: plant.nx])[2]
-    direction = hidden @ rotation[0]
-    shares = np.abs(direction[plant.nx + plant.nd :])
-    if np.max(shares, initial=0.0) > RANK_TOLERANCE:
-        return leading_names(shares, plant.disturbance_names, most=MOST_NAMES)
-    return leading_names(np.abs(direction[: plant.nx]), plant.state_names, most=MOST_NAMES)
-
-
-def _zero_condition(plant: DescriptorSystem) -> Condition:
+def _zero_condition(plant: DescriptorSystem, units: PlantUnits) -> Condition:
     claim = "rank [sE - A, -Bd; C, Dd] = nx + rank [Bd; Dd] on and outside the boundary of stability"
     source = "Share Pasand, Lemma 4 (9.2)"
     inputs, direct = independent_disturbances(plant)
@@ -217,35 +125,42 @@ def _zero_condition(plant: DescriptorSystem) -> Condition:
     outside = [zero for zero, out in zip(zeros, are_outside(wide_e, wide_a, found, plant.dt), strict=True) if out]
     if outside:
         worst = max(outside, key=lambda zero: instability(zero.value, plant.dt))
-        return _zero_failure(plant, worst, inputs, direct, claim, source)
+        return _zero_failure(plant, units, worst, inputs, direct, claim, source)
     return Condition(
         "(D2) zeros", claim, True, float(found.normal_rank), float(full), source, f"{len(zeros)} stable zero(s)"
     )
 
 
 def _zero_failure(
-    plant: DescriptorSystem, zero: Zero, inputs: FloatArray, direct: FloatArray, claim: str, source: str
+    plant: DescriptorSystem,
+    units: PlantUnits,
+    zero: Zero,
+    inputs: FloatArray,
+    direct: FloatArray,
+    claim: str,
+    source: str,
 ) -> Condition:
+    value = units.eigenvalue(zero.value)
     states = leading_names(np.abs(zero.state_direction), plant.state_names, most=MOST_NAMES)
     shares = in_disturbances(plant, inputs, direct, zero.input_direction)
     disturbances = () if zero.is_unobservable_mode else leading_names(shares, plant.disturbance_names, most=MOST_NAMES)
-    where = f"s = {number(zero.value)}" if plant.dt == 0.0 else f"z = {number(zero.value)}"
+    where = f"s = {number(value)}" if plant.dt == 0.0 else f"z = {number(value)}"
     masked = f" under the unknown input {', '.join(map(repr, disturbances))}" if disturbances else ""
     detail = (
         f"at {where} the states {', '.join(map(repr, states))} move{masked} without showing in any output, and do not "
         "come to rest: no observer can know them. Measure something they move."
     )
     return Condition(
-        "(D2) zeros", claim, False, zero.value.real if plant.dt == 0.0 else abs(zero.value), 0.0, source, detail,
-        mode=zero.value, signals=(*states, *disturbances),
+        "(D2) zeros", claim, False, value.real if plant.dt == 0.0 else abs(value), 0.0, source, detail, mode=value,
+        signals=(*states, *disturbances),
     )  # fmt: skip
 
 
-def _fixed_modes(plant: DescriptorSystem, model: Exosystem) -> tuple[ComplexArray, Condition]:
+def _fixed_modes(plant: DescriptorSystem, model: Exosystem, units: PlantUnits) -> tuple[ComplexArray, Condition]:
     augmented = AugmentedPlant.of(plant, model)
     inputs, direct = independent_disturbances(plant)
     below = np.vstack([inputs, np.zeros((model.order, inputs.shape[1]))])
-    zeros = finite_zeros(*system_pencil(augmented.E, augmented.A, below, augmented.C, direct)).values
+    zeros = units.eigenvalues(finite_zeros(*system_pencil(augmented.E, augmented.A, below, augmented.C, direct)).values)
     text = ", ".join(number(complex(value)) for value in zeros if value.imag >= 0.0)
     return zeros, Condition(
         "fixed modes",

@@ -15,16 +15,15 @@ equations of the states, and what is left is a plant without ``Dd`` (`Decoupled.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.models.exosystems import Exosystem
-from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import RANK_TOLERANCE, decide_rank
-from obsynth.numerics.scaling import Scaling, balance_system, power_of_two_below
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,27 +126,6 @@ def _range_basis(matrix: FloatArray) -> FloatArray:
     return np.asarray(left[:, : int(np.sum(values > RANK_TOLERANCE * values[0]))])
 
 
-def balancing(plant: DescriptorSystem) -> Scaling:
-    """Return the power-of-two factors in which a plant is decoupled.
-
-    Equations with derivatives are scaled by their row of E alone, so that the unit of time plays no role: how much of
-    a state is read from the outputs and how much is integrated must not depend on it.
-    """
-    scaling = balance_system(plant.E, plant.A, inputs=[plant.Bd, plant.Bf], outputs=[plant.C])
-    rows = np.max(np.abs(plant.E) * scaling.states, axis=1, initial=0.0)
-    moving = rows > RANK_TOLERANCE * np.max(rows, initial=0.0)
-    equations = np.where(moving, 1.0 / power_of_two_below(rows), scaling.equations)
-    return replace(scaling, equations=read_only(equations))
-
-
-def balanced(plant: DescriptorSystem, scaling: Scaling) -> DescriptorSystem:
-    """Return the plant with equations, states and outputs scaled, which is exact."""
-    changes = {name: scaling.scale_dynamics(getattr(plant, name)) for name in ("E", "A")}
-    changes |= {name: scaling.scale_input(getattr(plant, name)) for name in ("B", "Bf", "Bd", "Bw")}
-    changes |= {name: scaling.scale_feedthrough(getattr(plant, name)) for name in ("D", "Df", "Dd", "Dw")}
-    return plant.replace(**changes, C=scaling.scale_output(plant.C))
-
-
 def decouple(plant: DescriptorSystem) -> Decoupled:
     r"""Return U and Dhat with ``U E + Dhat C = I``, ``U Bd2 = 0`` and ``ker U = im Bd2``; (D1) must hold.
 
@@ -157,7 +135,7 @@ def decouple(plant: DescriptorSystem) -> Decoupled:
     Parameters
     ----------
     plant : DescriptorSystem
-        Balanced.
+        Scaled.
     """
     seen, injection, remaining = direct_part(plant)
     nx, left_over = plant.nx, plant.nx - remaining.shape[1]
@@ -169,14 +147,16 @@ def decouple(plant: DescriptorSystem) -> Decoupled:
     null = q[:, nx:].T
     ut, dt = inverse[:, :left_over], inverse[:, left_over:]
     nu, nd = null[:, :left_over], null[:, left_over:]
-    z = _completing(ut, nu)
+    z = _completing(ut, nu, (kept @ plant.A).T)
     return Decoupled((ut + z @ nu) @ kept, (dt + z @ nd) @ seen, nu @ kept, nd @ seen, seen, injection)
 
 
-def _completing(ut: FloatArray, nu: FloatArray) -> FloatArray:
+def _completing(ut: FloatArray, nu: FloatArray, wanted: FloatArray) -> FloatArray:
     """Return Z such that ``ut + Z nu`` has full column rank; ``[ut; nu]`` has, so what ut lacks, nu sees.
 
-    Kernel directions of ut (all those whose singular value is small) are sent to directions outside its range.
+    Kernel directions of ut (all those whose singular value is small) are sent to directions outside its range: as
+    nearly as can be to where ``wanted`` (like ut, the transposed equations) sends them, so that the choice does not
+    hang on rounding.
     """
     rows, columns = ut.shape
     if columns == 0 or nu.shape[0] == 0:
@@ -187,9 +167,16 @@ def _completing(ut: FloatArray, nu: FloatArray) -> FloatArray:
     lacking = columns - rank
     if lacking == 0:
         return np.zeros((rows, nu.shape[0]))
-    kernel, outside = right[rank:].T, left[:, rank : rank + lacking]
+    kernel = right[rank:].T
+    outside = left[:, rank:] @ _nearest_isometry(left[:, rank:].T @ wanted @ kernel)
     shown = nu @ kernel
     return np.asarray(outside @ np.linalg.pinv(shown) * largest)
+
+
+def _nearest_isometry(matrix: FloatArray) -> FloatArray:
+    """Return the matrix ``(m, n)``, ``m >= n``, with orthonormal columns that is nearest: the polar factor."""
+    left, _, right = np.linalg.svd(matrix, full_matrices=False)
+    return np.asarray(left @ right)
 
 
 def paper_decoupling(

@@ -68,6 +68,30 @@ def designed(spec: Spec, report_stage: Any) -> ObserverDesign:
     )
 
 
+def designed_or_loaded(spec: Spec, gains: Path | None, report_stage: Any) -> ObserverDesign:
+    """Return the design that a spec asks for, or a saved one of the same plant.
+
+    Raises
+    ------
+    SpecError
+        The gain set is malformed, or for a plant with other signals.
+    """
+    if gains is None:
+        return designed(spec, report_stage)
+    from obsynth.results.serialise import load
+
+    design = load(gains)
+    require_same_signals(design, gains, spec)
+    return design
+
+
+def require_same_signals(design: ObserverDesign, gains: Path, spec: Spec) -> None:
+    """Raise `SpecError` unless a gain set is for a plant with the inputs and outputs of a spec's plant."""
+    # States may differ: a method may have eliminated some.
+    if any(getattr(design.plant, name) != getattr(spec.plant, name) for name in ("input_names", "output_names")):
+        raise SpecError(f"{gains} is for a plant with other signals than that of {spec.path}.", path=str(gains))
+
+
 def output_file(wanted: Path | None, spec: Spec, *, option: str = "--output") -> Path:
     """Return where to write; refuse a hopeless place before any work is done.
 

@@ -6,8 +6,11 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-_RUN = "Run a linear design on measured data: a log, or a stream on standard input, a row in, a row out."
-_EXPORT = "Write a linear gain set for Simulink (.mat), numpy (.npz) or C99 (.c and .h)."
+_RUN = "Run a design on measured data: a log, or a stream on standard input, a row in, a row out."
+_EXPORT = (
+    "Write a gain set for Simulink (.mat), numpy (.npz) or C99 (.c and .h); of a recursive design for a time-invariant "
+    "plant, its steady state."
+)
 _REPORT = "Verify a gain set again and write one self-contained HTML page about it."
 _RUN_DETAILS = """\
 The data have a column 'time' in seconds and one for each known input and output, by name.
@@ -15,8 +18,19 @@ Each row of estimates has a status:
   ok          all is well
   warm-up     the start is not forgotten yet
   gap         a sample is missing: fault estimates are held, the plant model stands in, no alarms
+  partial     recursive and nonlinear designs: some outputs are missing, the others are used
   recovering  after a gap, like warm-up
 An estimate that lags has a column 'time of ...', the time of which it is the estimate.
+
+--monitor KIND adds columns 'statistic', 'threshold' and 'alarm', with the fault that stands out. The thresholds hold
+however long the data are. KIND is one of
+  pointwise   linear designs: the residual's peak bound, for disturbances and noise within bounds
+  window      the same for its l2 norm over a window
+  paper       linear, discrete: eq. (66) of Wang et al. 2015; no bound
+  chi-square  linear: a window of the residual against its covariance; recursive: the parameters against theirs
+  cusum       small changes of the residual, or of a parameter
+  nis         recursive and nonlinear designs: innovations that the model does not explain
+What disturbances and noise are to be expected comes from the scenario of --system, or from the options.
 """
 
 
@@ -48,6 +62,20 @@ def add_data_verbs(verbs: Any) -> None:
         "--threshold", type=_pair, action="append", default=[], metavar="COLUMN=LEVEL",
         help="alarm when the absolute value of a column of the output passes a level; may be repeated",
     )  # fmt: skip
+    add_monitor_arguments(run)
+    run.add_argument(
+        "--nominal", type=_pair, action="append", default=[], metavar="NAME=VALUE",
+        help="monitor of a recursive design: nominal value of a parameter; may be repeated",
+    )  # fmt: skip
+    run.add_argument(
+        "--sample-time", type=float, metavar="SECONDS", help="monitor of a continuous design: between the rows"
+    )
+    run.add_argument(
+        "--system",
+        type=Path,
+        metavar="FILE",
+        help="spec (YAML) whose scenario tells what is to be expected",
+    )
     run.add_argument("--gap", type=float, metavar="SECONDS", help="continuous designs: longer intervals are gaps")
     run.add_argument("--warm-up", type=float, metavar="SECONDS", help="how long to mark the start, and after gaps")
     run.add_argument(
@@ -72,6 +100,33 @@ def add_data_verbs(verbs: Any) -> None:
     report.add_argument("--system", type=Path, metavar="SPEC", help="show the design on the scenario of this spec")
     _add_json(report)
     report.set_defaults(verb="report")
+
+
+def add_monitor_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add what a monitor is made of.
+
+    Parameters
+    ----------
+    parser : argparse.ArgumentParser
+        Of ``run`` or ``evaluate``.
+    """
+    group = parser.add_argument_group("monitor")
+    group.add_argument("--monitor", metavar="KIND", help="watch the residual (or the parameters) by a threshold")
+    group.add_argument(
+        "--disturbance", type=_pair, action="append", default=[], metavar="NAME=BOUND",
+        help="largest absolute value of a disturbance; may be repeated",
+    )  # fmt: skip
+    group.add_argument("--noise-bound", type=float, metavar="N", help="standard deviations that no noise exceeds")
+    group.add_argument("--initial-error", type=float, metavar="E", help="bound on the norm of the error at the start")
+    group.add_argument(
+        "--false-alarms", type=float, default=0.01, metavar="P",
+        help="statistical kinds: probability of a false alarm in the whole run (default: 0.01)",
+    )  # fmt: skip
+    group.add_argument("--window", type=int, default=20, metavar="N", help="samples looked back (default: 20)")
+    group.add_argument(
+        "--change", type=float, default=1.0, metavar="X",
+        help="cusum: change to be found, in deviations of the residual, or in parameter units (default: 1)",
+    )  # fmt: skip
 
 
 def _add_gains(parser: argparse.ArgumentParser) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,6 +15,8 @@ from obsynth.errors import SpecError, VerificationError
 
 if TYPE_CHECKING:
     from obsynth.data.run import DataRun
+    from obsynth.evaluation.online import OnlineMonitor
+    from obsynth.results.design import ObserverDesign
 
 STREAM = "-"
 
@@ -24,8 +27,8 @@ def run_run(options: argparse.Namespace) -> int:
     Parameters
     ----------
     options : argparse.Namespace
-        ``gains``, ``data``, ``out``, ``map``, ``scale``, ``threshold``, ``gap``, ``warm_up``, ``state``, ``json``,
-        ``quiet``.
+        ``gains``, ``data``, ``out``, ``map``, ``scale``, ``threshold``, ``monitor`` and its options, ``system``,
+        ``gap``, ``warm_up``, ``state``, ``json``, ``quiet``.
 
     Returns
     -------
@@ -43,21 +46,30 @@ def run_run(options: argparse.Namespace) -> int:
     if options.json and out is sys.stdout:
         raise SpecError("--json and the estimates cannot both go to stdout: give --out a file.", path="--json")
     design = load(options.gains)
+    watched = _monitor(design, options)
     from obsynth.data.run import run_on_data
 
-    with _rows_done(quiet=options.quiet or out is sys.stdout) as progress:
+    with _rows_done(options.data, quiet=options.quiet or out is sys.stdout) as progress:
         found = run_on_data(
             design, sys.stdin if options.data == STREAM else Path(options.data), out,
-            columns=dict(options.map), scales=_numbers(options.scale), thresholds=_numbers(options.threshold),
-            gap=options.gap, warm_up=options.warm_up, state=options.state, progress=progress,
+            columns=dict(options.map), scales=numbers_of(options.scale), thresholds=numbers_of(options.threshold),
+            monitor=watched, gap=options.gap, warm_up=options.warm_up, state=options.state, progress=progress,
         )  # fmt: skip
     for text in found.warnings:
         print(f"Warning: {text}", file=sys.stderr)
     if options.json:
-        print_json({"command": "run", "gains": str(options.gains), "file": str(out), **found.as_dict()})
+        print_json(
+            {
+                "command": "run",
+                "gains": str(options.gains),
+                "file": str(out),
+                **found.as_dict(),
+                "monitor": None if watched is None else {"kind": watched.kind, "statement": watched.statement},
+            }
+        )
     elif not options.quiet:
         # The estimates themselves may be on stdout.
-        print(_summary(found), file=sys.stderr if out is sys.stdout else sys.stdout)
+        print(_summary(found, watched), file=sys.stderr if out is sys.stdout else sys.stdout)
     return 0
 
 
@@ -146,7 +158,14 @@ def _target(options: argparse.Namespace) -> Path | TextIO:
     return target
 
 
-def _numbers(pairs: list[tuple[str, str]]) -> Mapping[str, float]:
+def numbers_of(pairs: list[tuple[str, str]]) -> Mapping[str, float]:
+    """Return values by name, from arguments of the form NAME=VALUE.
+
+    Raises
+    ------
+    SpecError
+        A value is no number.
+    """
     found = {}
     for name, text in pairs:
         try:
@@ -156,21 +175,85 @@ def _numbers(pairs: list[tuple[str, str]]) -> Mapping[str, float]:
     return found
 
 
-def _summary(found: DataRun) -> str:
+def _monitor(design: ObserverDesign, options: argparse.Namespace) -> OnlineMonitor | None:
+    """Return the monitor that is asked for."""
+    if options.monitor is None:
+        asked = [name for name in ("system", "noise_bound", "initial_error", "sample_time") if getattr(options, name)]
+        asked += [name for name in ("disturbance", "nominal") if getattr(options, name)]
+        if asked:
+            flag = f"--{asked[0].replace('_', '-')}"
+            raise SpecError(f"{flag} is for a monitor: say which one by --monitor.", path=flag)
+        return None
+    from obsynth.evaluation.making_online import online_monitor
+
+    scenario = None
+    if options.system is not None:
+        from obsynth.cli.commands import require_same_signals
+        from obsynth.spec import load_spec
+
+        spec = load_spec(options.system)
+        require_same_signals(design, options.gains, spec)
+        scenario = spec.scenario
+        if scenario is None:
+            raise SpecError(f"{options.system} has no scenario, which would tell what is to be expected.",
+                            path="scenario")  # fmt: skip
+    return online_monitor(
+        design, options.monitor, scenario=scenario, disturbance_bounds=numbers_of(options.disturbance),
+        noise_bound=options.noise_bound, initial_error=options.initial_error, window=options.window,
+        false_alarms=options.false_alarms, change=options.change, nominal=numbers_of(options.nominal),
+        sample_time=options.sample_time,
+    )  # fmt: skip
+
+
+def _summary(found: DataRun, watched: OnlineMonitor | None) -> str:
     counts = ", ".join(f"{count} {status}" for status, count in found.statuses.items())
     lines = [f"{found.rows} rows: {counts}."]
-    lines += [f"Alarm: {name} first above its threshold at {time:g} s." for name, time in found.alarms.items()]
+    if found.recovered:
+        kinds = Counter(found.recovered.values())
+        told = ", ".join(f"{count} {kind.replace('needs', 'with')}" for kind, count in kinds.items())
+        lines.append(f"{len(found.recovered)} states as written recovered: {told}.")
+    for name, time in found.alarms.items():
+        fault = f"; {found.isolated} stands out" if watched and name == watched.kind and found.isolated else ""
+        lines.append(f"Alarm: {name} first above its threshold at {time:g} s{fault}.")
+    if watched is not None:
+        if watched.kind not in found.alarms:
+            lines.append(f"No alarm by {watched.kind}.")
+        lines.append(f"The {watched.kind} threshold: {watched.statement}.")
     return "\n".join(lines)
 
 
 @contextmanager
-def _rows_done(*, quiet: bool) -> Iterator[Callable[[int], None] | None]:
-    """Show on a terminal how many rows are done."""
+def _rows_done(data: str, *, quiet: bool) -> Iterator[Callable[[int], None] | None]:
+    """Show a bar on a terminal: how many rows are done, of how many where that can be known."""
     if quiet or not sys.stderr.isatty():
         yield None
         return
     from rich.console import Console
-    from rich.text import Text
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    with Console(stderr=True).status(Text("reading")) as status:
-        yield lambda rows: status.update(Text(f"{rows} rows done"))
+    columns = (TextColumn("rows"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("rows", total=None if data == STREAM else rows_in(Path(data)))
+        yield lambda rows: bar.update(task, completed=rows)
+
+
+def rows_in(path: Path) -> int | None:
+    """Return how many rows a file of data has, about; `None` where that cannot be told without reading it whole.
+
+    Parameters
+    ----------
+    path : Path
+        CSV or Parquet.
+    """
+    try:
+        if path.suffix.lower() == ".parquet":
+            import pyarrow.parquet
+
+            return int(pyarrow.parquet.ParquetFile(path).metadata.num_rows)
+        with path.open("rb") as stream:
+            sample = stream.read(1 << 20)
+        # The rows of the beginning stand for all.
+        lines = sample.count(b"\n")
+        return round(path.stat().st_size / len(sample) * lines) - 1 if lines > 1 else None
+    except (OSError, ImportError, ValueError):
+        return None

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from obsynth import __version__
 from obsynth.cli.data_arguments import add_data_verbs
+from obsynth.cli.evaluating import add_evaluate_verb
 from obsynth.cli.output import print_error, print_json
 from obsynth.errors import ObsynthError
 
@@ -95,10 +96,14 @@ def _parser() -> argparse.ArgumentParser:
 
     simulate = verbs.add_parser("simulate", help=_SIMULATE, description=_SIMULATE)
     _add_system(simulate)
+    simulate.add_argument(
+        "--gains", type=Path, metavar="FILE", help="a gain set for the spec's plant: nothing is designed"
+    )
     simulate.add_argument("--out", type=Path, metavar="FILE", help="write every signal to this file (CSV)")
     _add_json(simulate)
     simulate.add_argument("--quiet", action="store_true", help="print no progress")
     simulate.set_defaults(verb="simulate")
+    add_evaluate_verb(verbs)
     add_data_verbs(verbs)
     return parser
 
@@ -134,13 +139,14 @@ def _digits(text: str) -> int:
 
 
 def _verb(name: str) -> Callable[[argparse.Namespace], int]:
-    from obsynth.cli import commands, data_commands, simulating
+    from obsynth.cli import commands, data_commands, evaluating, simulating
 
     return {
         "design": commands.run_design,
         "check": commands.run_check,
         "verify": commands.run_verify,
         "simulate": simulating.run_simulate,
+        "evaluate": evaluating.run_evaluate,
         "run": data_commands.run_run,
         "export": data_commands.run_export,
         "report": data_commands.run_report,

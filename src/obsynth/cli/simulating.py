@@ -34,7 +34,7 @@ def run_simulate(options: argparse.Namespace) -> int:
     Parameters
     ----------
     options : argparse.Namespace
-        ``system``, ``out``, ``json``, ``quiet``.
+        ``system``, ``gains``, ``out``, ``json``, ``quiet``.
 
     Returns
     -------
@@ -46,7 +46,7 @@ def run_simulate(options: argparse.Namespace) -> int:
     ObsynthError
         As its exit code says; nothing is written then.
     """
-    from obsynth.cli.commands import designed, output_file
+    from obsynth.cli.commands import designed_or_loaded, output_file
     from obsynth.spec import load_spec
 
     with progress(quiet=options.quiet) as report_stage:
@@ -54,7 +54,7 @@ def run_simulate(options: argparse.Namespace) -> int:
         spec = load_spec(options.system)
         scenario = required_scenario(spec)
         target = None if options.out is None else output_file(options.out, spec, option="--out")
-        design = designed(spec, report_stage)
+        design = designed_or_loaded(spec, options.gains, report_stage)
         report_stage("simulating")
         from obsynth.evaluation.simulating import simulate
 

@@ -7,6 +7,8 @@ from collections import OrderedDict
 from collections.abc import Callable
 from typing import TypeAlias
 
+from obsynth.errors import SpecError
+from obsynth.models.arguments import is_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.spectra import abscissa
 from obsynth.observers.linear import LinearObserver
@@ -61,3 +63,25 @@ def transient(observer: LinearObserver) -> float:
     return observer.dt * (
         max(samples, observer.order) + max((*observer.state_delays, *observer.fault_delays), default=0)
     )
+
+
+def checked_warm_up(asked: float | None, default: float) -> float:
+    """Return the warm-up in seconds.
+
+    Parameters
+    ----------
+    asked : float or None
+        By the user.
+    default : float
+        Where nothing is asked.
+
+    Raises
+    ------
+    SpecError
+        It is negative or not finite.
+    """
+    if asked is None:
+        return default
+    if not (is_number(asked) and asked >= 0.0):
+        raise SpecError(f"warm_up is {asked!r}: give seconds, 0 or more.", path="warm_up")
+    return float(asked)

@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-import math
-from collections import Counter
+import copy
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
-import numpy as np
-
-from obsynth.data.operating import FirstSecond
-from obsynth.data.running import OK, DataObserver, Row
-from obsynth.data.signals import Signals, delayed, estimate_columns, output_columns
+from obsynth.data.job import Job
+from obsynth.data.signals import Signals
 from obsynth.data.sinks import FrameSink, Sink, TextSink, file_sink
 from obsynth.data.sources import Data, chunks
+from obsynth.data.starting import engine_of
 from obsynth.data.states import digest_of_gains, resume_state, save_state
 from obsynth.errors import SpecError
-from obsynth.numerics.arrays import FloatArray
+from obsynth.evaluation.online import OnlineMonitor
+from obsynth.models.arguments import require_kind, require_mapping
 from obsynth.results.design import ObserverDesign
 
 if TYPE_CHECKING:
@@ -38,9 +36,14 @@ class DataRun:
     rows : int
         Rows of data.
     statuses : mapping of str to int
-        How many rows were ``ok``, ``warm-up``, ``gap`` and ``recovering``.
+        How many rows were ``ok``, ``warm-up``, ``partial``, ``gap`` and ``recovering``.
     alarms : mapping of str to float
-        Time in seconds at which each column first passed its threshold.
+        Time in seconds at which each column, or the monitor, first passed its threshold.
+    isolated : str
+        The fault that the monitor named at its first alarm; empty without one.
+    recovered : mapping of str to str
+        States of the plant as written that were recovered from the estimates, and what each of these estimates is:
+        ``exact``, ``needs the fault estimate`` (it is used) or ``biased by the disturbance``.
     warnings : tuple of str
         What a user should know about the data.
     digest : str
@@ -52,6 +55,8 @@ class DataRun:
     rows: int
     statuses: Mapping[str, int]
     alarms: Mapping[str, float]
+    isolated: str
+    recovered: Mapping[str, str]
     warnings: tuple[str, ...]
     digest: str
     table: pd.DataFrame | None = field(default=None, repr=False)
@@ -60,7 +65,8 @@ class DataRun:
         """Return the summary as plain data, without the table."""
         return {
             "rows": self.rows, "statuses": dict(self.statuses), "alarms": dict(self.alarms),
-            "warnings": list(self.warnings), "gains_sha256": self.digest,
+            "isolated": self.isolated, "recovered": dict(self.recovered), "warnings": list(self.warnings),
+            "gains_sha256": self.digest,
         }  # fmt: skip
 
 
@@ -72,21 +78,23 @@ def run_on_data(
     columns: Mapping[str, str] | None = None,
     scales: Mapping[str, float] | None = None,
     thresholds: Mapping[str, float] | None = None,
+    monitor: OnlineMonitor | None = None,
     gap: float | None = None,
     warm_up: float | None = None,
     state: str | Path | None = None,
     chunk_rows: int = CHUNK_ROWS,
     progress: Callable[[int], None] | None = None,
 ) -> DataRun:
-    """Run a linear design on measured data, in constant memory.
+    """Run a design on measured data, in constant memory.
 
     Each row of data gives one row of estimates.  The operating point is subtracted from the data and added back to
-    the estimates.  An estimate that lags has a column ``time of ...``: the time of which it is the estimate.
+    the estimates.  An estimate that lags has a column ``time of ...``: the time of which it is the estimate.  Where the
+    design is for a plant whose algebraic states were eliminated, these are recovered and stand beside the others.
 
     Parameters
     ----------
     design : ObserverDesign
-        A linear design.
+        Of any method.
     data : path, text stream or pandas.DataFrame
         With a column ``time`` in seconds and a column for each known input and output.  Files are CSV or Parquet by
         their suffix; a stream is CSV and is answered row by row.
@@ -95,11 +103,14 @@ def run_on_data(
     columns : mapping, optional
         Column of a signal (or of ``time``) where their names differ.
     scales : mapping, optional, signal's unit per column's unit
-        Factor of a signal's column.
+        Factor of a signal's column; by default the plant's.
     thresholds : mapping, optional
         Level of the absolute value by column of the output, such as ``fhat[actuator]`` or ``r[speed]`` (of faults
         with an operating point, of the deviation): the column ``alarm`` names those above their level.  Alarms are
-        suspended in rows that are not ``ok``.
+        suspended in rows that are not ``ok`` or ``partial``.
+    monitor : OnlineMonitor, optional
+        From `obsynth.online_monitor`: columns ``statistic`` and ``threshold``, and its alarms in ``alarm``, with the
+        fault that stands out.
     gap : float, optional, seconds
         Continuous-time designs: longer intervals are gaps; by default those ten times the longest one before.
     warm_up : float, optional, seconds
@@ -119,7 +130,7 @@ def run_on_data(
     Raises
     ------
     SpecError
-        The design is recursive, columns are missing, a cell is no number, a time is missing, repeated, decreasing or
+        Columns are missing, a cell is no number, a time is missing, repeated, decreasing or
         does not fit the design's dt (the row is named), or a file cannot be read or written.
 
     Notes
@@ -132,16 +143,32 @@ def run_on_data(
     the plant (it misses the outputs by more than their size before and after the gap, as an unstable one will in the
     end), and after every gap of a plant of index 2 or more, whose model cannot be propagated.  Intervals are rounded to
     the resolution of the time stamps.
+
+    Recursive and nonlinear designs take missing outputs themselves, with what they cost in the columns ``sd ...``
+    (standard deviations): a row without some outputs is ``partial``, one without all of them, or without an input, is a
+    ``gap``.  The first row is k = 0, of which recursive designs do not use the outputs.  Missing inputs are held;
+    the rows after that are ``recovering``.  ``r`` is the innovation at the parameters estimated one sample before
+    (whitened, for recursive designs).
     """
-    plant, observer = design.linear
+    require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
+    for name, value in (("columns", columns), ("scales", scales), ("thresholds", thresholds)):
+        require_mapping(value, name)
+    if monitor is not None:
+        require_kind(monitor, OnlineMonitor, "monitor", "what obsynth.online_monitor returns")
+    if state is not None:
+        require_kind(state, (str, Path), "state", "the name of a file")
+    if out is not None and not hasattr(out, "write"):
+        require_kind(out, (str, Path), "out", "the name of a file, or a text stream")
     if isinstance(chunk_rows, bool) or not isinstance(chunk_rows, int) or chunk_rows < 1:
         raise SpecError(f"chunk_rows is {chunk_rows!r}: give a whole number, 1 or more.", path="chunk_rows")
-    job = _Job(design, Signals.of(plant, observer, columns, scales), thresholds or {}, gap, warm_up)
+    engine = engine_of(design, gap=gap, warm_up=warm_up)
+    # The monitor is not used up: a second run may begin with it.
+    watched = None if monitor is None else copy.deepcopy(monitor)
+    job = Job(engine, Signals.of(engine, columns, scales), design.recovery, thresholds or {}, watched)
     digest = digest_of_gains(design)
     if state is not None and Path(state).exists():
-        resume_state(Path(state), job.observer, digest)
-    header = output_columns(observer, alarms=bool(thresholds))
-    with _sink(out, header) as sink:
+        resume_state(Path(state), job, digest)
+    with _sink(out, job.header) as sink:
         try:
             for chunk in chunks(data, job.signals, chunk_rows):
                 sink.write(job.take(chunk))
@@ -150,11 +177,15 @@ def run_on_data(
         finally:
             # What has left on a stream cannot be taken back, so the state goes with it.
             if state is not None and isinstance(sink, TextSink) and not isinstance(out, str | Path) and job.rows:
-                save_state(Path(state), job.observer, digest)
+                save_state(Path(state), job, digest)
     if state is not None:
-        save_state(Path(state), job.observer, digest)
+        save_state(Path(state), job, digest)
     table = sink.frame() if isinstance(sink, FrameSink) else None
-    return DataRun(job.rows, dict(job.statuses), dict(job.alarms), job.first.warnings(), digest, table)
+    recovered = {} if job.recovered is None else dict(job.recovered.flags)
+    return DataRun(
+        job.rows, dict(job.statuses), dict(job.alarms), job.isolated, recovered,
+        (*engine.notes, *job.first.warnings()), digest, table,
+    )  # fmt: skip
 
 
 @contextmanager
@@ -166,53 +197,3 @@ def _sink(out: str | Path | TextIO | None, header: tuple[str, ...]) -> Iterator[
         yield FrameSink(header)
     else:
         yield TextSink(out, header)
-
-
-class _Job:
-    """One run: rows of data to rows of output, and what is counted on the way."""
-
-    def __init__(
-        self, design: ObserverDesign, signals: Signals, thresholds: Mapping[str, float], gap: float | None,
-        warm_up: float | None,
-    ) -> None:  # fmt: skip
-        observer = design.linear[1]
-        names = estimate_columns(observer)
-        for name, level in thresholds.items():
-            if name not in names:
-                raise SpecError(f"There is no column {name!r} to watch: there are {', '.join(names)}.",
-                                path="thresholds")  # fmt: skip
-            if not (math.isfinite(level) and level > 0.0):
-                raise SpecError(f"The threshold of {name!r} is {level}: give a positive number.", path="thresholds")
-        self.signals, self.observer = signals, DataObserver(design, gap=gap, warm_up=warm_up)
-        self._levels = tuple((name, names.index(name), level) for name, level in thresholds.items())
-        self._lags = [delay * observer.dt for _, delay in delayed(observer)]
-        self._point = signals.estimates_point(observer)
-        self.first, self.rows = FirstSecond(signals), 0
-        self.statuses, self.alarms = Counter[str](), dict[str, float]()
-
-    def take(self, chunk: FloatArray) -> list[list[Any]]:
-        """Take rows ``[time, u, y]`` as read; return rows of output."""
-        times: list[float] = chunk[:, 0].tolist()
-        found = []
-        for time, deviations in zip(times, self.signals.scale * chunk[:, 1:] - self.signals.offset, strict=True):
-            found.append(self.observer.step(time, deviations, self.rows + 1))
-            self.rows += 1
-            self.first.take(time, deviations)
-        values: list[list[float]] = (np.array([row.values for row in found]) + self._point).tolist()
-        self.statuses.update(row.status for row in found)
-        rows: list[list[Any]] = [
-            [time, row.status, *(time - lag for lag in self._lags), *estimates]
-            for time, row, estimates in zip(times, found, values, strict=True)
-        ]
-        if self._levels:
-            for time, row, cells in zip(times, found, rows, strict=True):
-                cells.append(self._alarm(time, row))
-        return rows
-
-    def _alarm(self, time: float, found: Row) -> str:
-        above = [
-            name for name, i, level in self._levels if found.status == OK and np.abs(found.values[i]) > level
-        ]  # fmt: skip
-        for name in above:
-            self.alarms.setdefault(name, time)
-        return "; ".join(above)

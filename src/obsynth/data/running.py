@@ -5,23 +5,20 @@ from __future__ import annotations
 import math
 from collections import deque
 from functools import partial
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
 from obsynth.data.bridge import Bridge
 from obsynth.data.clock import Clock
-from obsynth.data.holds import KeptHolds, transient
+from obsynth.data.engine import GAP, LONGEST_BRIDGE, OK, RECOVERING, WARM_UP, Row, estimate_columns
+from obsynth.data.holds import KeptHolds, checked_warm_up, transient
+from obsynth.data.linear_signals import LinearSignals
 from obsynth.errors import ObsynthError, SpecError
+from obsynth.models.arguments import is_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.sampling import first_order_hold
 from obsynth.results.design import ObserverDesign
-
-#: What a row of estimates is.
-OK, WARM_UP, GAP, RECOVERING = "ok", "warm-up", "gap", "recovering"
-#: Gaps longer than this many samples are not bridged: the observer starts again.
-LONGEST_BRIDGE = 10_000
-
 
 _Part = TypeVar("_Part")
 
@@ -39,22 +36,7 @@ def _running(part: _Part | None) -> _Part:
     return part
 
 
-class Row(NamedTuple):
-    """Estimates at one row of data.
-
-    Parameters
-    ----------
-    status : str
-        ``ok``, ``warm-up``, ``gap`` or ``recovering``.
-    values : FloatArray
-        ``[xhat, fhat, r]``, deviations; NaN where nothing is known.
-    """
-
-    status: str
-    values: FloatArray
-
-
-class DataObserver:
+class DataObserver(LinearSignals):
     """A linear observer in motion on measured data.
 
     Parameters
@@ -74,16 +56,16 @@ class DataObserver:
     """
 
     def __init__(self, design: ObserverDesign, *, gap: float | None = None, warm_up: float | None = None) -> None:
-        self.plant, self.observer = design.linear
-        if gap is not None and not (math.isfinite(gap) and gap > 0.0):
-            raise SpecError(f"gap is {gap}: give seconds, a positive number.", path="gap")
-        if warm_up is not None and not (math.isfinite(warm_up) and warm_up >= 0.0):
-            raise SpecError(f"warm_up is {warm_up}: give seconds, 0 or more.", path="warm_up")
+        super().__init__(design)
+        if gap is not None and not (is_number(gap) and gap > 0.0):
+            raise SpecError(f"gap is {gap!r}: give seconds, a positive number.", path="gap")
         if gap is not None and self.observer.dt > 0.0:
             raise SpecError(
                 "gap is for continuous-time designs: a sampled one knows which rows are missing.", path="gap"
             )
-        self.warm_up = transient(self.observer) if warm_up is None else warm_up
+        self.warm_up = checked_warm_up(warm_up, transient(self.observer))
+        self.columns = estimate_columns(self.state_names, self.fault_names, self.observer.residual_names)
+        self.notes: tuple[str, ...] = ()
         self.clock = Clock(self.observer.dt, gap)
         self.bridge = Bridge.of(self.plant)
         lags = set(self.observer.state_delays) or {0}
@@ -148,12 +130,12 @@ class DataObserver:
             else:
                 found, status = self._unmeasured(seconds, u), GAP
         if status == GAP:
-            return Row(GAP, found)
+            return Row(GAP, found, missing)
         if self.z is None or not (np.isfinite(self.z).all() and np.isfinite(found).all()):
             self._restart()
-            return Row(GAP, self._held())
+            return Row(GAP, self._held(), missing)
         self.fault = found[self.observer.fault_rows].copy()
-        return Row(status, found)
+        return Row(status, found, missing)
 
     def _measured(self, seconds: float, v: FloatArray) -> FloatArray:
         if self.observer.dt == 0.0:

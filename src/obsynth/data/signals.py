@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
+from obsynth.data.engine import Engine
 from obsynth.errors import SpecError
-from obsynth.models.descriptor import DescriptorSystem
+from obsynth.models.arguments import is_number
 from obsynth.numerics.arrays import FloatArray, read_only
-from obsynth.observers.linear import LinearObserver
 
 #: The column of time stamps, in seconds.
 TIME = "time"
@@ -42,30 +41,27 @@ class Signals:
     @classmethod
     def of(
         cls,
-        plant: DescriptorSystem,
-        observer: LinearObserver,
+        engine: Engine,
         columns: Mapping[str, str] | None,
         scales: Mapping[str, float] | None,
     ) -> Signals:
-        """Return the signals that an observer reads.
+        """Return the signals that a design in motion reads.
 
         Parameters
         ----------
-        plant : DescriptorSystem
-            With the operating point.
-        observer : LinearObserver
-            What is run.
+        engine : Engine
+            What is run, with its operating point.
         columns : mapping or None
             Column of a signal, or of ``time``, where the two names differ.
         scales : mapping or None
-            Factor of a signal: the column's value times the factor is in the signal's unit.
+            Factor of a signal: the column's value times the factor is in the signal's unit; the plant's by default.
 
         Raises
         ------
         SpecError
             A key is no signal that is read, or a factor is not finite or zero.
         """
-        names = observer.input_names + observer.output_names
+        names = engine.input_names + engine.output_names
         renamed, factors = dict(columns or {}), dict(scales or {})
         unknown = [name for name in renamed if name not in (TIME, *names)]
         unknown += [name for name in factors if name not in names]
@@ -74,14 +70,14 @@ class Signals:
                 f"{unknown[0]!r} is no signal that this observer reads: it reads {', '.join(names)}.", path="columns"
             )
         for name, factor in factors.items():
-            if not math.isfinite(factor) or factor == 0.0:
-                raise SpecError(f"The scale of {name!r} is {factor}: give a finite number, not zero.", path="scales")
+            if not is_number(factor) or factor == 0.0:
+                raise SpecError(f"The scale of {name!r} is {factor!r}: give a finite number, not zero.", path="scales")
         return cls(
             names,
             tuple(renamed.get(name, name) for name in (TIME, *names)),
-            read_only(np.array([factors.get(name, 1.0) for name in names])),
-            read_only(np.array([plant.operating_point.get(name, 0.0) for name in names])),
-            dict(plant.operating_point),
+            read_only(np.array([factors.get(name, engine.scales.get(name, 1.0)) for name in names])),
+            read_only(np.array([engine.point.get(name, 0.0) for name in names])),
+            dict(engine.point),
         )
 
     def positions(self, header: tuple[str, ...]) -> list[int]:
@@ -101,7 +97,7 @@ class Signals:
         if missing:
             raise SpecError(
                 f"The data have no column {', '.join(map(repr, missing))}; they have "
-                f"{', '.join(map(repr, header)) or 'none'}. Map signals to columns where their names differ.",
+                f"{', '.join(map(repr, header)) or 'none'}. {_advice(header)}",
                 path="data",
             )
         repeated = sorted({name for name in self.columns if header.count(name) > 1})
@@ -109,47 +105,14 @@ class Signals:
             raise SpecError(f"The data have more than one column {', '.join(map(repr, repeated))}.", path="data")
         return [header.index(name) for name in self.columns]
 
-    def estimates_point(self, observer: LinearObserver) -> FloatArray:
-        """Return what is added to the rows ``[xhat, fhat, r]``: the operating point of states and faults."""
-        named = observer.state_names + observer.fault_names
-        values = [self.point.get(name, 0.0) for name in named] + [0.0] * len(observer.residual_names)
-        return np.array(values)
+    def estimates_point(self, engine: Engine) -> FloatArray:
+        """Return what is added to the columns of estimates: the operating point of states and faults."""
+        named = engine.state_names + engine.fault_names
+        values = [self.point.get(name, 0.0) for name in named]
+        return np.array(values + [0.0] * (len(engine.columns) - len(named)))
 
 
-def output_columns(observer: LinearObserver, *, alarms: bool) -> tuple[str, ...]:
-    """Return the header of the estimates.
-
-    Parameters
-    ----------
-    observer : LinearObserver
-        Whose estimates they are.
-    alarms : bool
-        Whether there is a column of alarms.
-
-    Returns
-    -------
-    tuple of str
-        ``time, status``, a column ``time of ...`` for each kind of estimate that lags, ``xhat[...]``, ``fhat[...]``,
-        ``r[...]`` and ``alarm``.
-    """
-    late = [f"time of {name}" for name, _ in delayed(observer)]
-    return (TIME, "status", *late, *estimate_columns(observer), *(("alarm",) if alarms else ()))
-
-
-def estimate_columns(observer: LinearObserver) -> tuple[str, ...]:
-    """Return the names of the rows ``[xhat, fhat, r]`` of an observer."""
-    return (
-        *(f"xhat[{name}]" for name in observer.state_names),
-        *(f"fhat[{name}]" for name in observer.fault_names),
-        *(f"r[{name}]" for name in observer.residual_names),
-    )
-
-
-def delayed(observer: LinearObserver) -> tuple[tuple[str, int], ...]:
-    """Return name and delay in samples of what lags: the states (together where they lag alike), and each fault."""
-    states = set(observer.state_delays)
-    found = [(f"xhat[{name}]", delay) for name, delay in zip(observer.state_names, observer.state_delays, strict=True)]
-    if len(states) == 1:
-        found = [("xhat", observer.state_delays[0])]
-    found += [(f"fhat[{name}]", delay) for name, delay in zip(observer.fault_names, observer.fault_delays, strict=True)]
-    return tuple((name, delay) for name, delay in found if delay)
+def _advice(header: tuple[str, ...]) -> str:
+    if len(header) == 1 and any(mark in header[0] for mark in ";\t|"):
+        return "Separate columns by commas."
+    return "Map signals to columns where their names differ."

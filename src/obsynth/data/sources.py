@@ -13,6 +13,7 @@ import numpy as np
 
 from obsynth.data.signals import Signals
 from obsynth.errors import SpecError
+from obsynth.models.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray
 
 if TYPE_CHECKING:
@@ -49,8 +50,13 @@ def chunks(data: Data, signals: Signals, rows: int) -> Iterator[FloatArray]:
         with _readable(path):
             frames = _parquet(path, signals, rows) if path.suffix.lower() == ".parquet" else _csv(path, rows)
             yield from _converted(frames, signals)
+    elif is_stream(data):
+        yield from _stream(data, signals)
     else:
-        yield from _stream(data, signals) if is_stream(data) else _converted(iter([data]), signals)
+        import pandas as pd
+
+        require_kind(data, pd.DataFrame, "data", "the name of a file, a text stream or a pandas.DataFrame")
+        yield from _converted(iter([data]), signals)
 
 
 def is_stream(data: TextIO | pd.DataFrame) -> TypeIs[TextIO]:
@@ -155,7 +161,9 @@ def _number(text: str | None, row: int, column: str) -> float:
     try:
         return float(text)
     except ValueError:
-        raise SpecError(f"Row {row}, column {column!r}: {text!r} is no number.", path=f"row {row}") from None
+        # What looks like a date is most likely the time.
+        advice = " Give the time in seconds." if ":" in text else ""
+        raise SpecError(f"Row {row}, column {column!r}: {text!r} is no number.{advice}", path=f"row {row}") from None
 
 
 def _stream(stream: TextIO, signals: Signals) -> Iterator[FloatArray]:

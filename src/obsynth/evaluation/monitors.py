@@ -23,6 +23,21 @@ STATEMENTS: Mapping[str, str] = {
     "cusum": "cumulative sum of the whitened residual: passed in a run without a fault with at most the stated "
     "probability, for Gaussian noise, after the start is forgotten",
 }
+#: What a statement adds for a continuous design.
+BETWEEN_SAMPLES = "; as far as outputs are straight lines between samples, where disturbances bend them"
+
+
+def statement_of(kind: str, *, continuous: bool) -> str:
+    """Return what a threshold promises.
+
+    Parameters
+    ----------
+    kind : str
+        One of `KINDS`.
+    continuous : bool
+        Whether the design is for continuous time.
+    """
+    return STATEMENTS[kind] + (BETWEEN_SAMPLES if continuous else "")
 
 
 @dataclass(frozen=True, eq=False)

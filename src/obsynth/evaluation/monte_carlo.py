@@ -18,6 +18,7 @@ from obsynth.evaluation.progress import Progress, shown_progress
 from obsynth.evaluation.recursive_bench import make_recursive_bench
 from obsynth.evaluation.recursive_monte_carlo import ParameterMonitor, RecursiveTask, recursive_tasks
 from obsynth.evaluation.simulating import aligned_errors, warm_up_ends
+from obsynth.models.arguments import is_number, require_kind
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear import LinearObserver
 from obsynth.results.design import ObserverDesign
@@ -127,10 +128,12 @@ def evaluate(
     PreconditionError
         As for `simulate`.
     """
+    require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
+    require_kind(scenario, Scenario, "scenario", "an obsynth.Scenario")
     if isinstance(runs, bool) or not isinstance(runs, int) or runs < 1:
         raise SpecError(f"runs is {runs!r}: give a whole number, 1 or more.", path="runs")
-    if not 0.0 < confidence < 1.0:
-        raise SpecError(f"confidence is {confidence}: give a number between 0 and 1.", path="confidence")
+    if not (is_number(confidence) and 0.0 < confidence < 1.0):
+        raise SpecError(f"confidence is {confidence!r}: give a number between 0 and 1.", path="confidence")
     seeds = range(scenario.seed, scenario.seed + runs)
     tasks: Sequence[_Task] | Sequence[RecursiveTask]
     if isinstance(design.observer, LinearObserver):

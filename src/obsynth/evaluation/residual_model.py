@@ -1,4 +1,4 @@
-"""What reaches the residual of a discrete design when nothing is wrong: disturbances, noise, an error at the start."""
+"""What reaches the residual of a design when nothing is wrong: disturbances, noise, an error at the start."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import cast
 import numpy as np
 
 from obsynth.errors import SpecError
+from obsynth.evaluation.sampled_residual import sampled_errors, tracked_errors
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.norms import output_covariance
 from obsynth.results.design import ObserverDesign
@@ -15,12 +16,11 @@ from obsynth.simulation.drive import resolve
 from obsynth.simulation.failures import Random, Uniform
 from obsynth.simulation.profiles import Additive, sampled
 from obsynth.simulation.scenario import Scenario
-from obsynth.verification.error_system import ErrorSystem
 
 
 @dataclass(frozen=True, eq=False)
 class ResidualModel:
-    """``e+ = A e + Bd d + Bw w``, ``r = C e + Dd d + Dw w`` without faults, w of unit covariance.
+    """``e+ = A e + Bd d + Bw w``, ``r = C e + Dd d + Dw w`` at the samples, without faults, w of unit covariance.
 
     Parameters
     ----------
@@ -30,13 +30,17 @@ class ResidualModel:
         Of the fault estimates.
     steps : int
         Samples of the scenario.
-    initial_error : float
-        Norm of e at the start of the scenario.
+    start : FloatArray
+        ``(n,)``: e at the start of the scenario.
     bounds, means, deviations : FloatArray
         ``(nd,)``: largest absolute value of each disturbance in the scenario (infinite if there is none), mean and
         standard deviation of what is random in it.
     steady : tuple of bool
         Whether each disturbance has no part but random ones over the whole record.
+    flow : tuple of FloatArray, optional
+        Of a continuous design: A and Bd in continuous time.
+    start_noise : FloatArray, optional
+        Of a continuous design, ``(n, any)``: what the noise w of the first sample (its first signals) adds to e there.
     """
 
     A: FloatArray
@@ -49,11 +53,18 @@ class ResidualModel:
     fault_Dd: FloatArray
     fault_Dw: FloatArray
     steps: int
-    initial_error: float
+    start: FloatArray
     bounds: FloatArray
     means: FloatArray
     deviations: FloatArray
     steady: tuple[bool, ...]
+    flow: tuple[FloatArray, FloatArray] | None = None
+    start_noise: FloatArray | None = None
+
+    @property
+    def initial_error(self) -> float:
+        """Norm of e at the start of the scenario."""
+        return float(np.linalg.norm(self.start))
 
     def powers(self) -> list[FloatArray]:
         """Return ``A^k`` for every sample."""
@@ -87,47 +98,45 @@ class ResidualModel:
 
 
 def residual_model(design: ObserverDesign, scenario: Scenario) -> ResidualModel:
-    """Return the model of a discrete design's residual on a scenario.
+    """Return the model of a design's residual on a scenario.
 
     Parameters
     ----------
     design : ObserverDesign
-        Of a linear method, discrete time.
+        Of a linear method.  Of a continuous one the residual at the samples, see `sampled_residual`.
     scenario : Scenario
         Whose disturbances, noise and start count.
 
     Raises
     ------
     SpecError
-        A continuous design, one without residuals, or one whose certificate has no tracking map.
+        A recursive design, one without residuals, or one whose certificate has no tracking map.
     """
     plant, observer = design.linear
-    if not plant.is_discrete:
-        raise SpecError(
-            "Thresholds are for discrete designs: what a continuous observer sees between samples has no bound here. "
-            "Sample the plant first (transform: {sample_time: ...}).", path="dt",
-        )  # fmt: skip
-    matrices = design.certificate.matrices
-    if "tracking" not in matrices or not observer.residual_names:
-        raise SpecError(f"Design {design.name!r} has no residual, or no tracking map.", path="observer")
     drive = resolve(plant, scenario)
     noisy = plant.replace(
         Bw=np.hstack([scenario.noise * plant.Bw, np.zeros((plant.nx, plant.ny))]),
         Dw=np.hstack([scenario.noise * plant.Dw, np.diag(drive.deviations)]),
         noise_names=None,
     )
-    # A fault model's states come after the plant's own in the map; they track no fault here.
-    tracking = matrices["tracking"][:, : plant.nx] if "Phi" in matrices else matrices["tracking"]
-    errors = ErrorSystem.of(noisy, observer, tracking, tracking.shape[1] // plant.nx - 1)
+    found = tracked_errors(design, noisy)
+    errors = found.errors
     start = np.array([scenario.initial_state.get(name, 0.0) for name in plant.state_names])
     begin = np.zeros(observer.order) if scenario.observer_state is None else np.array(scenario.observer_state)
-    initial = float(np.linalg.norm(tracking[:, : plant.nx] @ (plant.E @ start) - begin))
+    if len(begin) != observer.order:
+        raise SpecError(f"observer_state needs {observer.order} numbers, not {len(begin)}.", path="observer_state")
+    initial = found.tracking @ (plant.E @ start) - begin
     shown, _, direct_d, direct_w = errors.residual_output
     faults, _, faults_d, faults_w = errors.fault_output
     bounds, means, deviations, steady = _disturbances(scenario, plant.disturbance_names, drive.steps, drive.dt)
+    a, driven, noise, flow, start_noise = errors.Az, errors.disturbance, errors.noise, None, None
+    if not plant.is_discrete:
+        held, flow = sampled_errors(noisy, observer, found, drive.dt), (errors.Az, errors.disturbance)
+        a, driven, noise, start_noise = held.A, held.Bd, held.Bw, held.start
+        direct_w, faults_w = held.direct(observer.residual_rows), held.direct(observer.fault_rows)
     return ResidualModel(
-        errors.Az, -shown, errors.disturbance, direct_d, errors.noise, direct_w, -faults, faults_d, faults_w,
-        drive.steps, initial, bounds, means, deviations, steady,
+        a, -shown, driven, direct_d, noise, direct_w, -faults, faults_d, faults_w,
+        drive.steps, initial, bounds, means, deviations, steady, flow, start_noise,
     )  # fmt: skip
 
 

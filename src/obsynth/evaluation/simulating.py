@@ -10,6 +10,7 @@ import numpy as np
 
 from obsynth.evaluation.bench import Bench, make_bench
 from obsynth.evaluation.columns import named_columns, write_columns
+from obsynth.models.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.linear import Estimates, LinearObserver
 from obsynth.results.design import ObserverDesign
@@ -160,6 +161,8 @@ def simulate(design: ObserverDesign, scenario: Scenario) -> Simulation | Recursi
     taken as linear between samples.  The continuous observer runs on the samples, by a first-order hold.  A DAE is
     integrated by Radau IIA (fifth order) with inputs that are constant during each step, whatever its observer uses.
     """
+    require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
+    require_kind(scenario, Scenario, "scenario", "an obsynth.Scenario")
     if not isinstance(design.observer, LinearObserver):
         from obsynth.evaluation.recursive_simulating import simulate_recursive
 

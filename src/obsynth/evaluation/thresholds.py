@@ -2,16 +2,38 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.evaluation.residual_model import ResidualModel
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.norms import hinf_norm
+from obsynth.numerics.peak_gain import peak_gain
 
 
-def scaled_inputs(model: ResidualModel, bounds: FloatArray, noise_bound: float | None) -> tuple[FloatArray, FloatArray]:
-    """Return B and D with every input scaled to at most one in absolute value.
+class ScaledInputs(NamedTuple):
+    """What drives a residual, each input scaled to at most one in absolute value.
+
+    Parameters
+    ----------
+    B, D : FloatArray
+        Inputs that change from sample to sample, ``(n, m)`` and ``(nr, m)``.
+    constant : float
+        What disturbances of any shape in continuous time add to the norm of the residual, at most.
+    start : FloatArray
+        ``(n, any)``: inputs of the first sample alone, straight to the error.
+    """
+
+    B: FloatArray
+    D: FloatArray
+    constant: float
+    start: FloatArray
+
+
+def scaled_inputs(model: ResidualModel, bounds: FloatArray, noise_bound: float | None) -> ScaledInputs:
+    """Return what drives the residual, with every input scaled to at most one in absolute value.
 
     Parameters
     ----------
@@ -40,7 +62,15 @@ def scaled_inputs(model: ResidualModel, bounds: FloatArray, noise_bound: float |
         )  # fmt: skip
     sizes = np.where(reached, bounds, 0.0)
     factor = 0.0 if noise_bound is None else noise_bound
-    return np.hstack([model.Bd * sizes, factor * model.Bw]), np.hstack([model.Dd * sizes, factor * model.Dw])
+    if model.flow is None:
+        return ScaledInputs(
+            np.hstack([model.Bd * sizes, factor * model.Bw]), np.hstack([model.Dd * sizes, factor * model.Dw]), 0.0,
+            np.zeros((len(model.A), 0)),
+        )  # fmt: skip
+    a, driven = model.flow
+    peaks = peak_gain(a, driven * sizes, model.C) + np.linalg.norm(model.Dd * sizes, axis=0)
+    noisy = np.zeros((len(a), 0)) if model.start_noise is None else factor * model.start_noise
+    return ScaledInputs(factor * model.Bw, factor * model.Dw, float(np.sum(peaks)), noisy)
 
 
 def paper_threshold(model: ResidualModel, bounds: FloatArray, initial_error: float, gamma: float | None) -> FloatArray:
@@ -62,6 +92,9 @@ def paper_threshold(model: ResidualModel, bounds: FloatArray, initial_error: flo
     SpecError
         A disturbance has no bound.
     """
+    if model.flow is not None:
+        raise SpecError("Eq. (66) is for discrete designs: use kind='pointwise', or sample the plant first.",
+                        path="kind")  # fmt: skip
     if not np.isfinite(bounds).all():
         raise SpecError("The paper's threshold needs a bound of each disturbance.", path="disturbance_bounds")
     gain = hinf_norm(model.A, model.Bd, model.C, model.Dd).upper if gamma is None else gamma
@@ -69,47 +102,53 @@ def paper_threshold(model: ResidualModel, bounds: FloatArray, initial_error: flo
     return np.hypot(gain * float(np.linalg.norm(bounds)), float(np.linalg.norm(model.C, 2)) * decay * initial_error)
 
 
-def pointwise_threshold(model: ResidualModel, B: FloatArray, D: FloatArray, initial_error: float) -> FloatArray:
+def pointwise_threshold(model: ResidualModel, inputs: ScaledInputs, initial_error: float) -> FloatArray:
     """Return what the norm of the residual never passes: exact initial-error term and l1 (peak) gains of each input.
 
     Parameters
     ----------
     model : ResidualModel
         The residual's.
-    B, D : FloatArray
-        Inputs of at most one in absolute value, see `scaled_inputs`.
+    inputs : ScaledInputs
+        From `scaled_inputs`.
     initial_error : float
         Norm of the error at the start, at most.
     """
     powers = model.powers()
     start = np.array([np.linalg.norm(model.C @ power, 2) for power in powers]) * initial_error
-    gathered = np.array([np.sum(np.linalg.norm(model.C @ power @ B, axis=0)) for power in powers])
+    start += np.array([np.sum(np.linalg.norm(model.C @ power @ inputs.start, axis=0)) for power in powers])
+    gathered = np.array([np.sum(np.linalg.norm(model.C @ power @ inputs.B, axis=0)) for power in powers])
     earlier = np.concatenate([[0.0], np.cumsum(gathered)[:-1]])
-    return np.asarray(start + earlier + np.sum(np.linalg.norm(D, axis=0)))
+    return np.asarray(start + earlier + np.sum(np.linalg.norm(inputs.D, axis=0)) + inputs.constant)
 
 
-def window_threshold(
-    model: ResidualModel, B: FloatArray, D: FloatArray, initial_error: float, window: int
-) -> FloatArray:
+def window_threshold(model: ResidualModel, inputs: ScaledInputs, initial_error: float, window: int) -> FloatArray:
     """Return what the l2 norm of the residual over the last ``window`` samples never passes.
 
     The inputs give at most their l2 gain times ``sqrt(window m)``; the error at the window's start gives the square
-    root of its energy, bounded as the pointwise bound is.
+    root of its energy, bounded as the pointwise bound is.  No window has more than the pointwise bounds of its samples,
+    summed up in squares: that is used where it is less, and for continuous designs, whose disturbances may do anything
+    between samples.
 
     Parameters
     ----------
     model : ResidualModel
         The residual's.
-    B, D : FloatArray
-        m inputs of at most one in absolute value.
+    inputs : ScaledInputs
+        From `scaled_inputs`.
     initial_error : float
         Norm of the error at the start, at most.
     window : int
         Samples.
     """
+    one_by_one = pointwise_threshold(model, inputs, initial_error)
+    summed = np.array([np.linalg.norm(one_by_one[max(k - window + 1, 0) : k + 1]) for k in range(model.steps)])
+    if model.flow is not None:
+        return summed
+    B, D = inputs.B, inputs.D
     powers = model.powers()
-    inputs = int(np.sum(np.any(B != 0.0, axis=0) | np.any(D != 0.0, axis=0)))
-    gain = hinf_norm(model.A, B, model.C, D).upper if inputs else 0.0
+    count = int(np.sum(np.any(B != 0.0, axis=0) | np.any(D != 0.0, axis=0)))
+    gain = hinf_norm(model.A, B, model.C, D).upper if count else 0.0
     bound = np.empty(model.steps)
     energy = np.zeros_like(model.A)
     roots = []
@@ -120,7 +159,7 @@ def window_threshold(
         roots.append(np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T)
     for k in range(model.steps):
         length = min(window, k + 1)
-        bound[k] = gain * np.sqrt(length * inputs) + (
+        bound[k] = gain * np.sqrt(length * count) + (
             0.0 if k + 1 > window else float(np.linalg.norm(roots[length - 1], 2)) * initial_error
         )
     full = roots[-1]
@@ -128,4 +167,4 @@ def window_threshold(
     for k in range(window, model.steps):
         begin = k - window + 1
         bound[k] += float(np.linalg.norm(full @ powers[begin], 2)) * initial_error + gathered[begin]
-    return bound
+    return np.asarray(np.minimum(bound, summed))

@@ -9,10 +9,11 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.evaluation.bench import Bench, make_bench
-from obsynth.evaluation.monitors import KINDS, STATEMENTS, Monitor
+from obsynth.evaluation.monitors import KINDS, Monitor, statement_of
 from obsynth.evaluation.residual_model import ResidualModel, residual_model
 from obsynth.evaluation.thresholds import paper_threshold, pointwise_threshold, scaled_inputs, window_threshold
 from obsynth.evaluation.whitening import innovation_whitener, settled, steady_mean, whitener_of, window_covariance
+from obsynth.models.arguments import is_number, require_kind, require_mapping
 from obsynth.models.names import index_of
 from obsynth.numerics.arrays import FloatArray
 from obsynth.results.design import ObserverDesign
@@ -36,14 +37,14 @@ def monitor(
     change: float = 1.0,
     isolation_delay: int = 0,
 ) -> Monitor:
-    """Return a threshold for the residual of a discrete design, and the statistic it belongs to.
+    """Return a threshold for the residual of a linear design, and the statistic it belongs to.
 
     Parameters
     ----------
     design : ObserverDesign
-        Of a linear method, discrete time, with residuals.
+        Of a linear method, with residuals.
     scenario : Scenario
-        Its length, start, disturbances and noise count; its faults do not.
+        Its length, sampling, inputs, start, disturbances and noise count; its faults do not.
     kind : {"pointwise", "paper", "window", "chi-square", "cusum"}, optional
         ``pointwise``: norm of the residual against its l1 (peak) bound, never passed without a fault.  ``paper``: the
         same norm against (66) with the norm of the power, which is not a pointwise bound.  ``window``: l2 norm over a
@@ -76,57 +77,80 @@ def monitor(
     Raises
     ------
     SpecError
-        A continuous or recursive design, an option out of range, a signal without a bound (or without a covariance),
-        or a record that is too short.
+        A recursive design, an option out of range, a signal without a bound (or without a covariance), or a record that
+        is too short; the paper's threshold for a continuous design.
+
+    Notes
+    -----
+    Of a continuous design, the pointwise bound is that of the observer in continuous time, for disturbances of any
+    shape within their bounds: a rigorous bound on its peak gain, with what the known inputs and the plant's start alone
+    do to the sampled observer (which takes them as straight lines between samples) computed and added.  What the
+    curvature of the response to disturbances does between samples is not in it: sample fast enough, as the statement
+    says.  The statistical kinds use disturbances that are held between samples, and exact covariances of the noise.
     """
+    require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
+    require_kind(scenario, Scenario, "scenario", "an obsynth.Scenario")
+    require_mapping(disturbance_bounds, "disturbance_bounds")
     if kind not in KINDS:
         raise SpecError(f"kind is {kind!r}: use one of {', '.join(KINDS)}.", path="kind")
-    _require_options(noise_bound, initial_error, gamma, window, false_alarms, change, isolation_delay)
+    require_options(noise_bound, initial_error, gamma, window, false_alarms, change, isolation_delay)
     model = residual_model(design, scenario)
     start = model.initial_error if initial_error is None else float(initial_error)
-    bounds = _bounds(design, model, disturbance_bounds)
+    bounds = bounds_of(design, model, disturbance_bounds)
     whitener, mean = np.zeros((0, 0)), np.zeros(len(model.C))
     if kind == "paper":
         threshold = paper_threshold(model, bounds, start, gamma)
     elif kind in ("pointwise", "window"):
         inputs = scaled_inputs(model, bounds, noise_bound)
         threshold = (
-            pointwise_threshold(model, *inputs, start)
+            pointwise_threshold(model, inputs, start)
             if kind == "pointwise"
-            else window_threshold(model, *inputs, start, window)
+            else window_threshold(model, inputs, start, window)
         )
     else:
         covariance = window_covariance(model, window)
         whitener = whitener_of(covariance) if kind == "chi-square" else innovation_whitener(covariance, len(model.C))
         mean, threshold = steady_mean(model), _statistical(kind, model, len(whitener), start, window, false_alarms)
+    bench = make_bench(design, scenario)
+    if model.flow is not None:
+        threshold = threshold + _straight_lines(design, scenario, model, kind, window)
     return Monitor(
-        kind, STATEMENTS[kind], threshold, _floor(make_bench(design, scenario), scenario), design.linear[0].dt, window,
+        kind, statement_of(kind, continuous=model.flow is not None), threshold, _floor(bench, scenario), bench.drive.dt,
+        window,
         mean, whitener, float(change), model.fault_scales(), design.linear[1].fault_names, isolation_delay,
     )  # fmt: skip
 
 
-def _require_options(
+def require_options(
     noise_bound: float | None, initial_error: float | None, gamma: float | None, window: int, false_alarms: float,
     change: float, isolation_delay: int,
 ) -> None:  # fmt: skip
+    """Raise `SpecError` where an option of a monitor is out of range."""
     for name, value in (("noise_bound", noise_bound), ("initial_error", initial_error), ("gamma", gamma)):
-        if value is not None and not (math.isfinite(value) and value >= 0.0):
-            raise SpecError(f"{name} is {value}: give a number, 0 or more.", path=name)
+        if value is not None and not (is_number(value) and value >= 0.0):
+            raise SpecError(f"{name} is {value!r}: give a number, 0 or more.", path=name)
     for name, count, least in (("window", window, 1), ("isolation_delay", isolation_delay, 0)):
         if isinstance(count, bool) or not isinstance(count, int) or count < least:
             raise SpecError(f"{name} is {count!r}: give a whole number of samples, {least} or more.", path=name)
-    if not 0.0 < false_alarms < 1.0:
-        raise SpecError(f"false_alarms is {false_alarms}: give a probability between 0 and 1.", path="false_alarms")
-    if not (math.isfinite(change) and change > 0.0):
-        raise SpecError(f"change is {change}: give a positive number of deviations.", path="change")
+    if not (is_number(false_alarms) and 0.0 < false_alarms < 1.0):
+        raise SpecError(f"false_alarms is {false_alarms!r}: give a probability between 0 and 1.", path="false_alarms")
+    if not (is_number(change) and change > 0.0):
+        raise SpecError(f"change is {change!r}: give a positive number of deviations.", path="change")
 
 
-def _bounds(design: ObserverDesign, model: ResidualModel, given: Mapping[str, float] | None) -> FloatArray:
+def bounds_of(design: ObserverDesign, model: ResidualModel, given: Mapping[str, float] | None) -> FloatArray:
+    """Return the largest absolute value of each disturbance ``(nd,)``: the scenario's, or what is given.
+
+    Raises
+    ------
+    SpecError
+        A name is unknown, or a bound negative.
+    """
     bounds = model.bounds.copy()
     for name, value in (given or {}).items():
         place = index_of(name, design.linear[0].disturbance_names, what="disturbance_bounds")
-        if not (math.isfinite(value) and value >= 0.0):
-            raise SpecError(f"The bound of {name!r} is {value}: give a number, 0 or more.", path="disturbance_bounds")
+        if not (is_number(value) and value >= 0.0):
+            raise SpecError(f"The bound of {name!r} is {value!r}: give a number, 0 or more.", path="disturbance_bounds")
         bounds[place] = float(value)
     return bounds
 
@@ -156,3 +180,21 @@ def _floor(bench: Bench, scenario: Scenario) -> float:
         + np.abs(runs.inputs) @ np.abs(bench.observer.Du[rows]).T
     )
     return ROUNDING_SHARE * float(np.max(np.linalg.norm(size, axis=2)))
+
+
+def _straight_lines(
+    design: ObserverDesign, scenario: Scenario, model: ResidualModel, kind: str, window: int
+) -> FloatArray:
+    """Return what straight lines between samples add to a norm of the residual: known inputs and start alone."""
+    if kind not in ("pointwise", "window"):
+        return np.zeros(model.steps)
+    calm = scenario.replace(faults={}, sensors={}, disturbances={}, noise=0.0, sensor_noise={})
+    bench = make_bench(design, calm)
+    residuals = bench.run([scenario.seed]).rows[:, 0, bench.observer.residual_rows]
+    sizes = np.array([
+        np.linalg.norm(residual - model.C @ power @ model.start)
+        for residual, power in zip(residuals, model.powers(), strict=True)
+    ])  # fmt: skip
+    if kind == "pointwise":
+        return sizes
+    return np.array([np.linalg.norm(sizes[max(k - window + 1, 0) : k + 1]) for k in range(model.steps)])

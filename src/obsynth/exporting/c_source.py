@@ -46,11 +46,12 @@ def header_text(found: Realisation, prefix: str) -> str:
     before, after = found.operating_point
     lines = [
         _comment(f"Observer {_quoted(found.design.name)} by {_quoted(found.design.method)}, written by obsynth."),
-        f"#ifndef {guard}", f"#define {guard}", "",
+        *([_comment(found.note)] if found.note else []), f"#ifndef {guard}", f"#define {guard}", "",
         _comment("sha256 of the gain set"), f'#define {prefix.upper()}_SHA256 "{found.digest}"',
         _comment("seconds between samples"), f"#define {prefix.upper()}_DT {observer.dt!r}",
         "", "typedef struct {", f"    double z[{max(observer.order, 1)}];", f"}} {prefix}_state;", "",
-        _comment("Start at rest."), f"void {prefix}_reset({prefix}_state *state);", "",
+        _comment("Start where the design does." if found.start.any() else "Start at rest."),
+        f"void {prefix}_reset({prefix}_state *state);", "",
         _comment("Take one sample of each signal, write the estimates at that sample, and advance."),
         _comment("Signals are deviations from the operating point. Returns 0; or 1 if a sample is not finite:"),
         _comment("the state and the estimates are left as they were then."),
@@ -95,13 +96,22 @@ def source_text(found: Realisation, prefix: str, header: str) -> str:
     copy = [f"    for (i = 0; i < {sizes['z']}; i++) {{", "        state->z[i] = next[i];", "    }"]
     return "\n".join([
         _comment(f"sha256 of the gain set: {found.digest}"), f'#include "{_include(header)}"', "", "#include <math.h>",
-        "", *tables, f"void {prefix}_reset({prefix}_state *state)", "{", "    int i;",
-        f"    for (i = 0; i < {max(sizes['z'], 1)}; i++) {{", "        state->z[i] = 0.0;", "    }", "}", "",
+        "", *tables, *_reset(found, prefix),
         _step_signature(found, prefix), "{", "    int i;", *(["    int j;"] if any(sizes.values()) else []),
         *([f"    double next[{sizes['z']}];"] if sizes["z"] else []),
         *([] if sizes["z"] else ["    (void)state;"]),
         *_guards(sizes), *body, *(copy if sizes["z"] else []), "    return 0;", "}",
     ]) + "\n"  # fmt: skip
+
+
+def _reset(found: Realisation, prefix: str) -> Iterator[str]:
+    start = "0.0"
+    if found.start.any():
+        yield from _table("start", found.start.reshape(1, -1))
+        start = "start[0][i]"
+    yield f"void {prefix}_reset({prefix}_state *state)"
+    yield from ("{", "    int i;", f"    for (i = 0; i < {max(found.observer.order, 1)}; i++) {{")
+    yield from (f"        state->z[i] = {start};", "    }", "}", "")
 
 
 def _guards(sizes: dict[str, int]) -> Iterator[str]:

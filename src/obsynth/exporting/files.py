@@ -11,6 +11,7 @@ from obsynth.errors import SpecError
 from obsynth.exporting.c_source import c_identifier, header_text, source_text
 from obsynth.exporting.dae_c_source import write_dae_c
 from obsynth.exporting.realisation import Realisation
+from obsynth.models.arguments import require_kind
 from obsynth.observers.dae import DAEObserver
 from obsynth.results.design import ObserverDesign
 from obsynth.results.serialise import write_atomically
@@ -19,12 +20,13 @@ SUFFIXES = (".mat", ".npz", ".c")
 
 
 def export(design: ObserverDesign, path: str | Path, *, sample_time: float | None = None) -> tuple[Path, ...]:
-    """Write the observer of a linear design for MATLAB and Simulink, for numpy, or as C99.
+    """Write the observer of a design for MATLAB and Simulink, for numpy, or as C99.
 
     Parameters
     ----------
     design : ObserverDesign
-        A linear design.
+        Linear, or recursive for a time-invariant plant: then the steady state of its recursion, which is what it is
+        once the covariances have settled.
     path : path
         Its suffix says what is written.  ``.mat`` and ``.npz``: ``A (nz, nz)``, ``B (nz, nu + ny)``, ``C``, ``D``,
         ``x0 (nz, 1)`` and ``Ts`` (seconds, 0 for continuous time) of the system from ``[u; y]`` to
@@ -43,13 +45,16 @@ def export(design: ObserverDesign, path: str | Path, *, sample_time: float | Non
     Raises
     ------
     SpecError
-        The design is recursive, the suffix is unknown, the sample time is missing or does not fit, or a file cannot
-        be written.
+        A plant or its noise changes with k, the plant is nonlinear, the suffix is unknown, the sample time is missing
+        or does not fit, or a file cannot be written.
+    PreconditionError, SolverError
+        A recursive design has no stable steady state, or none that is reached.
 
     Notes
     -----
     Every file holds the sha256 digest of the gain set.  Signals are deviations from the operating point.
     """
+    require_kind(path, (str, Path), "path", "the name of a file")
     target = Path(path)
     suffix = target.suffix.lower()
     if suffix not in SUFFIXES:

@@ -8,11 +8,22 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
+from obsynth.models.arguments import require_kind
+from obsynth.models.dae import DAEModel
 from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.dae import DAEObserver
 from obsynth.observers.linear import LinearObserver
+from obsynth.observers.recursive import RecursiveObserver
 from obsynth.observers.sampling import sample_observer
+from obsynth.observers.steady import steady_observer
 from obsynth.results.design import ObserverDesign
 from obsynth.results.serialise import design_as_dict
+
+#: What a file says about the steady state of a recursion.
+STEADY = (
+    "The steady state of a recursive design: its estimates are those of the recursion once the covariances have "
+    "settled, and it takes complete samples only."
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,16 +33,22 @@ class Realisation:
     Parameters
     ----------
     design : ObserverDesign
-        Linear.
+        Linear, or recursive for a time-invariant plant.
     observer : LinearObserver
-        Its observer, sampled if that was asked for.
+        Its observer, sampled if that was asked for, or the steady state of its recursion.
     digest : str
         sha256 of the gain set.
+    start : FloatArray
+        ``z(0)``.
+    note : str
+        What a reader must know; may be empty.
     """
 
     design: ObserverDesign
     observer: LinearObserver
     digest: str
+    start: FloatArray
+    note: str = ""
 
     @classmethod
     def of(cls, design: ObserverDesign, sample_time: float | None) -> Realisation:
@@ -40,15 +57,30 @@ class Realisation:
         Parameters
         ----------
         design : ObserverDesign
-            Linear.
+            Linear, or recursive.
         sample_time : float or None
             Seconds; samples a continuous-time observer by a first-order hold.
 
         Raises
         ------
         SpecError
-            The design is recursive, or the sample time is not positive or does not fit a sampled design.
+            The plant or its noise changes with k, the design is nonlinear, or the sample time is not positive or does
+            not fit a sampled design.
+        PreconditionError, SolverError
+            A recursive design has no stable steady state.
         """
+        require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
+        digest = str(design_as_dict(design)["sha256"])
+        if isinstance(design.observer, RecursiveObserver):
+            found = steady_observer(design.observer)
+            if sample_time is not None:
+                raise SpecError("A recursive design is sampled already: leave the sample time out.", path="sample_time")
+            return cls(design, found.observer, digest, found.start, STEADY)
+        if isinstance(design.observer, DAEObserver):
+            raise SpecError(
+                f"Design {design.name!r} is for a nonlinear plant: it has no constant gains to write. Run it with "
+                "obsynth run, or with observer.step.", path="observer",
+            )  # fmt: skip
         _, observer = design.linear
         if sample_time is not None:
             if observer.dt > 0.0:
@@ -57,7 +89,7 @@ class Realisation:
                     path="sample_time",
                 )
             observer = sample_observer(observer, sample_time)
-        return cls(design, observer, str(design_as_dict(design)["sha256"]))
+        return cls(design, observer, digest, np.zeros(observer.order))
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -74,7 +106,8 @@ class Realisation:
     @property
     def operating_point(self) -> tuple[FloatArray, FloatArray]:
         """The operating point of inputs and of outputs: inputs are deviations from it, outputs as well."""
-        point = self.design.linear[0].operating_point
+        plant = self.design.plant
+        point = {} if isinstance(plant, DAEModel) else plant.operating_point
         estimated = self.observer.state_names + self.observer.fault_names
         after = [point.get(name, 0.0) for name in estimated] + [0.0] * len(self.observer.residual_names)
         return np.array([point.get(name, 0.0) for name in self.inputs]), np.array(after)
@@ -85,7 +118,7 @@ class Realisation:
         before, after = self.operating_point
         return {
             "A": observer.Az, "B": np.hstack([observer.Bu, observer.By]), "C": observer.Cz,
-            "D": np.hstack([observer.Du, observer.Dy]), "x0": np.zeros((observer.order, 1)), "Ts": observer.dt,
+            "D": np.hstack([observer.Du, observer.Dy]), "x0": self.start.reshape(-1, 1), "Ts": observer.dt,
             "input_point": before, "output_point": after,
             "delays": np.array([*observer.state_delays, *observer.fault_delays], dtype=np.float64),
             "input_names": list(self.inputs), "output_names": list(self.outputs),

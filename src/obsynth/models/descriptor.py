@@ -15,6 +15,7 @@ from obsynth.models.validation import (
     Problems,
     checked_dt,
     checked_point,
+    checked_scales,
     checked_units,
     expected_shapes,
     matrix_or_picks,
@@ -63,6 +64,8 @@ class DescriptorSystem:
         Signal names; ``x1, x2, ...`` and so on by default.
     operating_point : mapping, optional
         Value of named signals at the point where a linear model was taken, in the signal's unit.
+    scales : mapping, optional
+        Factor of named inputs and outputs: what a log holds, times the factor, is in the signal's unit.
     units : mapping, optional
         Unit of named signals, as text.
 
@@ -98,6 +101,7 @@ class DescriptorSystem:
     disturbance_names: tuple[str, ...]
     noise_names: tuple[str, ...]
     operating_point: Mapping[str, float]
+    scales: Mapping[str, float]
     units: Mapping[str, str]
 
     def __init__(
@@ -122,6 +126,7 @@ class DescriptorSystem:
         disturbance_names: Sequence[str] | None = None,
         noise_names: Sequence[str] | None = None,
         operating_point: Mapping[str, float] | None = None,
+        scales: Mapping[str, float] | None = None,
         units: Mapping[str, str] | None = None,
     ) -> None:
         problems = Problems()
@@ -152,6 +157,8 @@ class DescriptorSystem:
         problems.raise_if_any()
         known = {name for field in ("state_names", *named) for name in values[field]}
         values["operating_point"] = problems.collect(lambda: checked_point(operating_point, known))
+        measured = {*values["input_names"], *values["output_names"]}
+        values["scales"] = problems.collect(lambda: checked_scales(scales, measured))
         values["units"] = problems.collect(lambda: checked_units(units, known))
         problems.raise_if_any()
         for field, value in values.items():

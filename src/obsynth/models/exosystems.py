@@ -62,9 +62,10 @@ def exosystem(data: Any, fault_names: Sequence[str], dt: float) -> Exosystem:
     Raises
     ------
     SpecError
-        A model is malformed, names an unknown fault, or a fault has none.
+        A model is malformed, names an unknown fault, oscillates too fast for the samples, or a fault has none.
     """
     models = _by_fault(data, fault_names)
+    _require_below_nyquist(fault_names, models, dt)
     count = sum(model.order for model in models)
     phi, cw = np.zeros((count, count)), np.zeros((len(models), count))
     names: list[str] = []
@@ -78,6 +79,23 @@ def exosystem(data: Any, fault_names: Sequence[str], dt: float) -> Exosystem:
         start += model.order
     descriptions = tuple(model.description for model in models)
     return Exosystem(read_only(phi), read_only(cw), tuple(names), np.array(values, dtype=np.complex128), descriptions)
+
+
+def _require_below_nyquist(names: Sequence[str], models: Sequence[FaultModel], dt: float) -> None:
+    """Raise for a course in continuous time that samples cannot tell from a slower one."""
+    if dt == 0.0:
+        return
+    problems = []
+    for name, model in zip(names, models, strict=True):
+        fastest = 0.0 if model.sampled else float(np.max(np.abs(model.eigenvalues(0.0).imag), initial=0.0))
+        if fastest * dt >= np.pi:
+            problems.append(
+                f"the model of {name!r} ({model.description}) oscillates with {fastest:.6g} rad/s, but samples every "
+                f"{dt:g} s show only what is slower than {np.pi / dt:.6g} rad/s (Nyquist): sample faster, or give the "
+                "frequency that the samples show."
+            )
+    if problems:
+        raise SpecError("fault_model:", path="fault_model", problems=problems)
 
 
 def _by_fault(data: Any, fault_names: Sequence[str]) -> list[FaultModel]:

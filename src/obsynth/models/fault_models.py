@@ -14,7 +14,12 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.models.fault_model_spectra import MULTIPLE_EIGENVALUE, SAME_EIGENVALUE, distinct_eigenvalues
+from obsynth.models.fault_model_spectra import (
+    MULTIPLE_EIGENVALUE,
+    SAME_EIGENVALUE,
+    balanced_transition,
+    distinct_eigenvalues,
+)
 from obsynth.numerics.arrays import ComplexArray, FloatArray, as_matrix, read_only
 from obsynth.numerics.ranks import decide_rank
 
@@ -235,8 +240,11 @@ def fault_model(data: Any) -> FaultModel:
 
 
 def _observable(model: FaultModel) -> FaultModel:
+    balanced, states = balanced_transition(model.Phi)
+    shown = model.Cw * states
+    size = float(np.linalg.norm(balanced, 2)) / (float(np.linalg.norm(shown)) or 1.0)
     for value in model.eigenvalues(0.0):
-        tested = np.vstack([model.Phi - value * np.eye(model.order), model.Cw.astype(complex)])
+        tested = np.vstack([balanced - value * np.eye(model.order), (size or 1.0) * shown.astype(complex)])
         if not decide_rank(tested, expected=model.order, equilibrated=False).full:
             raise SpecError(
                 f"Some state of the fault model ({model.description}) never shows in the fault, at the eigenvalue "

@@ -22,7 +22,7 @@ from obsynth.models.time_varying_checks import (
     missing,
     positive_dt,
 )
-from obsynth.models.validation import Problems, checked_units
+from obsynth.models.validation import Problems, checked_point, checked_scales, checked_units
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -57,6 +57,10 @@ class TimeVaryingDescriptorSystem:
         Names and values that expressions may use besides ``k``.
     state_names, input_names, output_names, parameter_names : list of str, optional
         Signal names; ``x1, x2, ...``, ``u1``, ``y1`` and ``theta1`` by default.
+    operating_point : mapping, optional
+        Value of named signals at the point of which the signals are deviations, in the signal's unit.
+    scales : mapping, optional
+        Factor of named inputs and outputs: what a log holds, times the factor, is in the signal's unit.
     units : mapping, optional
         Unit of named signals, as text.
 
@@ -89,6 +93,8 @@ class TimeVaryingDescriptorSystem:
     input_names: tuple[str, ...]
     output_names: tuple[str, ...]
     parameter_names: tuple[str, ...]
+    operating_point: Mapping[str, float]
+    scales: Mapping[str, float]
     units: Mapping[str, str]
 
     def __init__(
@@ -107,6 +113,8 @@ class TimeVaryingDescriptorSystem:
         input_names: Sequence[str] | None = None,
         output_names: Sequence[str] | None = None,
         parameter_names: Sequence[str] | None = None,
+        operating_point: Mapping[str, float] | None = None,
+        scales: Mapping[str, float] | None = None,
         units: Mapping[str, str] | None = None,
     ) -> None:
         problems = Problems()
@@ -134,6 +142,9 @@ class TimeVaryingDescriptorSystem:
             fields[field] = problems.collect(partial(checked_names, names, sizes[signal], prefix=signal, what=field))
         problems.raise_if_any()
         signals = {name for field in named for name in fields[field]}
+        fields["operating_point"] = problems.collect(lambda: checked_point(operating_point, signals))
+        measured = {*fields["input_names"], *fields["output_names"]}
+        fields["scales"] = problems.collect(lambda: checked_scales(scales, measured))
         fields["units"] = problems.collect(lambda: checked_units(units, signals))
         problems.collect(lambda: check_every_k(values, fields["horizon"]))
         problems.raise_if_any()
@@ -168,6 +179,8 @@ class TimeVaryingDescriptorSystem:
             plant.E, plant.A, plant.B, plant.C, Phi=plant.Bf, Psi=plant.Df, dt=plant.dt,
             state_names=plant.state_names, input_names=plant.input_names, output_names=plant.output_names,
             parameter_names=plant.fault_names,
+            operating_point={name: value for name, value in plant.operating_point.items() if name in signals},
+            scales=plant.scales,
             units={name: unit for name, unit in plant.units.items() if name in signals},
         )  # fmt: skip
 
@@ -230,7 +243,10 @@ class TimeVaryingDescriptorSystem:
     def _labels(self) -> dict[str, Any]:
         names = ("state_names", "input_names", "output_names", "parameter_names")
         labels = {name: list(getattr(self, name)) for name in names}
-        return {**labels, "dt": self.dt, "horizon": self.horizon, "constants": self.constants, "units": self.units}
+        return {
+            **labels, "dt": self.dt, "horizon": self.horizon, "constants": self.constants,
+            "operating_point": self.operating_point, "scales": self.scales, "units": self.units,
+        }  # fmt: skip
 
     def __repr__(self) -> str:
         steps = "no horizon" if self.horizon is None else f"{self.horizon} steps"

@@ -128,6 +128,19 @@ def checked_point(point: Mapping[str, float] | None, known: set[str]) -> dict[st
     return checked
 
 
+def checked_scales(scales: Mapping[str, float] | None, known: set[str]) -> dict[str, float]:
+    """Return factors of measured signals, which all exist."""
+    checked: dict[str, float] = {}
+    for name, value in (scales or {}).items():
+        if name not in known:
+            raise SpecError(f"scales names {name!r}, which is no input or output of the plant.", path="scales")
+        factor = float(as_matrix(value, f"scales[{name!r}]")[0, 0])
+        if factor == 0.0:
+            raise SpecError(f"The scale of {name!r} is 0: give a factor that is not zero.", path="scales")
+        checked[name] = factor
+    return checked
+
+
 def checked_units(units: Mapping[str, str] | None, known: set[str]) -> dict[str, str]:
     """Return units whose signals all exist."""
     for name, value in (units or {}).items():

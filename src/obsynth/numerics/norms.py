@@ -84,7 +84,7 @@ def hinf_norm(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> Hin
     poles = np.linalg.eigvals(a) if a.size else np.zeros(0, dtype=complex)
     if np.any(np.abs(poles) >= 1.0):
         return HinfNorm(np.inf, np.inf, np.nan, 0.0)
-    a, b, c = _balanced(a, b, c)
+    a, b, c = balanced_realisation(a, b, c)
     angles = np.concatenate([np.linspace(0.0, np.pi, GRID_POINTS), np.abs(np.angle(poles))])
     best, angle = _peak(a, b, c, d, angles)
     if best == 0.0 or not np.isfinite(best) or a.shape[0] == 0:
@@ -105,15 +105,21 @@ def hinf_norm(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> Hin
     return HinfNorm(best, np.inf, angle, distance)
 
 
-def _balanced(a: FloatArray, b: FloatArray, c: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def balanced_realisation(a: FloatArray, b: FloatArray, c: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the realisation with its states scaled by powers of two, which is exact: units must not cost digits."""
-    from scipy.linalg.lapack import dgebal
-
     n, inputs, outputs = a.shape[0], b.shape[1], c.shape[0]
     system = np.zeros((n + inputs + outputs, n + inputs + outputs))
     system[:n, :n], system[:n, n : n + inputs], system[n + inputs :, :n] = a, b, c
-    scale = dgebal(system, scale=1, permute=0)[3][:n]
+    scale = balancing_factors(system)[:n]
     return a * scale / scale[:, None], b / scale[:, None], c * scale
+
+
+def balancing_factors(matrix: FloatArray) -> FloatArray:
+    """Return powers of two ``(n,)`` that balance a matrix ``(n, n)``: ``matrix * s / s[:, None]`` is balanced."""
+    # Not by scipy's matrix_balance, which casts the factors to integers and warns where they are too large for that.
+    from scipy.linalg.lapack import dgebal
+
+    return np.asarray(dgebal(matrix, scale=1, permute=0)[3], dtype=np.float64)
 
 
 def _peak(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, angles: FloatArray) -> tuple[float, float]:

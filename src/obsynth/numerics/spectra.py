@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from obsynth.numerics.arrays import ComplexArray, FloatArray
-from obsynth.numerics.norms import output_covariance
+from obsynth.numerics.norms import balanced_realisation, output_covariance
 
 #: Wanted poles closer than this, relative to their size, are compared as a group: rounding scatters a multiple
 #: eigenvalue by a root of the unit roundoff, but hardly moves the mean of the group.
@@ -97,7 +97,11 @@ def noise_covariance(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray,
         return np.zeros((c.shape[0], c.shape[0]))
     if not abscissa(a, dt) < 0.0:
         return np.full((c.shape[0], c.shape[0]), np.inf)
-    return np.asarray(c @ solve_continuous_lyapunov(a, -b @ b.T) @ c.T)
+    # In states and a time of their own: units must not cost digits.
+    a, b, c = balanced_realisation(a, b, c)
+    size = float(np.linalg.norm(a, 2))
+    states = solve_continuous_lyapunov(a / size, -b @ b.T)
+    return np.asarray(c @ states @ c.T) / size
 
 
 def response(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, points: ComplexArray) -> ComplexArray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -70,7 +71,7 @@ def gain_steps(observer: RecursiveObserver, steps: int) -> Iterator[GainStep]:
     factor, Upsilon, parameters = start.factor, start.Upsilon, start.parameters
     adaptation, model = observer.adaptation, start.model
     first = [model.first()] if isinstance(model, EarlySteps) else []
-    for step in (*first, *(model.at(k) for k in range(steps))):
+    for step in chain(first, (model.at(k) for k in range(steps))):
         ne, rows, nq = len(step.A), len(step.H), Upsilon.shape[1]
         S = np.zeros((rows, max(factor.shape[1] + step.noise.shape[1], rows)))
         S[:ne, : factor.shape[1]] = step.A @ factor

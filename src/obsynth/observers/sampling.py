@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
 
 from obsynth.errors import SpecError
+from obsynth.models.arguments import is_number, require_kind
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear import LinearObserver
 
@@ -39,10 +39,11 @@ def sample_observer(observer: LinearObserver, dt: float) -> LinearObserver:
     SpecError
         The observer is discrete in time already, or ``dt`` is not positive and finite.
     """
+    require_kind(observer, LinearObserver, "observer", "the LinearObserver of a continuous design")
     if observer.dt > 0.0:
         raise SpecError(f"The observer is discrete in time already (dt = {observer.dt:g} s).", path="dt")
-    if not (math.isfinite(dt) and dt > 0.0):
-        raise SpecError(f"dt is {dt}: give the seconds between two samples, a positive number.", path="dt")
+    if not (is_number(dt) and dt > 0.0):
+        raise SpecError(f"dt is {dt!r}: give the seconds between two samples, a positive number.", path="dt")
     inputs = len(observer.input_names)
     b, d = np.hstack([observer.Bu, observer.By]), np.hstack([observer.Du, observer.Dy])
     transition, constant, ramp = first_order_hold(observer.Az, b, dt)

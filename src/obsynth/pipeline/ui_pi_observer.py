@@ -33,7 +33,8 @@ def ui_pi_observer(
 
     The estimates converge to the state and to every fault that follows its model, whatever the unknown inputs do.
     Without poles, decay or region: the fastest Kalman gain, up to the median speed of the plant's own modes, that
-    costs at most ten times the noise of the quietest one.
+    costs no fault estimate more than ten times the noise of the quietest one.  The units of the data play no role: they
+    are chosen by the plant itself, and undone in the gains.
 
     Parameters
     ----------
@@ -48,7 +49,8 @@ def ui_pi_observer(
     decay : float, optional, 1/s
         A Kalman gain all of whose movable poles decay at this rate or faster; 0 is the plain Kalman gain.
     region : mapping, optional
-        ``decay`` (1/s), ``radius`` (1/s), ``damping`` (ratio): movable poles by a matrix inequality, with little noise.
+        ``decay`` (1/s), ``radius`` (1/s), ``damping`` (ratio): movable poles by a matrix inequality, with little noise;
+        where there are many (20), those that a Kalman gain of this rate has inside already stay there.
     noise : mapping, optional
         Weights of the Kalman gain: ``measurement`` (standard deviation, one or by output; the plant's own noise by
         default), ``process`` and ``fault`` (drive of states and fault models, relative to the default, dimensionless).
@@ -74,7 +76,8 @@ def ui_pi_observer(
     Raises
     ------
     SpecError
-        A malformed option or fault model; poles of the wrong count, not stable, or not closed under conjugation.
+        A malformed option or fault model, or one too fast for the samples; poles of the wrong count, not stable, or
+        not closed under conjugation.
     PreconditionError
         (D1), (D2) or (D3) fails: the eigenvalue, and the fault and disturbance that mask each other, are named.
     SolverError

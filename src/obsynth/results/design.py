@@ -166,15 +166,23 @@ class ObserverDesign:
     def to_control(self) -> control.StateSpace:
         """Return the observer as a ``control.StateSpace`` from ``[u; y]`` to ``[xhat; fhat; r]``, with names.
 
+        Of a recursive design for a time-invariant plant it is the steady state of the recursion.
+
         Raises
         ------
         SpecError
-            The design is recursive or nonlinear: it has no constant realisation.
+            The plant changes with k or is nonlinear: there is no constant realisation.
+        PreconditionError, SolverError
+            A recursive design has no stable steady state.
         """
         import control
         import numpy as np
 
-        _, observer = self.linear
+        from obsynth.observers.steady import steady_observer
+
+        observer = (
+            steady_observer(self.observer).observer if isinstance(self.observer, RecursiveObserver) else self.linear[1]
+        )
         outputs = [
             *(f"xhat[{name}]" for name in observer.state_names),
             *(f"fhat[{name}]" for name in observer.fault_names),

@@ -112,6 +112,8 @@ def write_atomically(path: str | Path, content: str | bytes) -> Path:
     SpecError
         The folder does not exist, the path is a folder, or the system refuses.
     """
+    if not isinstance(path, (str, os.PathLike)):
+        raise SpecError(f"path is {path!r}: give the name of a file.", path="path")
     target = Path(path)
     if target.is_dir():
         raise SpecError(f"{target} is a folder: give the name of a file.", path=str(target))
@@ -156,6 +158,8 @@ def load(path: str | Path) -> ObserverDesign:
     SpecError
         The file is missing, is no gain set, has an unknown schema version, or was changed.
     """
+    if not isinstance(path, (str, os.PathLike)):
+        raise SpecError(f"path is {path!r}: give the name of a file that a design was saved to.", path="path")
     source = Path(path)
     try:
         document = json.loads(source.read_text(encoding="utf-8"), parse_constant=_refuse_constant)

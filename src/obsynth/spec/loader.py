@@ -156,7 +156,8 @@ def _listed(row: Any) -> list[Any]:
 
 def _varying_plant(section: TimeVaryingSection, source: Path, prefix: str) -> TimeVaryingDescriptorSystem:
     problems = DocumentProblems(source, what="plant" if not prefix else "spec")
-    arguments: dict[str, Any] = {name: getattr(section, name) for name in ("dt", "horizon", "constants", "units")}
+    kept = ("dt", "horizon", "constants", "operating_point", "scales", "units")
+    arguments: dict[str, Any] = {name: getattr(section, name) for name in kept}
     for name in ("E", "A", "B", "C", "Phi", "Psi"):
         arguments[name] = _matrix(getattr(section, name), source.parent, _joined(prefix, name), problems)
     for name in ("state_names", "input_names", "output_names", "parameter_names"):
@@ -186,7 +187,12 @@ def _nonlinear_plant(section: DAESection, source: Path, prefix: str) -> DAEModel
 
 def _built_plant(section: PlantSection, source: Path, prefix: str) -> DescriptorSystem:
     problems = DocumentProblems(source, what="plant" if not prefix else "spec")
-    arguments: dict[str, Any] = {"dt": section.dt, "operating_point": section.operating_point, "units": section.units}
+    arguments: dict[str, Any] = {
+        "dt": section.dt,
+        "operating_point": section.operating_point,
+        "scales": section.scales,
+        "units": section.units,
+    }
     for name in _MATRICES:
         arguments[name] = _matrix(getattr(section, name), source.parent, _joined(prefix, name), problems)
     for name in _NAME_LISTS:
@@ -197,7 +203,7 @@ def _built_plant(section: PlantSection, source: Path, prefix: str) -> Descriptor
             arguments[names] = arguments[matrix]
     try:
         # The operating point may name noise that is appended below, so it is checked with the whole plant.
-        bare = DescriptorSystem(**{**arguments, "operating_point": None, "units": None})
+        bare = DescriptorSystem(**{**arguments, "operating_point": None, "scales": None, "units": None})
         noisy = _noise_arguments(bare, section.sensor_noise)
         return DescriptorSystem(**{**bare.as_dict(), **noisy, **_labels(arguments)})
     except SpecError as error:
@@ -209,7 +215,7 @@ def _built_plant(section: PlantSection, source: Path, prefix: str) -> Descriptor
 
 
 def _labels(arguments: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: arguments[name] for name in ("operating_point", "units")}
+    return {name: arguments[name] for name in ("operating_point", "scales", "units")}
 
 
 def _noise_arguments(plant: DescriptorSystem, sensor_noise: Mapping[str, float] | None) -> dict[str, Any]:

@@ -165,6 +165,7 @@ class PlantSection(Section):
     disturbance_names: Names | None = None
     noise_names: Names | None = None
     operating_point: dict[Text, float] | None = None
+    scales: dict[Text, float] | None = None
     units: dict[Text, str] | None = None
     sensor_noise: dict[Text, Positive] | None = None
     transform: TransformSection | None = None
@@ -193,6 +194,8 @@ class TimeVaryingSection(Section):
     input_names: Names | None = None
     output_names: Names | None = None
     parameter_names: Names | None = None
+    operating_point: dict[Text, float] | None = None
+    scales: dict[Text, float] | None = None
     units: dict[Text, str] | None = None
 
 

@@ -8,6 +8,7 @@ from itertools import product
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.norms import balancing_factors
 from obsynth.numerics.spectra import abscissa
 from obsynth.verification.lyapunov import prove_stable
 
@@ -44,11 +45,10 @@ def lyapunov_factor(a: FloatArray, dt: float) -> FloatArray:
 
 
 def _factor(a: FloatArray, dt: float, share: float, rounds: int, edge: float) -> FloatArray | None:
-    from scipy.linalg import matrix_balance, solve_continuous_lyapunov, solve_discrete_lyapunov
+    from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov
 
     n = a.shape[0]
-    scale = matrix_balance(a, permute=False, separate=True)[1][0]
-    change = np.diag(scale)
+    change = np.diag(balancing_factors(a))
     for _ in range(rounds):
         moved = np.linalg.solve(change, a @ change)
         try:

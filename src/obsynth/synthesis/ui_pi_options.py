@@ -16,7 +16,7 @@ from obsynth.numerics.spectra import decay_rates
 from obsynth.synthesis.lmi import SOLVER_SETTINGS
 from obsynth.synthesis.placement.eigenstructure import OBJECTIVES
 from obsynth.synthesis.placement.region import Region
-from obsynth.synthesis.ui_pi_problem import NoiseWeights
+from obsynth.synthesis.ui_pi_noise import NoiseWeights
 
 #: Poles given as numbers count as a conjugate pair when they agree to this, relative to their size.
 PAIR_TOLERANCE = 1e-9

@@ -12,11 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.unknown_inputs import (
     AugmentedPlant,
     Decoupled,
-    balanced,
-    balancing,
     decouple,
     direct_part,
     paper_decoupling,
@@ -26,50 +25,49 @@ from obsynth.models.descriptor import DescriptorSystem
 from obsynth.models.exosystems import Exosystem
 from obsynth.numerics.arrays import ComplexArray, FloatArray, as_matrix
 from obsynth.numerics.pencils import finite_zeros, pencil_structure
-from obsynth.numerics.scaling import Scaling
+from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
 from obsynth.numerics.spectra import DEAD_BEAT, eigenvalues, speeds
-from obsynth.synthesis.placement.kalman import KalmanProblem
 from obsynth.synthesis.placement.observable import ObservableSplit, observable_split
 from obsynth.synthesis.ui_pi_realisation import ObserverGains
 
 #: Modes slower than this share of the fastest do not count for the plant's time scale: integrators and rounding.
 SLOW_SHARE = 1e-6
-#: Noise on innovations that have none of their own, relative to the outputs' noise.
-BACKGROUND_NOISE = 0.1
+#: Where all modes are slower than this share of the pair's size, they are integrators that rounding has scattered.
+SCATTER = 3e-5
+#: Poles of sampled plants are not asked to decay by more than this exponent in one sample: nearer to zero they cannot
+#: be told apart, and printed gains miss them.
+MOST_PER_SAMPLE = 2.0
 
 
 @dataclass(frozen=True, eq=False)
 class PlacementProblem:
-    """A decoupled plant in balanced units, and the pair whose poles are to be placed.
+    """A decoupled plant in units of its own, and the pair whose poles are to be placed.
 
     Parameters
     ----------
     plant : DescriptorSystem
-        As given, in the user's units.
-    scaled : DescriptorSystem
-        Balanced.
-    scaling : Scaling
-        Between the two.
+        Scaled.
     model : Exosystem
-        Of the faults.
+        Of its faults, scaled.
+    units : PlantUnits
+        Between the user's plant and the scaled one.
     decoupled : Decoupled
-        Of the balanced plant.
+        Of the scaled plant.
     U, D : FloatArray
-        ``(na, na)`` and ``(na, ny)`` of the balanced augmented plant, without the free part.
+        ``(na, na)`` and ``(na, ny)`` of the scaled augmented plant, without the free part.
     F, C : FloatArray
         The pair ``(na, na)`` and ``(rows, na)``; the first ``free`` rows of C are those of the free part Z.
     free : int
         Number of rows of the free part; 0 unless K and Z are designed together.
     split : ObservableSplit
         Of the pair.
-    rate : float, 1/s
-        The plant's own speed: the median of ``abs(s)`` over its modes.
+    rate : float
+        The plant's own speed, in scaled time: the median of ``abs(s)`` over its modes.
     """
 
     plant: DescriptorSystem
-    scaled: DescriptorSystem
-    scaling: Scaling
     model: Exosystem
+    units: PlantUnits
     decoupled: Decoupled
     U: FloatArray
     D: FloatArray
@@ -83,11 +81,15 @@ class PlacementProblem:
         """Return the gains in the user's units for one of the observable part ``(no, rows)``."""
         k = self.split.lift(placed)
         u, d, k = _completed(self, k)
-        states = np.concatenate([self.scaling.states, np.ones(self.model.order)])
-        equations = np.concatenate([self.scaling.equations, np.ones(self.model.order)])
-        outputs = self.scaling.outputs
-        return ObserverGains(states[:, None] * u * equations, states[:, None] * d * outputs,
-                             states[:, None] * k * outputs)  # fmt: skip
+        states, outputs = self.units.augmented_states[:, None], self.units.outputs
+        return ObserverGains(
+            states * u * self.units.augmented_equations, states * d * outputs, states * k * outputs / self.units.rate
+        )
+
+    @property
+    def fixed_modes(self) -> ComplexArray:
+        """Poles that no gain moves, in the user's time."""
+        return self.units.eigenvalues(self.split.fixed_modes)
 
 
 def placement_problem(
@@ -106,7 +108,7 @@ def placement_problem(
         For which (D1) holds.
     model : Exosystem
         Of its faults.
-    fixed_modes : ComplexArray
+    fixed_modes : ComplexArray, 1/s (dimensionless for sampled plants)
         Poles that no gain moves.
     joint : bool, optional
         Whether the free part Z of the decoupling is designed together with K.
@@ -118,13 +120,18 @@ def placement_problem(
     SpecError
         The given matrices do not decouple.
     """
-    scaling = balancing(plant)
-    scaled = balanced(plant, scaling)
-    decoupled = decouple(scaled) if given is None else _given_decoupling(plant, scaling, given)
+    units = PlantUnits.of(plant, model).for_decoupling(plant)
+    if given is not None:
+        # Powers of two: the given numbers come back as they are.
+        units = units.rounded()
+    scaled, model = units.scaled_plant(plant), units.scaled_model(model)
+    decoupled = decouple(scaled) if given is None else _given_decoupling(plant, units, given)
     u, d = with_faults(decoupled.U, decoupled.Dhat, scaled, model)
     augmented = AugmentedPlant.of(scaled, model)
-    injected = augmented.A - np.vstack([decoupled.injection, np.zeros((model.order, plant.ny))]) @ augmented.C
-    f, c = u @ injected, decoupled.seen @ augmented.C
+    injection = np.vstack([decoupled.injection, np.zeros((model.order, plant.ny))])
+    injected = _product(injection, augmented.C, augmented.A)
+    f, c = _product(u, injected), _product(decoupled.seen, augmented.C)
+    fixed_modes = units.rate * fixed_modes
     free = 0
     if joint:
         more, _ = _free_part(decoupled, scaled, model)
@@ -134,9 +141,15 @@ def placement_problem(
         n = len(f)
         fixed_modes = finite_zeros(np.vstack([np.eye(n), np.zeros((len(c), n))]), np.vstack([f, c])).values
     split = observable_split(f, c, fixed_modes)
-    return PlacementProblem(
-        plant, scaled, scaling, model, decoupled, u, d, f, c, free, split, _own_rate(plant, split.F)
-    )
+    return PlacementProblem(scaled, model, units, decoupled, u, d, f, c, free, split, _own_rate(scaled, split.F))
+
+
+def _product(left: FloatArray, right: FloatArray, minuend: FloatArray | None = None) -> FloatArray:
+    """Return ``left @ right``, or ``minuend - left @ right``, without entries that are only rounding."""
+    found, size = left @ right, np.abs(left) @ np.abs(right)
+    if minuend is not None:
+        found, size = minuend - found, np.abs(minuend) + size
+    return np.where(np.abs(found) > CANCELLATION_TOLERANCE * size, found, 0.0)
 
 
 def with_faults(
@@ -154,8 +167,8 @@ def _free_part(decoupled: Decoupled, plant: DescriptorSystem, model: Exosystem) 
 
 
 def _completed(problem: PlacementProblem, k: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return U_a, D_a, K_a of the balanced plant: the gain of the pair is ``[-Z K]``."""
-    decoupled, plant, model = problem.decoupled, problem.scaled, problem.model
+    """Return U_a, D_a, K_a of the scaled plant: the gain of the pair is ``[-Z K]``."""
+    decoupled, plant, model = problem.decoupled, problem.plant, problem.model
     u, d = problem.U, problem.D
     if problem.free:
         more_u, more_d = _free_part(decoupled, plant, model)
@@ -165,94 +178,26 @@ def _completed(problem: PlacementProblem, k: FloatArray) -> tuple[FloatArray, Fl
     return u, d, k[:, problem.free :] @ decoupled.seen + u @ injection
 
 
-def _given_decoupling(plant: DescriptorSystem, scaling: Scaling, given: Mapping[str, Any]) -> Decoupled:
+def _given_decoupling(plant: DescriptorSystem, units: PlantUnits, given: Mapping[str, Any]) -> Decoupled:
     if plant.Dd.any():
         raise SpecError("E_sharp, C_sharp and G are for plants without Dd: leave them out.", path="E_sharp")
     matrices = [as_matrix(given[name], name) for name in ("E_sharp", "C_sharp", "G")]
     _, u, d = paper_decoupling(plant, e_sharp=matrices[0], c_sharp=matrices[1], g=matrices[2])
     seen, injection, _ = direct_part(plant)
-    # x = states * x_balanced: U and D of the balanced plant; the factors are powers of two, so this is exact.
-    u = u / scaling.states[:, None] / scaling.equations
-    d = d / scaling.states[:, None] / scaling.outputs
+    u = u / units.states[:, None] / units.equations
+    d = d / units.states[:, None] / units.outputs
     return Decoupled(u, d, np.zeros((0, plant.nx)), np.zeros((0, plant.ny)), seen, injection)
 
 
 def _own_rate(plant: DescriptorSystem, f: FloatArray) -> float:
     """Return the median speed of the plant's modes; of the pair's where it has none; or its size."""
     structure = pencil_structure(plant.E, plant.A)
+    size = float(np.linalg.norm(f, 2)) if f.size else 0.0
     for values in (structure.finite_eigenvalues, eigenvalues(f)):
         found = speeds(values, plant.dt)
         found = found[np.isfinite(found)]
         found = found[found > max(SLOW_SHARE * float(np.max(found, initial=0.0)), DEAD_BEAT)]
-        if found.size:
-            return float(np.median(found))
-    size = float(np.linalg.norm(f, 2)) if f.size else 0.0
+        if found.size and (plant.dt > 0.0 or np.max(found) > SCATTER * size):
+            median = float(np.median(found))
+            return min(median, MOST_PER_SAMPLE / plant.dt) if plant.dt > 0.0 else median
     return 1.0 / plant.dt if plant.dt > 0.0 else size or 1.0
-
-
-@dataclass(frozen=True)
-class NoiseWeights:
-    """What the Kalman filter believes, beside what the plant states.
-
-    Parameters
-    ----------
-    measurement : float or mapping, optional
-        Standard deviation of each output's noise, one number or by name, in the output's unit (times the square root
-        of a second in continuous time); the plant's own noise, or one in balanced units, by default.
-    process, fault : float
-        How strongly states and fault models are driven, relative to the default.
-    """
-
-    measurement: Any = None
-    process: float = 1.0
-    fault: float = 1.0
-
-
-def kalman_problem(problem: PlacementProblem, weights: NoiseWeights) -> KalmanProblem:
-    """Return the observable part of the pair with its noise, in the coordinates of the split."""
-    plant, scaled, split = problem.plant, problem.scaled, problem.split
-    order = problem.model.order
-    bw, dw = _noise(problem, weights)
-    augmented_bw = np.vstack([bw, np.zeros((order, bw.shape[1]))])
-    injection = np.vstack([problem.decoupled.injection, np.zeros((order, plant.ny))])
-    entering = problem.U @ augmented_bw - problem.F @ problem.D @ dw - problem.U @ injection @ dw
-    shown = np.eye(plant.ny) - AugmentedPlant.of(scaled, problem.model).C @ problem.D
-    measured = problem.decoupled.seen @ shown @ dw
-    size = float(np.sqrt(np.mean(np.sum(dw**2, axis=1)))) if dw.any() else 1.0
-    if problem.free:
-        # The free outputs carry the noise of derivatives; as a stand-in they get the size of the others.
-        entering = np.hstack([entering, np.zeros((len(entering), problem.free))])
-        measured = np.block([
-            [np.zeros((problem.free, measured.shape[1])), size * np.eye(problem.free)],
-            [measured, np.zeros((len(measured), problem.free))],
-        ])  # fmt: skip
-    per_step = problem.rate * (plant.dt if plant.dt > 0.0 else 1.0)
-    strength = np.concatenate([np.full(plant.nx, weights.process), np.full(order, weights.fault)])
-    faults = np.hstack([np.zeros((plant.nf, plant.nx)), problem.model.Cw])
-    return KalmanProblem(
-        F=split.F,
-        C=split.C,
-        B=split.lower(entering),
-        D=measured,
-        drive=split.basis[:, : split.order].T @ np.diag(per_step * size * strength),
-        background=BACKGROUND_NOISE * size * np.eye(len(problem.C)),
-        estimates=split.shown(faults),
-        dt=plant.dt,
-    )
-
-
-def _noise(problem: PlacementProblem, weights: NoiseWeights) -> tuple[FloatArray, FloatArray]:
-    """Return the noise inputs of the balanced plant."""
-    plant, scaled, outputs = problem.plant, problem.scaled, problem.scaling.outputs
-    if weights.measurement is None:
-        if scaled.Dw.any():
-            return scaled.Bw, scaled.Dw
-        return np.hstack([scaled.Bw, np.zeros((plant.nx, plant.ny))]), np.hstack([
-            np.zeros((plant.ny, plant.nw)), np.eye(plant.ny),
-        ])  # fmt: skip
-    given = weights.measurement
-    deviations = np.array([given[name] if isinstance(given, Mapping) else given for name in plant.output_names])
-    return (
-        np.hstack([scaled.Bw, np.zeros((plant.nx, plant.ny))]),
-        np.hstack([np.zeros((plant.ny, plant.nw)), np.diag(deviations * outputs)]),
-    )

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from obsynth.analysis.unknown_inputs import AugmentedPlant
+from obsynth.analysis.plant_units import PlantUnits
+from obsynth.analysis.unknown_inputs import AugmentedPlant, direct_part
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.models.exosystems import Exosystem
 from obsynth.numerics.arrays import FloatArray
@@ -67,3 +68,12 @@ def realise(
     )  # fmt: skip
     letters = {"U_a": gains.U, "D_a": gains.D, "K_a": gains.K, "Ahat": a_hat, "Bhat": b_hat, "Jhat": j_hat}
     return observer, letters
+
+
+def combinations_seen(plant: DescriptorSystem) -> FloatArray:
+    """Return the combinations of outputs that no disturbance reaches directly, each of unit length."""
+    if not plant.Dd.any():
+        return np.eye(plant.ny)
+    units = PlantUnits.of(plant)
+    seen = direct_part(units.scaled_plant(plant))[0] * units.outputs
+    return np.asarray(seen / np.linalg.norm(seen, axis=1, keepdims=True))

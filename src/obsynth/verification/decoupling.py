@@ -10,9 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from obsynth.analysis.unknown_inputs import balanced, balancing
+from obsynth.analysis.plant_units import PlantUnits
+from obsynth.analysis.unknown_input_pencils import equilibrated
 from obsynth.models.descriptor import DescriptorSystem
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.numerics.norms import balancing_factors
 from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.numerics.spectra import boundary_points, eigenvalues, speeds
 from obsynth.observers.linear import LinearObserver
@@ -33,7 +35,7 @@ class DecouplingNorm:
     relative : float
         Largest error of an estimate, relative to the terms it is computed from.
     fault_gain : float
-        Largest error of a fault estimate for unit size of the trajectory ``(x, d)`` in balanced units.
+        Largest error of a fault estimate for unit size of the trajectory ``(x, d)`` in scaled units.
     frequency : float
         Where, rad/s.
     """
@@ -65,42 +67,91 @@ def decoupling_norm(plant: DescriptorSystem, observer: LinearObserver) -> Decoup
     observer : LinearObserver
         What is shipped.
     """
-    scaling = balancing(plant)
-    scaled = balanced(plant, scaling)
-    frequencies = frequency_grid(observer)
-    worst = DecouplingNorm(0.0, 0.0, 0.0)
     if not all(np.all(np.isfinite(part)) for part in (observer.Az, observer.By, observer.Cz, observer.Dy)):
         return DecouplingNorm(float("nan"), float("nan"), float("nan"))
-    # Outputs of the balanced plant are those of the plant times powers of two.
-    by, dy = observer.By / scaling.outputs, observer.Dy / scaling.outputs
-    # Bhat = Ahat D + K may cancel: what it is formed of says how well it can be known.
-    formed = np.abs(by) + np.abs(observer.Az[:, : plant.nx]) @ np.abs(dy[: plant.nx])
-    for frequency, point in zip(frequencies, boundary_points(frequencies, plant.dt), strict=True):
-        _, values, right = np.linalg.svd(np.hstack([point * scaled.E - scaled.A, -scaled.Bd]))
-        rank = int(np.sum(values > RANK_TOLERANCE * values[0]))
-        trajectories = right[rank:].conj().T
-        if trajectories.shape[1] == 0:
-            continue
-        x, d = trajectories[: plant.nx], trajectories[plant.nx :]
-        y = scaled.C @ x + scaled.Dd @ d
-        try:
-            resolvent = np.linalg.inv(point * np.eye(observer.order) - observer.Az)
-        except np.linalg.LinAlgError:
+    frequencies = frequency_grid(observer)
+    units = PlantUnits.of(plant).rounded()
+    scaled = units.scaled_plant(plant)
+    points = boundary_points(frequencies * (1.0 if units.discrete else units.time), scaled.dt)
+    pencils = [np.hstack([point * scaled.E - scaled.A, -scaled.Bd]) for point in points]
+    moved = [_trajectories(pencil) for pencil in pencils]
+    # How many trajectories there are at almost every frequency: where there seem to be more, rounding hides the rest.
+    count = min(nullity for _, nullity in moved)
+    worst = DecouplingNorm(0.0, 0.0, 0.0)
+    if count == 0:
+        return worst
+    shipped = _Shipped.of(observer, units)
+    for frequency, point, (basis, _) in zip(frequencies, points, moved, strict=True):
+        found = shipped.misses(scaled, point, basis[:, -count:])
+        if found is None:
             return DecouplingNorm(float("inf"), float("inf"), float(frequency))
-        error = observer.Cz @ (resolvent @ (by @ y)) + dy @ y
-        error[: plant.nx] -= scaling.states[:, None] * x
-        terms = np.abs(scaled.C) @ np.abs(x) + np.abs(scaled.Dd) @ np.abs(d)
-        size = np.abs(observer.Cz) @ (np.abs(resolvent) @ (formed @ terms)) + np.abs(dy) @ terms
-        size[: plant.nx] += scaling.states[:, None] * np.abs(x)
-        # A signal that a trajectory does not move is rounding: it is judged by what trajectories of its size could do.
-        unit = np.sum(np.abs(scaled.C), axis=1) + np.sum(np.abs(scaled.Dd), axis=1)
-        possible = np.abs(observer.Cz) @ (np.abs(resolvent) @ (formed @ unit)) + np.abs(dy) @ unit
-        possible[: plant.nx] += scaling.states
-        rows = np.maximum(np.max(size, axis=1), UNMOVED * possible)
-        relative = float(np.max(np.max(np.abs(error), axis=1) / np.where(rows > 0.0, rows, 1.0), initial=0.0))
-        fault = float(np.max(np.linalg.norm(error[observer.fault_rows], axis=1), initial=0.0))
+        relative, fault = found
         if not relative <= worst.relative:
             worst = DecouplingNorm(relative, max(fault, worst.fault_gain), float(frequency))
         elif fault > worst.fault_gain:
             worst = DecouplingNorm(worst.relative, fault, worst.frequency)
     return worst
+
+
+def _trajectories(pencil: ComplexArray) -> tuple[ComplexArray, int]:
+    """Return the right singular vectors ``(n, n)``, least singular value last, and how many are null vectors.
+
+    Equations and signals are scaled by powers of two first: fast and slow ones meet at every frequency.
+    """
+    scaled, columns = equilibrated(pencil)
+    _, values, right = np.linalg.svd(scaled)
+    rank = int(np.sum(values > RANK_TOLERANCE * values[0]))
+    vectors = columns[:, None] * right.conj().T
+    return vectors / np.linalg.norm(vectors, axis=0), vectors.shape[1] - rank
+
+
+@dataclass(frozen=True, eq=False)
+class _Shipped:
+    """An observer that reads scaled outputs in scaled time; its own states are balanced, which is exact."""
+
+    Az: FloatArray
+    By: FloatArray
+    Cz: FloatArray
+    Dy: FloatArray
+    formed: FloatArray
+    direct: FloatArray
+    faults: slice
+
+    @classmethod
+    def of(cls, observer: LinearObserver, units: PlantUnits) -> _Shipped:
+        order, outputs, nx = observer.order, observer.By.shape[1], len(units.states)
+        rows = np.ones(len(observer.Cz))
+        rows[:nx] = 1.0 / units.states
+        az, by = units.rate * observer.Az, units.rate * observer.By / units.outputs
+        cz, dy = rows[:, None] * observer.Cz, rows[:, None] * observer.Dy / units.outputs
+        system = np.zeros((order + outputs + len(cz),) * 2)
+        system[:order, :order], system[:order, order : order + outputs] = az, by
+        system[order + outputs :, :order] = cz
+        states = balancing_factors(system)[:order]
+        az, by, cz = az * states / states[:, None], by / states[:, None], cz * states
+        # Bhat = Ahat D + K may cancel: what it is formed of says how well it can be known.
+        offsets = (units.states / states[:nx])[:, None] * np.abs(dy[:nx])
+        formed = np.abs(by) + np.abs(az[:, :nx]) @ offsets
+        # The same holds for a residual, y - C xhat with xhat = z + D y.
+        return cls(az, by, cz, dy, formed, np.abs(dy) + np.abs(cz[:, :nx]) @ offsets, observer.fault_rows)
+
+    def misses(self, plant: DescriptorSystem, point: complex, trajectories: ComplexArray) -> tuple[float, float] | None:
+        """Return the largest relative error of an estimate and that of a fault; ``None`` at a pole."""
+        nx = plant.nx
+        x, d = trajectories[:nx], trajectories[nx:]
+        y = plant.C @ x + plant.Dd @ d
+        try:
+            resolvent = np.linalg.inv(point * np.eye(len(self.Az)) - self.Az)
+        except np.linalg.LinAlgError:
+            return None
+        error = self.Cz @ (resolvent @ (self.By @ y)) + self.Dy @ y
+        error[:nx] -= x
+        passed = np.abs(self.Cz) @ (np.abs(resolvent) @ self.formed) + self.direct
+        size = passed @ (np.abs(plant.C) @ np.abs(x) + np.abs(plant.Dd) @ np.abs(d))
+        size[:nx] += np.abs(x)
+        # A signal that a trajectory does not move is rounding: it is judged by what trajectories of its size could do.
+        possible = passed @ (np.sum(np.abs(plant.C), axis=1) + np.sum(np.abs(plant.Dd), axis=1))
+        possible[:nx] += 1.0
+        rows = np.maximum(np.max(size, axis=1), UNMOVED * possible)
+        relative = float(np.max(np.max(np.abs(error), axis=1) / np.where(rows > 0.0, rows, 1.0), initial=0.0))
+        return relative, float(np.max(np.linalg.norm(error[self.faults], axis=1), initial=0.0))

@@ -14,11 +14,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.analysis.unknown_input_pencils import number
+from obsynth.analysis.plant_units import PlantUnits
+from obsynth.analysis.unknown_input_pencils import number, system_pencil
 from obsynth.analysis.zeros import invariant_zeros, is_outside, leading_names
 from obsynth.errors import SpecError
 from obsynth.models.descriptor import DescriptorSystem
+from obsynth.models.fault_model_spectra import balanced_transition
 from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.numerics.norms import balanced_realisation
 from obsynth.numerics.pencils import finite_zeros
 from obsynth.numerics.ranks import NEGLIGIBLE_INPUT
 from obsynth.numerics.spectra import abscissa, boundary_points, decay_rates, eigenvalues, response
@@ -34,7 +37,7 @@ if TYPE_CHECKING:
 FAITHFUL = 0.1
 #: A step counts as settled within this share, after this many time constants of the slowest pole.
 SETTLED, TIME_CONSTANTS = 0.02, 4.0
-#: Eigenvalues of a fault model closer to constant courses than this are constants.
+#: Eigenvalues of a fault model closer to constant courses than this, relative to the model's size, are constants.
 CONSTANT = 1e-9
 
 
@@ -68,7 +71,8 @@ def _system(
     plant: DescriptorSystem, observer: LinearObserver, tracking: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     errors = ErrorSystem.of(plant, observer, tracking[:, : plant.nx], 0)
-    return errors.Az, errors.fault, -errors.fault_output[0], errors.fault_output[1]
+    # In balanced states: units must not cost digits.
+    return *balanced_realisation(errors.Az, errors.fault, -errors.fault_output[0]), errors.fault_output[1]
 
 
 def _transfer(
@@ -130,7 +134,11 @@ def _constants(phi: FloatArray, row: FloatArray, *, shift: float) -> int:
     for _ in range(len(row)):
         reached = reached | (np.any(phi[reached] != 0.0, axis=0) if reached.any() else reached)
     part = phi[np.ix_(reached, reached)]
-    return int(np.sum(np.abs(np.linalg.eigvals(part) - shift) <= CONSTANT)) if part.size else 0
+    if not part.size:
+        return 0
+    balanced = balanced_transition(part)[0]
+    reach = CONSTANT * float(np.linalg.norm(balanced, 2))
+    return int(np.sum(np.abs(np.linalg.eigvals(balanced) - shift) <= reach))
 
 
 def tracking_rows(
@@ -169,28 +177,28 @@ def tracking_rows(
 
 def _limits(plant: DescriptorSystem, observer: LinearObserver, tracking: FloatArray) -> Iterator[Check]:
     """Yield a row for each zero of (f, d) -> y outside the region of stability: it limits every gain."""
-    inputs, direct = np.hstack([plant.Bf, plant.Bd]), np.hstack([plant.Df, plant.Dd])
-    padded = np.zeros((plant.nx + plant.ny, plant.nx + inputs.shape[1]))
-    padded[: plant.nx, : plant.nx] = plant.E
-    whole = np.block([[plant.A, inputs], [plant.C, direct]])
+    units = PlantUnits.of(plant).rounded()
+    scaled = units.scaled_plant(plant)
+    inputs, direct = np.hstack([scaled.Bf, scaled.Bd]), np.hstack([scaled.Df, scaled.Dd])
+    padded, whole = system_pencil(scaled.E, scaled.A, inputs, scaled.C, direct)
     if plant.nf == 0 or finite_zeros(padded, whole).normal_rank < whole.shape[1]:
         return
     slowest = float(np.min(decay_rates(eigenvalues(observer.Az), plant.dt), initial=np.inf))
-    for zero in invariant_zeros(plant.E, plant.A, inputs, plant.C, direct):
-        fault = zero.input_direction[: plant.nf]
+    for zero in invariant_zeros(scaled.E, scaled.A, inputs, scaled.C, direct):
         if zero.value.imag < 0.0 or not is_outside(zero.value, plant.dt):
             continue
-        if float(np.linalg.norm(fault)) <= NEGLIGIBLE_INPUT:
+        if float(np.linalg.norm(zero.input_direction[: plant.nf])) <= NEGLIGIBLE_INPUT:
             continue
-        value = _transfer(plant, observer, tracking, np.array([zero.value]))[0] @ fault
+        fault, place = units.faults * zero.input_direction[: plant.nf], units.eigenvalue(zero.value)
+        value = _transfer(plant, observer, tracking, np.array([place]))[0] @ fault
         names = leading_names(np.abs(fault), plant.fault_names)
         yield information(
-            f"limit at {number(zero.value)}",
+            f"limit at {number(place)}",
             f"at this zero of (f, d) -> y the estimate of {', '.join(names)} cannot follow, whatever the gains: "
             "|T(zero) f0| of this observer",
             float(np.linalg.norm(value) / np.linalg.norm(fault)),
             source="a zero outside the region of stability",
-            detail=_undershoot(plant, zero.value, slowest),
+            detail=_undershoot(plant, place, slowest),
         )
 
 

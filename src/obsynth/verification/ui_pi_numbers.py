@@ -92,9 +92,9 @@ def _some(poles: list[complex], most: int = 8) -> str:
 
 
 def _rounded(matrix: FloatArray, digits: int) -> FloatArray:
-    sizes = np.where(matrix != 0.0, np.abs(matrix), 1.0)
-    places = 10.0 ** (digits - 1 - np.floor(np.log10(sizes)))
-    return np.asarray(np.round(matrix * places) / places)
+    """Return each entry as it is when printed with so many significant digits."""
+    text = np.char.mod(f"%.{digits - 1}e", matrix)
+    return np.asarray(text.astype(np.float64))
 
 
 def _least_digits(matrix: FloatArray, dt: float) -> int:

@@ -9,13 +9,13 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.unknown_input_conditions import existence
 from obsynth.analysis.unknown_inputs import AugmentedPlant
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.models.exosystems import Exosystem
 from obsynth.models.fault_model_spectra import stated_eigenvalues
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.scaling import balance_by_least_squares
 from obsynth.observers.linear import LinearObserver
 from obsynth.results.design import ObserverDesign
 from obsynth.results.report import Check, information, upper_bound_check
@@ -54,7 +54,7 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     else:
         yield from condition_rows([last])
     tolerance = relative_tolerance(printed_digits, plant.nx + len(phi) + plant.ny)
-    for name, claim, found, source in _identities(plant, observer, AugmentedPlant.of(plant, model), tracking, cw):
+    for name, claim, found, source in _identities(plant, observer, model, tracking):
         yield equality(name, claim, found, source, bound=tolerance)
     yield from stability_rows(design, poles, factor)
     norm = decoupling_norm(plant, observer)
@@ -95,17 +95,17 @@ def _fits(design: ObserverDesign) -> bool:
 def _identities(
     plant: DescriptorSystem,
     observer: LinearObserver,
-    augmented: AugmentedPlant,
+    model: Exosystem,
     tracking: FloatArray,
-    cw: FloatArray,
 ) -> Iterator[tuple[str, str, Residual, str]]:
     """Yield the identities (19) of the shipped realisation: name, claim, residual, source."""
+    augmented = AugmentedPlant.of(plant, model)
     az, bu, by, cz, du, dy = observer.Az, observer.Bu, observer.By, observer.Cz, observer.Du, observer.Dy
     ve = tracking @ augmented.E
     # A row that is nothing but rounding is judged in the units of what it stands for, not against itself.
-    scaling = balance_by_least_squares(augmented.E, augmented.A, outputs=[augmented.C])
-    units = scaling.states
-    own_u = np.outer(units, scaling.equations)
+    scaling = PlantUnits.of(plant, model)
+    units = scaling.augmented_states
+    own_u = np.outer(units, scaling.augmented_equations)
     own_dy = np.outer(np.max(np.abs(cz) * units, axis=1, initial=0.0), scaling.outputs)
     # Bhat = Ahat D + K may cancel: what it is formed of says how well it can be known.
     formed = (az[:, : plant.nx], dy[observer.state_rows], augmented.C)
@@ -129,7 +129,7 @@ def _identities(
         "state": (observer.state_rows, np.eye(plant.nx, augmented.order), "U_a E_a + D_a C_a = I, rows of the state"),
         "fault": (
             observer.fault_rows,
-            np.hstack([np.zeros((plant.nf, plant.nx)), cw]),
+            np.hstack([np.zeros((plant.nf, plant.nx)), model.Cw]),
             "Cw (U_a E_a + D_a C_a) = Cw: the fault estimate follows the fault model",
         ),
         "residual": (

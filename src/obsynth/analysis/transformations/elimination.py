@@ -9,6 +9,7 @@ import numpy as np
 from obsynth.analysis.transformations.recovery import (
     StateRecovery,
     Transformation,
+    state_point,
     unchanged_states,
     with_states,
 )
@@ -65,8 +66,9 @@ def eliminate_algebraic_states(plant: DescriptorSystem) -> Transformation:
     )
     new = with_states(plant, names, E=None, A=A, B=B, Bf=Bf, Bd=Bd, Bw=Bw, C=C, D=D, Df=Df, Dd=Dd, Dw=Dw)
     recovery = StateRecovery(
-        plant.state_names, from_state, from_input, from_fault, from_disturbance, from_noise, np.eye(plant.nw)
-    )
+        plant.state_names, from_state, from_input, from_fault, from_disturbance, from_noise, np.eye(plant.nw),
+        state_point(plant),
+    )  # fmt: skip
     done = f"eliminated {plant.nx - count} algebraic states" if count < plant.nx else "multiplied by the inverse of E"
     return Transformation(plant, new, done, recovery)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Any, TypeVar
 
 import numpy as np
@@ -28,6 +28,8 @@ class StateRecovery:
         ``(nx_source, nx)``, ``(nx_source, nu)`` and so on, read-only.
     noise_kept : FloatArray
         ``(nw_source, nw)``: the noise of the source as far as the transformed plant still has it.
+    operating_point : mapping, optional
+        Of the source states: the transformed plant forgets that of states which are gone.
     """
 
     names: tuple[str, ...]
@@ -37,11 +39,13 @@ class StateRecovery:
     from_disturbance: FloatArray
     from_noise: FloatArray
     noise_kept: FloatArray
+    operating_point: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Make the arrays private and read-only."""
-        for field in fields(self)[1:]:
-            object.__setattr__(self, field.name, read_only(getattr(self, field.name)))
+        for item in fields(self)[1:-1]:
+            object.__setattr__(self, item.name, read_only(getattr(self, item.name)))
+        object.__setattr__(self, "operating_point", dict(self.operating_point))
 
     def flags(self) -> tuple[str, ...]:
         """Return per source state what an estimate from state and input alone is.
@@ -64,6 +68,7 @@ class StateRecovery:
             from_disturbance=step @ later.from_disturbance + self.from_disturbance,
             from_noise=step @ later.from_noise + self.from_noise @ later.noise_kept,
             noise_kept=self.noise_kept @ later.noise_kept,
+            operating_point=self.operating_point,
         )
 
 
@@ -104,7 +109,13 @@ def unchanged_states(
         from_disturbance=np.zeros((source.nx, new.nd)),
         from_noise=np.zeros((source.nx, new.nw)),
         noise_kept=np.eye(source.nw) if noise_kept is None else noise_kept,
+        operating_point=state_point(source),
     )
+
+
+def state_point(plant: DescriptorSystem) -> dict[str, float]:
+    """Return the operating point of the states of a plant, as far as it is stated."""
+    return {name: value for name, value in plant.operating_point.items() if name in plant.state_names}
 
 
 def with_states(plant: DescriptorSystem, names: Sequence[str], **changes: Any) -> DescriptorSystem:

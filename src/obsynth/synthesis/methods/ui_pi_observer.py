@@ -25,7 +25,6 @@ import numpy as np
 from obsynth.analysis.conditions import Condition, require_all
 from obsynth.analysis.unknown_input_conditions import existence
 from obsynth.analysis.unknown_input_pencils import number
-from obsynth.analysis.unknown_inputs import direct_part
 from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.models.exosystems import Exosystem, exosystem
@@ -38,15 +37,10 @@ from obsynth.synthesis.placement.eigenstructure import place
 from obsynth.synthesis.placement.kalman import compromise
 from obsynth.synthesis.placement.region import Region, region_gain
 from obsynth.synthesis.result import Synthesis
+from obsynth.synthesis.ui_pi_noise import NoiseWeights, kalman_problem
 from obsynth.synthesis.ui_pi_options import UiPiOptions, checked_poles, plain
-from obsynth.synthesis.ui_pi_problem import (
-    NoiseWeights,
-    PlacementProblem,
-    kalman_problem,
-    placement_problem,
-    with_faults,
-)
-from obsynth.synthesis.ui_pi_realisation import ObserverGains, realise
+from obsynth.synthesis.ui_pi_problem import PlacementProblem, placement_problem, with_faults
+from obsynth.synthesis.ui_pi_realisation import ObserverGains, combinations_seen, realise
 
 
 def conditions(plant: DescriptorSystem, *, fault_model: Any = "step") -> tuple[Condition, ...]:
@@ -66,12 +60,12 @@ def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **op
     working = found.plant
     progress("decoupling the unknown inputs")
     problem = placement_problem(working, model, found.fixed_modes, joint=asked.joint, given=asked.given_decoupling())
-    _require_stable(problem, working.dt)
+    _require_stable(problem.fixed_modes, working.dt)
     progress("choosing the gains")
-    chosen = _chosen(asked, problem, region, weights)
+    chosen = _chosen(asked, problem, region, weights, plant.dt)
     progress("building the realisation and its certificate")
     gains = problem.gains(chosen.gain)
-    poles = None if chosen.poles is None else np.array([*chosen.poles, *problem.split.fixed_modes])
+    poles = None if chosen.poles is None else np.array([*chosen.poles, *problem.fixed_modes])
     synthesis = _assembled(working, model, gains, poles, dict(chosen.claims), structured=not asked.joint)
     return Synthesis(
         asked.resolved(model, plant.fault_names),
@@ -79,7 +73,7 @@ def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **op
         synthesis.observer,
         synthesis.certificate,
         {"runs": list(chosen.runs)},
-        (*_elimination_note(found.conditions, found.transformation is not None), *_notes(problem, asked)),
+        (*_elimination_note(found.conditions, found.transformation is not None), *_notes(problem, asked, plant.dt)),
         found.transformation,
     )
 
@@ -96,30 +90,32 @@ class _Chosen:
 
 def _placed(problem: PlacementProblem, wanted: Sequence[complex], objective: str) -> _Chosen:
     """Return the gain for given poles; its size is that in the user's units where outputs are not mixed."""
-    split, plant = problem.split, problem.plant
-    states = np.concatenate([problem.scaling.states, np.ones(problem.model.order)])
+    split, plant, units = problem.split, problem.plant, problem.units
     plain_outputs = problem.free == 0 and np.array_equal(problem.decoupled.seen, np.eye(plant.ny))
-    outputs = problem.scaling.outputs if plain_outputs else np.ones(len(split.C))
+    outputs = units.outputs if plain_outputs else np.ones(len(split.C))
+    scaled_poles = [units.rate * pole for pole in wanted]
     found = place(
-        split.F, split.C / outputs[:, None], wanted, dt=plant.dt, objective=objective,
-        weight=states[:, None] * split.lift(np.eye(split.order)),
+        split.F, split.C / outputs[:, None], scaled_poles, dt=plant.dt, objective=objective,
+        weight=units.augmented_states[:, None] * split.lift(np.eye(split.order)),
     )  # fmt: skip
     return _Chosen(found.K / outputs, wanted, {"condition": found.condition})
 
 
-def _chosen(asked: UiPiOptions, problem: PlacementProblem, region: Region | None, weights: NoiseWeights) -> _Chosen:
-    split = problem.split
+def _chosen(
+    asked: UiPiOptions, problem: PlacementProblem, region: Region | None, weights: NoiseWeights, dt: float
+) -> _Chosen:
+    split, time = problem.split, problem.units.time
     if asked.poles is not None:
-        wanted = checked_poles(asked.poles, split.order, split.fixed_modes, problem.plant.dt)
+        wanted = checked_poles(asked.poles, split.order, problem.fixed_modes, dt)
         return _placed(problem, wanted, asked.objective)
     kalman = kalman_problem(problem, weights)
     claims: dict[str, float] = {}
     runs: tuple[Mapping[str, Any], ...] = ()
     if region is not None:
-        gain, record = region_gain(kalman, region, solver=asked.solver)
+        gain, record = region_gain(kalman, region.in_time(time), solver=asked.solver)
         runs = (record,)
     elif asked.decay is not None:
-        found = kalman.gain(asked.decay)
+        found = kalman.gain(time * asked.decay)
         if found is None:
             raise SolverError(
                 f"The Riccati equation for decay {asked.decay:g} 1/s has no usable solution: some mode shows too "
@@ -130,7 +126,7 @@ def _chosen(asked: UiPiOptions, problem: PlacementProblem, region: Region | None
         fair = compromise(kalman, problem.rate)
         if fair is None:
             raise SolverError("The Riccati equation has no usable solution: give poles= or a slow decay=.")
-        gain, claims = fair.K, {"noise_price": fair.deviation / fair.quietest if fair.quietest > 0.0 else 1.0}
+        gain, claims = fair.K, {"noise_price": fair.price}
     return _Chosen(gain, None, claims, runs)
 
 
@@ -151,9 +147,8 @@ def _require_all(found: Sequence[Condition]) -> None:
         ) from None
 
 
-def _require_stable(problem: PlacementProblem, dt: float) -> None:
+def _require_stable(modes: ComplexArray, dt: float) -> None:
     """Raise when a mode that no gain moves is not stable: only a given ``E#`` or ``G`` can bring one in."""
-    modes = problem.split.fixed_modes
     unstable = [complex(value) for value in modes if not decay_rates([complex(value)], dt)[0] > 0.0]
     if unstable:
         raise PreconditionError(
@@ -190,8 +185,7 @@ def _assembled(
     structured: bool,
 ) -> Synthesis:
     """Return realisation and certificate of gains in the plant's units; poles that were not asked for are computed."""
-    seen = direct_part(plant)[0]
-    observer, letters = realise(plant, model, gains, seen)
+    observer, letters = realise(plant, model, gains, combinations_seen(plant))
     nx = plant.nx
     if structured:
         letters |= {"U": gains.U[:nx, :nx], "D": gains.D[:nx], "K": gains.K[:nx], "F": gains.K[nx:]}
@@ -233,9 +227,9 @@ def _elimination_note(found: tuple[Condition, ...], eliminated: bool) -> tuple[s
     return (f"(D1) holds only without the algebraic states, which were eliminated: {detail}.",)
 
 
-def _notes(problem: PlacementProblem, asked: UiPiOptions) -> tuple[str, ...]:
+def _notes(problem: PlacementProblem, asked: UiPiOptions, dt: float) -> tuple[str, ...]:
     found = []
-    fixed, dt = problem.split.fixed_modes, problem.plant.dt
+    fixed = problem.fixed_modes
     if fixed.size:
         text = ", ".join(number(complex(value)) for value in fixed if value.imag >= 0.0)
         rates = decay_rates(fixed, dt)

@@ -18,6 +18,10 @@ from obsynth.numerics.spectra import abscissa, noise_covariance
 NOISE_PRICE = 10.0
 #: The default rate is found to about this factor.
 RATE_STEP = 1.05
+#: Times the Riccati equation is solved, each time in the coordinates of the last solution, which improve it.
+ROUNDS = 2
+#: Estimates with less than this share of the outputs' noise have none but rounding.
+SILENT = 1e-8
 #: Halvings of the default rate before the quietest filter is taken as it is.
 MOST_HALVINGS = 12
 
@@ -58,8 +62,6 @@ class KalmanProblem:
         ----------
         .. [AndersonMoore1971] B. D. O. Anderson, J. B. Moore, "Linear optimal control", 1971, section 4.
         """
-        import control
-
         n = self.F.shape[0]
         if n == 0:
             return np.zeros((0, self.C.shape[0]))
@@ -69,23 +71,19 @@ class KalmanProblem:
         free = self.F - direct @ self.C
         rest = self.B @ self.B.T + self.drive @ self.drive.T - direct @ self.D @ self.B.T
         rest = 0.5 * (rest + rest.T)
-        with warnings.catch_warnings(), np.errstate(all="ignore"):
-            # What a badly conditioned equation gives is judged below, by its poles.
-            warnings.simplefilter("ignore")
-            try:
-                if self.dt > 0.0:
-                    radius = np.exp(-decay * self.dt)
-                    found = radius * control.dlqe(free / radius, np.eye(n), self.C, rest, measured)[0]
-                else:
-                    found = control.lqe(free + decay * np.eye(n), np.eye(n), self.C, rest, measured)[0]
-            except (np.linalg.LinAlgError, ValueError, ArithmeticError):
-                return None
-        total = np.asarray(found) + direct
-        if not np.all(np.isfinite(total)):
-            return None
-        bound = np.exp(-decay * self.dt) if self.dt > 0.0 else -decay
-        # Strictly: a rate that is only met within rounding is none.
-        return total if abscissa(self.F - total @ self.C, self.dt) < bound else None
+        bound = float(np.exp(-decay * self.dt)) if self.dt > 0.0 else -decay
+        best: FloatArray | None = None
+        change = np.eye(n)
+        for _ in range(ROUNDS):
+            found = _filtered(free, self.C, rest, measured, (bound, self.dt), change)
+            if found is None:
+                break
+            total = found[0] + direct
+            # Strictly: a rate that is only met within rounding is none.
+            if abscissa(self.F - total @ self.C, self.dt) < bound:
+                best = total
+            change = found[1]
+        return best
 
     def deviations(self, gain: FloatArray) -> FloatArray:
         """Return the standard deviation of each estimate under the noise that counts (for unit intensity, dt = 0)."""
@@ -93,6 +91,55 @@ class KalmanProblem:
         direct = np.zeros((self.estimates.shape[0], entering.shape[1]))
         covariance = noise_covariance(self.F - gain @ self.C, entering, self.estimates, direct, self.dt)
         return np.asarray(np.sqrt(np.maximum(np.diag(covariance), 0.0)))
+
+
+def _filtered(
+    f: FloatArray,
+    c: FloatArray,
+    driven: FloatArray,
+    measured: FloatArray,
+    asked: tuple[float, float],
+    change: FloatArray,
+) -> tuple[FloatArray, FloatArray] | None:
+    """Return the gain of a Kalman filter, and states in which its error covariance is the identity.
+
+    Parameters
+    ----------
+    f, c, driven, measured : FloatArray
+        The pair and its noise covariances, uncorrelated.
+    asked : tuple of float
+        Bound of the poles, and seconds between samples.
+    change : FloatArray
+        ``(n, n)``: the equation is solved in states ``change^-1 e``.
+    """
+    import control
+
+    (bound, dt), n = asked, len(f)
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        # What a badly conditioned equation gives is judged by its poles; by scipy, so that no gain depends on whether
+        # slycot is there.
+        warnings.simplefilter("ignore")
+        try:
+            inverse = np.linalg.inv(change)
+            moved, noise = inverse @ f @ change, inverse @ driven @ inverse.T
+            noise = 0.5 * (noise + noise.T)
+            if dt > 0.0:
+                found, covariance, _ = control.dlqe(
+                    moved / bound, np.eye(n), c @ change, noise, measured, method="scipy"
+                )
+                found = bound * np.asarray(found)
+            else:
+                found, covariance, _ = control.lqe(
+                    moved - bound * np.eye(n), np.eye(n), c @ change, noise, measured, method="scipy"
+                )
+            values, vectors = np.linalg.eigh(0.5 * (covariance + np.asarray(covariance).T))
+        except (np.linalg.LinAlgError, ValueError, ArithmeticError):
+            return None
+    gain = change @ found
+    if not np.all(np.isfinite(gain)) or not np.all(np.isfinite(values)) or values[-1] <= 0.0:
+        return None
+    floor = float(np.finfo(np.float64).eps) * values[-1]
+    return np.asarray(gain), np.asarray(change @ (vectors * np.sqrt(np.maximum(values, floor))))
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,14 +152,13 @@ class Compromise:
         ``(n, ny)``.
     decay : float
         1/s.
-    deviation, quietest : float
-        Largest standard deviation of an estimate, of this gain and of the Kalman gain without a rate.
+    price : float
+        Largest ratio of the standard deviation of an estimate to that with the Kalman gain without a rate.
     """
 
     K: FloatArray
     decay: float
-    deviation: float
-    quietest: float
+    price: float
 
 
 def compromise(problem: KalmanProblem, rate: float) -> Compromise | None:
@@ -131,15 +177,19 @@ def compromise(problem: KalmanProblem, rate: float) -> Compromise | None:
     plain = problem.gain(0.0)
     if plain is None:
         return None
-    quietest = float(np.max(problem.deviations(plain), initial=0.0))
-    best = Compromise(plain, 0.0, quietest, quietest)
+    # Each estimate by itself: they have units of their own.
+    quietest = problem.deviations(plain)
+    silent = SILENT * np.linalg.norm(problem.estimates, axis=1) * float(np.linalg.norm(problem.D))
+    counted = (quietest > silent) & np.isfinite(quietest)
+    best = Compromise(plain, 0.0, 1.0)
 
     def attempt(decay: float) -> Compromise | None:
         gain = problem.gain(decay)
         if gain is None:
             return None
-        deviation = float(np.max(problem.deviations(gain), initial=0.0))
-        return Compromise(gain, decay, deviation, quietest) if deviation <= NOISE_PRICE * quietest else None
+        ratios = problem.deviations(gain)[counted] / quietest[counted]
+        price = float(np.max(ratios)) if ratios.size else 1.0
+        return Compromise(gain, decay, price) if price <= NOISE_PRICE else None
 
     high = rate
     for _ in range(MOST_HALVINGS):

@@ -14,14 +14,13 @@ import numpy as np
 
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.numerics.log_balance import LogBalance
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, HIDDEN_MODE_TOLERANCE, RANK_TOLERANCE
 from obsynth.numerics.spectra import eigenvalues
 
 #: Fixed modes closer than this, relative to their size, are peeled off together, at their mean: a double one that
 #: rounding split lies at about the square root of the unit roundoff from it.
 SAME_MODE = 1e-5
-#: Weight of leaving the states' units alone.
-SMALL_RIDGE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +34,7 @@ class ObservableSplit:
     basis : FloatArray
         ``(n, n)``, orthogonal.
     units : FloatArray
-        ``(n,)``, powers of two: the states are balanced first.
+        ``(n,)``: the states are balanced first.
     F, C : FloatArray
         The observable part, ``(no, no)`` and ``(ny, no)``.
     fixed_modes : ComplexArray
@@ -85,7 +84,7 @@ def observable_split(f: FloatArray, c: FloatArray, fixed_modes: ComplexArray) ->
     units = _balancing(f, c)
     work_f, work_c, basis = f * units / units[:, None], c * units, np.eye(n)
     size = max(float(np.linalg.norm(work_f, 2)), float(np.linalg.norm(work_c, 2))) if n else 1.0
-    waiting = [complex(value) for value in fixed_modes if value.imag >= 0.0]
+    waiting = _upper_half(fixed_modes)
     seen = n
     while waiting:
         value = waiting[0]
@@ -111,6 +110,17 @@ def observable_split(f: FloatArray, c: FloatArray, fixed_modes: ComplexArray) ->
     return ObservableSplit(basis, units, work_f[:seen, :seen], work_c[:, :seen], hidden)
 
 
+def _upper_half(modes: ComplexArray) -> list[complex]:
+    """Return one mode of each pair; a double real mode that rounding has split into a pair is real twice."""
+    found: list[complex] = []
+    for mode in map(complex, modes):
+        if 0.0 < abs(mode.imag) <= SAME_MODE * max(1.0, abs(mode)):
+            found.append(complex(mode.real, 0.0))
+        elif mode.imag >= 0.0:
+            found.append(mode)
+    return found
+
+
 def _hidden_directions(f: FloatArray, c: FloatArray, value: complex, size: float) -> FloatArray:
     """Return a real orthonormal basis of the states that stay invisible at the mode, and at its conjugate."""
     shifted = f - (value if value.imag else value.real) * np.eye(f.shape[0])
@@ -126,30 +136,20 @@ def _hidden_directions(f: FloatArray, c: FloatArray, value: complex, size: float
 
 
 def _balancing(f: FloatArray, c: FloatArray) -> FloatArray:
-    """Return powers of two by which the states are scaled, so that the entries of F, and of each row of C, are alike.
+    """Return factors of the states with which the entries of F, and those of C, are alike.
 
     Least squares on the logarithms, with the common size of F free: unlike the usual balancing it does not run away
     where F is reducible, as that of a fault model is.
     """
-    n, outputs = f.shape[0], c.shape[0]
-    if n == 0:
-        return np.ones(0)
-    rows, right = [], []
-
-    floor = CANCELLATION_TOLERANCE * float(np.max(np.abs(f), initial=0.0))
-    for i, j in zip(*np.nonzero(np.abs(f) > floor), strict=True):
-        if i != j:
-            row = np.zeros(n + 1 + outputs)
-            row[j], row[i], row[n] = 1.0, -1.0, -1.0
-            rows.append(row)
-            right.append(-np.log2(abs(f[i, j])))
-    floor = CANCELLATION_TOLERANCE * float(np.max(np.abs(c), initial=0.0))
-    for k, j in zip(*np.nonzero(np.abs(c) > floor), strict=True):
-        row = np.zeros(n + 1 + outputs)
-        row[j], row[n + 1 + k] = 1.0, -1.0
-        rows.append(row)
-        right.append(-np.log2(abs(c[k, j])))
-    # The ridge leaves a state alone that nothing ties to the others.
-    whole = np.vstack([*rows, SMALL_RIDGE * np.eye(n + 1 + outputs)])
-    exponents = np.linalg.lstsq(whole, np.concatenate([right, np.zeros(n + 1 + outputs)]), rcond=None)[0][:n]
-    return np.asarray(np.exp2(np.round(exponents)))
+    n = f.shape[0]
+    problem = LogBalance(n + 2)
+    states = range(n)
+    links = np.where(np.eye(n, dtype=bool), 0.0, f)
+    # All outputs together: which combinations of them are looked at must not matter.
+    shown = np.linalg.norm(c, axis=0, keepdims=True)
+    floor_f, floor_c = (CANCELLATION_TOLERANCE * float(np.max(np.abs(part), initial=0.0)) for part in (f, shown))
+    problem.add(np.where(np.abs(links) > floor_f, f, 0.0), states, states, signs=(-1, 1), common=n)
+    problem.add(np.where(shown > floor_c, shown, 0.0), range(n + 1, n + 2), states)
+    for state in states:
+        problem.wish(state, 0.0)
+    return np.asarray(np.exp2(problem.solve()[:n]))

@@ -8,8 +8,9 @@ References
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,8 @@ INNER_SHARE = 1e-3
 STATE_WEIGHT = 1e-3
 #: The matrix of the Lyapunov function stays above this multiple of the identity, in scaled states.
 LEAST_LYAPUNOV = 1e-6
+#: Above this many states the inequality moves only those poles that a Kalman gain leaves outside the region.
+LARGE = 20
 
 
 @dataclass(frozen=True)
@@ -34,7 +37,7 @@ class Region:
 
     Parameters
     ----------
-    decay : float, optional, 1/s
+    decay : float, optional, 1/s (of whatever time the problem has)
         Every mode decays at least as ``exp(-decay t)``.
     radius : float, optional, 1/s
         No mode is faster than this: ``abs(s) <= radius``; continuous time only.
@@ -81,6 +84,19 @@ class Region:
             )  # fmt: skip
         return cls(**data)
 
+    def in_time(self, unit: float) -> Region:
+        """Return the region with rates per ``unit`` (seconds) instead of per second."""
+        return replace(self, decay=unit * self.decay, radius=None if self.radius is None else unit * self.radius)
+
+    def shrunk(self) -> Region:
+        """Return the region inside of which poles count as well within it."""
+        return replace(
+            self,
+            decay=(1.0 + 0.5 * INNER_SHARE) * self.decay,
+            radius=None if self.radius is None else (1.0 - 0.5 * INNER_SHARE) * self.radius,
+            damping=None if self.damping is None else min((1.0 + 0.5 * INNER_SHARE) * self.damping, 1.0),
+        )
+
     def holds(self, values: Any, dt: float) -> bool:
         """Whether all ``values`` lie in the region."""
         poles = np.asarray(values, dtype=np.complex128)
@@ -96,6 +112,8 @@ class Region:
 
 def region_gain(problem: KalmanProblem, region: Region, *, solver: str) -> tuple[FloatArray, dict[str, Any]]:
     """Return K ``(n, ny)`` with all poles of ``F - K C`` in the region and little noise, and the solver's record.
+
+    Above `LARGE` states a Kalman gain of the region's rate comes first, and the record is empty where it is enough.
 
     Parameters
     ----------
@@ -115,6 +133,54 @@ def region_gain(problem: KalmanProblem, region: Region, *, solver: str) -> tuple
     n, dt = problem.F.shape[0], problem.dt
     if n == 0:
         return np.zeros((0, problem.C.shape[0])), {}
+    # What one way cannot find, the other may.
+    ways = [_partly, _by_inequality] if n > LARGE else [_by_inequality, _partly]
+    failures: list[SolverError] = []
+    for way in ways:
+        try:
+            gain, record = way(problem, region, solver=solver)
+        except SolverError as error:
+            failures.append(error)
+            continue
+        if region.holds(eigenvalues(problem.F - gain @ problem.C), dt):
+            return gain, record
+        failures.append(SolverError(
+            f"{solver} ended with poles outside the region: nothing is known. Widen the region, or use decay= instead.",
+            record=record,
+        ))  # fmt: skip
+    raise failures[ways.index(_by_inequality)]
+
+
+def _partly(problem: KalmanProblem, region: Region, *, solver: str) -> tuple[FloatArray, dict[str, Any]]:
+    """Move only those poles into the region that a Kalman gain of the same rate leaves outside.
+
+    With ``F - K C = V diag(T1, T2) V^-1``, the poles of T1 inside, a further gain ``V [0; K2]`` keeps these and moves
+    the others to those of ``T2 - K2 C V2``: the inequality has the size of T2.
+    """
+    from scipy.linalg import schur, solve_sylvester
+
+    gain = problem.gain((1.0 + INNER_SHARE) * region.decay)
+    if gain is None:
+        raise SolverError("The Riccati equation has no usable solution: give poles=, or a slower region.")
+    inner = region.shrunk()
+    triangular, turn, good = schur(
+        problem.F - gain @ problem.C, output="real", sort=lambda re, im: inner.holds([complex(re, im)], problem.dt)
+    )
+    if good == len(triangular):
+        return gain, {}
+    first, mixed, second = triangular[:good, :good], triangular[:good, good:], triangular[good:, good:]
+    apart = np.vstack([solve_sylvester(first, -second, -mixed), np.eye(len(second))])
+    moved, rows = turn @ apart, turn[:, good:].T
+    rest = replace(
+        problem, F=second, C=problem.C @ moved, B=rows @ (problem.B - gain @ problem.D), drive=rows @ problem.drive,
+        estimates=problem.estimates @ moved,
+    )  # fmt: skip
+    more, record = _by_inequality(rest, region, solver=solver)
+    return np.asarray(gain + moved @ more), record
+
+
+def _by_inequality(problem: KalmanProblem, region: Region, *, solver: str) -> tuple[FloatArray, dict[str, Any]]:
+    n, dt = problem.F.shape[0], problem.dt
     change = _scaling(problem, region)
     inverse = np.linalg.inv(change)
     f, c = inverse @ problem.F @ change, problem.C @ change
@@ -141,14 +207,7 @@ def region_gain(problem: KalmanProblem, region: Region, *, solver: str) -> tuple
         constraints.append(lmi.at_most(moved + moved.T + weight, 0.0))
         constraints += _continuous_region(region, p, moved)
     record = lmi.minimise(lmi.trace(z), constraints, what="poles in a region", solver=solver)
-    gain = change @ np.linalg.solve(lmi.value_of(p), lmi.value_of(y))
-    poles = eigenvalues(problem.F - gain @ problem.C)
-    if not region.holds(poles, dt):
-        raise SolverError(
-            f"{solver} ended with poles outside the region: nothing is known. Widen the region, or use decay= instead.",
-            record=record,
-        )
-    return np.asarray(gain), record
+    return np.asarray(change @ np.linalg.solve(lmi.value_of(p), lmi.value_of(y))), record
 
 
 def _continuous_region(region: Region, p: Any, moved: Any) -> list[Any]:
@@ -176,13 +235,18 @@ def _scaling(problem: KalmanProblem, region: Region) -> FloatArray:
     closed, entering = problem.F - gain @ problem.C, problem.B - gain @ problem.D
     noise = entering @ entering.T + problem.drive @ problem.drive.T
     noise = noise + gain @ problem.background @ problem.background.T @ gain.T
-    if problem.dt > 0.0:
-        radius = np.exp(-region.decay * problem.dt)
-        covariance = solve_discrete_lyapunov(closed / radius, noise)
-    else:
-        covariance = solve_continuous_lyapunov(closed + region.decay * np.eye(len(closed)), -noise)
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        # A poor scaling is judged by what the solver makes of it.
+        warnings.simplefilter("ignore")
+        if problem.dt > 0.0:
+            radius = np.exp(-region.decay * problem.dt)
+            covariance = solve_discrete_lyapunov(closed / radius, noise)
+        else:
+            covariance = solve_continuous_lyapunov(closed + region.decay * np.eye(len(closed)), -noise)
+    if not np.all(np.isfinite(covariance)):
+        return np.eye(len(closed))
     values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
-    if not np.all(np.isfinite(values)) or values[-1] <= 0.0:
+    if values[-1] <= 0.0:
         return np.eye(len(closed))
     floor = float(np.finfo(np.float64).eps) * values[-1]
     return np.asarray(vectors * np.sqrt(np.maximum(values, floor)))

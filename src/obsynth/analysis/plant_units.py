@@ -1,0 +1,173 @@
+r"""Units in which a plant, its faults and its time are near one: decisions and gains must not depend on those given.
+
+With ``x = S x'``, ``t = tau t'``, ``f = Phi_f f'``, ``w = W w'`` and so on the scaled plant is
+
+    E' = Q E S,  A' = tau Q A S,  Bf' = tau Q Bf Phi_f,  C' = Y C S,  Df' = Y Df Phi_f,  Phi' = tau W^-1 Phi W
+
+(no tau in discrete time).  The factors are those of a least-squares problem in the logarithms of all entries, so that
+the scaled plant is the same whatever units the plant came in.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from obsynth.models.descriptor import DescriptorSystem
+from obsynth.models.exosystems import Exosystem
+from obsynth.numerics.arrays import ComplexArray, FloatArray, read_only
+from obsynth.numerics.log_balance import LogBalance
+from obsynth.numerics.ranks import RANK_TOLERANCE
+
+#: Weight of inputs and outputs beside equations and states, which they scale only where A and E leave that open.
+SIGNALS_WEIGHT = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class PlantUnits:
+    """Factors between a plant as given and the scaled one.
+
+    Parameters
+    ----------
+    time : float, seconds
+        The unit of time: tau, or the sample time.
+    equations, states, outputs, faults, disturbances, model : FloatArray
+        ``(nx,)``, ``(nx,)``, ``(ny,)``, ``(nf,)``, ``(nd,)``, ``(nw,)``: equations and outputs are multiplied by
+        theirs; a state, fault, disturbance or state of the fault model is its factor times the scaled one.
+    discrete : bool
+        Whether the plant is sampled: its matrices have no unit of time then.
+    """
+
+    time: float
+    equations: FloatArray
+    states: FloatArray
+    outputs: FloatArray
+    faults: FloatArray
+    disturbances: FloatArray
+    model: FloatArray
+    discrete: bool
+
+    @classmethod
+    def of(cls, plant: DescriptorSystem, model: Exosystem | None = None) -> PlantUnits:
+        """Return the units that suit a plant and the model of its faults."""
+        nx, ny, order = plant.nx, plant.ny, 0 if model is None else model.order
+        ends = np.cumsum([1, nx, nx, ny, plant.nf, plant.nd, order])
+        equations, states, outputs, faults, disturbances, fault_model = (
+            range(int(start), int(end)) for start, end in pairwise(ends)
+        )
+        problem = LogBalance(int(ends[-1]))
+        time = None if plant.is_discrete else 0
+        # A state and the equation of its derivative belong together, however many others A links them to.
+        problem.add(plant.E, equations, states, weight=float(nx))
+        problem.add(plant.A, equations, states, common=time)
+        problem.add(plant.Bf, equations, faults, common=time, weight=SIGNALS_WEIGHT)
+        problem.add(plant.Bd, equations, disturbances, common=time, weight=SIGNALS_WEIGHT)
+        problem.add(plant.C, outputs, states, weight=SIGNALS_WEIGHT)
+        if model is not None:
+            problem.add(model.Phi, fault_model, fault_model, signs=(-1, 1), common=time)
+        for row, size in zip(outputs, np.linalg.norm(plant.Dw, axis=1), strict=True):
+            # Parts of a plant that do not touch each other compare by their noise.
+            if size > 0.0:
+                problem.wish(row, -float(np.log2(size)))
+        factors = np.exp2(problem.solve())
+        own, left = factors[states], factors[equations] * (1.0 if plant.is_discrete else factors[0])
+        shown = _inverse_sizes(plant.C * own, plant.Df, plant.Dd)
+        entering = [
+            _inverse_sizes((left[:, None] * inner).T, (shown[:, None] * direct).T)
+            for inner, direct in ((plant.Bf, plant.Df), (plant.Bd, plant.Dd))
+        ]
+        courses = _model_units(model, factors[fault_model], entering[0])
+        return cls(
+            plant.dt or float(factors[0]), read_only(factors[equations]), read_only(own), read_only(shown),
+            read_only(entering[0]), read_only(entering[1]), read_only(courses), plant.is_discrete,
+        )  # fmt: skip
+
+    @property
+    def rate(self) -> float:
+        """What eigenvalues are multiplied by: those of sampled plants have no unit."""
+        return 1.0 if self.discrete else self.time
+
+    @property
+    def augmented_states(self) -> FloatArray:
+        """Factors of the state and of that of the fault model, ``(nx + nw,)``."""
+        return np.concatenate([self.states, self.model])
+
+    @property
+    def augmented_equations(self) -> FloatArray:
+        """Factors of the equations, those of the fault model included, ``(nx + nw,)``."""
+        return np.concatenate([self.equations, 1.0 / self.model])
+
+    def rounded(self) -> PlantUnits:
+        """Return the same with powers of two, with which scaling is exact."""
+
+        def nearest(factors: FloatArray) -> FloatArray:
+            return read_only(np.exp2(np.round(np.log2(factors))))
+
+        time = self.time if self.discrete else float(np.exp2(np.round(np.log2(self.time))))
+        return PlantUnits(
+            time, nearest(self.equations), nearest(self.states), nearest(self.outputs), nearest(self.faults),
+            nearest(self.disturbances), nearest(self.model), self.discrete,
+        )  # fmt: skip
+
+    def for_decoupling(self, plant: DescriptorSystem) -> PlantUnits:
+        """Return the same with each equation that holds a derivative scaled by its row of E.
+
+        How much of a state is read from the outputs and how much is integrated then does not depend on how fast it is.
+        """
+        rows = np.max(np.abs(plant.E) * self.states, axis=1, initial=0.0)
+        moving = rows * self.equations > RANK_TOLERANCE * np.max(rows * self.equations, initial=0.0)
+        return replace(self, equations=read_only(np.where(moving, 1.0 / np.where(moving, rows, 1.0), self.equations)))
+
+    def scaled_plant(self, plant: DescriptorSystem) -> DescriptorSystem:
+        """Return the plant in these units; known inputs keep theirs, and noise its unit intensity."""
+        left = self.rate * self.equations[:, None]
+        shown = self.outputs[:, None]
+        spread = 1.0 if self.discrete else float(np.sqrt(self.time))
+        return plant.replace(
+            E=self.equations[:, None] * plant.E * self.states, A=left * plant.A * self.states, B=left * plant.B,
+            Bf=left * plant.Bf * self.faults, Bd=left * plant.Bd * self.disturbances,
+            Bw=spread * self.equations[:, None] * plant.Bw, C=shown * plant.C * self.states, D=shown * plant.D,
+            Df=shown * plant.Df * self.faults, Dd=shown * plant.Dd * self.disturbances, Dw=shown * plant.Dw / spread,
+            dt=1.0 if self.discrete else 0.0,
+        )  # fmt: skip
+
+    def scaled_model(self, model: Exosystem) -> Exosystem:
+        """Return the fault model in these units."""
+        return replace(
+            model,
+            Phi=read_only(self.rate * model.Phi * self.model / self.model[:, None]),
+            Cw=read_only(model.Cw * self.model / self.faults[:, None]),
+            eigenvalues=self.rate * model.eigenvalues,
+        )
+
+    def eigenvalue(self, scaled: complex) -> complex:
+        """Return an eigenvalue or zero in the plant's own time."""
+        return complex(scaled) / self.rate
+
+    def eigenvalues(self, scaled: ComplexArray) -> ComplexArray:
+        """Return eigenvalues or zeros in the plant's own time."""
+        return np.asarray(scaled / self.rate, dtype=np.complex128)
+
+
+def _inverse_sizes(*parts: FloatArray) -> FloatArray:
+    """Return the inverse length of each row of the first part in which it is not zero; 1 where it is in none."""
+    found = np.zeros(len(parts[0]))
+    for part in parts:
+        found = np.where(found > 0.0, found, np.linalg.norm(part, axis=1))
+    return np.asarray(1.0 / np.where(found > 0.0, found, 1.0))
+
+
+def _model_units(model: Exosystem | None, factors: FloatArray, faults: FloatArray) -> FloatArray:
+    """Return the factors of the states of the fault model, such that the rows of Cw have unit length for each fault."""
+    if model is None:
+        return factors
+    found, links = factors.copy(), model.Phi != 0.0
+    for fault, row in zip(faults, model.Cw, strict=True):
+        linked = row != 0.0
+        for _ in range(model.order):
+            linked = linked | np.any(links[linked], axis=0) | np.any(links[:, linked], axis=1)
+        size = float(np.linalg.norm(row * factors))
+        found[linked] = factors[linked] * (fault / size if size > 0.0 else 1.0)
+    return found

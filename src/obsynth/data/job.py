@@ -1,0 +1,157 @@
+"""One run: rows of data to rows of output, and what is counted on the way."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from obsynth.analysis.transformations import StateRecovery
+from obsynth.data.engine import DECIDING, Engine, Row, delayed
+from obsynth.data.operating import FirstSecond
+from obsynth.data.recovered import LATE, RecoveredStates
+from obsynth.data.signals import TIME, Signals
+from obsynth.errors import SpecError
+from obsynth.evaluation.online import OnlineMonitor
+from obsynth.models.arguments import is_number
+from obsynth.numerics.arrays import FloatArray
+
+
+class Job:
+    """Rows of data to rows of output.
+
+    Parameters
+    ----------
+    engine : Engine
+        What is run.
+    signals : Signals
+        Which columns it reads.
+    recovery : StateRecovery or None
+        The way back to the states of the plant as written.
+    thresholds : mapping
+        Level by column.
+    monitor : OnlineMonitor or None
+        What watches residuals or parameters.
+
+    Raises
+    ------
+    SpecError
+        A threshold is for no column, or not positive; or the monitor is for another design.
+    """
+
+    def __init__(
+        self, engine: Engine, signals: Signals, recovery: StateRecovery | None, thresholds: Mapping[str, float],
+        monitor: OnlineMonitor | None,
+    ) -> None:  # fmt: skip
+        self.engine, self.signals, self.monitor = engine, signals, monitor
+        self.recovered = RecoveredStates.of(recovery, engine)
+        extra = () if self.recovered is None else self.recovered.columns
+        names = (*engine.columns, *extra)
+        for name, level in thresholds.items():
+            if name not in names:
+                raise SpecError(f"There is no column {name!r} to watch: there are {', '.join(names)}.",
+                                path="thresholds")  # fmt: skip
+            if not (is_number(level) and level > 0.0):
+                raise SpecError(f"The threshold of {name!r} is {level!r}: give a positive number.", path="thresholds")
+        self._levels = tuple((name, names.index(name), level) for name, level in thresholds.items())
+        lags = list(delayed(engine))
+        if self.recovered is not None and self.recovered.delay:
+            lags.append((LATE, self.recovered.delay))
+        self._lags = [delay * engine.dt for _, delay in lags]
+        self._point = signals.estimates_point(engine)
+        if self.recovered is not None:
+            self._point = np.concatenate([self._point, self.recovered.point])
+        states, faults = len(engine.state_names), len(engine.fault_names)
+        self._faults = slice(states, states + faults)
+        residuals = [i for i, name in enumerate(engine.columns) if name.startswith("r[")]
+        self._residuals = slice(residuals[0], residuals[-1] + 1) if residuals else slice(0, 0)
+        if monitor is not None:
+            monitor.require_fit(len(residuals), engine.fault_names)
+        self.header = (
+            TIME, "status", *(f"time of {name}" for name, _ in lags), *names,
+            *(("statistic", "threshold") if monitor is not None else ()),
+            *(("alarm",) if thresholds or monitor is not None else ()),
+        )  # fmt: skip
+        self.first, self.rows = FirstSecond(signals), 0
+        self.statuses, self.alarms, self.isolated = Counter[str](), dict[str, float](), ""
+
+    def take(self, chunk: FloatArray) -> list[list[Any]]:
+        """Take rows ``[time, u, y]`` as read; return rows of output.
+
+        Parameters
+        ----------
+        chunk : FloatArray
+            ``(rows, 1 + nu + ny)``.
+        """
+        times: list[float] = chunk[:, 0].tolist()
+        nu = len(self.engine.input_names)
+        found, estimates = [], []
+        for time, deviations in zip(times, self.signals.scale * chunk[:, 1:] - self.signals.offset, strict=True):
+            row = self.engine.step(time, deviations, self.rows + 1)
+            self.rows += 1
+            self.first.take(time, deviations)
+            values = row.values
+            if self.recovered is not None:
+                values = np.concatenate([values, self.recovered.take(row, deviations[:nu])])
+            found.append(row)
+            estimates.append(values)
+        self.statuses.update(row.status for row in found)
+        shown: list[list[float]] = (np.array(estimates) + self._point).tolist()
+        rows: list[list[Any]] = [
+            [time, row.status, *(time - lag for lag in self._lags), *cells]
+            for time, row, cells in zip(times, found, shown, strict=True)
+        ]
+        if self._levels or self.monitor is not None:
+            for time, row, values, cells in zip(times, found, estimates, rows, strict=True):
+                cells.extend(self._decided(time, row, values))
+        return rows
+
+    def _decided(self, time: float, row: Row, values: FloatArray) -> list[Any]:
+        """Return statistic and threshold, if there is a monitor, and what alarms there are."""
+        deciding = row.status in DECIDING
+        names = [name for name, i, level in self._levels if deciding and np.abs(values[i]) > level]
+        for name in names:
+            self.alarms.setdefault(name, time)
+        cells: list[Any] = []
+        if self.monitor is not None:
+            seen = self.monitor.see(
+                time, deciding=deciding, skipped=row.skipped, residuals=row.values[self._residuals],
+                faults=row.values[self._faults], evidence=row.evidence,
+            )  # fmt: skip
+            cells = [seen.statistic, seen.threshold]
+            if seen.alarm:
+                if self.monitor.kind not in self.alarms:
+                    self.alarms[self.monitor.kind], self.isolated = time, seen.fault
+                names.append(f"{self.monitor.kind}: {seen.fault}" if seen.fault else self.monitor.kind)
+        return [*cells, "; ".join(names)]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what is carried from row to row, as data."""
+        return {
+            "observer": self.engine.as_dict(),
+            "recovered": None if self.recovered is None else self.recovered.as_dict(),
+            "monitor": None if self.monitor is None else self.monitor.as_dict(),
+        }
+
+    def resume(self, data: dict[str, Any]) -> None:
+        """Go on from what `as_dict` returned.
+
+        Parameters
+        ----------
+        data : dict
+            From a run with the same gain set and options.
+
+        Raises
+        ------
+        SpecError
+            The options differ.
+        """
+        if (data["monitor"] is None) != (self.monitor is None):
+            raise SpecError("The saved state is of a run with another monitor: use the same options.", path="state")
+        self.engine.resume(data["observer"])
+        if self.recovered is not None:
+            self.recovered.resume(data["recovered"])
+        if self.monitor is not None:
+            self.monitor.resume(data["monitor"])

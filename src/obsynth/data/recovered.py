@@ -1,0 +1,117 @@
+"""States of the plant as it was written, from the estimates for the plant it was made into."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from obsynth.analysis.transformations import StateRecovery
+from obsynth.data.engine import Engine, Row
+from obsynth.numerics.arrays import FloatArray
+
+#: Its column says of which time the recovered states are.
+LATE = "recovered states"
+
+
+class RecoveredStates:
+    """Estimates of the states that a transformation took away, all of one moment.
+
+    Parameters
+    ----------
+    recovery : StateRecovery
+        Of the design.
+    engine : Engine
+        Whose estimates are used.
+
+    Notes
+    -----
+    ``x_source = from_state x + from_input u + from_fault f``: what disturbances and noise add is not known.  Where the
+    fault estimate lags more than that of the state, both are taken of the older moment.  Faults that the observer does
+    not estimate count as zero.
+    """
+
+    def __init__(self, recovery: StateRecovery, engine: Engine) -> None:
+        places = [recovery.names.index(name) for name in recovery.names if not _kept(recovery, engine, name)]
+        self.names = tuple(recovery.names[i] for i in places)
+        self.columns = tuple(
+            f"xhat[{name}]" if name not in engine.state_names else f"xhat[{name} as written]" for name in self.names
+        )
+        flags = recovery.flags()
+        self.flags: Mapping[str, str] = {recovery.names[i]: flags[i] for i in places}
+        self.point = np.array([recovery.operating_point.get(name, 0.0) for name in self.names])
+        states, faults = len(engine.state_names), recovery.from_fault.shape[1]
+        known = faults if faults == len(engine.fault_names) else 0
+        self._map = np.hstack([recovery.from_state, recovery.from_fault[:, :known]])[places]
+        self._inputs = recovery.from_input[places]
+        used = self._map.any(axis=0)
+        delays = np.array([*engine.state_delays, *engine.fault_delays[:known]], dtype=int)
+        self.delay = int(np.max(delays[used], initial=0))
+        self._ages = np.where(used, self.delay - delays, 0)
+        self._used, self._columns = used, np.arange(states + known)
+        self._rows: deque[FloatArray] = deque(maxlen=self.delay + 1)
+        self._known = np.zeros(len(engine.input_names))
+
+    @classmethod
+    def of(cls, recovery: StateRecovery | None, engine: Engine) -> RecoveredStates | None:
+        """Return the recovery of a design; `None` where there is nothing to recover.
+
+        Parameters
+        ----------
+        recovery : StateRecovery or None
+            Of the design.
+        engine : Engine
+            Whose estimates are used.
+        """
+        if recovery is None or recovery.from_state.shape[1] != len(engine.state_names):
+            return None
+        found = cls(recovery, engine)
+        return found if found.names else None
+
+    def take(self, row: Row, inputs: FloatArray) -> FloatArray:
+        """Return the recovered states, deviations; NaN where they are not known.
+
+        Parameters
+        ----------
+        row : Row
+            Estimates.
+        inputs : FloatArray
+            ``(nu,)``, deviations; the last known ones stand for those that are missing.
+        """
+        if row.skipped:
+            self._rows.clear()
+        self._known = np.where(np.isfinite(inputs), inputs, self._known)
+        self._rows.append(np.concatenate([row.values[self._columns], self._known]))
+        if len(self._rows) <= self.delay:
+            return np.full(len(self.names), np.nan)
+        rows = np.array(self._rows)[::-1]
+        estimates = np.where(self._used, rows[self._ages, self._columns], 0.0)
+        return np.asarray(self._map @ estimates + self._inputs @ rows[self.delay, len(self._columns) :])
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what is carried from row to row, as data."""
+        return {"rows": list(self._rows), "known": self._known}
+
+    def resume(self, data: Mapping[str, Any]) -> None:
+        """Go on from what `as_dict` returned.
+
+        Parameters
+        ----------
+        data : mapping
+            From a run with the same gain set.
+        """
+        self._rows.clear()
+        self._rows.extend(data["rows"])
+        self._known = data["known"]
+
+
+def _kept(recovery: StateRecovery, engine: Engine, name: str) -> bool:
+    """Whether a state of the source is one of the observer's own, by name and as it is."""
+    if name not in engine.state_names:
+        return False
+    row = recovery.names.index(name)
+    own = np.arange(len(engine.state_names)) == engine.state_names.index(name)
+    others = (recovery.from_input, recovery.from_fault, recovery.from_disturbance)
+    return bool(np.array_equal(recovery.from_state[row], own)) and not any(matrix[row].any() for matrix in others)

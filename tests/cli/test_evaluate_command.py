@@ -1,0 +1,150 @@
+"""``obsynth evaluate`` and ``obsynth run --monitor``: what they print, count and refuse."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+import obsynth
+from obsynth.cli.main import main
+from obsynth.spec import load_spec
+
+ROOT = Path(__file__).parents[2]
+WANG = str(ROOT / "designs" / "wang2015" / "spec.yaml")
+FILASOVA = str(ROOT / "designs" / "filasova" / "spec.yaml")
+
+
+@pytest.fixture(scope="module")
+def gains(tmp_path_factory) -> str:
+    path = str(tmp_path_factory.mktemp("gains") / "wang2015.json")
+    assert main(["design", "--system", WANG, "--output", path, "--quiet"]) == 0
+    return path
+
+
+def evaluated(gains: str, *more: str) -> int:
+    return main(["evaluate", "--system", WANG, "--gains", gains, "--quiet", *more])
+
+
+def test_json_is_what_python_gives(gains, capsys):
+    assert evaluated(gains, "--runs", "40", "--monitor", "pointwise", "--json") == 0
+    printed = json.loads(capsys.readouterr().out)
+    design, scenario = obsynth.load(gains), load_spec(WANG).scenario
+    wanted = obsynth.evaluate(design, scenario, runs=40, monitor=obsynth.monitor(design, scenario)).as_dict()
+    assert printed["detection_delay"] == wanted["detection_delay"]
+    assert printed["fault_rmse"] == wanted["fault_rmse"]
+    assert (printed["runs"], printed["confidence"]) == (40, 0.95)
+    assert printed["monitor"]["kind"] == "pointwise"
+    assert "never passed without a fault" in printed["monitor"]["statement"]
+
+
+def test_the_table_has_intervals_and_says_what_the_threshold_means(gains, capsys):
+    assert evaluated(gains, "--runs", "40", "--monitor", "paper", "--confidence", "0.9") == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    for text in ("wang2015: 40 runs", "90 % interval", "false alarms", "missed detections", "actuator 1", "x4"):
+        assert text in printed
+    assert "not a pointwise bound" in printed
+    assert evaluated(gains, "--runs", "3") == 0
+    printed = capsys.readouterr().out
+    assert "false alarms" not in printed
+    assert "RMSE" in printed
+
+
+def test_processes_do_not_change_the_numbers(gains, capsys):
+    found = []
+    for jobs in ("1", "2"):
+        assert evaluated(gains, "--runs", "340", "--monitor", "pointwise", "--json", "--jobs", jobs) == 0
+        found.append(json.loads(capsys.readouterr().out))
+    assert found[0] == found[1]
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["--runs", "0"], "runs is 0"),
+        (["--confidence", "1"], "confidence is 1"),
+        (["--jobs", "0"], "--jobs is 0"),
+        (["--monitor", "nonsense"], "use one of"),
+        (["--monitor", "pointwise", "--disturbance", "v=1"], "no signal named 'v'"),
+        (["--monitor", "pointwise", "--disturbance", "w=one"], "'one' is no number"),
+        (["--monitor", "cusum", "--false-alarms", "2"], "probability between 0 and 1"),
+    ],
+)
+def test_bad_options_are_refused(gains, capsys, more, message):
+    assert evaluated(gains, *more) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_decisions_on_parameters_are_counted(capsys):
+    spec = str(ROOT / "designs" / "moussaali2013_ltv" / "spec.yaml")
+    assert main(["evaluate", "--system", spec, "--runs", "3", "--monitor", "nis", "--quiet"]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "moussaali2013_ltv: 3 runs" in printed
+    assert "Monitor nis" in printed
+    assert "theta" in printed
+
+
+def test_a_spec_without_a_scenario_has_nothing_to_evaluate(capsys):
+    spec = str(ROOT / "designs" / "smib" / "pd_observer.yaml")
+    assert main(["evaluate", "--system", spec, "--quiet"]) == 2
+    assert "has no scenario" in capsys.readouterr().err
+
+
+def test_a_run_has_threshold_and_alarm_columns(gains, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["simulate", "--system", WANG, "--gains", gains, "--out", "log.csv", "--quiet"]) == 0
+    capsys.readouterr()
+    run = ["run", "--gains", gains, "--data", "log.csv", "--out", "out.csv"]
+    assert main([*run, "--monitor", "pointwise", "--system", WANG, "--threshold", "fhat[actuator 1]=0.9"]) == 0
+    printed = capsys.readouterr().out
+    assert "Alarm: pointwise first above its threshold at 81 s; actuator 1 stands out." in printed
+    assert "The pointwise threshold: never passed without a fault" in printed
+    found = pd.read_csv("out.csv")
+    assert list(found.columns[-3:]) == ["statistic", "threshold", "alarm"]
+    assert found["alarm"][81] == "fhat[actuator 1]; pointwise: actuator 1"
+    assert found["alarm"][:81].isna().all()
+    above = found["statistic"] > found["threshold"]
+    assert (found["alarm"].fillna("").str.contains("pointwise") == above).all()
+    assert main([*run, "--monitor", "cusum", "--system", WANG, "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["isolated"] == "actuator 1"
+    assert printed["monitor"]["kind"] == "cusum"
+    assert 81.0 <= printed["alarms"]["cusum"] <= 90.0
+
+
+def test_parquet_holds_the_columns_as_well(gains, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["simulate", "--system", WANG, "--gains", gains, "--out", "log.csv", "--quiet"]) == 0
+    run = ["run", "--gains", gains, "--data", "log.csv", "--quiet", "--monitor", "window", "--disturbance", "w=0.1"]
+    for out in ("out.csv", "out.parquet"):
+        assert main([*run, "--out", out]) == 0
+    pd.testing.assert_frame_equal(
+        pd.read_parquet("out.parquet").fillna({"alarm": ""}), pd.read_csv("out.csv").fillna({"alarm": ""})
+    )
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["--system", WANG], "--system is for a monitor"),
+        (["--noise-bound", "3"], "--noise-bound is for a monitor"),
+        (["--disturbance", "w=1"], "--disturbance is for a monitor"),
+        (["--monitor", "pointwise"], "has no bound"),
+        (["--monitor", "nis"], "for this design use one of"),
+        (["--monitor", "pointwise", "--system", "bare.yaml"], "has no scenario"),
+        (["--monitor", "pointwise", "--system", FILASOVA], "other signals"),
+    ],
+)
+def test_a_monitor_that_makes_no_sense_is_refused_before_anything_is_written(
+    gains, tmp_path, monkeypatch, capsys, more, message
+):
+    monkeypatch.chdir(tmp_path)
+    Path("log.csv").write_text("time,u1,u2,x2,x3,x4\n0,0,0,0,0,0\n", encoding="utf-8")
+    plant = f"plant: {{file: {Path(WANG).parent / 'plant.yaml'}}}"
+    bare = f"schema_version: 1\nname: bare\n{plant}\nmethod: {{id: fault-estimation-filter}}\n"
+    Path("bare.yaml").write_text(bare, encoding="utf-8")
+    assert main(["run", "--gains", gains, "--data", "log.csv", "--out", "out.csv", *more]) == 2
+    assert message in capsys.readouterr().err
+    assert not Path("out.csv").exists()

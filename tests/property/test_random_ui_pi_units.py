@@ -1,0 +1,105 @@
+"""Random plants in random units: the same verdict, the same observer in the other time, and it passes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from ui_pi_plants import Case, random_case
+
+from obsynth import DescriptorSystem, ObserverDesign, PreconditionError, ui_pi_observer
+from obsynth.numerics.spectra import spectrum_error
+
+BATCHES, SIZE = 6, 10
+#: Poles may differ by this, relative to their size, or else by this many times what rounding the data moves them.
+SAME, ROUNDINGS = 1e-6, 100.0
+
+
+@dataclass(frozen=True)
+class Rescaled:
+    """The plant of a case in other units; ``rate`` turns its rates into those of the case."""
+
+    case: Case
+    time: float
+
+
+def in_other_units(case: Case, seed: int) -> Rescaled:
+    """States, equations, outputs, faults and disturbances by 1e-3 to 1e3, time by 1e-9 to 1e6."""
+    rng = np.random.default_rng([7, seed])
+    plant = case.plant
+
+    def factors(count: int) -> np.ndarray:
+        return 10.0 ** rng.integers(-3, 4, count)
+
+    states, faults, disturbances = factors(plant.nx), factors(plant.nf), factors(plant.nd)
+    equations, outputs = factors(plant.nx)[:, None], factors(plant.ny)[:, None]
+    time = 10.0 ** rng.integers(-9, 7)
+    rate = 1.0 if plant.dt else time
+    other = DescriptorSystem(
+        E=equations * plant.E * states, A=rate * equations * plant.A * states,
+        Bf=rate * equations * plant.Bf * faults, Bd=rate * equations * plant.Bd * disturbances,
+        C=outputs * plant.C * states, Df=outputs * plant.Df * faults, Dd=outputs * plant.Dd * disturbances,
+        dt=plant.dt * (1.0 / time),
+    )  # fmt: skip
+    model = case.model
+    if isinstance(model, dict) and "polynomial" not in model:
+        model = {kind: value * time for kind, value in model.items()}
+    return Rescaled(Case(other, model, case.kind), time)
+
+
+def outcome(case: Case, **options: object) -> ObserverDesign | PreconditionError:
+    """Any other error, and any warning, fails the test."""
+    try:
+        return ui_pi_observer(case.plant, fault_model=case.model, **options)
+    except PreconditionError as error:
+        return error
+
+
+def moved_by_rounding(case: Case, poles: np.ndarray) -> float:
+    """Return how far the poles go when the data change in the last digits: clusters near zero go far."""
+    rng = np.random.default_rng(1)
+    changed = case.plant.replace(A=case.plant.A * (1.0 + 1e-15 * rng.standard_normal(case.plant.A.shape)))
+    return spectrum_error(ui_pi_observer(changed, fault_model=case.model).observer.Az, poles, case.plant.dt)
+
+
+@pytest.mark.parametrize("number", range(BATCHES))
+def test_units_change_neither_verdict_nor_observer(number: int) -> None:
+    refused = 0
+    for seed in range(number * SIZE, (number + 1) * SIZE):
+        case = random_case(seed)
+        rescaled = in_other_units(case, seed)
+        own, other = outcome(case), outcome(rescaled.case)
+        rate = 1.0 if case.plant.dt else rescaled.time
+        if isinstance(own, PreconditionError) or isinstance(other, PreconditionError):
+            assert isinstance(own, PreconditionError), (seed, other)
+            assert isinstance(other, PreconditionError), (seed, own)
+            assert (own.condition or "").split(" at ")[0] == (other.condition or "").split(" at ")[0], seed
+            states = set(case.plant.state_names)
+            assert set(own.signals) - states == set(other.signals) - states, seed
+            refused += 1
+            if own.mode is not None:
+                assert other.mode == pytest.approx(rate * own.mode, rel=1e-5, abs=1e-7 * rate), seed
+            continue
+        assert own.report.passed, seed
+        assert other.report.passed, seed
+        poles = np.linalg.eigvals(own.observer.Az)
+        miss = spectrum_error(other.observer.Az, rate * poles, case.plant.dt)
+        assert miss < SAME or miss < ROUNDINGS * moved_by_rounding(case, poles), (seed, miss)
+        assert other.certificate.claims["noise_price"] == pytest.approx(
+            own.certificate.claims["noise_price"], rel=1e-3
+        ), seed
+    assert 0 < refused < SIZE
+
+
+@pytest.mark.parametrize("seed", [1000, 1002, 1018, 1024, 1028])
+def test_poles_are_placed_in_any_units(seed: int) -> None:
+    case = random_case(seed)
+    own = outcome(case)
+    assert isinstance(own, ObserverDesign)
+    rescaled, dt = in_other_units(case, seed), case.plant.dt
+    count = own.observer.order - int(own.report["fixed modes"].value)
+    rates = np.random.default_rng(seed).uniform(0.5, 2.0, count)
+    poles = np.exp(-rates * dt) if dt else -rates * rescaled.time
+    design = ui_pi_observer(rescaled.case.plant, fault_model=rescaled.case.model, poles=list(poles))
+    assert design.report["poles"].value < 1e-6

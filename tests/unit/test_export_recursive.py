@@ -1,0 +1,183 @@
+"""The steady state of recursive designs: what the recursion becomes, in every form, and in C."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from test_export import digest, through_c
+
+import obsynth
+from obsynth import PreconditionError, SolverError, SpecError, TimeVaryingDescriptorSystem
+from obsynth.observers.steady import steady_observer
+
+PLANT = TimeVaryingDescriptorSystem(
+    E=[[1, 0, 0], [0, 1, 0], [0, 0, 0]], A=[[0.9, 0.1, 0], [-0.2, 0.7, 0.1], [1, 0.5, -1]], B=[[0], [1], [0.3]],
+    C=[[1, 0, 0], [0, 0, 1]], Phi=[[0], [1], [0]], dt=0.1, parameter_names=["leak"],
+    operating_point={"y1": 3.0, "x1": 3.0, "leak": 0.5},
+)  # fmt: skip
+Q = np.diag([1e-3, 1e-3, 1e-4])
+START = {"initial_state": [0.5, -0.2, 0.4]}
+DESIGNS = {
+    "filter": obsynth.descriptor_kalman(PLANT, Q=Q, R=1e-2, **START),
+    "singular": obsynth.descriptor_kalman(PLANT, Q=np.diag([1e-3, 1e-3, 0]), R=1e-2),
+    "early": obsynth.descriptor_kalman(PLANT, Q=Q, R=1e-2, early_constraints=True, **START),
+    "innovation": obsynth.adaptive_observer(PLANT, Q=Q, R=1e-2, forgetting=0.95, initial_parameters=[0.3], **START),
+    "early innovation": obsynth.adaptive_observer(PLANT, Q=Q, R=1e-2, forgetting=0.95, early_constraints=True),
+    "unguarded": obsynth.adaptive_observer(PLANT, Q=Q, R=1e-2, forgetting=0.95, guard="none"),
+    "directional": obsynth.adaptive_observer(PLANT, Q=Q, R=1e-2, forgetting=0.95, guard="directional"),
+    "literal": obsynth.adaptive_observer(PLANT, Q=Q, R=1e-2, forgetting=0.95, form="literal"),
+    "walk": obsynth.adaptive_observer(PLANT, Q=Q, R=1e-2, form="random-walk", random_walk=1e-4, **START),
+}
+SAMPLES = 900
+
+
+def record(samples: int = SAMPLES) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(0)
+    return rng.normal(size=(samples, 2)), rng.normal(size=(samples, 1))
+
+
+@pytest.mark.parametrize("name", DESIGNS)
+def test_the_recursion_becomes_its_steady_state(name):
+    design = DESIGNS[name]
+    y, u = record()
+    found = steady_observer(design.observer)
+    assert not found.start.flags.writeable
+    wanted, steady = design.observer.run(y, u), found.observer.run(y, u, initial_state=found.start)
+    late = slice(600, None)
+    np.testing.assert_allclose(steady.states[late], wanted.states[late], rtol=0.0, atol=1e-11)
+    np.testing.assert_allclose(steady.faults[late], wanted.parameters[late], rtol=0.0, atol=1e-11)
+    # Directions of the innovation are free up to their sign: their length is not.
+    gaps = wanted.innovations
+    if name not in ("filter", "singular", "early", "walk"):
+        gaps = gaps[1:] - np.einsum("kmq,kq->km", wanted.regressors[1:], wanted.parameters[:-1])
+    lengths = np.linalg.norm(gaps, axis=1)[-200:]
+    np.testing.assert_allclose(np.linalg.norm(steady.residuals, axis=1)[-200:], lengths, rtol=1e-10)
+
+
+def test_its_gains_are_those_of_the_riccati_equation():
+    design = DESIGNS["filter"]
+    state = obsynth.steady_state_filter(PLANT, Q=Q, R=1e-2 * np.eye(2))
+    found = steady_observer(design.observer).observer
+    np.testing.assert_allclose(found.Dy[:3], state.K, atol=1e-12)
+    np.testing.assert_allclose(found.Cz[:3], state.L, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["filter", "early", "innovation", "walk"])
+def test_c_equals_python_over_ten_thousand_steps(name, tmp_path):
+    design = DESIGNS[name]
+    source, header = obsynth.export(design, tmp_path / "steady.c")
+    found = steady_observer(design.observer)
+    y, u = record(10_000)
+    shown = through_c(found.observer, source, np.hstack([u, y]))
+    run = found.observer.run(y, u, initial_state=found.start)
+    wanted = np.hstack([run.states, run.faults, run.residuals])
+    assert np.all(np.abs(shown - wanted).max(axis=0) <= 1e-12 * np.abs(wanted).max(axis=0))
+    for path in (source, header):
+        assert digest(design, tmp_path) in path.read_text(encoding="ascii")
+    text = header.read_text(encoding="ascii")
+    assert "steady state of a recursive design" in text
+    assert 'y[0]: "y1", operating point 3.0' in text
+
+
+def test_arrays_and_state_space(tmp_path):
+    design = DESIGNS["innovation"]
+    (path,) = obsynth.export(design, tmp_path / "steady.npz")
+    data, found = np.load(path), steady_observer(design.observer)
+    np.testing.assert_array_equal(data["A"], found.observer.Az)
+    np.testing.assert_array_equal(data["x0"].ravel(), found.start)
+    assert list(data["output_names"][:4]) == ["xhat[x1]", "xhat[x2]", "xhat[x3]", "fhat[leak]"]
+    assert dict(zip(data["output_names"], data["output_point"], strict=True))["fhat[leak]"] == 0.5
+    assert float(data["Ts"]) == 0.1
+    system = design.to_control()
+    np.testing.assert_array_equal(system.A, found.observer.Az)
+    assert system.input_labels == ["u1", "y1", "y2"]
+
+
+def test_what_has_no_steady_state_is_refused(tmp_path):
+    moving = PLANT.replace(A=[[0.9, "0.1 * sin(k)", 0], [-0.2, 0.7, 0.1], [1, 0.5, -1]], horizon=50)
+    with pytest.raises(SpecError, match=r"^A may change with k"):
+        obsynth.export(obsynth.descriptor_kalman(moving, Q=Q, R=1e-2), tmp_path / "a.c")
+    noise = obsynth.descriptor_kalman(PLANT, Q=Q, R=[["0.01 + 0.001 * k", 0], [0, 0.01]])
+    with pytest.raises(SpecError, match=r"^R may change with k"):
+        obsynth.export(noise, tmp_path / "a.c")
+    resetting = obsynth.adaptive_observer(PLANT, Q=Q, R=1e-2, reset=1e-6)
+    with pytest.raises(SpecError, match="resets its gains"):
+        obsynth.export(resetting, tmp_path / "a.c")
+    with pytest.raises(SpecError, match="sampled already"):
+        obsynth.export(DESIGNS["filter"], tmp_path / "a.c", sample_time=0.1)
+    # A constant that nothing disturbs is learnt for ever: the gain goes to zero like 1 / k, and is never constant.
+    still = TimeVaryingDescriptorSystem(E=[[1]], A=[[1]], C=[[1]], dt=1.0)
+    with pytest.raises((SolverError, PreconditionError), match=r"do not settle|not stable"):
+        obsynth.export(obsynth.descriptor_kalman(still, Q=0.0, R=1.0), tmp_path / "a.c")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_nonlinear_design_is_refused(tmp_path):
+    model = obsynth.DAEModel(
+        equations={"balance": "area * der(level) = inflow - c * out", "valve": "out - sqrt(level) = 0"},
+        outputs={"height": "level", "drain": "out"}, states={"level": 1.0, "out": 1.0}, inputs={"inflow": 1.0},
+        parameters={"c": 1.0}, constants={"area": 2.0},
+        units={"level": "m", "out": "m0.5", "inflow": "m3/s", "c": "1", "height": "m", "drain": "m0.5", "area": "m2"},
+    )  # fmt: skip
+    design = obsynth.dae_adaptive_observer(model, dt=0.1, Q={"balance": 1e-8}, R={"height": 1e-4, "drain": 1e-4})
+    with pytest.raises(SpecError, match="nonlinear plant"):
+        obsynth.export(design, tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: obsynth.load(None), "path is None"),
+        (lambda: obsynth.load(3), "path is 3"),
+        (lambda: obsynth.sample_observer(None, 0.1), "observer is a NoneType"),
+        (lambda: obsynth.sample_observer(DESIGNS["filter"], 0.1), "observer is a ObserverDesign"),
+        (lambda: obsynth.export(None, "a.c"), "design is a NoneType"),
+        (lambda: obsynth.export(DESIGNS["filter"], None), "path is a NoneType"),
+        (lambda: DESIGNS["filter"].save(None), "path is None"),
+        (lambda: obsynth.run_on_data(None, "log.csv"), "design is a NoneType"),
+        (lambda: obsynth.run_on_data(DESIGNS["filter"], None), "data is a NoneType"),
+        (lambda: obsynth.run_on_data(DESIGNS["filter"], [[0.0]]), "data is a list"),
+        (lambda: obsynth.run_on_data(DESIGNS["filter"], "log.csv", 3), "out is a int"),
+        (lambda: obsynth.run_on_data(DESIGNS["filter"], "log.csv", monitor="nis"), "monitor is a str"),
+        (lambda: obsynth.run_on_data(DESIGNS["filter"], "log.csv", thresholds={"xhat[x1]": "a"}), "threshold of"),
+        (lambda: obsynth.run_on_data(DESIGNS["filter"], "log.csv", scales={"y1": "a"}), "scale of"),
+        (lambda: obsynth.run_on_data(DESIGNS["filter"], "log.csv", columns=["y1"]), "columns is a list"),
+        (lambda: obsynth.run_on_data(DESIGNS["filter"], "log.csv", warm_up="a"), "warm_up is 'a'"),
+        (lambda: obsynth.run_on_data(DESIGNS["filter"], "log.csv", state=3), "state is a int"),
+        (lambda: obsynth.simulate(None, None), "design is a NoneType"),
+        (lambda: obsynth.simulate(DESIGNS["filter"], None), "scenario is a NoneType"),
+        (lambda: obsynth.monitor(None, None), "design is a NoneType"),
+        (lambda: obsynth.monitor(DESIGNS["filter"], obsynth.Scenario(horizon=1)), "no linear time-invariant"),
+        (lambda: obsynth.evaluate(None, None), "design is a NoneType"),
+        (lambda: obsynth.online_monitor(DESIGNS["filter"], "nis", scenario=3), "scenario is a int"),
+        (lambda: obsynth.online_monitor(DESIGNS["filter"], "nis", false_alarms="a"), "false_alarms is 'a'"),
+        (lambda: obsynth.online_monitor(DESIGNS["filter"], "nis", window="a"), "window is 'a'"),
+        (lambda: obsynth.online_monitor(DESIGNS["filter"], "nis", noise_bound="a"), "noise_bound is 'a'"),
+        (lambda: obsynth.online_monitor(DESIGNS["walk"], "nis", nominal={"leak": "a"}), "nominal value of 'leak'"),
+    ],
+)  # fmt: skip
+def test_calls_that_make_no_sense_are_refused_in_words(call, message):
+    with pytest.raises(SpecError, match=message):
+        call()
+
+
+@pytest.mark.parametrize("dt", ["a", None, True, float("nan"), 0.0])
+def test_a_sampling_time_is_a_positive_number(dt):
+    continuous = obsynth.LinearObserver(
+        [[-1.0]],
+        np.zeros((1, 0)),
+        [[1.0]],
+        [[1.0]],
+        np.zeros((1, 0)),
+        [[0.0]],
+        0.0,
+        (),
+        ("y",),
+        ("x",),
+        (),
+        (),
+        (0,),
+        (),
+    )
+    with pytest.raises(SpecError, match="dt is"):
+        obsynth.sample_observer(continuous, dt)

@@ -1,0 +1,137 @@
+"""Unknown-input PI observers in people's units: kilohertz, nanofarads, microseconds; and rods of many states."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.linalg
+
+from obsynth import DescriptorSystem, PreconditionError, SpecError, ui_pi_observer
+from obsynth.numerics.spectra import spectrum_error
+
+#: Two masses, a spring and a damper: positions and velocities.
+MASSES = np.array([[0, 1, 0, 0], [-2, -0.1, 2, 0.1], [0, 0, 0, 1], [2, 0.1, -2, -0.1]])
+
+
+def resonator(frequency: float) -> DescriptorSystem:
+    w = 2.0 * np.pi * frequency
+    return DescriptorSystem(None, [[0, 1], [-w * w, -0.02 * w]], [[0], [1]], C=[[1, 0]], Bf=[[0], [1]])
+
+
+def masses(states: list[float], time: float) -> DescriptorSystem:
+    """The masses with their states in other units, and ``time`` seconds for each second."""
+    size, eye = np.array(states), np.eye(4)
+    force = np.array([[0.0], [1.0], [0.0], [0.0]]) / size[:, None]
+    return DescriptorSystem(None, MASSES * size / size[:, None] / time, C=eye[[0, 2]] * size, Bf=force / time)
+
+
+def rod(count: int, sample_time: float = 0.0) -> DescriptorSystem:
+    """A heated rod: a fault inside, an unknown source at the end, three thermometers."""
+    a = -2.0 * np.eye(count) + np.eye(count, k=1) + np.eye(count, k=-1)
+    inputs = np.eye(count)[:, [15, count - 1]]
+    if sample_time:
+        whole = scipy.linalg.expm(sample_time * np.block([[a, inputs], [np.zeros((2, count + 2))]]))
+        a, inputs = whole[:count, :count], whole[:count, count:]
+    outputs = np.eye(count)[[7, 15, count - 1]]
+    return DescriptorSystem(None, a, C=outputs, Bf=inputs[:, :1], Bd=inputs[:, 1:], dt=sample_time)
+
+
+@pytest.mark.parametrize("frequency", [1e-4, 1e3, 3e3, 1e4, 1e5, 1e9])
+def test_a_resonator_of_any_frequency(frequency: float) -> None:
+    slow, fast = ui_pi_observer(resonator(1.0)), ui_pi_observer(resonator(frequency))
+    assert fast.report.passed
+    poles = frequency * np.linalg.eigvals(slow.observer.Az)
+    assert spectrum_error(fast.observer.Az, poles, 0.0) < 1e-6
+
+
+def test_an_oscillating_circuit_in_farad_and_henry() -> None:
+    circuit = DescriptorSystem(np.diag([1e-9, 1e-6]), [[-1 / 50, 1], [-1, -0.1]], [[0], [1]], C=[[1, 0]], Bf=[[1], [0]])
+    design = ui_pi_observer(circuit)
+    assert design.report.passed
+    assert design.certificate.claims["decay"] > 1e5
+
+
+@pytest.mark.parametrize("model", ["step", "ramp", {"polynomial": 4}])
+@pytest.mark.parametrize("states", [[1, 1, 1, 1], [1e-2, 1e2, 1e-2, 1e2], [1e3, 1e-3, 1, 1e3]])
+@pytest.mark.parametrize("time", [1e-9, 1e-6, 1e6])
+def test_two_masses_in_any_units(states: list[float], time: float, model: object) -> None:
+    own = ui_pi_observer(masses([1, 1, 1, 1], 1.0), fault_model=model)
+    other = ui_pi_observer(masses(states, time), fault_model=model)
+    assert other.report.passed
+    assert spectrum_error(other.observer.Az, np.linalg.eigvals(own.observer.Az) / time, 0.0) < 1e-5
+    assert other.certificate.claims["noise_price"] == pytest.approx(own.certificate.claims["noise_price"], rel=1e-4)
+
+
+@pytest.mark.parametrize("options", [{"decay": 2.0}, {"region": {"decay": 1.0, "radius": 30.0}}, {"joint": True}])
+def test_every_way_to_choose_gains_in_microseconds(options: dict) -> None:
+    def in_microseconds(value: object) -> object:
+        if isinstance(value, bool):
+            return value
+        return {k: 1e6 * v for k, v in value.items()} if isinstance(value, dict) else 1e6 * value
+
+    own = ui_pi_observer(masses([1, 1, 1, 1], 1.0), **options)
+    quick = {name: in_microseconds(value) for name, value in options.items()}
+    other = ui_pi_observer(masses([1e2, 1e-2, 1, 1], 1e-6), **quick)
+    assert other.report.passed
+    assert spectrum_error(other.observer.Az, 1e6 * np.linalg.eigvals(own.observer.Az), 0.0) < 1e-3
+
+
+@pytest.mark.parametrize("size", [1e-9, 1e-6, 1e6])
+def test_the_unit_of_a_fault_plays_no_role(size: float) -> None:
+    plants = [DescriptorSystem(None, [[-1.0, 1], [0, -2]], C=[[1, 0]], Bf=[[0], [unit]]) for unit in (1.0, size)]
+    own, other = (ui_pi_observer(plant) for plant in plants)
+    assert spectrum_error(other.observer.Az, np.linalg.eigvals(own.observer.Az), 0.0) < 1e-6
+
+
+def test_stated_noise_in_other_units() -> None:
+    """Continuous noise has a unit of time: the same sensor in milliseconds and millimetres."""
+    noise = {"Bw": np.zeros((4, 2)), "Dw": np.diag([1e-3, 2e-3])}
+    own = ui_pi_observer(masses([1, 1, 1, 1], 1.0).replace(**noise, noise_names=None))
+    scaled = masses([1e-3, 1e3, 1, 1], 1e-3)
+    other = ui_pi_observer(scaled.replace(Bw=noise["Bw"], Dw=np.sqrt(1e-3) * noise["Dw"], noise_names=None))
+    assert spectrum_error(other.observer.Az, 1e3 * np.linalg.eigvals(own.observer.Az), 0.0) < 1e-5
+
+
+@pytest.mark.parametrize(("count", "sample_time"), [(30, 0.0), (30, 0.2), (80, 0.2)])
+def test_a_rod_with_many_weakly_seen_modes(count: int, sample_time: float) -> None:
+    design = ui_pi_observer(rod(count, sample_time))
+    assert design.report.passed
+    assert design.observer.order == count + 1
+    assert design.certificate.claims["decay"] > 0.01
+
+
+def test_outputs_that_show_nothing_are_refused_by_name() -> None:
+    with pytest.raises(PreconditionError) as caught:
+        ui_pi_observer(DescriptorSystem(None, [[-2.0]], C=[[0.0]], Bf=[[1.0]], fault_names=["leak"]))
+    assert caught.value.condition == "(D3) fault model at 0"
+    assert caught.value.signals == ("leak",)
+    assert "'leak' can persist without showing in any output" in str(caught.value)
+    with pytest.raises(PreconditionError) as caught:
+        ui_pi_observer(DescriptorSystem(None, [[2.0]], C=[[0.0]]))
+    assert (caught.value.condition, caught.value.mode, caught.value.signals) == ("(D2) zeros", 2.0, ("x1",))
+    assert ui_pi_observer(DescriptorSystem(None, [[-2.0]], C=[[0.0]])).report.passed
+
+
+def test_a_course_too_fast_for_the_samples_is_refused() -> None:
+    plant = DescriptorSystem(None, [[0.5]], C=[[1.0]], Bf=[[1.0]], dt=0.1, fault_names=["hum"])
+    with pytest.raises(SpecError, match=r"'hum' .*40 rad/s.*slower than 31\.4159 rad/s \(Nyquist\)"):
+        ui_pi_observer(plant, fault_model={"sinusoid": 40.0})
+    assert ui_pi_observer(plant, fault_model={"sinusoid": 30.0}).report.passed
+
+
+def test_the_reason_why_nothing_was_eliminated_is_one_sentence() -> None:
+    plant = DescriptorSystem([[0.0, 1], [0, 0]], np.eye(2), C=[[0, 1.0]], Bf=[[1.0], [0]])
+    with pytest.raises(PreconditionError) as caught:
+        ui_pi_observer(plant)
+    text = str(caught.value)
+    assert "the algebraic states cannot be eliminated (the plant has index 2 or more): the states 'x1'" in text
+    assert "use a method that takes the descriptor form" not in text
+
+
+def test_given_exosystems_of_any_frequency() -> None:
+    w = 2e5
+    plant = DescriptorSystem(None, [[-1e5]], C=[[1.0]], Bf=[[1.0]])
+    design = ui_pi_observer(plant, fault_model={"Phi": [[0, 1], [-w * w, 0]], "Cw": [[1, 0]]})
+    assert design.report.passed
+    conditions = [check.name for check in design.report.checks if check.name.startswith("exists: (D3)")]
+    assert conditions == ["exists: (D3) fault model at 0 +- 200000j"]
