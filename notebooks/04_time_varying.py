@@ -170,8 +170,8 @@ plt.show()
 # ## 8. Missing samples
 #
 # Nothing is measured for three samples. $E$ alone does not determine the state, so the observer says that the states
-# are unknown for that time (their deviations are infinite) and goes on as soon as it can. (The literal form cannot: it
-# needs $L$ and $K$ at every step. This is the default, the innovation form.)
+# are unknown for that time (their deviations are infinite) and goes on as soon as it can. Decisions go on as well: the
+# signatures of the GLR are those of the record with its gap.
 
 # %%
 gappy = both.outputs.copy()
@@ -182,6 +182,8 @@ print("deviations of the states around the gap:")
 print(holes.state_deviations[48:56])
 assert np.isinf(holes.state_deviations[50:53]).any()
 assert np.isfinite(holes.state_deviations[53:]).all()
+alarm = obsynth.decide(robust.observer, holes, statistic="glr", nominal=[1.0], false_alarms=0.01).alarm
+print(f"glr: {alarm.parameter} at k = {alarm.k}, onset {alarm.onset}, confidence {alarm.confidence:.4f}")
 
 # %%
 plt.close("all")

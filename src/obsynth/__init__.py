@@ -32,12 +32,13 @@ if TYPE_CHECKING:
     from obsynth.models.descriptor import DescriptorSystem
     from obsynth.models.fault_models import FaultModel, fault_model
     from obsynth.models.time_varying import TimeVaryingDescriptorSystem
+    from obsynth.observers.alarms import Alarm, Decision
     from obsynth.observers.batches import run_batch
     from obsynth.observers.dae import DAEObserver
     from obsynth.observers.dae_batch import DAEBatchEstimates
     from obsynth.observers.dae_estimates import DAEEstimates
     from obsynth.observers.dae_running import RunningDAEObserver
-    from obsynth.observers.decisions import Alarm, Decision, decide
+    from obsynth.observers.decisions import decide
     from obsynth.observers.gain_schedule import BatchEstimates
     from obsynth.observers.linear import Estimates, LinearObserver, RunningObserver
     from obsynth.observers.recursive import Adaptation, RecursiveObserver
@@ -85,12 +86,12 @@ _HOMES = {
     "identifiability": "obsynth.analysis.dae_identifiability",
     "DAEModel": "obsynth.models.dae",
     "Adaptation": "obsynth.observers.recursive",
-    "Alarm": "obsynth.observers.decisions",
+    "Alarm": "obsynth.observers.alarms",
     "BatchEstimates": "obsynth.observers.gain_schedule",
     "Certificate": "obsynth.results.design",
     "Check": "obsynth.results.report",
     "DataRun": "obsynth.data.run",
-    "Decision": "obsynth.observers.decisions",
+    "Decision": "obsynth.observers.alarms",
     "DeltaScan": "obsynth.results.delta_scan",
     "DescriptorSystem": "obsynth.models.descriptor",
     "Detection": "obsynth.evaluation.monitors",

@@ -7,7 +7,8 @@ import pytest
 from time_varying_plants import maximum_likelihood, observer_for, printed, record, textbook, varying
 
 from obsynth import PreconditionError, SpecError, run_batch, simulate_time_varying
-from obsynth.analysis.time_varying import horizon_ranks, residual_condition
+from obsynth.analysis.recursive_conditions import residual_condition
+from obsynth.analysis.time_varying import horizon_ranks
 from obsynth.numerics.paper_filter import PaperState, paper_step
 from obsynth.numerics.recursive_least_squares import ParameterState, start_of, update
 from obsynth.observers.recursive_running import RawEstimate

@@ -9,23 +9,62 @@ import pytest
 ROOT = Path(__file__).parents[2]
 
 
-def test_the_fault_filter_benchmark_runs():
-    script = ROOT / "benchmarks" / "fault_estimation_filter.py"
+def small_table(name):
+    """Return the rows that the small instance of a benchmark prints, cell by cell."""
+    script = ROOT / "benchmarks" / f"{name}.py"
     done = subprocess.run([sys.executable, script, "--small"], capture_output=True, text=True, check=True)
-    rows = [line.strip("| ").split(" | ") for line in done.stdout.splitlines()[2:]]
+    return [line.strip("| ").split(" | ") for line in done.stdout.splitlines()[2:]]
+
+
+def test_the_fault_filter_benchmark_runs():
+    rows = small_table("fault_estimation_filter")
     assert [row[0] for row in rows] == ["6"]
     gains = [float(cell.split(", ")[1]) for cell in rows[0][1:]]
     # The bisection ends within 1e-4 of the least gain, the others much closer.
     assert max(gains) <= min(gains) * (1.0 + 2e-4)
 
 
+def test_the_false_alarm_benchmark_runs():
+    script = ROOT / "benchmarks" / "false_alarms.py"
+    done = subprocess.run([sys.executable, script, "1"], capture_output=True, text=True, check=True)
+    rows = [line.strip("| ").split(" | ") for line in done.stdout.splitlines()[3:]]
+    assert len(rows) == 6
+    for _, *cells in rows:
+        for cell in cells:
+            shares = [float(share) for share in cell.split(" / ")]
+            assert len(shares) == 3
+            # One run: an alarm or none, and none at a small probability without one at a larger.
+            assert set(shares) <= {0.0, 100.0}
+            assert shares == sorted(shares)
+
+
 def test_the_unknown_input_observer_benchmark_runs():
-    script = ROOT / "benchmarks" / "ui_pi_observer.py"
-    done = subprocess.run([sys.executable, script, "--small"], capture_output=True, text=True, check=True)
-    (row,) = [line.strip("| ").split(" | ") for line in done.stdout.splitlines()[2:]]
+    (row,) = small_table("ui_pi_observer")
     rates = [float(cell.split(", ")[1].split()[0]) for cell in row[1:]]
     assert row[0] == "16"
     assert min(rates[:3]) > max(rates[3], 0.0)
+
+
+def test_the_pd_observer_benchmark_runs():
+    rows = small_table("pd_observer")
+    assert [row[0] for row in rows] == ["6"]
+    # Time, gain and slowest mode of each engine, which ran itself.
+    for cell in rows[0][1:]:
+        seconds, gain, slowest = cell.split(", ")
+        assert seconds.endswith(" s")
+        assert float(gain) > 0.0
+        assert float(slowest) >= 0.1
+
+
+def test_the_definiteness_benchmark_proves_every_row():
+    rows = small_table("definiteness")
+    assert len(rows) == 6
+    assert all(" ms" in row[1] for row in rows)
+    assert sum("ball arithmetic" in row[1] for row in rows) == 1
+
+
+def test_the_benchmark_of_threads_runs():
+    assert [row[0] for row in small_table("blas_threads")] == ["6"]
 
 
 @pytest.mark.parametrize("name", ["evaluate", "run_on_data"])

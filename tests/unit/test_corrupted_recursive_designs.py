@@ -17,13 +17,26 @@ from obsynth.models.sequences import MatrixSequence
 FITS, STATE, COVARIANCE, REGRESSOR = "fits the plant", "batch: state", "batch: covariance", "batch: regressor"
 CONTRACTION, CLAIMS, NEES, NIS, WHITE, RUNS = "contraction", "claims", "NEES", "NIS", "whiteness", "runs"
 RANK, PARAMETERS, DIRECTIONS = "exists: rank [E; C]", "exists: parameters", "exists: residual directions"
+EARLY_RANK = "exists: rank [E; C; algebraic rows of A]"
+DETECTABLE, IDENTIFIABLE, KNOWN = "exists: detectability", "exists: identifiable parameters", "known directions"
 EVERYTHING = {FITS, STATE, COVARIANCE, REGRESSOR, CLAIMS, NEES, NIS, WHITE, CONTRACTION}
 
 Corruption = Callable[[ObserverDesign], ObserverDesign]
 
 
+GOOD = ("innovation", "literal", "early", "walk", "constant", "exact output")
+STILL = {
+    "E": np.diag([1.0, 1, 0]), "A": [[0.8, 0.1, 0.3], [0, 0.7, 0.2], [1, 0.4, -1]],
+    "C": [[1, 0, 0.3], [0, 1, 1]], "Phi": [[0.5, 0.3], [1, 0.2], [0.2, 0]], "Psi": None,
+}  # fmt: skip
+
+
 @cache
 def good(name: str = "innovation") -> ObserverDesign:
+    if name == "constant":
+        return obsynth.adaptive_observer(varying(horizon=60, **STILL), Q=0.1, R=0.2, window=10, name=name)
+    if name == "exact output":
+        return obsynth.descriptor_kalman(varying(horizon=60, **STILL), Q=0.1, R=np.diag([0.0, 0.2]), name=name)
     options = {"literal": {"form": "literal"}, "early": {"early_constraints": True},
                "walk": {"form": "random-walk", "random_walk": 1e-3}}.get(name, {})  # fmt: skip
     return obsynth.adaptive_observer(varying(horizon=60), Q=0.1, R=0.2, window=10, name=name, **options)
@@ -80,6 +93,8 @@ OTHER_A = [["0.8 + 0.1 * cos(0.2 * k)", 0.1, 0.3], [0, 0.7, "0.2 * sin(k)"], [1,
 BLIND = {
     "E": np.diag([1.0, 1, 0]), "A": [[1.2, 0, 0], [0, 0.5, 0], [0, 0, 1]], "C": [[0, 1, 1], [0, 0, 1]],
 }  # fmt: skip
+BLIND_AND_VARYING = {**BLIND, "A": [["1.2 + 0.1 * sin(k)", 0, 0], [0, 0.5, 0], [0, 0, 1]]}
+TWINS = [[0.5, 1.0], [1, 2.0], [0.2, 0.4]]
 
 #: Corruption -> what must fail, at least.
 TABLE: dict[str, tuple[str, Corruption, set[str]]] = {
@@ -113,8 +128,16 @@ TABLE: dict[str, tuple[str, Corruption, set[str]]] = {
         "innovation", lambda d: d.replace(options={k: v for k, v in d.options.items() if k != "Q"}), {FITS},
     ),
     "an option is wrong": ("innovation", lambda d: d.replace(options={**d.options, "Q": -1.0}), {FITS}),
-    "an undetectable mode": ("innovation", with_both(**BLIND), {CONTRACTION, CLAIMS}),
+    "an undetectable mode": ("innovation", with_both(**BLIND_AND_VARYING), {CONTRACTION, CLAIMS}),
+    "an undetectable mode, constant": ("constant", with_both(**BLIND), {DETECTABLE}),
+    "two parameters in one": ("innovation", with_both(Phi=TWINS, Psi=None), {IDENTIFIABLE}),
+    "two parameters in one, constant": ("constant", with_both(Phi=TWINS), {IDENTIFIABLE}),
     "no rank": ("innovation", with_both(E=np.diag([1.0, 0, 0]), C=[[1, 0, 0], [0, 1, 0]]), {RANK}),
+    "no rank, early": ("early", with_both(E=np.diag([1.0, 0, 0]), A=np.diag([0.5, 0.5, 0]), C=[[1, 0, 0], [0, 1, 0]]),
+                       {EARLY_RANK}),
+    "an output taken as exact": (
+        "exact output", noise("R", 2, 0.0), {FITS, STATE, COVARIANCE, CLAIMS, NEES, NIS, KNOWN},
+    ),
     "no parameters": (
         "innovation", with_both(Phi=None, Psi=None, parameter_names=None), {PARAMETERS},
     ),
@@ -141,7 +164,7 @@ def adapted(design: ObserverDesign, corrupt: Corruption) -> ObserverDesign:
     return corrupt(design)
 
 
-@pytest.mark.parametrize("name", ["innovation", "literal", "early", "walk"])
+@pytest.mark.parametrize("name", GOOD)
 def test_the_good_designs_pass(name: str) -> None:
     assert failed(good(name)) == set()
 
@@ -161,18 +184,13 @@ def test_claims_alone_fail_alone() -> None:
 
 def test_every_row_that_decides_has_a_corruption() -> None:
     broken = set().union(*(expected for _, _, expected in TABLE.values()))
-    produced = {
-        check.name
-        for name in ("innovation", "literal", "early", "walk")
-        for check in good(name).report.checks
-        if check.kind != "information"
-    }
+    produced = {check.name for name in GOOD for check in good(name).report.checks if check.kind != "information"}
     assert produced <= broken
     assert broken - produced == {RUNS}
 
 
 def test_a_report_passes_only_with_rows_that_decide_and_names_are_unique() -> None:
-    for name in ("innovation", "literal", "early", "walk"):
+    for name in GOOD:
         names = [check.name for check in good(name).report.checks]
         assert len(set(names)) == len(names)
     assert not good().replace(report=obsynth.VerificationReport()).report.passed

@@ -1,4 +1,4 @@
-"""Decisions on parameters, the steady state, and consistent simulation."""
+"""Decisions on parameters, and consistent simulation."""
 
 from __future__ import annotations
 
@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from time_varying_plants import observer_for, printed, textbook, varying
 
-from obsynth import DescriptorSystem, PreconditionError, SpecError, TimeVaryingDescriptorSystem
+from obsynth import PreconditionError, SpecError, TimeVaryingDescriptorSystem
 from obsynth.observers.decisions import STATISTICS, decide
 from obsynth.simulation.time_varying import simulate_time_varying
-from obsynth.synthesis.steady_filter import steady_state_filter
 
 SAMPLES, CHANGE = 160, 90
 PLANT = varying(horizon=SAMPLES)
@@ -83,16 +82,24 @@ def test_a_parameter_that_is_not_nominal_from_the_start() -> None:
 
 def test_missing_samples_and_the_random_walk() -> None:
     observer, found = run(3, missing=True)
-    for statistic in ("chi-square", "cusum", "nis"):
+    for statistic in STATISTICS:
         assert decide(observer, found, statistic=statistic).alarm is None
-    with pytest.raises(SpecError, match="complete record"):
-        decide(observer, found, statistic="glr")
     walking, walked = run(3, jump=4.0, adapt={"form": "random-walk", "walk": 1e-4 * np.eye(2)})
     alarm = decide(walking, walked).alarm
     assert alarm is not None
     assert alarm.parameter == "theta2"
     with pytest.raises(SpecError, match="needs regressors"):
         decide(walking, walked, statistic="cusum")
+
+
+@pytest.mark.parametrize("statistic", STATISTICS)
+@pytest.mark.parametrize("samples", [0, 1, 2])
+def test_short_records(statistic: str, samples: int) -> None:
+    observer = observer_for(PLANT, adapt={})
+    found = observer.run(np.zeros((samples, 2)), np.zeros((samples, 1)))
+    decision = decide(observer, found, statistic=statistic, nominal=[0.1, 0.0])
+    assert decision.alarm is None
+    assert decision.values.shape == decision.thresholds.shape == (samples,)
 
 
 def test_bad_options() -> None:
@@ -110,46 +117,22 @@ def test_bad_options() -> None:
         decide(observer_for(PLANT), found)
 
 
-class TestSteadyState:
-    PLANT = TimeVaryingDescriptorSystem(
-        np.diag([1.0, 1, 0]), [[0.9, 0.1, 0.3], [0.0, 0.7, 0.2], [1.0, 0.4, -1.0]], C=[[1, 0, 0.3], [0, 1, 1]], dt=1.0
-    )
-    Q, R = np.diag([0.1, 0.2, 0.3]), np.array([[20.0, 5.0], [5.0, 40.0]])
-
-    def covariances(self, steps: int) -> list[np.ndarray]:
-        running = observer_for(self.PLANT, Q=self.Q, R=self.R).start()
-        rows = [running.raw_step(np.zeros(2), np.zeros(0)) for _ in range(steps)]
-        return [row.factor @ row.factor.T for row in rows]
-
-    def test_the_recursion_converges_to_it_at_its_rate(self) -> None:
-        steady = steady_state_filter(self.PLANT, Q=self.Q, R=self.R)
-        found = self.covariances(200)
-        np.testing.assert_allclose(found[-1], steady.P, rtol=0, atol=1e-13)
-        np.testing.assert_allclose(steady.L @ self.PLANT.E.at(1) + steady.K @ self.PLANT.C.at(1), np.eye(3), atol=1e-12)
-        A = self.PLANT.A.at(0)
-        np.testing.assert_allclose(steady.P_predicted, A @ steady.P @ A.T + self.Q, atol=1e-15)
-        gaps = [np.linalg.norm(P - steady.P) for P in found]
-        assert (gaps[30] / gaps[20]) ** (1 / 10) == pytest.approx(steady.rate, rel=0.01)
-        assert 0.05 < steady.rate < 0.9
-
-    def test_the_printed_equation_has_it_for_a_solution(self) -> None:
-        """(16), with E and A as printed."""
-        steady = steady_state_filter(self.PLANT, Q=self.Q, R=self.R)
-        E, A, C, P = self.PLANT.E.at(1), self.PLANT.A.at(0), self.PLANT.C.at(1), steady.P_predicted
-        inner = E.T @ np.linalg.inv(P) @ E + C.T @ np.linalg.inv(self.R) @ C
-        np.testing.assert_allclose(A @ np.linalg.inv(inner) @ A.T + self.Q, P, atol=1e-12)
-
-    def test_refusals(self) -> None:
-        with pytest.raises(SpecError, match="changes with k"):
-            steady_state_filter(varying(), Q=np.eye(3), R=np.eye(2))
-        with pytest.raises(SpecError, match="Q is singular"):
-            steady_state_filter(self.PLANT, Q=np.diag([1.0, 1, 0]), R=self.R)
-        with pytest.raises(SpecError, match=r"R is \(1, 1\)"):
-            steady_state_filter(self.PLANT, Q=self.Q, R=[[1.0]])
-        with pytest.raises(PreconditionError, match="rank"):
-            steady_state_filter(self.PLANT.replace(C=[[1, 0, 0], [0, 1, 0]]), Q=self.Q, R=self.R)
-        discrete = DescriptorSystem(np.eye(2), 0.5 * np.eye(2), C=np.eye(2), dt=1.0)
-        assert steady_state_filter(discrete, Q=np.eye(2), R=np.eye(2)).rate < 0.25
+def test_a_filter_without_parameters_has_the_nis() -> None:
+    """A change of a parameter that the filter does not know is something that its model does not explain."""
+    for jump, expected in ((0.0, False), (4.0, True)):
+        observer = observer_for(PLANT, Q=np.diag([0.1, 0.2, 0.3]))
+        rng = np.random.default_rng(2)
+        theta = np.zeros((SAMPLES, 2))
+        theta[CHANGE:, 1] = jump
+        y = simulate_time_varying(
+            PLANT, samples=SAMPLES, parameters=theta,
+            equation_noise=rng.standard_normal((SAMPLES, 3)) * np.sqrt([0.1, 0.2, 0.3]),
+            output_noise=rng.standard_normal((SAMPLES - 1, 2)) * np.sqrt([0.2, 0.4]),
+        ).outputs  # fmt: skip
+        decision = decide(observer, observer.run(y, np.zeros((SAMPLES, 1))), statistic="nis")
+        assert (decision.alarm is not None) is expected
+    assert decision.alarm.parameter == ""
+    assert 0 <= decision.alarm.k - CHANGE <= 15
 
 
 class TestSimulation:
@@ -184,3 +167,28 @@ class TestSimulation:
             )
         with pytest.raises(SpecError, match="parameters has shape"):
             simulate_time_varying(printed(), samples=5, parameters=np.zeros((4, 1)))
+
+
+@pytest.mark.parametrize("adapt", [{}, {"form": "literal"}, {"form": "random-walk", "walk": 1e-4 * np.eye(2)}])
+def test_a_start_far_from_nominal_is_no_alarm(adapt: dict) -> None:
+    """The parameters are nominal, and the observer starts elsewhere: what it has not yet forgotten says nothing."""
+    for missing in (False, True):
+        observer, found = run(1, missing=missing, adapt={**adapt, "initial_parameters": np.array([8.0, -9.0])})
+        assert np.abs(found.parameters[0]).max() == 9.0
+        decision = decide(observer, found, nominal=[0.0, 0.0], false_alarms=0.05)
+        assert decision.values[0] == 0.0
+        assert decision.alarm is None
+        # With the same data, an observer that starts at the nominal values gives the same statistic.
+        other, same = run(1, missing=missing, adapt={**adapt, "initial_parameters": np.zeros(2)})
+        np.testing.assert_allclose(decision.values, decide(other, same).values, rtol=1e-7, atol=1e-9)
+    observer, found = run(1, jump=3.0, adapt={**adapt, "initial_parameters": np.array([8.0, -9.0])})
+    alarm = decide(observer, found, nominal=[0.0, 0.0]).alarm
+    assert alarm is not None
+    assert (alarm.parameter, 0 <= alarm.k - CHANGE <= 15) == ("theta2", True)
+
+
+def test_a_reset_forgets_the_start_at_times_that_data_choose() -> None:
+    observer, found = run(1, adapt={"reset": 1e-6, "initial_parameters": np.array([8.0, -9.0])})
+    with pytest.raises(SpecError, match="chi-square with reset"):
+        decide(observer, found, nominal=[0.0, 0.0])
+    assert decide(observer, found, nominal=[0.0, 0.0], statistic="glr", false_alarms=0.05).alarm is None

@@ -5,6 +5,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
+from obsynth.numerics import definiteness
 from obsynth.numerics.balls import Ball
 from obsynth.numerics.definiteness import prove_positive_definite
 
@@ -82,25 +83,47 @@ def off_by_one_ulp_of_indefinite(rng, size):
 FAMILIES = (singular_gram, gram_off_by_one_ulp, known_inertia, shifted_to_the_edge, off_by_one_ulp_of_indefinite)
 
 
+@pytest.fixture
+def without_flint(monkeypatch):
+    monkeypatch.setattr(definiteness, "is_available", lambda: False)
+
+
 @pytest.mark.parametrize("family", FAMILIES, ids=lambda family: family.__name__)
 def test_no_false_proof_in_2000_matrices(family):
-    """Five families: 10,000 matrices."""
+    """Five families: 10,000 matrices.  With ball arithmetic none that is definite is missed, either."""
     rng = np.random.default_rng(11)
-    definite = 0
+    definite, by_balls = 0, 0
     for _ in range(2000):
         matrix = family(rng, int(rng.integers(2, 8)))
         assert np.array_equal(matrix, matrix.T)
         truth = is_positive_definite(whole(matrix))
         definite += truth
-        assert truth or not prove_positive_definite(matrix).proved, matrix.tolist()
+        proof = prove_positive_definite(matrix)
+        assert proof.proved is truth, matrix.tolist()
+        by_balls += proof.means == "ball arithmetic"
+        assert (proof.lower_bound > 0.0) is truth
     assert definite <= 1500  # at least 500 of each family could have been proved falsely
+    if family in (gram_off_by_one_ulp, shifted_to_the_edge, off_by_one_ulp_of_indefinite):
+        assert by_balls >= 50
 
 
-@pytest.mark.parametrize("size", [50, 120])
-def test_no_false_proof_of_larger_singular_matrices(size):
+@pytest.mark.parametrize("family", FAMILIES, ids=lambda family: family.__name__)
+def test_no_false_proof_without_ball_arithmetic(family, without_flint):
+    rng = np.random.default_rng(18)
+    for _ in range(500):
+        matrix = family(rng, int(rng.integers(2, 8)))
+        proof = prove_positive_definite(matrix)
+        assert not proof.proved or is_positive_definite(whole(matrix)), matrix.tolist()
+        assert proof.means != "ball arithmetic"
+
+
+@pytest.mark.parametrize(("size", "count"), [(50, 5), (120, 2)])
+def test_no_false_proof_of_larger_singular_matrices(size, count, monkeypatch):
     """Sizes at which LAPACK's blocked kernels run; whole numbers make the rank certain."""
     rng = np.random.default_rng(size)
-    for _ in range(10):
+    for i in range(10 + count):
+        if i == count:
+            monkeypatch.setattr(definiteness, "is_available", lambda: False)
         factor = rng.integers(-9, 10, (size, size - 1)).astype(float)
         assert not prove_positive_definite(factor @ factor.T).proved
 
@@ -224,11 +247,14 @@ def test_what_is_not_finite_is_not_proved(value, place):
     assert not prove_positive_definite(Ball(np.eye(3), np.abs(matrix - np.eye(3)))).proved
 
 
-def test_extreme_sizes_neither_warn_nor_raise():
+def test_extreme_sizes_neither_warn_nor_raise(monkeypatch):
     """Entries that overflow when scaled, and a Cholesky factor whose LU pivots underflow."""
     assert not prove_positive_definite(np.array([[1.0, 1e308], [1e308, 1.0]])).proved
     assert not prove_positive_definite(np.array([[1e-300, 1e300], [1e300, 1e-300]])).proved
     assert prove_positive_definite(np.diag([1e-320, 1e308])).proved
     factor = np.eye(60, k=-1) + 2.0**-25 * np.eye(60)
     factor[0, 0] = 1.0
+    # Definite (the product is exact), with a smallest eigenvalue far below every double.
+    assert prove_positive_definite(factor @ factor.T).means == "ball arithmetic"
+    monkeypatch.setattr(definiteness, "is_available", lambda: False)
     assert not prove_positive_definite(factor @ factor.T).proved

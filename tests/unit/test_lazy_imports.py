@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 HEAVY = (
-    "casadi", "control", "cvxpy", "matplotlib", "numba", "pandas", "pyarrow", "pydantic", "scipy.linalg", "slycot",
+    "casadi", "control", "cvxpy", "flint", "matplotlib", "numba", "pandas", "pyarrow", "pydantic", "scipy.linalg",
+    "slycot",
 )  # fmt: skip
 SOURCE = Path(__file__).parents[2] / "src"
 

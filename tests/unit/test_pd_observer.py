@@ -15,8 +15,13 @@ from obsynth.numerics.continuous import continuous_hinf_norm
 from obsynth.simulation import simulate_plant
 from obsynth.spec import load_spec
 from obsynth.synthesis import lmi, pd_design
-from obsynth.synthesis.pd_certificate import explicit_certificate, gain_certificate, symmetric_certificate
-from obsynth.synthesis.pd_options import least_noise_gain
+from obsynth.synthesis.pd_certificate import (
+    coupled_certificate,
+    explicit_certificate,
+    gain_certificate,
+    symmetric_certificate,
+)
+from obsynth.synthesis.pd_limits import least_noise_gain
 from obsynth.verification.pd_inequality import (
     error_inputs,
     prove_gain,
@@ -338,11 +343,19 @@ class TestCertificates:
         a = np.array([[0.0, 1.0], [-4.0, -0.4]])
         found = symmetric_certificate(a, decay=0.0)
         assert found is not None
-        q, limit = found
         none = np.zeros((2, 1))
-        for delta, proved in ((0.9 * limit, True), (1.1 * limit, False)):
-            assert prove_gains(a, none.T, none, none, q, q, delta=delta, decay=0.0).proved is proved
+        for delta, proved in ((0.999 * found.limit, True), (1.001 * found.limit, False)):
+            p1 = found.P1(delta)
+            assert prove_gains(a, none.T, none, none, p1, found.P3, delta=delta, decay=0.0).proved is proved
         assert symmetric_certificate(-a, decay=0.0) is None
+
+    @pytest.mark.parametrize("delta", [1e-3, 0.1, 1.0, 10.0, 1e3])
+    def test_a_coupled_certificate_serves_for_every_delta(self, delta: float) -> None:
+        a, none = np.array([[0.0, 1.0], [-4.0, -0.4]]), np.zeros((2, 1))
+        p1, p3 = coupled_certificate(a, delta)
+        p1 = 0.5 * (p1 + p1.T)
+        assert prove_symmetric_positive(p1).proved
+        assert prove_gains(a, none.T, none, none, p1, p3, delta=delta, decay=0.0).proved
 
     def test_an_l2_gain_is_proved_down_to_the_norm_and_not_below(self) -> None:
         for plant in (PLANT, rich()):
@@ -470,6 +483,27 @@ class TestRefusals:
         with pytest.raises(obsynth.InfeasibleError, match="-1/delta") as caught:
             obsynth.pd_observer(PLANT, disk=[5.0, 4.5], delta=10.0)
         assert not caught.value.necessary
+
+    def test_outputs_that_show_nothing_end_in_the_mode_that_they_hide(self) -> None:
+        """In rates of many sizes too, where the zeros of [A - s I; C] computed another way are too few."""
+        with pytest.raises(obsynth.PreconditionError) as caught:
+            obsynth.pd_observer(PLANT.replace(C=np.zeros_like(PLANT.C)))
+        assert caught.value.condition == "detectability"
+        assert caught.value.mode == pytest.approx(np.max(np.linalg.eigvals(PLANT.A).real))
+        for seed in range(60):
+            rng = np.random.default_rng([7, seed])
+            n = int(rng.integers(1, 9))
+            a = rng.normal(size=(n, n)) * 10.0 ** rng.uniform(-8, 8, (n, n))
+            values = np.linalg.eigvals(a)
+            if not np.max(values.real) > 1e-6 * np.max(np.abs(values)):
+                continue
+            for c in (np.zeros((2, n)), np.eye(1, n)):
+                plant = obsynth.DescriptorSystem(None, a, C=c, Bf=np.ones((n, 1)))
+                failed = pd_observer_conditions(plant)[-1]
+                if not np.any(c) or failed.name == "detectability":
+                    assert failed.name == "detectability"
+                    assert failed.mode.real >= -1e-9 * abs(failed.mode)
+                    assert failed.signals
 
     def test_conditions_are_listed_for_check(self) -> None:
         names = [condition.name for condition in pd_observer_conditions(PLANT)]

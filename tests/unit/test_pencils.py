@@ -210,3 +210,12 @@ def test_singular_values_around_the_tolerance_give_a_consistent_answer(seed):
     assert len(structure.finite_eigenvalues) <= structure.normal_rank <= 6
     assert np.all(np.isfinite(structure.finite_eigenvalues))
     assert np.all(np.isfinite(finite_zeros(E, A).values))
+
+
+def test_a_pencil_on_which_lapack_does_not_converge():
+    """The QZ iteration ends in an error for this one; its eigenvalues are -1 plus the cube roots of one."""
+    a = np.array([[-1.0, 0.0, 1.0], [-1.0, -1.0, 0.0], [0.0, -1.0, -1.0]])
+    found = pencil_structure(np.eye(3), a).finite_eigenvalues
+    expected = -1.0 + np.exp(2j * np.pi * np.arange(3) / 3)
+    assert len(found) == 3
+    assert max(np.min(np.abs(found - value)) for value in expected) < 1e-12

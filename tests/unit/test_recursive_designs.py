@@ -23,6 +23,7 @@ FORMS = {
     "directional": {"guard": "directional"},
     "random walk": {"form": "random-walk", "random_walk": 1e-3},
     "early": {"early_constraints": True},
+    "early random walk": {"form": "random-walk", "random_walk": 1e-3, "early_constraints": True},
 }
 SPEC = """\
 schema_version: 1

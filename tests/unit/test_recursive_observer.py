@@ -196,8 +196,6 @@ class TestBadInput:
         coupled = np.diag([0.1, 0.2, 0.3]) + 0.01
         with pytest.raises(SpecError, match="couples the noise of algebraic equations"):
             observer_for(varying(), Q=coupled, early_constraints=True).run(*record(varying(), 3))
-        with pytest.raises(SpecError, match="do not go together"):
-            observer_for(varying(), early_constraints=True, adapt={"form": "random-walk"})
 
     def test_adaptation(self) -> None:
         for changes, part in (
@@ -225,3 +223,67 @@ def test_data_come_back() -> None:
     object.__setattr__(called, "R", MatrixSequence.of(lambda k: np.eye(2), "R"))
     with pytest.raises(SpecError, match="R is a Python function"):
         called.as_dict()
+
+
+def walking_likelihood(observer: RecursiveObserver, y: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Estimate and covariance of ``[x(N); theta(N)]``: all states and parameters of a record, early rows too."""
+    plant, adapt, steps = observer.plant, observer.adaptation, len(y) - 1
+    nx, nq = plant.nx, plant.nq
+    size = (nx + nq) * (steps + 1)
+    rows, values, weights = [], [], []
+
+    def add(blocks: dict[int, np.ndarray], value: np.ndarray, covariance: np.ndarray) -> None:
+        row, kept = np.zeros((len(value), size)), np.isfinite(value)
+        for column, block in blocks.items():
+            row[:, column : column + block.shape[1]] = block
+        rows.append(row[kept])
+        values.append(value[kept])
+        weights.append(np.linalg.inv(covariance[np.ix_(kept, kept)]))
+
+    state, theta = [k * (nx + nq) for k in range(steps + 1)], [k * (nx + nq) + nx for k in range(steps + 1)]
+    add({0: np.eye(nx)}, observer.initial_state, observer.initial_covariance)
+    add({theta[0]: np.eye(nq)}, adapt.initial_parameters, adapt.initial_covariance)
+    for k in range(steps):
+        add({state[k + 1]: plant.E.at(k + 1), state[k]: -plant.A.at(k), theta[k]: -plant.Phi.at(k)},
+            plant.B.at(k) @ u[k], observer.Q.at(k))  # fmt: skip
+        add({state[k + 1]: plant.C.at(k + 1), theta[k]: plant.Psi.at(k)}, y[k + 1], observer.R.at(k))
+        add({theta[k + 1]: np.eye(nq), theta[k]: -np.eye(nq)}, np.zeros(nq), adapt.walk)
+    late = ~plant.E.at(1).any(axis=1)
+    add({state[steps]: plant.A.at(steps)[late], theta[steps]: plant.Phi.at(steps)[late]},
+        -(plant.B.at(steps) @ u[steps])[late], observer.Q.at(steps)[np.ix_(late, late)])  # fmt: skip
+    matrix, value = np.vstack(rows), np.concatenate(values)
+    weight = np.zeros((len(value), len(value)))
+    top = 0
+    for block in weights:
+        weight[top : top + len(block), top : top + len(block)] = block
+        top += len(block)
+    covariance = np.linalg.inv(matrix.T @ weight @ matrix)
+    return (covariance @ matrix.T @ weight @ value)[state[steps] :], covariance[state[steps] :, state[steps] :]
+
+
+@pytest.mark.parametrize("missing", [False, True])
+def test_early_constraints_and_a_random_walk_are_maximum_likelihood(missing: bool) -> None:
+    plant = varying(horizon=30)
+    walk = np.array([[0.02, 0.005], [0.005, 0.01]])
+    observer = observer_for(plant, adapt={"form": "random-walk", "walk": walk}, early_constraints=True)
+    y, u = record(plant, 14)
+    y = y.copy()
+    if missing:
+        y[4, 0] = y[9, 1] = y[12, 1] = np.nan
+    for samples in (1, 2, 7, 14):
+        found = observer.run(y[:samples], u[:samples])
+        exact, covariance = walking_likelihood(observer, y[:samples], u[:samples])
+        np.testing.assert_allclose(found.states[-1], exact[:3], rtol=0, atol=1e-11)
+        np.testing.assert_allclose(found.parameters[-1], exact[3:], rtol=0, atol=1e-11)
+        np.testing.assert_allclose(found.state_deviations[-1] ** 2, np.diag(covariance)[:3], rtol=1e-10)
+        np.testing.assert_allclose(found.parameter_covariances[-1], covariance[3:, 3:], rtol=0, atol=1e-12)
+
+
+def test_early_constraints_and_parameters_that_stand_still() -> None:
+    """A walk of no length is least squares that forgets nothing."""
+    plant = varying(horizon=30)
+    data = record(plant, 20)
+    still = observer_for(plant, adapt={"form": "random-walk"}, early_constraints=True).run(*data)
+    squares = observer_for(plant, adapt={"forgetting": 1.0}, early_constraints=True).run(*data)
+    np.testing.assert_allclose(still.parameters, squares.parameters, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(still.states, squares.states, rtol=0, atol=1e-12)

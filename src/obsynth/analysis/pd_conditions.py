@@ -14,9 +14,10 @@ from dataclasses import replace
 import numpy as np
 
 from obsynth.analysis.conditions import Condition, rank_condition
+from obsynth.analysis.far_zeros import equilibrated_at
 from obsynth.analysis.structure import analyse_structure
 from obsynth.analysis.transformations import Transformation, eliminate_algebraic_states
-from obsynth.analysis.zeros import invariant_zeros, leading_names
+from obsynth.analysis.zeros import leading_names
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.pencils import pencil_structure
@@ -136,16 +137,21 @@ def _detectability(plant: DescriptorSystem) -> Condition:
         )
         return Condition("detectability", claim, True, 0.0, 0.0, source, detail)
     mode = max(hidden, key=lambda value: value.real)
-    none = np.zeros((plant.nx, 0))
-    zeros = invariant_zeros(plant.E, plant.A, none, plant.C)
-    nearest = min(zeros, key=lambda zero: abs(zero.value - mode))
-    signals = leading_names(np.abs(nearest.state_direction), plant.state_names, most=MOST_NAMES)
+    signals = leading_names(_hidden_direction(plant, mode), plant.state_names, most=MOST_NAMES)
     value = f"{mode.real:.6g}" if mode.imag == 0.0 else f"{mode:.6g}"
     detail = (
         f"the mode s = {value} (states {', '.join(map(repr, signals))}) never shows in the outputs and does not "
         "decay: measure something it moves."
     )
     return Condition("detectability", claim, False, float(len(hidden)), 0.0, source, detail, mode=mode, signals=signals)
+
+
+def _hidden_direction(plant: DescriptorSystem, mode: complex) -> FloatArray:
+    """Return the sizes ``(nx,)`` of the states in the direction that ``[A - s I; C]`` shows least at a mode."""
+    still = np.vstack([plant.E, np.zeros_like(plant.C)])
+    pencil = equilibrated_at(still, np.vstack([plant.A, plant.C]), mode, nx=plant.nx)
+    point = mode if mode.imag else mode.real
+    return np.asarray(np.abs(pencil.columns * np.linalg.svd(pencil.A - point * pencil.E)[2][-1]))
 
 
 def _null_vector(matrix: FloatArray) -> FloatArray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from types import MappingProxyType
 
 import numpy as np
@@ -77,6 +78,8 @@ class Structure:
         return tuple(name for name, decision in self.decisions.items() if not decision.clear)
 
 
+# Conditions, synthesis and verification ask for the same plant's; plants never change.
+@lru_cache(maxsize=4)
 def analyse_structure(plant: DescriptorSystem) -> Structure:
     """Analyse regularity, index, stability and observability of ``plant``.
 

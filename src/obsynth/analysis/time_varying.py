@@ -1,18 +1,17 @@
-"""What is known of a time-varying plant before a design: rank and condition of H_k along the horizon."""
+"""What is known of a time-varying plant before a design: its steps as they are used, rank and condition of H_k."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from typing import TypeAlias
+from dataclasses import dataclass
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.analysis.conditions import Condition, rank_condition
 from obsynth.errors import SpecError
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.models.time_varying import TimeVaryingDescriptorSystem
+from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import RankDecision, decide_rank
 
 #: Steps that are looked at where the plant has no horizon.
@@ -22,12 +21,53 @@ WARN_CONDITION = 1e6
 
 IntArray: TypeAlias = NDArray[np.intp]
 
-_SOURCE = "Moussa Ali, Zhang 2013"
+
+class StepBlocks(NamedTuple):
+    """The matrices of one step as a filter uses them, without noise and inputs.
+
+    Parameters
+    ----------
+    E, A, Phi : FloatArray
+        ``(rows, nx)``, ``(rows, nx)`` and ``(rows, nq)``: the equations that lead to x(k + 1).
+    C, Psi : FloatArray
+        ``(outputs, nx)`` and ``(outputs, nq)``: with early constraints the algebraic equations of step k + 1 too.
+    """
+
+    E: FloatArray
+    A: FloatArray
+    Phi: FloatArray
+    C: FloatArray
+    Psi: FloatArray
+
+
+def step_blocks(plant: TimeVaryingDescriptorSystem, k: int, late: IntArray) -> StepBlocks:
+    """Return the matrices of the step from k to k + 1.
+
+    Parameters
+    ----------
+    plant : TimeVaryingDescriptorSystem
+        The plant.
+    k : int
+        Time index.
+    late : IntArray
+        Equations that are used one step early, see `algebraic_rows`; empty for none.
+    """
+    E, A, C = plant.E.at(k + 1), plant.A.at(k), plant.C.at(k + 1)
+    Phi, Psi = plant.Phi.at(k), plant.Psi.at(k)
+    if not late.size:
+        return StepBlocks(E, A, Phi, C, Psi)
+    others = np.setdiff1d(np.arange(plant.ne), late)
+    return StepBlocks(
+        E[others], A[others], Phi[others], np.vstack([C, plant.A.at(k + 1)[late]]),
+        np.vstack([Psi, plant.Phi.at(k + 1)[late]]),
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
 class HorizonRanks:
     """Rank and condition of ``H_k = [E_k; C_k]``, and the residual directions of (18), where they are worst.
+
+    With early constraints H_k holds them among the outputs.
 
     Parameters
     ----------
@@ -42,7 +82,7 @@ class HorizonRanks:
     condition_k : int
         Where that is.
     directions : int
-        The least ``rank E_k + ny - nx``.
+        The least ``rank E_k + ny - nx``, early constraints being outputs.
     directions_k : int
         Where that is.
     """
@@ -56,32 +96,42 @@ class HorizonRanks:
     directions_k: int
 
 
-def checked_steps(plant: TimeVaryingDescriptorSystem) -> int:
-    """Return how many steps of a plant are looked at: its horizon, one where nothing changes, or a thousand.
+def early_rows(plant: TimeVaryingDescriptorSystem, *, early: bool) -> IntArray:
+    """Return the equations that are used one step early: the algebraic ones, or none where this is not asked for.
 
     Parameters
     ----------
     plant : TimeVaryingDescriptorSystem
         The plant.
+    early : bool
+        Whether it is.
     """
-    if plant.E.is_constant and plant.C.is_constant:
-        return 1
-    return plant.horizon or STEPS_WITHOUT_HORIZON
+    steps = plant.horizon or STEPS_WITHOUT_HORIZON
+    return algebraic_rows(plant, steps) if early else np.zeros(0, dtype=np.intp)
 
 
-def horizon_ranks(plant: TimeVaryingDescriptorSystem) -> HorizonRanks:
+def horizon_ranks(plant: TimeVaryingDescriptorSystem, *, early: bool = False) -> HorizonRanks:
     """Return rank and condition of H_k along the horizon.
 
     Parameters
     ----------
     plant : TimeVaryingDescriptorSystem
         The plant.
+    early : bool, optional
+        Whether the algebraic equations are used one step early.
     """
-    steps = checked_steps(plant)
+    late = early_rows(plant, early=early)
+    steps = plant.horizon or STEPS_WITHOUT_HORIZON
+    if plant.E.is_constant and plant.C.is_constant and (plant.A.is_constant or not late.size):
+        steps = 1
+    elif late.size:
+        steps = max(steps - 1, 1)
     worst, worst_k, condition, condition_k, directions, directions_k = None, 1, 0.0, 1, None, 1
     for k in range(1, steps + 1):
-        E = plant.E.at(k)
-        H = np.vstack([E, plant.C.at(k)])
+        E, C = plant.E.at(k), plant.C.at(k)
+        if late.size:
+            E, _, _, C, _ = step_blocks(plant, k - 1, late)
+        H = np.vstack([E, C])
         decision = decide_rank(H, expected=plant.nx)
         if worst is None or (decision.rank, decision.smallest_kept) < (worst.rank, worst.smallest_kept):
             worst, worst_k = decision, k
@@ -89,7 +139,7 @@ def horizon_ranks(plant: TimeVaryingDescriptorSystem) -> HorizonRanks:
         found = float(values[0] / values[-1]) if len(H) >= plant.nx and values[-1] > 0.0 else float("inf")
         if found > condition:
             condition, condition_k = found, k
-        here = decide_rank(E).rank + plant.ny - plant.nx
+        here = decide_rank(E).rank + len(C) - plant.nx
         if directions is None or here < directions:
             directions, directions_k = here, k
     if worst is None or directions is None:
@@ -108,63 +158,14 @@ def as_time_varying(plant: DescriptorSystem | TimeVaryingDescriptorSystem) -> Ti
     Raises
     ------
     SpecError
-        It is continuous in time, or has feedthrough or disturbances.
+        It is no linear plant, continuous in time, or has feedthrough or disturbances.
     """
-    return (
-        plant if isinstance(plant, TimeVaryingDescriptorSystem) else TimeVaryingDescriptorSystem.from_descriptor(plant)
-    )
-
-
-def recursive_conditions(
-    plant: DescriptorSystem | TimeVaryingDescriptorSystem, *, parameters: bool, literal: bool = False
-) -> Iterator[Condition]:
-    """Yield the existence conditions of the recursive methods; the list ends at the first failure.
-
-    Parameters
-    ----------
-    plant : DescriptorSystem or TimeVaryingDescriptorSystem
-        Any plant.
-    parameters : bool
-        Whether parameters are to be estimated.
-    literal : bool, optional
-        Whether by the form that is printed as (18).
-    """
-    try:
-        varying = as_time_varying(plant)
-    except SpecError as error:
-        yield Condition("plant of this kind", "discrete time, no feedthrough, no unknown disturbance", False, 0.0, 1.0,
-                        f"{_SOURCE}, eq. (4)", str(error))  # fmt: skip
-        return
-    ranks = horizon_ranks(varying)
-    where = "for every k" if ranks.steps == 1 else f"for k = 1 ... {ranks.steps}, worst at k = {ranks.worst_k}"
-    condition = rank_condition(
-        "rank [E; C]", ranks.worst, f"at k = {ranks.worst_k} equations and outputs do not determine the state; measure "
-        "more, or leave out states that nothing depends on", source=f"{_SOURCE}, A2", signals=varying.output_names,
-    )  # fmt: skip
-    yield replace(condition, claim=f"{condition.claim} {where}")
-    if not ranks.worst.full or not parameters:
-        return
-    yield Condition("parameters", "the plant has parameters (Phi or Psi)", varying.nq > 0, float(varying.nq), 1.0,
-                    f"{_SOURCE}, eq. (4)", f"{varying.nq} parameter(s)")  # fmt: skip
-    if literal:
-        yield residual_condition(ranks)
-
-
-def residual_condition(ranks: HorizonRanks) -> Condition:
-    """Return the condition that (18) can learn at all, which the paper never states.
-
-    Parameters
-    ----------
-    ranks : HorizonRanks
-        Of the plant.
-    """
-    return Condition(
-        "residual directions", "rank E_k + ny - nx >= 1 for every k", ranks.directions >= 1, float(ranks.directions),
-        1.0,         "our finding: missing in Moussa Ali, Zhang 2013",
-        f"at k = {ranks.directions_k} (18) sees only rank E + ny - nx = {ranks.directions} residual directions"
-        + ("" if ranks.directions >= 1 else ": y - C xhat is zero whatever the parameters are, so it never learns. Use "
-           "form 'innovation', which sees all the parity directions."),
-    )  # fmt: skip
+    if isinstance(plant, TimeVaryingDescriptorSystem):
+        return plant
+    if not isinstance(plant, DescriptorSystem):
+        raise SpecError(f"The plant is a {type(plant).__name__}: give an obsynth.DescriptorSystem or "
+                        "TimeVaryingDescriptorSystem.", path="plant")  # fmt: skip
+    return TimeVaryingDescriptorSystem.from_descriptor(plant)
 
 
 def algebraic_rows(plant: TimeVaryingDescriptorSystem, steps: int) -> IntArray:

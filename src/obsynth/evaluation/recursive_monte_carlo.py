@@ -12,7 +12,8 @@ from obsynth.errors import SpecError
 from obsynth.evaluation.monitors import Monitor
 from obsynth.evaluation.recursive_bench import RecursiveBench, RowEstimates
 from obsynth.numerics.arrays import FloatArray
-from obsynth.observers.decisions import STATISTICS, Decision, decide
+from obsynth.observers.alarms import Decision
+from obsynth.observers.decisions import STATISTICS, decide
 from obsynth.observers.recursive import RecursiveObserver
 from obsynth.observers.recursive_estimates import RecursiveEstimates
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ def checked_names(names: Sequence[str] | None, count: int, *, prefix: str, what:
     """Return ``count`` unique names; ``prefix1, prefix2, ...`` when none are given."""
     if names is None:
         return tuple(f"{prefix}{i + 1}" for i in range(count))
-    given = tuple(names)
+    given = tuple(names) if isinstance(names, Iterable) else (names,)
     if isinstance(names, str) or not all(isinstance(name, str) and name.strip() for name in given):
         raise SpecError(f"{what} must be a list of non-empty texts.", path=what)
     if len(given) != count:

@@ -177,6 +177,10 @@ def _named(make: Callable[[], FloatArray], name: str, k: int) -> FloatArray:
         return make()
     except SpecError as error:
         raise SpecError(f"At k = {k}: {error}", path=f"{name}({k})") from error
+    except Exception as error:
+        # A function of the user may raise anything: say for which k it did.
+        raise SpecError(f"The function for {name} fails at k = {k}: {type(error).__name__}: {error}.",
+                        path=f"{name}({k})") from error  # fmt: skip
 
 
 def _has_text(value: Any) -> bool:

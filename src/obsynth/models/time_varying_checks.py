@@ -38,8 +38,12 @@ def positive_dt(dt: Any) -> float:
 
 def checked_constants(constants: Mapping[str, float] | None) -> dict[str, float]:
     """Return names and finite values that expressions may use."""
-    checked = {}
-    for name, value in (constants or {}).items():
+    checked: dict[str, float] = {}
+    if constants is None:
+        return checked
+    if not isinstance(constants, Mapping):
+        raise SpecError(f"constants is a {type(constants).__name__}: give names and values.", path="constants")
+    for name, value in constants.items():
         if not (isinstance(name, str) and name.isidentifier()) or name == "k" or name in CONSTANTS:
             raise SpecError(f"constants names {name!r}: use letters, digits and '_', not k or pi.", path="constants")
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):

@@ -143,6 +143,8 @@ def checked_scales(scales: Mapping[str, float] | None, known: set[str]) -> dict[
 
 def checked_units(units: Mapping[str, str] | None, known: set[str]) -> dict[str, str]:
     """Return units whose signals all exist."""
+    if units is not None and not isinstance(units, Mapping):
+        raise SpecError(f"units is a {type(units).__name__}: give signal names and their units.", path="units")
     for name, value in (units or {}).items():
         if name not in known:
             raise SpecError(f"units names {name!r}, which is no signal of the plant.", path="units")

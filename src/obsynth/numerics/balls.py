@@ -12,7 +12,10 @@ any order, with or without fused multiply-add, differs from the exact one by at 
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,8 +38,70 @@ def rounded_up(value: FloatArray, operations: int) -> FloatArray:
     return value * (1.0 + 2.0 * (operations + 2) * UNIT_ROUNDOFF) + (operations + 1) * UNDERFLOW
 
 
+class Enclosure(ABC):
+    """A set of real matrices on which sums and products can be formed so that they hold those of all members.
+
+    `Ball` does so in double precision, `obsynth.numerics.extended_balls.ExtendedBall` in any other.
+    """
+
+    @classmethod
+    @abstractmethod
+    def exact(cls, matrix: FloatArray) -> Self:
+        """Return the set that holds ``matrix`` alone: floating-point numbers are exact data."""
+
+    @classmethod
+    @abstractmethod
+    def of(cls, ball: Ball) -> Self:
+        """Return a set that holds every member of ``ball``."""
+
+    @classmethod
+    @abstractmethod
+    def blocks(cls, rows: Sequence[Sequence[Self]]) -> Self:
+        """Return the set of block matrices with the given rows of blocks."""
+
+    @property
+    @abstractmethod
+    def shape(self) -> tuple[int, ...]:
+        """Rows and columns."""
+
+    @property
+    @abstractmethod
+    def T(self) -> Self:
+        """The transpose."""
+
+    @abstractmethod
+    def __add__(self, other: Self) -> Self:
+        """Return a set that holds all sums of members."""
+
+    @abstractmethod
+    def __neg__(self) -> Self:
+        """Return the set of the negative members."""
+
+    def __sub__(self, other: Self) -> Self:
+        """Return a set that holds all differences of members."""
+        return self + (-other)
+
+    @abstractmethod
+    def __matmul__(self, other: Self) -> Self:
+        """Return a set that holds all products of members."""
+
+    @abstractmethod
+    def scaled(self, factor: float) -> Self:
+        """Return a set that holds ``factor`` times every member."""
+
+
+Enclosed = TypeVar("Enclosed", bound=Enclosure)
+
+
+class Formula(Protocol):
+    """How a matrix is formed, in an arithmetic of whoever calls it: ``formula(Ball)`` for double precision."""
+
+    def __call__(self, kind: type[Enclosed], /) -> Enclosed:
+        """Return the matrix with what forming it may have cost."""
+
+
 @dataclass(frozen=True, eq=False)
-class Ball:
+class Ball(Enclosure):
     """All real matrices within ``radius`` of ``midpoint``, entry by entry.
 
     Parameters
@@ -49,9 +114,21 @@ class Ball:
     radius: FloatArray
 
     @classmethod
-    def exact(cls, matrix: FloatArray) -> Ball:
+    def exact(cls, matrix: FloatArray) -> Self:
         """Return the ball that holds ``matrix`` alone: floating-point numbers are exact data."""
         return cls(np.asarray(matrix, dtype=np.float64), np.zeros(np.shape(matrix)))
+
+    @classmethod
+    def of(cls, ball: Ball) -> Self:
+        """Return ``ball``."""
+        return cls(ball.midpoint, ball.radius)
+
+    @classmethod
+    def blocks(cls, rows: Sequence[Sequence[Self]]) -> Self:
+        """Return the ball of the block matrix with the given rows of blocks."""
+        return cls(
+            np.block([[b.midpoint for b in row] for row in rows]), np.block([[b.radius for b in row] for row in rows])
+        )
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -59,35 +136,46 @@ class Ball:
         return tuple(self.midpoint.shape)
 
     @property
-    def T(self) -> Ball:
+    def T(self) -> Self:
         """The transpose."""
-        return Ball(self.midpoint.T, self.radius.T)
+        return type(self)(self.midpoint.T, self.radius.T)
 
-    def __add__(self, other: Ball) -> Ball:
+    def __add__(self, other: Self) -> Self:
         """Return the ball of all sums of members."""
         with np.errstate(over="ignore", invalid="ignore"):
             total = self.midpoint + other.midpoint
             radius = rounded_up(self.radius + other.radius + UNIT_ROUNDOFF * np.abs(total), 3)
-        return Ball(total, radius)
+        return type(self)(total, radius)
 
-    def __neg__(self) -> Ball:
+    def __neg__(self) -> Self:
         """Return the ball of the negative members; exact."""
-        return Ball(-self.midpoint, self.radius)
+        return type(self)(-self.midpoint, self.radius)
 
-    def __sub__(self, other: Ball) -> Ball:
-        """Return the ball of all differences of members."""
-        return self + (-other)
-
-    def __matmul__(self, other: Ball) -> Ball:
+    def __matmul__(self, other: Self) -> Self:
         """Return the ball of all products of members."""
         length = self.shape[1]
         size, other_size = np.abs(self.midpoint), np.abs(other.midpoint)
         with np.errstate(over="ignore", invalid="ignore"):
             # gamma multiplies the product, not a factor: what a factor loses by underflow, the other may magnify.
-            rounding = gamma(length + 1) * (size @ other_size)
-            spread = rounding + size @ other.radius + self.radius @ (other_size + other.radius)
+            spread = gamma(length + 1) * (size @ other_size)
+            if not other.is_exact:
+                spread = spread + size @ other.radius
+            if not self.is_exact:
+                spread = spread + self.radius @ (other_size + other.radius)
             radius = rounded_up(spread, 2 * length + 6) + 3 * length * UNDERFLOW
-            return Ball(self.midpoint @ other.midpoint, radius)
+            return type(self)(self.midpoint @ other.midpoint, radius)
+
+    def scaled(self, factor: float) -> Self:
+        """Return the ball of ``factor`` times every member."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            product = factor * self.midpoint
+            radius = abs(factor) * self.radius + UNIT_ROUNDOFF * np.abs(product) + UNDERFLOW
+            return type(self)(product, rounded_up(radius, 4))
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether there is one member alone."""
+        return not np.any(self.radius)
 
     def congruent(self, exponents: NDArray[np.int64]) -> Ball:
         """Return ``diag(2^k) X diag(2^k)``, k the ``exponents``: exact but for underflow."""
@@ -96,8 +184,6 @@ class Ball:
             return Ball(np.ldexp(self.midpoint, total), np.ldexp(self.radius, total) + UNDERFLOW)
 
 
-def block(rows: list[list[Ball]]) -> Ball:
-    """Return the ball of the block matrix with the given rows of blocks."""
-    return Ball(
-        np.block([[b.midpoint for b in row] for row in rows]), np.block([[b.radius for b in row] for row in rows])
-    )
+def block(rows: Sequence[Sequence[Enclosed]]) -> Enclosed:
+    """Return the set of block matrices with the given rows of blocks."""
+    return type(rows[0][0]).blocks(rows)

@@ -16,6 +16,7 @@ import numba
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.ranks import OUTGROWN
 
 Function = TypeVar("Function", bound=Callable[..., object])
 
@@ -152,7 +153,10 @@ def _steps(
     sums, right = np.zeros(rows), np.zeros(rows)
     for k in range(len(data)):
         move, noise, top = moved[k % len(moved)], known[k % len(known)], head[k % len(head)]
-        suspect = share * math.sqrt(_fill(work, factor, move, noise))
+        squares = _fill(work, factor, move, noise)
+        if not squares < OUTGROWN * OUTGROWN:
+            return k
+        suspect = share * math.sqrt(squares)
         _triangularise(work, sums)
         for i in range(m):
             if not abs(work[i, i]) > suspect:

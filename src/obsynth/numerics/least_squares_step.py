@@ -13,7 +13,7 @@ import numpy as np
 
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.ranks import RANK_TOLERANCE
+from obsynth.numerics.ranks import OUTGROWN, RANK_TOLERANCE
 
 #: A column of H that keeps less than this of its length beside the others goes to the rank-revealing step: far below
 #: what a condition number of 1e12 does, far above rounding.
@@ -91,6 +91,8 @@ def projection_of(H: FloatArray) -> Projection | None:
 def projected_step(projection: Projection, noise: FloatArray, data: FloatArray) -> LeastSquaresStep | None:
     """Solve one step from rotated noise and data, or return ``None`` where the rank of the noise has to be decided.
 
+    Noise that outgrows double precision is left to the caller too.
+
     Parameters
     ----------
     projection : Projection
@@ -106,7 +108,10 @@ def projected_step(projection: Projection, noise: FloatArray, data: FloatArray) 
     rows, columns = data.shape
     m = rows - n
     flat = noise.ravel(order="K")
-    suspect = SUSPECT_PARITY * math.sqrt(flat.dot(flat)) if m else 0.0
+    squares = flat.dot(flat)
+    if not squares < OUTGROWN * OUTGROWN:
+        return None
+    suspect = SUSPECT_PARITY * math.sqrt(squares)
     triangle = dgeqrf(noise, overwrite_a=1)[0]
     right = np.empty((n, columns + n), order="F")
     innovation = data[:m]

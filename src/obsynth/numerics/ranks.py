@@ -38,6 +38,8 @@ NAMED_SHARE = 1e-3
 CANCELLATION_TOLERANCE = 1e-14
 #: Largest eigenvalue, relative to the norm of the balanced matrix, below which all of them are rounding errors of zero.
 NEGLIGIBLE_MODE = 1e-6
+#: Standard deviations above this outgrow double precision soon: their squares overflow at 1e154.
+OUTGROWN = 1e100
 #: Fault zeros of a sampled plant between this radius and 1 make the fault estimate ring for long.
 SLOW_ZERO_RADIUS = 0.98
 

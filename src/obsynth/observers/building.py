@@ -10,6 +10,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.models.sequences import MatrixSequence
 from obsynth.models.time_varying import TimeVaryingDescriptorSystem
+from obsynth.numerics.arguments import is_number, real_number, real_vector
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.observers.recursive import Adaptation, RecursiveObserver
 
@@ -42,7 +43,7 @@ def observer_from_options(plant: TimeVaryingDescriptorSystem, options: Mapping[s
         nq = plant.nq
         adaptation = Adaptation(
             form=options["form"],
-            forgetting=float(options["forgetting"]),
+            forgetting=options["forgetting"],
             guard=options["guard"],
             initial_parameters=_vector(options["initial_parameters"], nq, "initial_parameters"),
             initial_covariance=_square(
@@ -50,13 +51,13 @@ def observer_from_options(plant: TimeVaryingDescriptorSystem, options: Mapping[s
             ),
             walk=_square(options["random_walk"], nq, 0.0, "random_walk"),
             window=options["window"],
-            reset=float(options["reset"]),
+            reset=options["reset"],
         )
     return RecursiveObserver(
         plant, _sequence(options["Q"], plant.ne, "Q", plant), _sequence(options["R"], plant.ny, "R", plant),
         _vector(options["initial_state"], plant.nx, "initial_state"),
         _square(options["initial_covariance"], plant.nx, 1.0, "initial_covariance"), adaptation,
-        bool(options["early_constraints"]),
+        options["early_constraints"],
     )  # fmt: skip
 
 
@@ -69,7 +70,8 @@ def plain_options(options: Mapping[str, Any]) -> dict[str, Any]:
         As for `observer_from_options`.
     """
     plain: dict[str, Any] = {}
-    for name, value in options.items():
+    for name, given in options.items():
+        value = given.item() if isinstance(given, np.generic) else given
         if isinstance(value, MatrixSequence):
             plain[name] = value.as_data() if value.is_data else value.function
         elif value is None or callable(value) or isinstance(value, (bool, int, float, str)) or _has_text(value):
@@ -86,8 +88,8 @@ def _has_text(value: Any) -> bool:
 def _sequence(value: Any, size: int, name: str, plant: TimeVaryingDescriptorSystem) -> MatrixSequence:
     if value is None:
         return MatrixSequence.of(np.eye(size), name)
-    if isinstance(value, (int, float)) and not isinstance(value, bool):
-        value = float(value) * np.eye(size)
+    if is_number(value):
+        value = real_number(value, name, "a variance, or a covariance matrix") * np.eye(size)
     found = MatrixSequence.of(value, name, constants=plant.constants)
     if found.length is not None and (plant.horizon is None or found.length < plant.horizon):
         raise SpecError(f"{name} is a stack for {found.length} steps: it must reach as far as the plant's horizon "
@@ -96,15 +98,7 @@ def _sequence(value: Any, size: int, name: str, plant: TimeVaryingDescriptorSyst
 
 
 def _vector(value: Any, size: int, name: str) -> FloatArray:
-    if value is None:
-        return np.zeros(size)
-    try:
-        vector = np.atleast_1d(np.asarray(value, dtype=np.float64))
-    except (TypeError, ValueError):
-        raise SpecError(f"{name} must be {size} finite number(s).", path=name) from None
-    if vector.shape != (size,) or not np.isfinite(vector).all():
-        raise SpecError(f"{name} must be {size} finite number(s).", path=name)
-    return vector
+    return np.zeros(size) if value is None else real_vector(value, size, name)
 
 
 def _square(value: Any, size: int, default: float, name: str) -> FloatArray:

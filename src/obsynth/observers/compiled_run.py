@@ -19,7 +19,7 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.least_squares_step import SUSPECT_PARITY
 from obsynth.observers.recursive import RecursiveObserver
-from obsynth.observers.recursive_estimates import RecursiveEstimates, deviations_of
+from obsynth.observers.recursive_estimates import RecursiveEstimates, deviations_of, received_in
 from obsynth.observers.recursive_running import RawEstimate, RunningRecursiveObserver
 from obsynth.observers.step_stacks import stacked_matrices, stacked_steps
 
@@ -123,7 +123,7 @@ class _Record:
         self.parameters[k], self.covariances[k] = row.parameters.theta, row.parameters.spread @ row.parameters.spread.T
         self.innovations[k, : len(row.innovation)], self.degrees[k] = row.innovation, len(row.innovation)
 
-    def estimates(self, observer: RecursiveObserver) -> RecursiveEstimates:
+    def estimates(self, observer: RecursiveObserver, y: FloatArray) -> RecursiveEstimates:
         """Return the whole."""
         most = int(self.degrees.max(initial=0.0))
         innovations = self.innovations[:, :most]
@@ -132,7 +132,7 @@ class _Record:
             read_only(self.states), read_only(self.deviations), read_only(self.parameters),
             read_only(self.covariances), read_only(innovations), read_only(np.full((samples, most, nq), np.nan)),
             read_only(np.nansum(innovations * innovations, axis=1)), read_only(self.degrees),
-            read_only(np.zeros(samples)), observer.state_names, observer.fault_names,
+            read_only(np.zeros(samples)), observer.state_names, observer.fault_names, received_in(y),
         )  # fmt: skip
 
 
@@ -163,7 +163,7 @@ def run_compiled(observer: RecursiveObserver, y: FloatArray, u: FloatArray) -> R
         if taken < count:
             # A step for the other path; where such steps are the rule, the kernel is tried less and less often.
             pause, patience = patience, 2 * patience
-    return record.estimates(observer)
+    return record.estimates(observer, y)
 
 
 def _complete_stretches(y: FloatArray) -> FloatArray:

@@ -6,72 +6,22 @@ that a run of N samples raises a false alarm with at most about the stated proba
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
+from obsynth.numerics.arguments import chosen, real_array, real_number, real_vector
 from obsynth.numerics.arrays import FloatArray, read_only
-from obsynth.observers.gain_schedule import gain_steps
+from obsynth.observers.alarms import Alarm, Decision, alone, quantile, tail
+from obsynth.observers.likelihood_ratio import likelihood_ratio, pull_of_the_start
 from obsynth.observers.recursive import RecursiveObserver
 from obsynth.observers.recursive_estimates import RecursiveEstimates
 
 STATISTICS = ("chi-square", "cusum", "glr", "nis")
-#: Onsets that the GLR considers, and samples that the NIS sums up: the choices that the thresholds were tried with.
-GLR_WINDOW = 40
+#: Samples that the NIS sums up: the choice that its threshold was tried with.
 NIS_WINDOW = 20
 #: Correlated looks count as this share of independent ones: measured false-alarm rates stay below what is asked.
-GLR_LOOKS = 1.0 / 4.0
 NIS_LOOKS = 1.0 / 2.0
-
-
-@dataclass(frozen=True)
-class Alarm:
-    """The first sample at which a statistic passes its threshold.
-
-    Parameters
-    ----------
-    k : int
-        The sample.
-    parameter : str
-        The parameter whose change alone explains it best; empty for the NIS, which knows no parameters.
-    onset : int
-        Estimate of the sample at which the change began.
-    confidence : float
-        One minus the probability that a whole run without a change reaches this value (at the first alarm, at least one
-        minus what was asked).
-    value : float
-        The statistic there.
-    """
-
-    k: int
-    parameter: str
-    onset: int
-    confidence: float
-    value: float
-
-
-@dataclass(frozen=True, eq=False)
-class Decision:
-    """A statistic along a run, its threshold, and the alarm if there is one.
-
-    Parameters
-    ----------
-    statistic : str
-        Its name.
-    values : FloatArray
-        ``(samples,)``.
-    thresholds : FloatArray
-        ``(samples,)``; they differ where samples are missing.
-    alarm : Alarm or None
-        The first one.
-    """
-
-    statistic: str
-    values: FloatArray
-    thresholds: FloatArray
-    alarm: Alarm | None
 
 
 def decide(
@@ -88,7 +38,7 @@ def decide(
     Parameters
     ----------
     observer : RecursiveObserver
-        That gave the estimates, with parameters.
+        That gave the estimates, with parameters (a filter without any knows the ``nis`` alone).
     estimates : RecursiveEstimates
         Of a whole run.
     statistic : {"chi-square", "cusum", "glr", "nis"}, optional
@@ -112,53 +62,49 @@ def decide(
         The statistic is unknown or does not go with the observer's form, or an option is out of range.
     """
     adaptation = observer.adaptation
-    if adaptation is None:
-        raise SpecError("A decision on parameters needs an observer that estimates them.", path="observer")
-    if statistic not in STATISTICS:
-        raise SpecError(f"statistic is {statistic!r}: use one of {', '.join(STATISTICS)}.", path="statistic")
+    chosen(statistic, "statistic", STATISTICS)
+    if adaptation is None and statistic != "nis":
+        raise SpecError("A decision on parameters needs an observer that estimates them; of a filter alone, statistic "
+                        "'nis' tells whether the model still explains the data.", path="observer")  # fmt: skip
+    false_alarms = real_number(false_alarms, "false_alarms", "a probability between 0 and 1")
     if not 0.0 < false_alarms < 1.0:
         raise SpecError(f"false_alarms is {false_alarms}: give a probability between 0 and 1.", path="false_alarms")
-    if adaptation.form == "random-walk" and statistic in ("cusum", "glr"):
+    form = "" if adaptation is None else adaptation.form
+    if form == "random-walk" and statistic in ("cusum", "glr"):
         raise SpecError(f"{statistic} needs regressors, which the random walk does not have: use form 'innovation'.",
                         path="statistic")  # fmt: skip
-    nq = len(adaptation.initial_parameters)
-    theta = adaptation.initial_parameters if nominal is None else np.atleast_1d(np.asarray(nominal, dtype=np.float64))
-    size = np.broadcast_to(np.asarray(change, dtype=np.float64), (nq,)) if np.ndim(change) == 0 else np.asarray(change)
-    if theta.shape != (nq,) or not np.isfinite(theta).all():
-        raise SpecError(f"nominal must be {nq} finite number(s).", path="nominal")
-    if size.shape != (nq,) or not (size > 0.0).all():
+    nq = 0 if adaptation is None else len(adaptation.initial_parameters)
+    start = np.zeros(0) if adaptation is None else adaptation.initial_parameters
+    theta = start if nominal is None else real_vector(nominal, nq, "nominal")
+    size = real_array(change, "change")
+    size = np.broadcast_to(size, (nq,)) if size.ndim == 0 else size
+    if size.shape != (nq,) or not ((size > 0.0) & (size < np.inf)).all():
         raise SpecError(f"change must be one positive number, or {nq}.", path="change")
+    if not len(estimates.states):
+        return Decision(statistic, read_only(np.zeros(0)), read_only(np.zeros(0)), None)
     if statistic == "chi-square":
-        return _chi_square(estimates, theta, false_alarms)
+        return _chi_square(observer, estimates, theta, false_alarms)
     gaps = estimates.innovations
-    if adaptation.form != "random-walk":
+    if nq and form != "random-walk":
         gaps = gaps - estimates.regressors @ theta
     if statistic == "nis":
         return _nis(estimates, gaps, false_alarms)
     if statistic == "cusum":
         return _cusum(estimates, gaps, size, false_alarms)
-    return _glr(observer, estimates, gaps, false_alarms)
+    return likelihood_ratio(observer, estimates, gaps, false_alarms)
 
 
-def _tail(degrees: FloatArray, value: FloatArray) -> FloatArray:
-    """Return the probability that chi-square with these degrees of freedom passes ``value``."""
-    from scipy.special import chdtrc
-
-    return np.asarray(chdtrc(degrees, value))
-
-
-def _quantile(degrees: FloatArray, probability: float) -> FloatArray:
-    """Return what chi-square passes with this probability; infinite where there are no degrees of freedom."""
-    from scipy.special import chdtri
-
-    return np.where(degrees > 0.0, chdtri(np.maximum(degrees, 1.0), probability), np.inf)
-
-
-def _chi_square(estimates: RecursiveEstimates, nominal: FloatArray, false_alarms: float) -> Decision:
+def _chi_square(
+    observer: RecursiveObserver, estimates: RecursiveEstimates, nominal: FloatArray, false_alarms: float
+) -> Decision:
     gaps, nq = estimates.parameters - nominal, len(nominal)
+    start = np.zeros(nq) if observer.adaptation is None else observer.adaptation.initial_parameters - nominal
+    if start.any():
+        # Where the observer starts is no evidence: only what data have said since may raise an alarm.
+        gaps = gaps - pull_of_the_start(observer, estimates, start)
     values = np.einsum("ki,kij,kj->k", gaps, _inverses(estimates.parameter_covariances), gaps)
     looks = len(values)
-    thresholds = np.full(looks, float(_quantile(np.array(float(nq)), false_alarms / looks)))
+    thresholds = np.full(looks, float(quantile(np.array(float(nq)), false_alarms / looks)))
     hits = np.flatnonzero(values > thresholds)
     if not hits.size:
         return Decision("chi-square", read_only(values), read_only(thresholds), None)
@@ -167,9 +113,9 @@ def _chi_square(estimates: RecursiveEstimates, nominal: FloatArray, false_alarms
     # The last sample at which the statistic was what it is without a change, on average or less.
     quiet = np.flatnonzero(values[:k] <= nq)
     onset = int(quiet[-1]) + 1 if quiet.size else 0
-    confidence = 1.0 - min(1.0, looks * float(_tail(np.array(float(nq)), values[k])))
+    confidence = 1.0 - min(1.0, looks * float(tail(np.array(float(nq)), values[k])))
     alarm = Alarm(
-        k, estimates.parameter_names[_alone(weights @ gaps[k], np.diag(weights))], onset, confidence, float(values[k])
+        k, estimates.parameter_names[alone(weights @ gaps[k], np.diag(weights))], onset, confidence, float(values[k])
     )
     return Decision("chi-square", read_only(values), read_only(thresholds), alarm)
 
@@ -188,12 +134,12 @@ def _nis(estimates: RecursiveEstimates, gaps: FloatArray, false_alarms: float) -
     values = np.convolve(squares, window)[:samples]
     degrees = np.convolve(estimates.nis_degrees, window)[:samples]
     looks = max(samples * NIS_LOOKS, 1.0)
-    thresholds = _quantile(degrees, min(false_alarms / looks, 1.0))
+    thresholds = quantile(degrees, min(false_alarms / looks, 1.0))
     hits = np.flatnonzero(values > thresholds)
     alarm = None
     if hits.size:
         k = int(hits[0])
-        confidence = 1.0 - min(1.0, looks * float(_tail(degrees[k], values[k])))
+        confidence = 1.0 - min(1.0, looks * float(tail(degrees[k], values[k])))
         first = max(k - NIS_WINDOW + 1, 0)
         # The split of the window after which the squares are largest against their degrees of freedom.
         excess = np.cumsum((squares - estimates.nis_degrees)[first : k + 1][::-1])[::-1]
@@ -218,43 +164,6 @@ def _cusum(estimates: RecursiveEstimates, gaps: FloatArray, change: FloatArray, 
             which = int(np.argmax(level))
             confidence = 1.0 - min(1.0, 2.0 * nq * samples * float(np.exp(-values[k])))
             since = slice(int(started[which]), k + 1)
-            name = estimates.parameter_names[_alone(along[since].sum(axis=0), squares[since].sum(axis=0))]
+            name = estimates.parameter_names[alone(along[since].sum(axis=0), squares[since].sum(axis=0))]
             alarm = Alarm(k, name, int(started[which]), confidence, float(values[k]))
     return Decision("cusum", read_only(values), read_only(np.full(samples, threshold)), alarm)
-
-
-def _glr(observer: RecursiveObserver, estimates: RecursiveEstimates, gaps: FloatArray, false_alarms: float) -> Decision:
-    samples, nq = gaps.shape[0], estimates.parameters.shape[1]
-    expected = np.max(estimates.nis_degrees)
-    begin = 0 if observer.early_constraints else 1
-    if (estimates.nis_degrees[1:] < expected).any():
-        raise SpecError("glr needs a complete record: use another statistic where samples are missing.", path="y")
-    looks = max(samples * GLR_WINDOW * GLR_LOOKS, 1.0)
-    threshold = float(_quantile(np.array(float(nq)), min(false_alarms / looks, 1.0)))
-    values, alarm = np.zeros(samples), None
-    # Of a change at each onset in the window: the regressor that starts at zero there, and the sums it has gathered.
-    signatures = np.zeros((0, observer.plant.nx, nq))
-    information, scores = np.zeros((0, nq, nq)), np.zeros((0, nq))
-    for k, gains in enumerate(gain_steps(observer, samples - 1), begin):
-        step = gains.step
-        signatures = np.concatenate([signatures, np.zeros((1, observer.plant.nx, nq))])[-GLR_WINDOW:]
-        outputs = np.broadcast_to(-step.Psi, (len(signatures), *step.Psi.shape))
-        right = np.concatenate([step.A @ signatures + step.Phi, outputs], axis=1)
-        G = -gains.parity @ right
-        information = np.concatenate([information, np.zeros((1, nq, nq))])[-GLR_WINDOW:] + G.transpose(0, 2, 1) @ G
-        scores = np.concatenate([scores, np.zeros((1, nq))])[-GLR_WINDOW:] + gaps[k][: G.shape[1]] @ G
-        signatures = gains.gain @ right
-        jumps = (np.linalg.pinv(information, hermitian=True) @ scores[:, :, None])[:, :, 0]
-        found = np.einsum("oq,oq->o", scores, jumps)
-        best = int(np.argmax(found))
-        values[k] = found[best]
-        if alarm is None and values[k] > threshold:
-            confidence = 1.0 - min(1.0, looks * float(_tail(np.array(float(nq)), values[k])))
-            name = estimates.parameter_names[_alone(scores[best], np.diag(information[best]))]
-            alarm = Alarm(k, name, max(k + 1 - len(found), begin) + best, confidence, float(values[k]))
-    return Decision("glr", read_only(values), read_only(np.full(samples, threshold)), alarm)
-
-
-def _alone(scores: FloatArray, information: FloatArray) -> int:
-    """Return the parameter whose change alone explains most."""
-    return int(np.argmax(scores**2 / np.maximum(information, np.finfo(np.float64).tiny)))

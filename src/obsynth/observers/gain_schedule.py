@@ -8,9 +8,10 @@ from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from obsynth.errors import SpecError
+from obsynth.numerics.arguments import real_array
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.least_squares_step import least_squares_step, rank_revealing_step
 from obsynth.numerics.recursive_least_squares import update
@@ -18,7 +19,7 @@ from obsynth.observers.literal_form import posterior_residual
 from obsynth.observers.records import require_horizon
 from obsynth.observers.recursive import RecursiveObserver
 from obsynth.observers.recursive_running import RunningRecursiveObserver
-from obsynth.observers.step_model import EarlySteps, StepMatrices
+from obsynth.observers.step_model import EarlySteps, StepMatrices, require_in_range
 
 
 class GainStep(NamedTuple):
@@ -57,7 +58,9 @@ class GainStep(NamedTuple):
     spread: FloatArray
 
 
-def gain_steps(observer: RecursiveObserver, steps: int) -> Iterator[GainStep]:
+def gain_steps(
+    observer: RecursiveObserver, steps: int, *, received: NDArray[np.bool_] | None = None
+) -> Iterator[GainStep]:
     """Yield the gains of the first steps.
 
     Parameters
@@ -66,29 +69,38 @@ def gain_steps(observer: RecursiveObserver, steps: int) -> Iterator[GainStep]:
         At rest.
     steps : int
         How many; with early constraints the correction of x(0) comes before them.
+    received : numpy.ndarray, optional
+        ``(samples, ny)``, of bool: which outputs of a record were there; all by default.  The gains are those of that
+        record, with zero columns for what was missing.
     """
     start = RunningRecursiveObserver(observer)
-    factor, Upsilon, parameters = start.factor, start.Upsilon, start.parameters
+    factor, Upsilon, parameters, diffuse = start.factor, start.Upsilon, start.parameters, start.diffuse
     adaptation, model = observer.adaptation, start.model
     first = [model.first()] if isinstance(model, EarlySteps) else []
-    for step in chain(first, (model.at(k) for k in range(steps))):
+    for k, step in enumerate(chain(first, (model.at(k) for k in range(steps))), 1 - len(first)):
         ne, rows, nq = len(step.A), len(step.H), Upsilon.shape[1]
         S = np.zeros((rows, max(factor.shape[1] + step.noise.shape[1], rows)))
         S[:ne, : factor.shape[1]] = step.A @ factor
         S[:, factor.shape[1] : factor.shape[1] + step.noise.shape[1]] = step.noise
+        require_in_range(S, factor, k, observer.state_names)
         right = np.eye(rows)
         if nq:
             right = np.hstack([right, np.vstack([step.A @ Upsilon + step.Phi, -step.Psi])])
-        found = least_squares_step(step.H, S, right) or rank_revealing_step(
-            step.H, S, right, np.zeros((rows, 0)), mapped=rows
-        )
+        unknown = np.vstack([step.A @ diffuse, np.zeros((rows - ne, diffuse.shape[1]))])
+        H = step.H
+        if received is not None and k and not received[k].all():
+            kept = np.concatenate([np.ones(ne, dtype=bool), received[k], np.ones(len(step.Dn), dtype=bool)])
+            H, S, right, unknown = H[kept], S[kept], right[kept], unknown[kept]
+        found = None if unknown.shape[1] else least_squares_step(H, S, right)
+        found = found or rank_revealing_step(H, S, right, unknown, mapped=rows)
+        diffuse = found.diffuse
         gain, Upsilon, factor = found.estimate[:, :rows], found.estimate[:, rows:], found.factor
         parity, G = found.innovation[:, :rows], -found.innovation[:, rows:]
         learn, forget = np.zeros((nq, rows)), np.eye(nq)
         if adaptation is not None and nq:
             seen, regressor, noise = parity, G, None
-            if start.literal and rows > ne:
-                seen, regressor, noise = posterior_residual(found, step.H, S, right, ne, columns=rows)
+            if start.literal and len(H) > ne:
+                seen, regressor, noise = posterior_residual(found, H, S, right, ne, unknown=unknown, columns=rows)
             parameters, theta_gain = update(
                 parameters, np.zeros(len(regressor)), regressor, forgetting=adaptation.forgetting,
                 regular=start.regular, directional=start.directional, noise=noise,
@@ -140,11 +152,11 @@ def run_batch(observer: RecursiveObserver, y: ArrayLike, u: ArrayLike | None = N
     """
     if observer.adaptation is not None and observer.adaptation.reset:
         raise SpecError("Resets depend on the data of each trial: run them one by one, or without reset.", path="reset")
-    outputs = np.asarray(y, dtype=np.float64)
+    outputs = real_array(y, "y")
     if outputs.ndim != 3 or outputs.shape[2] != observer.plant.ny:
         raise SpecError(f"y has shape {outputs.shape}, but (trials, samples, {observer.plant.ny}) is needed.", path="y")
     trials, samples = outputs.shape[:2]
-    known = np.zeros((samples, 0)) if u is None and not observer.plant.nu else np.asarray(u, dtype=np.float64)
+    known = np.zeros((samples, 0)) if u is None and not observer.plant.nu else real_array(u, "u")
     if known.ndim not in (2, 3) or known.shape[-2:] != (samples, observer.plant.nu):
         raise SpecError(f"u has shape {known.shape}, but (trials, samples, {observer.plant.nu}) is needed.", path="u")
     if not (np.isfinite(outputs[:, 1:]).all() and np.isfinite(known).all()):

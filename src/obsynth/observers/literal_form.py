@@ -6,11 +6,18 @@ import numpy as np
 
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.least_squares_step import LeastSquaresStep, least_squares_step
+from obsynth.numerics.least_squares_step import LeastSquaresStep, least_squares_step, rank_revealing_step
 
 
 def posterior_residual(
-    found: LeastSquaresStep, H: FloatArray, S: FloatArray, right: FloatArray, ne: int, *, columns: int = 1
+    found: LeastSquaresStep,
+    H: FloatArray,
+    S: FloatArray,
+    right: FloatArray,
+    ne: int,
+    *,
+    unknown: FloatArray,
+    columns: int = 1,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return what (18f) learns from: ``y - C x`` weighted by R, its regressor (18d), and a root of its covariance.
 
@@ -22,13 +29,15 @@ def posterior_residual(
         What it was found from.
     ne : int
         Number of equations; the outputs follow.
+    unknown : FloatArray
+        ``(rows, r)``: directions that earlier missing samples have left undetermined.
     columns : int, optional
         How many columns of ``right`` are data; the regressors follow.
 
     Raises
     ------
     PreconditionError
-        R is singular, or samples are missing so that H_k is not of full rank.
+        R is singular.
 
     References
     ----------
@@ -39,12 +48,11 @@ def posterior_residual(
     if not np.all(np.abs(np.diag(triangle)) > 0.0):
         raise PreconditionError("The literal form (18) divides by R, which is singular: use form 'innovation'.",
                                 condition="R nonsingular")  # fmt: skip
-    gains = least_squares_step(H, S, np.eye(len(H)))
+    data = np.eye(len(H))
+    gains = None if unknown.shape[1] else least_squares_step(H, S, data)
     if gains is None:
-        raise PreconditionError(
-            "The literal form (18) needs the gains L and K, and H_k is not of full rank where samples are missing: "
-            "use form 'innovation'.", condition="rank [E; C]",
-        )  # fmt: skip
+        # Undetermined directions lie in the null space of the outputs that are there: y - C xhat is what it is.
+        gains = rank_revealing_step(H, S, data, unknown, mapped=len(H))
     spread = S[ne:] - H[ne:] @ gains.estimate @ S
     weighted = np.linalg.solve(triangle, np.hstack((gaps, spread)))
     regressor, end = slice(columns, gaps.shape[1]), gaps.shape[1]

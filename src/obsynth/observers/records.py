@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
+from obsynth.numerics.arguments import real_array
 from obsynth.numerics.arrays import FloatArray, as_matrix
 
 
@@ -27,8 +28,8 @@ def require_horizon(horizon: int | None, samples: int, *, early: bool) -> None:
 def measured_record(value: ArrayLike, columns: int) -> FloatArray:
     """Return outputs ``(samples, columns)`` in which NaN marks what is missing."""
     try:
-        array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
+        array = real_array(value, "y")
+    except SpecError:
         raise SpecError("y must be numbers (NaN for a missing sample), with the same number at each sample.",
                         path="y") from None  # fmt: skip
     if array.ndim == 1 and columns == 1:

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from obsynth.errors import SpecError
 from obsynth.models.sequences import MatrixSequence
 from obsynth.models.time_varying import TimeVaryingDescriptorSystem
+from obsynth.numerics.arguments import chosen, real_number, real_vector, truth, whole_number
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.covariances import covariance_factor
 from obsynth.observers.records import require_horizon, whole_record
@@ -64,32 +65,29 @@ class Adaptation:
     reset: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.form not in FORMS:
-            raise SpecError(f"form is {self.form!r}: use one of {', '.join(FORMS)}.", path="form")
-        if self.guard not in GUARDS:
-            raise SpecError(f"guard is {self.guard!r}: use one of {', '.join(GUARDS)}.", path="guard")
+        chosen(self.form, "form", FORMS)
+        chosen(self.guard, "guard", GUARDS)
+        wanted = "lambda in (0, 1], such as 0.98; 1 forgets nothing"
+        object.__setattr__(self, "forgetting", real_number(self.forgetting, "forgetting", wanted))
         if not 0.0 < self.forgetting <= 1.0:
-            raise SpecError(
-                f"forgetting is {self.forgetting}: give lambda in (0, 1], such as 0.98; 1 forgets nothing.",
-                path="forgetting",
-            )
-        if self.window < 1:
-            raise SpecError(f"window is {self.window}: give a number of samples, at least 1.", path="window")
+            raise SpecError(f"forgetting is {self.forgetting}: give {wanted}.", path="forgetting")
+        object.__setattr__(self, "window", whole_number(self.window, "window", "a number of samples"))
+        wanted = "a probability per sample, such as 1e-6; 0 never resets"
+        object.__setattr__(self, "reset", real_number(self.reset, "reset", wanted))
         if not 0.0 <= self.reset < 1.0:
-            raise SpecError(f"reset is {self.reset}: give a probability per sample, such as 1e-6; 0 never resets.",
-                            path="reset")  # fmt: skip
+            raise SpecError(f"reset is {self.reset}: give {wanted}.", path="reset")
         if self.reset and self.form == "random-walk":
             raise SpecError("reset belongs to the forms that forget: the random walk follows by itself.", path="reset")
         q = len(self.initial_parameters)
         object.__setattr__(self, "initial_parameters", read_only(self.initial_parameters))
-        for name in ("initial_covariance", "walk"):
-            matrix = as_matrix(getattr(self, name), name)
+        for field, option in (("initial_covariance", "initial_parameter_covariance"), ("walk", "random_walk")):
+            matrix = as_matrix(getattr(self, field), option)
             if matrix.shape != (q, q):
-                raise SpecError(f"{name} of the parameters is {matrix.shape}, but {(q, q)} is needed.", path=name)
-            object.__setattr__(self, name, matrix)
-            factor = covariance_factor(matrix, name)
-            if name == "initial_covariance" and (np.diag(matrix) <= 0.0).any() | (np.linalg.matrix_rank(factor) < q):
-                raise SpecError("initial_covariance of the parameters (S_0) must be positive definite.", path=name)
+                raise SpecError(f"{option} is {matrix.shape}, but {(q, q)} is needed.", path=option)
+            object.__setattr__(self, field, matrix)
+            factor = covariance_factor(matrix, option)
+            if field == "initial_covariance" and (np.diag(matrix) <= 0.0).any() | (np.linalg.matrix_rank(factor) < q):
+                raise SpecError(f"{option} (S_0) must be positive definite.", path=option)
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,9 +129,8 @@ class RecursiveObserver:
             shape = getattr(self, name).shape
             if shape != (size, size):
                 raise SpecError(f"{name} is {shape[0]} by {shape[1]}, but {size} by {size} is needed.", path=name)
-        state = np.asarray(self.initial_state, dtype=np.float64)
-        if state.shape != (plant.nx,) or not np.all(np.isfinite(state)):
-            raise SpecError(f"initial_state must be {plant.nx} finite numbers.", path="initial_state")
+        state = real_vector(self.initial_state, plant.nx, "initial_state")
+        object.__setattr__(self, "early_constraints", truth(self.early_constraints, "early_constraints"))
         covariance = as_matrix(self.initial_covariance, "initial_covariance")
         if covariance.shape != (plant.nx, plant.nx):
             raise SpecError(f"initial_covariance must be {plant.nx} by {plant.nx}.", path="initial_covariance")
@@ -142,11 +139,6 @@ class RecursiveObserver:
         object.__setattr__(self, "initial_covariance", covariance)
         if self.adaptation is not None and len(self.adaptation.initial_parameters) != plant.nq:
             raise SpecError(f"initial_parameters must be {plant.nq} numbers.", path="initial_parameters")
-        if self.adaptation is not None and self.adaptation.form == "random-walk" and self.early_constraints:
-            raise SpecError(
-                "early_constraints and the random walk do not go together: the early equation holds for the parameters "
-                "of the next step. Use form 'innovation'.", path="early_constraints",
-            )  # fmt: skip
 
     @property
     def dt(self) -> float:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from obsynth.numerics.arrays import FloatArray, read_only
 
@@ -45,6 +46,8 @@ class RecursiveEstimates:
         parameter units to the power -2; (26) asks that it stays above some alpha > 0.  Zero while the window fills.
     state_names, parameter_names : tuple of str
         Names of the columns.
+    received : numpy.ndarray
+        ``(samples, ny)``, of bool: which outputs were there.
     """
 
     states: FloatArray
@@ -58,6 +61,7 @@ class RecursiveEstimates:
     excitation: FloatArray
     state_names: tuple[str, ...]
     parameter_names: tuple[str, ...]
+    received: NDArray[np.bool_]
 
     @property
     def parameter_deviations(self) -> FloatArray:
@@ -107,7 +111,15 @@ class RecursiveEstimates:
             excitation=read_only(levels),
             state_names=observer.state_names,
             parameter_names=observer.fault_names,
+            received=received_in(np.array([row.y for row in rows]).reshape(len(rows), observer.plant.ny)),
         )
+
+
+def received_in(y: FloatArray) -> NDArray[np.bool_]:
+    """Return which outputs were there, ``(samples, ny)`` and read-only; NaN marks those that were not."""
+    received = ~np.isnan(y)
+    received.setflags(write=False)
+    return received
 
 
 def deviations_of(row: RawEstimate) -> FloatArray:

@@ -9,8 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.analysis.time_varying import STEPS_WITHOUT_HORIZON, algebraic_rows
-from obsynth.errors import PreconditionError, SpecError
+from obsynth.analysis.time_varying import early_rows
+from obsynth.errors import PreconditionError
+from obsynth.numerics.arguments import real_array, real_vector
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.covariances import covariance_factor
 from obsynth.numerics.least_squares_step import (
@@ -30,8 +31,9 @@ from obsynth.observers.step_model import (
     PlantSteps,
     StepMatrices,
     StepModel,
-    WalkingSteps,
+    require_in_range,
 )
+from obsynth.observers.walking_steps import WalkingEarlySteps, WalkingSteps
 
 
 class RawEstimate(NamedTuple):
@@ -55,6 +57,8 @@ class RawEstimate(NamedTuple):
         ``(m, nq)``.
     nis : float
         Squared length of the innovation at the parameters estimated one sample before.
+    y : FloatArray
+        ``(ny,)``: the outputs that were given, NaN where one was missing.
     """
 
     k: int
@@ -65,6 +69,7 @@ class RawEstimate(NamedTuple):
     innovation: FloatArray
     regressor: FloatArray
     nis: float
+    y: FloatArray
 
 
 def step_model_of(observer: RecursiveObserver) -> StepModel:
@@ -75,14 +80,14 @@ def step_model_of(observer: RecursiveObserver) -> StepModel:
     observer : RecursiveObserver
         The observer.
     """
-    model: StepModel = PlantSteps(observer.plant, observer.Q, observer.R)
-    if observer.early_constraints:
-        rows = algebraic_rows(observer.plant, observer.plant.horizon or STEPS_WITHOUT_HORIZON)
-        model = EarlySteps(observer.plant, observer.Q, observer.R, rows)
-    adaptation = observer.adaptation
+    parts, adaptation = (observer.plant, observer.Q, observer.R), observer.adaptation
+    walk = None
     if adaptation is not None and adaptation.form == "random-walk":
-        model = WalkingSteps(model, covariance_factor(adaptation.walk, "walk"))
-    return model
+        walk = covariance_factor(adaptation.walk, "walk")
+    if observer.early_constraints:
+        rows = early_rows(observer.plant, early=True)
+        return EarlySteps(*parts, rows) if walk is None else WalkingEarlySteps(*parts, rows, walk)
+    return PlantSteps(*parts) if walk is None else WalkingSteps(PlantSteps(*parts), walk)
 
 
 class RunningRecursiveObserver:
@@ -143,10 +148,8 @@ class RunningRecursiveObserver:
             Rank H_k is lost at this k although no sample is missing.
         """
         plant = self.observer.plant
-        outputs = measured_record(np.atleast_2d(np.asarray(y)), plant.ny)[0]
-        inputs = np.asarray(u, dtype=np.float64)
-        if inputs.shape != (plant.nu,) or not np.isfinite(inputs).all():
-            raise SpecError(f"u must be {plant.nu} finite number(s).", path="u")
+        outputs = measured_record(np.atleast_2d(real_array(y, "y")), plant.ny)[0]
+        inputs = real_vector(u, plant.nu, "u")
         require_horizon(plant.horizon, self.k + 1, early=self.observer.early_constraints)
         return RecursiveEstimates.of(self.observer, [self.raw_step(outputs, inputs)], window=list(self.window))
 
@@ -168,7 +171,7 @@ class RunningRecursiveObserver:
         self.window.append(found[1])
         self.u = u
         gap = found[0] - found[1] @ before if len(before) else found[0]
-        estimate = self._estimate(*found, float(gap @ gap))
+        estimate = self._estimate(*found, float(gap @ gap), y)
         self.k += 1
         return estimate
 
@@ -214,6 +217,7 @@ class RunningRecursiveObserver:
         S = np.zeros((len(H), max(width + step.noise.shape[1], len(H))))
         S[:ne, :width] = step.A @ self.factor
         S[:, width : width + step.noise.shape[1]] = step.noise
+        require_in_range(S, self.factor, self.k, self.observer.state_names)
         unknown = np.zeros((len(H), self.diffuse.shape[1]))
         unknown[:ne] = step.A @ self.diffuse
         kept = ~np.isnan(right[:, 0])
@@ -230,22 +234,22 @@ class RunningRecursiveObserver:
                 )  # fmt: skip
         self.lesson = None
         if self.literal and len(H) > ne:
-            seen, regressor, noise = posterior_residual(found, H, S, right, ne)
+            seen, regressor, noise = posterior_residual(found, H, S, right, ne, unknown=unknown)
             self.lesson = seen[:, 0], regressor, noise
         return found
 
-    def _estimate(self, innovation: FloatArray, regressor: FloatArray, nis: float) -> RawEstimate:
+    def _estimate(self, innovation: FloatArray, regressor: FloatArray, nis: float, y: FloatArray) -> RawEstimate:
         if self.walking:
             nx = self.observer.plant.nx
             nq = len(self.x) - nx
             spread = self.factor[nx:]
             known = ParameterState(self.x[nx:], np.zeros((nq, nq)), spread)
             return RawEstimate(
-                self.k, self.x[:nx], self.factor[:nx], self.diffuse[:nx], known, innovation, np.zeros((0, nq)), nis
+                self.k, self.x[:nx], self.factor[:nx], self.diffuse[:nx], known, innovation, np.zeros((0, nq)), nis, y
             )
         known = self.parameters
         x, factor = self.x, self.factor
         if len(known.theta):
             x = x + self.Upsilon @ known.theta
             factor = np.hstack((factor, self.Upsilon @ known.spread))
-        return RawEstimate(self.k, x, factor, self.diffuse, known, innovation, regressor, nis)
+        return RawEstimate(self.k, x, factor, self.diffuse, known, innovation, regressor, nis, y)

@@ -1,22 +1,24 @@
-"""The matrices of one step as the recursion needs them, with the two ways to rewrite a plant.
+"""The matrices of one step as the recursion needs them, of a plant as it is or with early constraints.
 
 Early constraints: an equation of step k + 1 without x(k + 2) is an output of x(k + 1) already.
-Random walk: the parameters become states, of the equations that led to x(k + 1).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from obsynth.analysis.time_varying import IntArray
-from obsynth.errors import SpecError
+from obsynth.analysis.zeros import leading_names
+from obsynth.errors import PreconditionError, SpecError
 from obsynth.models.sequences import MatrixSequence
 from obsynth.models.time_varying import TimeVaryingDescriptorSystem
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.covariances import covariance_factor
+from obsynth.numerics.ranks import OUTGROWN
 
 
 class StepMatrices(NamedTuple):
@@ -58,6 +60,31 @@ def stacked_noise(first: FloatArray, second: FloatArray) -> FloatArray:
     noise = np.zeros((len(first) + len(second), first.shape[1] + second.shape[1]))
     noise[: len(first), : first.shape[1]], noise[len(first) :, first.shape[1] :] = first, second
     return noise
+
+
+def require_in_range(S: FloatArray, factor: FloatArray, k: int, state_names: Sequence[str]) -> None:
+    """Raise `PreconditionError` when deviations outgrow double precision on the way to sample ``k``.
+
+    Parameters
+    ----------
+    S : FloatArray
+        Square root of the covariance of the data of a step.
+    factor : FloatArray
+        ``(nx or more, any)``: that of the state before it.
+    k : int
+        The sample that the step leads to.
+    state_names : sequence of str
+        Names of the first rows of ``factor``.
+    """
+    if float(np.max(np.abs(S), initial=0.0)) < OUTGROWN:
+        return
+    sizes = np.max(np.abs(np.nan_to_num(factor[: len(state_names)])), axis=1, initial=0.0)
+    names = leading_names(sizes, state_names)
+    raise PreconditionError(
+        f"The errors outgrow double precision at k = {k}: the outputs do not show, or not often enough, what grows in "
+        f"{', '.join(map(repr, names))}. Measure more, shorten the horizon, or leave out what grows unseen.",
+        condition="bounded errors", signals=names,
+    )  # fmt: skip
 
 
 @dataclass
@@ -183,55 +210,3 @@ class EarlySteps:
             H, np.eye(plant.nx), np.zeros((plant.nx, plant.nu)), np.zeros((plant.nx, plant.nq)),
             plant.Phi.at(0)[late], -plant.B.at(0)[late], noise,
         )  # fmt: skip
-
-
-@dataclass
-class WalkingSteps:
-    """The steps of a model with its parameters among the states, as a random walk.
-
-    The state at k + 1 is ``[x(k+1); theta(k)]``: the parameters that acted in the step that led there.  Their
-    increment then is noise of an equation of its own, and no noise is correlated in time.
-
-    Parameters
-    ----------
-    model : StepModel
-        With parameters.
-    walk : FloatArray
-        ``(nq, nq)``: square root of the covariance of one step of the walk.
-    """
-
-    model: StepModel
-    walk: FloatArray
-
-    def at(self, k: int) -> StepMatrices:
-        """Return the matrices of the step from k to k + 1.
-
-        Parameters
-        ----------
-        k : int
-            Time index.
-        """
-        return with_walking_parameters(self.model.at(k), self.walk)
-
-
-def with_walking_parameters(step: StepMatrices, walk: FloatArray) -> StepMatrices:
-    """Return one step with its parameters among the states.
-
-    Parameters
-    ----------
-    step : StepMatrices
-        With parameters.
-    walk : FloatArray
-        ``(nq, nq)``: square root of the covariance of one step of the walk.
-    """
-    ne, nx, nq = *step.A.shape, step.Phi.shape[1]
-    E, C = step.H[:ne], step.H[ne:]
-    H = np.block([[E, -step.Phi], [np.zeros((nq, nx)), np.eye(nq)], [C, step.Psi]])
-    noise = np.zeros((len(H), step.noise.shape[1] + nq))
-    noise[:ne, : step.noise.shape[1]], noise[ne + nq :, : step.noise.shape[1]] = step.noise[:ne], step.noise[ne:]
-    noise[ne : ne + nq, step.noise.shape[1] :] = walk
-    return StepMatrices(
-        np.asfortranarray(H), np.block([[step.A, np.zeros((ne, nq))], [np.zeros((nq, nx)), np.eye(nq)]]),
-        np.vstack([step.B, np.zeros((nq, step.B.shape[1]))]), np.zeros((ne + nq, 0)), np.zeros((len(C), 0)), step.Dn,
-        noise,
-    )  # fmt: skip

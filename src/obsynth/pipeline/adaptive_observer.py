@@ -77,8 +77,9 @@ def adaptive_observer(
     SpecError
         lambda outside (0, 1], a covariance that is not symmetric or indefinite, or an option of the wrong shape.
     PreconditionError
-        ``rank [E_k; C_k] < nx`` at some k; no parameters; or form ``literal`` where ``rank E + ny - nx`` is zero, so
-        that it would never learn.
+        As for `descriptor_kalman`; no parameters; parameters that the outputs cannot tell from each other or from the
+        state (of a time-invariant plant: ``rank [A - E, Phi; C, Psi] < nx + nq``), which are named with the ratio in
+        which they leave no trace; or form ``literal`` where ``rank E + ny - nx`` is zero, so that it would never learn.
     VerificationError
         The observer fails a check.
 

@@ -13,6 +13,7 @@ from obsynth.errors import SpecError, VerificationError
 from obsynth.models.dae import DAEModel
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.models.time_varying import TimeVaryingDescriptorSystem
+from obsynth.numerics.threads import one_thread_if_small
 from obsynth.results.design import ObserverDesign
 from obsynth.results.report import VerificationReport
 from obsynth.synthesis.methods import NONLINEAR, REGISTRY, TIME_VARYING, method_module
@@ -75,9 +76,10 @@ def design(
     options = _checked_options(method, options)
     for condition in _kind_conditions(plant, method):
         condition.require()
-    found = method_module(method).synthesise(plant, progress=report_stage, **options)
-    report_stage("verifying the shipped realisation")
-    return verified(plant, method, found, name=name, recovery=recovery)
+    with one_thread_if_small(plant.nx):
+        found = method_module(method).synthesise(plant, progress=report_stage, **options)
+        report_stage("verifying the shipped realisation")
+        return verified(plant, method, found, name=name, recovery=recovery)
 
 
 def check(plant: Plant, options: Mapping[str, Mapping[str, Any]] | None = None) -> dict[str, VerificationReport]:

@@ -27,6 +27,7 @@ def pd_observer(
     adaptation_gain: ArrayLike | None = None,
     adaptation_range: ArrayLike | None = None,
     delta_scan: ArrayLike | None = None,
+    engine: str = "auto",
     solver: str = "CLARABEL",
     name: str = "design",
 ) -> ObserverDesign:
@@ -45,7 +46,8 @@ def pd_observer(
         larger gains.
     delta : float, optional, seconds
         Parameter of the theorem.  It decides which gains are found, not whether there are any (Theorem 1).  By default
-        the inverse of the plant's fastest mode, well-damped ones far beyond all others left aside.
+        the inverse of the plant's fastest mode, well-damped ones far beyond all others left aside; the engine
+        ``"riccati"`` may take less.
     decay : float, optional, 1/seconds
         Errors die out at least like ``exp(-decay t)``.  By default nothing is imposed when the smallest gains give a
         tenth of the plant's fastest mode, else that rate, or as much of it as moderate gains allow; 0 imposes nothing.
@@ -64,6 +66,13 @@ def pd_observer(
         ``[low, high]``: one design that is stable for every ``G = g I`` with g in this range.
     delta_scan : array_like, optional, seconds
         Values of delta to try as well; what they give is in ``design.solver["delta_scan"]`` and in the report.
+    engine : {"auto", "lmi", "reduced-lmi", "riccati"}, optional
+        How the gains are found.  ``"lmi"`` solves the inequality of the theorem for the smallest gains.
+        ``"reduced-lmi"`` solves it without Y and Z, for a reduced-order observer of the states that the outputs do not
+        show, and puts gains with L = 0 around it in closed form.  ``"riccati"`` takes gains with L = 0 from a Riccati
+        equation, and their certificate from a Lyapunov equation.  The last two give stability and a decay rate alone.
+        ``"auto"`` takes the first up to 20 unknown states, or where more is asked, and the last above.  The result's
+        ``solver["engine"]`` says which ran.
     solver : {"CLARABEL", "SCS"}, optional
         Semidefinite solver.
     name : str, optional
@@ -104,7 +113,7 @@ def pd_observer(
     return design_by_method(
         plant, "pd-observer", name=name, theorem=theorem, delta=delta, decay=decay, disk=disk, gain_bound=gain_bound,
         fault_rate_gain=fault_rate_gain, noise_gain=noise_gain, adaptation_gain=adaptation_gain,
-        adaptation_range=adaptation_range, delta_scan=delta_scan, solver=solver,
+        adaptation_range=adaptation_range, delta_scan=delta_scan, engine=engine, solver=solver,
     )  # fmt: skip
 
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from obsynth.observers.decisions import Decision
+from obsynth.observers.alarms import Decision
 from obsynth.plotting.panels import MARK_STYLE, RESIDUAL_STYLE, THRESHOLD_STYLES, legend_above, new_panels, tidy
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ import numpy as np
 from obsynth.evaluation.monitors import Detection
 from obsynth.evaluation.recursive_simulating import RecursiveSimulation
 from obsynth.evaluation.simulating import Simulation
-from obsynth.observers.decisions import Decision
+from obsynth.observers.alarms import Decision
 from obsynth.plotting.faults import plot_faults
 from obsynth.plotting.panels import MARK_STYLE, RESIDUAL_STYLE, THRESHOLD_STYLES, legend_above, new_panels, tidy
 from obsynth.plotting.recursive import plot_decision

@@ -13,7 +13,8 @@ from obsynth.evaluation.monitors import Detection
 from obsynth.evaluation.recursive_simulating import RecursiveSimulation
 from obsynth.evaluation.simulating import Simulation, simulate
 from obsynth.evaluation.watching import monitor
-from obsynth.observers.decisions import Decision, decide
+from obsynth.observers.alarms import Decision
+from obsynth.observers.decisions import decide
 from obsynth.observers.linear import LinearObserver
 from obsynth.observers.recursive import RecursiveObserver
 from obsynth.observers.recursive_estimates import RecursiveEstimates

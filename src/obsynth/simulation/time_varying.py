@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from obsynth.analysis.time_varying import algebraic_rows
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.models.time_varying import TimeVaryingDescriptorSystem
+from obsynth.numerics.arguments import real_array, real_vector, whole_number
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.ranks import decide_rank
 
@@ -72,12 +73,13 @@ def simulate_time_varying(
     """
     if plant.ne != plant.nx:
         raise SpecError(f"{plant.ne} equations do not determine {plant.nx} states.", path="E")
-    nq = plant.nq
-    given = np.zeros(nq) if parameters is None else np.asarray(parameters, dtype=np.float64)
-    theta = _record(np.broadcast_to(given, (samples, nq)) if given.ndim == 1 else given, (samples, nq), "parameters")
+    nq, samples = plant.nq, whole_number(samples, "samples", "the length of the record")
+    given = np.zeros(nq) if parameters is None else real_array(parameters, "parameters")
+    whole = np.broadcast_to(given, (samples, nq)) if given.shape == (nq,) else given
+    theta = _record(whole, (samples, nq), "parameters")
     inputs, mu = _record(u, (samples, plant.nu), "u"), _record(equation_noise, (samples, plant.ne), "equation_noise")
     nu = _record(output_noise, (samples - 1, plant.ny), "output_noise")
-    start = np.zeros(plant.nx) if initial_state is None else np.asarray(initial_state, dtype=np.float64)
+    start = np.zeros(plant.nx) if initial_state is None else real_vector(initial_state, plant.nx, "initial_state")
     states, outputs = varying_runs(
         plant,
         parameters=theta,

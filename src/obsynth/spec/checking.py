@@ -175,7 +175,8 @@ def _explained(item: Any, model: type[BaseModel], prefix: str) -> tuple[str, str
     names = [str(part) for part in location if isinstance(part, str) and part != "[key]"]
     numbers = [part + 1 for part in location if isinstance(part, int)]
     kind, value, context = item["type"], item["input"], item.get("ctx", {})
-    in_rows = "<rows>" in item["loc"]
+    in_stack = "<stack>" in item["loc"]
+    in_rows = in_stack or "<rows>" in item["loc"]
     key = names[-1] if names else ""
     if kind == "extra_forbidden":
         known = _known_keys(item["loc"]) if len(names) > 1 else list(model.model_fields)
@@ -186,15 +187,16 @@ def _explained(item: Any, model: type[BaseModel], prefix: str) -> tuple[str, str
         text, numbers = f"a key must be a non-empty text, not {described(value)}.", []
     elif kind == "entry_of_k":
         text = f"{item['msg']}, not {described(value)}."
-    elif kind in ("ragged_rows", "finite_number"):
-        text = f"{item['msg']}." if kind == "ragged_rows" else f"must be a finite number, not {value}."
+    elif kind in ("ragged_rows", "stack_shapes", "finite_number"):
+        text = f"{item['msg']}." if kind != "finite_number" else f"must be a finite number, not {value}."
     elif kind == "string_pattern_mismatch":
         text = f"use letters, digits, '.', '_' and '-' only (at most 100), not {described(value)}."
     else:
         wanted = "a list of numbers" if in_rows and kind in ("list_type", "too_short") else _wanted(kind, context)
         wanted = "a list of rows, such as [[1, 0], [0, 1]]" if in_rows and not numbers else wanted
         text = f"must be {wanted}, not {_found(kind, value)}."
-    place = _position(numbers, in_rows=in_rows)
+    words = ("matrix", "row", "column") if in_stack else ("row", "column") if in_rows else ("entry",)
+    place = _position(numbers, words)
     return ".".join([*([prefix] if prefix else []), *names]), f"{place}{text}"
 
 
@@ -217,8 +219,7 @@ def _found(kind: str, value: Any) -> str:
     return "an empty one" if kind in ("too_short", "string_too_short") else described(value)
 
 
-def _position(numbers: Sequence[int], *, in_rows: bool) -> str:
-    words = ("row", "column") if in_rows else ("entry",)
+def _position(numbers: Sequence[int], words: Sequence[str]) -> str:
     place = ", ".join(f"{word} {number}" for word, number in zip(words, numbers, strict=False))
     return f"{place} " if place else ""
 

@@ -16,7 +16,7 @@ from obsynth.models.names import index_of
 from obsynth.models.time_varying import TimeVaryingDescriptorSystem
 from obsynth.spec.checking import DocumentProblems, checked_plant, checked_spec
 from obsynth.spec.documents import read_names, read_yaml
-from obsynth.spec.matrices import read_matrix
+from obsynth.spec.matrices import read_matrices, read_matrix
 from obsynth.spec.scenarios import built_scenario
 
 if TYPE_CHECKING:
@@ -130,8 +130,11 @@ def _matrix(value: Any, folder: Path, where: str, problems: DocumentProblems) ->
     if isinstance(value, list):
         return np.array(value, dtype=np.float64) if all(isinstance(row, list) for row in value) else value
     if hasattr(value, "file"):
+        path = folder / value.file
         try:
-            return read_matrix(folder / value.file, variable=value.variable, where=where)
+            if hasattr(value, "stack"):
+                return read_matrices(path, variable=value.variable, count=value.stack, where=where)
+            return read_matrix(path, variable=value.variable, where=where)
         except SpecError as error:
             problems.add(where, str(error))
             return None

@@ -11,8 +11,10 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from obsynth.errors import SpecError
-from obsynth.numerics.arrays import FloatArray, as_matrix
+from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.spec.documents import existing_file
 
 #: Larger matrices are refused: every computation here is dense.
@@ -48,6 +50,60 @@ def read_matrix(path: Path, *, variable: str | None = None, where: str) -> Float
     SpecError
         The file is missing, damaged, of an unknown kind, or holds no finite real matrix.
     """
+    return _checked(_read_array(path, variable=variable, where=where), path.name, where)
+
+
+def _checked(dense: Any, name: str, where: str) -> FloatArray:
+    try:
+        matrix = as_matrix(dense, name)
+    except SpecError as error:
+        raise SpecError(str(error), path=where) from error
+    if matrix.size == 0:
+        raise SpecError(f"{name} holds an empty matrix.", path=where)
+    return matrix
+
+
+def read_matrices(path: Path, *, variable: str | None = None, count: int | None = None, where: str) -> FloatArray:
+    """Return the matrix in a file, or a stack of matrices ``(entries, rows, columns)``.
+
+    Parameters
+    ----------
+    path : Path
+        As for `read_matrix`; an array of three dimensions is a stack: k counts along the first axis in an ``.npz``
+        file, and along the last in a ``.mat`` file, as each of them is used.
+    variable : str, optional
+        As for `read_matrix`.
+    count : int, optional
+        How many matrices stand one below the other, in a file that holds two dimensions.
+    where : str
+        The path inside the document that refers to the file.
+
+    Raises
+    ------
+    SpecError
+        As for `read_matrix`; or the rows cannot be shared out among that many matrices.
+    """
+    array = _read_array(path, variable=variable, where=where)
+    if np.ndim(array) != 3:
+        matrix = _checked(array, path.name, where)
+        if count is None:
+            return matrix
+        rows, columns = matrix.shape
+        if rows % count:
+            raise SpecError(f"{path.name} has {rows} rows, which cannot be shared out among {count} matrices.",
+                            path=where)  # fmt: skip
+        return read_only(matrix.reshape(count, rows // count, columns))
+    stack = np.moveaxis(array, -1, 0) if path.suffix.lower() == ".mat" else array
+    if not stack.size:
+        raise SpecError(f"{path.name} holds an empty stack of matrices.", path=where)
+    if count is not None and len(stack) != count:
+        raise SpecError(f"{path.name} holds a stack of {len(stack)} matrices, not {count}.", path=where)
+    named = ((f"{path.name}, matrix {k} of the stack,", matrix) for k, matrix in enumerate(stack, 1))
+    return read_only(np.array([_checked(matrix, name, where) for name, matrix in named]))
+
+
+def _read_array(path: Path, *, variable: str | None, where: str) -> Any:
+    """Return what a file holds as a dense array of any kind."""
     readers: dict[str, Callable[[Path], Any]] = {".mtx": _matrix_market, ".csv": _comma_separated}
     archives: dict[str, Callable[[Path], Mapping[str, Any]]] = {".npz": _numpy_archive, ".mat": _matlab_archive}
     suffix = path.suffix.lower()
@@ -62,16 +118,9 @@ def read_matrix(path: Path, *, variable: str | None = None, where: str) -> Float
             warnings.simplefilter("error", UserWarning)
             content = readers[suffix](path) if suffix in readers else archives[suffix](path)
             raw = content if suffix in readers else _selected(content, variable, path, where)
-            dense = _as_dense(raw)
+            return _as_dense(raw)
     except _READING_ERRORS as error:
         raise SpecError(f"{path} cannot be read as a matrix: {_reason(error)}", path=where) from error
-    try:
-        matrix = as_matrix(dense, path.name)
-    except SpecError as error:
-        raise SpecError(str(error), path=where) from error
-    if matrix.size == 0:
-        raise SpecError(f"{path} holds an empty matrix.", path=where)
-    return matrix
 
 
 def _matrix_market(path: Path) -> FloatArray:
@@ -81,14 +130,10 @@ def _matrix_market(path: Path) -> FloatArray:
 
 
 def _comma_separated(path: Path) -> Any:
-    import numpy as np
-
     return np.loadtxt(path, delimiter=",", ndmin=2, encoding="utf-8-sig")
 
 
 def _numpy_archive(path: Path) -> dict[str, Any]:
-    import numpy as np
-
     # Opened here, because numpy leaves a damaged file open.
     with path.open("rb") as stream:
         archive = np.load(stream, allow_pickle=False)

@@ -42,6 +42,7 @@ class PdObserverOptions(Section):
     adaptation_gain: Matrix | None = None
     adaptation_range: Two | None = None
     delta_scan: Annotated[list[Positive], Field(min_length=1)] | None = None
+    engine: Literal["auto", "lmi", "reduced-lmi", "riccati"] = "auto"
     solver: Literal["CLARABEL", "SCS"] = "CLARABEL"
 
 

@@ -25,7 +25,7 @@ SCHEMA_VERSION = 1
 
 # Tags of unions appear in the locations of pydantic's errors; the bracket marks them for removal.
 _ROWS, _FILE, _PICK, _LIST, _INLINE, _VARYING = "<rows>", "<file>", "<pick>", "<list>", "<inline>", "<varying>"
-_ONE = "<one>"
+_ONE, _STACK = "<one>", "<stack>"
 _NONLINEAR = "<dae>"
 
 
@@ -133,7 +133,38 @@ VaryingRows = Annotated[
     list[Annotated[list[Annotated[Any, BeforeValidator(_number_or_expression)]], Field(min_length=1)]],
     Field(min_length=1), WrapValidator(_rectangular), Tag(_ROWS),
 ]  # fmt: skip
-VaryingMatrix = Annotated[VaryingRows | Annotated[MatrixFile, Tag(_FILE)], Discriminator(_kind_without_pick)]
+
+
+def _same_shapes(stack: Any, check_entries: ValidatorFunctionWrapHandler) -> Any:
+    """Check that the matrices of a stack have as many rows and columns as the first one."""
+    checked = check_entries(stack)
+    shapes = [(len(matrix), len(matrix[0])) for matrix in checked]
+    k = next((k for k, shape in enumerate(shapes) if shape != shapes[0]), None)
+    if k is None:
+        return checked
+    raise PydanticCustomError(
+        "stack_shapes", "matrix {number} of the stack is {rows} by {columns}, but the first is {wanted}",
+        {"number": k + 1, "rows": shapes[k][0], "columns": shapes[k][1], "wanted": "{} by {}".format(*shapes[0])},
+    )  # fmt: skip
+
+
+Stack = Annotated[list[Rows], Field(min_length=1), WrapValidator(_same_shapes), Tag(_STACK)]
+
+
+class VaryingFile(MatrixFile):
+    """A matrix, or a stack of them, in a file; ``stack: 60`` tells that 60 matrices stand one below the other."""
+
+    stack: Annotated[int, Field(ge=1)] | None = None
+
+
+def _kind_of_varying(value: Any) -> str:
+    if isinstance(value, dict):
+        return _FILE
+    first = value[0] if isinstance(value, list) and value else None
+    return _STACK if isinstance(first, list) and first and isinstance(first[0], list) else _ROWS
+
+
+VaryingMatrix = Annotated[VaryingRows | Stack | Annotated[VaryingFile, Tag(_FILE)], Discriminator(_kind_of_varying)]
 
 
 class TransformSection(Section):

@@ -40,7 +40,7 @@ def bounded_real_certificate(
     errors = ErrorSystem.of(plant, observer, tracking, lag)
     a, b = observer.Az[:core, :core], errors.disturbance[:core] / gain
     c, d = -errors.fault_output[0][:, :core], errors.fault_output[2] / gain
-    best = np.eye(core)
+    best, spare = np.eye(core), None
     for path, tail in product(APPROACHES, TAILS):
         change = _coordinates(a, b, c, d, path=path, tail=tail)
         if change is None:
@@ -53,9 +53,11 @@ def bounded_real_certificate(
             if p is None:
                 continue
             best = _triangular(np.asarray(np.linalg.cholesky(p)).T @ inverse)
-            if prove_bounded_real(plant, observer, tracking, best, gain, lag=lag).proved:
+            proof = prove_bounded_real(plant, observer, tracking, best, gain, lag=lag)
+            if proof.in_double_precision:
                 return best
-    return best
+            spare = best if proof.proved and spare is None else spare
+    return best if spare is None else spare
 
 
 def _coordinates(

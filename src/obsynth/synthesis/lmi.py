@@ -151,11 +151,14 @@ def minimise(objective: Any, constraints: Sequence[Any], *, what: str, solver: s
             # "Solution may be inaccurate": every solution is verified, so the warning tells nobody anything.
             warnings.simplefilter("ignore")
             problem.solve(solver=solver, **settings)
-    except (KeyboardInterrupt, SystemExit, MemoryError):
+    except (KeyboardInterrupt, SystemExit):
         raise
-    except BaseException as error:
-        record |= {"status": "crashed", "reason": str(error)}
-        raise SolverError(f"{solver} failed while solving for {what}: nothing is known.", record=record) from error
+    except BaseException as error:  # Rust panics, and memory that ran out inside the solver
+        reason = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+        record |= {"status": "crashed", "reason": reason, "seconds": time.perf_counter() - began}
+        raise SolverError(
+            f"{solver} failed while solving for {what} ({reason}): nothing is known.", record=record
+        ) from error
     stats = problem.solver_stats
     record |= {
         "status": str(problem.status),

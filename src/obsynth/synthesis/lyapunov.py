@@ -30,7 +30,7 @@ def lyapunov_factor(a: FloatArray, dt: float) -> FloatArray:
         Seconds between samples, 0 for continuous time.
     """
     n = a.shape[0]
-    best = np.eye(n)
+    best, spare = np.eye(n), None
     edge = abscissa(a, dt)
     if n == 0 or not edge < (1.0 if dt > 0.0 else 0.0):
         return best
@@ -39,9 +39,11 @@ def lyapunov_factor(a: FloatArray, dt: float) -> FloatArray:
         if found is None:
             continue
         best = found
-        if prove_stable(a, best, dt).proved:
-            break
-    return best
+        proof = prove_stable(a, best, dt)
+        if proof.in_double_precision:
+            return best
+        spare = best if proof.proved and spare is None else spare
+    return best if spare is None else spare
 
 
 def _factor(a: FloatArray, dt: float, share: float, rounds: int, edge: float) -> FloatArray | None:

@@ -8,6 +8,7 @@ off-diagonal block of what P1 contributes.
 from __future__ import annotations
 
 import warnings
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -48,7 +49,8 @@ def explicit_certificate(
     balanced, (units, _) = matrix_balance(moving, permute=False, separate=True)
     try:
         p = _gram(balanced)
-        x, delta = _coupling(balanced, p)
+        delta = _good_delta(balanced)
+        x = _coupling(balanced, p, delta)
         inverse = np.linalg.inv(estimate)
     except np.linalg.LinAlgError:
         return None
@@ -56,10 +58,34 @@ def explicit_certificate(
     return 0.5 * (p1 + p1.T), (x / units[:, None] / units) @ inverse, delta
 
 
-def symmetric_certificate(Az: FloatArray, *, decay: float) -> tuple[FloatArray, float] | None:
-    """Return Q ``(n, n)``, to be taken for P1 and P3 of an observer with L = 0, and the delta below which it serves.
+@dataclass(frozen=True, eq=False)
+class SymmetricCertificate:
+    """A certificate with a symmetric P3 for an observer with L = 0, for every delta below a limit.
 
-    With P1 = P3 = Q the inequality is ``He(Q A) + (delta / 2) A' Q A < 0``.  ``None`` when errors do not decay so fast.
+    Parameters
+    ----------
+    P3 : FloatArray
+        ``(n, n)``, positive definite: ``A' P3 + P3 A = -weight`` for the observer's dynamics A.
+    weight : FloatArray
+        ``(n, n)``, positive definite.
+    limit : float, seconds
+        The delta from which it does not serve; infinite where it always does.
+    """
+
+    P3: FloatArray
+    weight: FloatArray
+    limit: float
+
+    def P1(self, delta: float) -> FloatArray:
+        """Return P1 ``(n, n)`` for a delta below the limit."""
+        return self.P3 + 0.5 * delta * self.weight
+
+
+def symmetric_certificate(Az: FloatArray, *, decay: float) -> SymmetricCertificate | None:
+    """Return a certificate of Theorem 2 in closed form; ``None`` when errors do not decay so fast.
+
+    With ``P1 = P3 + (delta / 2) weight``, the lower left block of the inequality is delta times the skew part S of
+    ``P3 A``, so that it holds when ``weight > (delta / 2) S' P3^-1 S``.
 
     Parameters
     ----------
@@ -75,11 +101,34 @@ def symmetric_certificate(Az: FloatArray, *, decay: float) -> tuple[FloatArray, 
         return None
     balanced, (units, _) = matrix_balance(moving, permute=False, separate=True)
     try:
-        q = _gram(balanced)
+        p = _gram(balanced)
+        through = p @ balanced
+        weight, skew = -(through + through.T), 0.5 * (through - through.T)
+        largest = float(eigvalsh(skew.T @ np.linalg.solve(p, skew), weight)[-1])
     except np.linalg.LinAlgError:
         return None
-    largest = float(eigvalsh(balanced.T @ q @ balanced)[-1]) / float(np.linalg.norm(balanced))
-    return q / units[:, None] / units, 2.0 / largest
+    limit = 2.0 / largest if largest > 0.0 else np.inf
+    return SymmetricCertificate(p / units[:, None] / units, weight / units[:, None] / units, limit)
+
+
+def coupled_certificate(a: FloatArray, delta: float) -> tuple[FloatArray, FloatArray]:
+    """Return P1 and P3 ``(n, n)`` of Theorem 1 for a stable observer with L = 0 and this delta.
+
+    Nothing but noise where ``-1 / delta`` is an eigenvalue: the inequality is then another one.
+
+    Parameters
+    ----------
+    a : FloatArray
+        ``(n, n)``, the observer's dynamics, stable.
+    delta : float, seconds
+        Positive.
+    """
+    from scipy.linalg import matrix_balance
+
+    balanced, (units, _) = matrix_balance(a, permute=False, separate=True)
+    p = _gram(balanced)
+    x = _coupling(balanced, p, delta)
+    return p / units[:, None] / units, x / units[:, None] / units
 
 
 def gain_certificate(a: FloatArray, b: Ball, c: FloatArray, gain: float) -> FloatArray | None:
@@ -101,6 +150,7 @@ def gain_certificate(a: FloatArray, b: Ball, c: FloatArray, gain: float) -> Floa
     balanced, (units, _) = matrix_balance(a, permute=False, separate=True)
     entering, shown = b.midpoint / units[:, None], c * units
     weight = max(float(np.linalg.norm(shown, 2)) ** 2, np.finfo(np.float64).tiny)
+    spare = None
     for slack in SLACKS:
         try:
             p = np.asarray(
@@ -113,9 +163,13 @@ def gain_certificate(a: FloatArray, b: Ball, c: FloatArray, gain: float) -> Floa
             continue
         found = 0.5 * (p + p.T) / units[:, None] / units
         found = np.asarray(0.5 * (found + found.T))
-        if np.all(np.isfinite(found)) and prove_gain(a, b, c, found, gain).proved:
+        if not np.all(np.isfinite(found)):
+            continue
+        proof = prove_gain(a, b, c, found, gain)
+        if proof.in_double_precision:
             return found
-    return None
+        spare = found if proof.proved and spare is None else spare
+    return spare
 
 
 def _gram(a: FloatArray) -> FloatArray:
@@ -129,19 +183,24 @@ def _gram(a: FloatArray) -> FloatArray:
     return np.asarray(0.5 * (p + p.T))
 
 
-def _coupling(a: FloatArray, p: FloatArray) -> tuple[FloatArray, float]:
-    """Return X and delta with ``He([a'; -I] X [I, delta I]) + [0, p; p, 0] < 0`` for a stable ``a`` with Gram matrix p.
-
-    With ``[xi1; xi2] = T [alpha; beta]``, ``alpha = a xi1 - xi2`` and ``beta = xi1 + delta xi2``, the first term is
-    ``2 alpha' X beta``; the second is negative on alpha = 0 and on beta = 0, whatever delta is.
-    """
-    n, one = len(a), np.eye(len(a))
+def _good_delta(a: FloatArray) -> float:
+    """Return a delta for which ``-1 / delta`` is far from the eigenvalues of a stable ``a``."""
+    one = np.eye(len(a))
     middle = 1.0 / float(np.exp(np.mean(np.log(np.abs(np.linalg.eigvals(a))))))
     steps = sorted(range(-DELTA_TRIES // 2, DELTA_TRIES // 2), key=abs)
     candidates = [middle * DELTA_STEP**step for step in steps]
     conditions = [float(np.linalg.cond(one + delta * a)) for delta in candidates]
     good = [i for i, condition in enumerate(conditions) if condition <= GOOD_CONDITION]
-    delta = candidates[good[0] if good else int(np.argmin(conditions))]
+    return candidates[good[0] if good else int(np.argmin(conditions))]
+
+
+def _coupling(a: FloatArray, p: FloatArray, delta: float) -> FloatArray:
+    """Return X with ``He([a'; -I] X [I, delta I]) + [0, p; p, 0] < 0`` for a stable ``a`` with Gram matrix p.
+
+    With ``[xi1; xi2] = T [alpha; beta]``, ``alpha = a xi1 - xi2`` and ``beta = xi1 + delta xi2``, the first term is
+    ``2 alpha' X beta``; the second is negative on alpha = 0 and on beta = 0, whatever delta is.
+    """
+    n, one = len(a), np.eye(len(a))
     change = np.linalg.inv(np.block([[a, -one], [one, delta * one]]))
     form = change.T @ np.block([[np.zeros((n, n)), p], [p, np.zeros((n, n))]]) @ change
-    return -form[:n, n:], delta
+    return np.asarray(-form[:n, n:])

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,10 +13,11 @@ from obsynth.analysis.structure import analyse_structure
 from obsynth.errors import InfeasibleError, SolverError
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray
-from obsynth.synthesis.pd_certificate import symmetric_certificate
 from obsynth.synthesis.pd_gains import PdGains, certified
-from obsynth.synthesis.pd_options import PdOptions, default_delta, fastest_mode, require_possible
+from obsynth.synthesis.pd_limits import default_delta, fastest_mode, require_possible
+from obsynth.synthesis.pd_options import PdOptions
 from obsynth.synthesis.pd_problem import PdSolution, PdTask, solve
+from obsynth.synthesis.pd_reduced import closed_form, reduced_lmi
 
 #: The unit of time is the power of two nearest to this many times the inverse of the plant's fastest mode, where the
 #: objective weighs J and L as it does for a plant with modes of a few 1/s in seconds.
@@ -85,57 +87,20 @@ def gains_for(plant: DescriptorSystem, asked: PdOptions, *, decay: float) -> PdG
     delta = default_delta(plant, asked, decay)
     require_possible(plant, asked, delta=delta, decay=decay)
     failure = SolverError("The gains that the solver returned could not be proved to be stable: nothing is known.")
-    for states, outputs in _units(plant, asked):
-        try:
-            found = _solved(plant, asked, delta, decay, states, outputs)
-        except SolverError as error:
-            failure = error
-            continue
-        if found is not None and found.proved:
-            return found
-    spare = riccati_gains(plant, asked, delta=delta, decay=decay)
-    if spare is not None and spare.proved:
-        return spare
+    engine, *spare = asked.engines_for(plant.nx + plant.nf)
+    for name in (engine, *spare):
+        for states, outputs in _units(plant, asked, balanced_first=name != "lmi"):
+            try:
+                found = _solved(plant, asked, name, delta, decay, states, outputs)
+            except SolverError as error:
+                # What the spare engine meets says less than why it was needed.
+                failure = error if name == engine else failure
+                continue
+            if found is not None and found.proved:
+                return replace(found, engine=name)
     raise SolverError(
         f"{failure} {_advice(asked)}", record={**failure.record, "delta": delta, "decay": decay}
     ) from failure
-
-
-#: What the inequalities ask for besides stability and a decay rate: a Riccati equation cannot give it.
-_FURTHER = ("disk", "gain_bound", "fault_rate_gain", "noise_gain", "adaptation_range")
-
-
-def riccati_gains(plant: DescriptorSystem, asked: PdOptions, *, delta: float, decay: float) -> PdGains | None:
-    """Return gains with L = 0 and J from a Riccati equation: a solution of the theorem that no solver has to find.
-
-    ``None`` where more is asked than a decay rate, when the equation is not solved, or when a delta that is asked for
-    is too large for these gains and Theorem 2.
-    """
-    from scipy.linalg import solve_continuous_are
-
-    if any(getattr(asked, name) is not None for name in _FURTHER):
-        return None
-    augmented = with_faults_as_states(plant)
-    *_, (states, outputs) = _units(plant, asked)
-    shifted = augmented.A * states / states[:, None] + decay * np.eye(augmented.nx)
-    c = augmented.C * states / outputs[:, None]
-    try:
-        p = np.asarray(solve_continuous_are(shifted.T, c.T, np.eye(len(shifted)), np.eye(len(c))))
-    except (np.linalg.LinAlgError, ValueError):
-        return None
-    gain = states[:, None] * (p @ c.T) / outputs
-    record = {
-        "what": "a PD observer with L = 0, after the solver failed",
-        "solver": "scipy.linalg.solve_continuous_are",
-    }
-    found = symmetric_certificate(augmented.A - gain @ augmented.C, decay=decay)
-    if found is None:
-        return None
-    q, limit = found
-    if asked.delta is None:
-        delta = min(delta, 0.5 * limit)
-    solution = PdSolution(gain, np.zeros_like(gain), (q,), q, record)
-    return certified(plant, asked, solution, delta=delta, decay=decay)
 
 
 def _advice(asked: PdOptions) -> str:
@@ -146,8 +111,19 @@ def _advice(asked: PdOptions) -> str:
     return f"Gains exist without {', '.join(given)}: ask for less there, or try another delta."
 
 
-def _units(plant: DescriptorSystem, asked: PdOptions) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Yield units of the augmented states and of the outputs: the user's, then those that balance the plant."""
+def _units(
+    plant: DescriptorSystem, asked: PdOptions, *, balanced_first: bool
+) -> Iterable[tuple[FloatArray, FloatArray]]:
+    """Return units of the augmented states and of the outputs: the user's, then those that balance the plant."""
+    found = _candidate_units(plant, asked)
+    if not balanced_first:
+        return found
+    # A Riccati equation has no objective that would weigh gains in the user's units.
+    users, *others = found
+    return (*others[:1], users, *others[1:]) if len(others) == 2 else (users, *others)
+
+
+def _candidate_units(plant: DescriptorSystem, asked: PdOptions) -> Iterator[tuple[FloatArray, FloatArray]]:
     from scipy.linalg import matrix_balance
 
     n, ny = plant.nx + plant.nf, plant.ny
@@ -176,12 +152,22 @@ def _inner_gain(plant: DescriptorSystem, asked: PdOptions) -> FloatArray | None:
 
 
 def _solved(
-    plant: DescriptorSystem, asked: PdOptions, delta: float, decay: float, states: FloatArray, outputs: FloatArray
+    plant: DescriptorSystem,
+    asked: PdOptions,
+    engine: str,
+    delta: float,
+    decay: float,
+    states: FloatArray,
+    outputs: FloatArray,
 ) -> PdGains | None:
     """Return the gains found in the given units, with a proved certificate where there is one."""
     unit = float(np.exp2(np.round(np.log2(TIME_UNITS / fastest_mode(plant.A)))))
     task = _task(plant, asked, delta, decay, states, outputs, unit)
-    found = solve(task, solver=asked.solver)
+    if engine == "riccati":
+        found, used = closed_form(task, free_delta=asked.delta is None)
+        delta = delta if used == task.delta else used * unit
+    else:
+        found = (solve if engine == "lmi" else reduced_lmi)(task, solver=asked.solver)
     g = _inner_gain(plant, asked)
     loop = np.eye(len(states))
     if g is not None:

@@ -50,6 +50,10 @@ class PdGains:
         Whether the certificate was proved.
     record : mapping
         Of the solver run.
+    proved_in_double_precision : bool
+        Whether that took no more digits.
+    engine : str
+        The engine that found the gains.
     """
 
     J: FloatArray
@@ -65,6 +69,8 @@ class PdGains:
     observer: LinearObserver
     proved: bool
     record: Mapping[str, Any]
+    proved_in_double_precision: bool = False
+    engine: str = ""
 
     @property
     def abscissa(self) -> float:
@@ -111,14 +117,14 @@ def certified(
     certificates = _gain_certificates(plant, asked, gains)
     if certificates is None:
         return gains
-    gains = replace(gains, gain_certificates=certificates)
-    if _is_proved(gains):
-        return replace(gains, proved=True)
+    gains = _judged(replace(gains, gain_certificates=certificates))
+    if gains.proved_in_double_precision:
+        return gains
     own = explicit_certificate(observer.Az, observer.Cz[: observer.order], decay=decay) if asked.theorem == 1 else None
     if own is None:
         return gains
-    gains = replace(gains, P1=own[0], P3=own[1], delta=own[2])
-    return replace(gains, proved=_is_proved(gains))
+    other = _judged(replace(gains, P1=own[0], P3=own[1], delta=own[2]))
+    return gains if gains.proved and not other.proved_in_double_precision else other
 
 
 def _gain_certificates(plant: DescriptorSystem, asked: PdOptions, gains: PdGains) -> dict[str, FloatArray] | None:
@@ -140,13 +146,18 @@ def _symmetric(matrix: FloatArray) -> FloatArray:
     return 0.5 * (matrix + matrix.T)
 
 
-def _is_proved(gains: PdGains) -> bool:
-    positive = prove_symmetric_positive(gains.P1).proved
-    symmetric = gains.theorem == 1 or prove_symmetric_positive(gains.P3).proved
-    return bool(
-        positive
-        and symmetric
-        and prove_shipped_stability(gains.observer, gains.P1, gains.P3, delta=gains.delta, decay=gains.decay).proved
+def _judged(gains: PdGains) -> PdGains:
+    """Return the gains with the outcome of proving their certificate."""
+    proofs = [
+        prove_symmetric_positive(gains.P1),
+        prove_shipped_stability(gains.observer, gains.P1, gains.P3, delta=gains.delta, decay=gains.decay),
+    ]
+    if gains.theorem == 2:
+        proofs.append(prove_symmetric_positive(gains.P3))
+    return replace(
+        gains,
+        proved=all(proof.proved for proof in proofs),
+        proved_in_double_precision=all(proof.in_double_precision for proof in proofs),
     )
 
 
@@ -175,4 +186,5 @@ def _certified_range(plant: DescriptorSystem, gains: PdGains, ends: tuple[float,
         gains, J=gain_j, L=gain_l, P1=_symmetric(back.T @ middle @ back), P3=p3, ends=p1,
         observer=realise_pd_observer(plant, with_faults_as_states(plant), gain_j, gain_l),
     )  # fmt: skip
-    return replace(moved, proved=proved and _is_proved(moved))
+    moved = _judged(moved)
+    return replace(moved, proved=proved and moved.proved)

@@ -57,6 +57,8 @@ class PdTask:
     process, sensor, sensor_rate : FloatArray
         ``(n, nw)``, ``(ny, nw)``, ``(ny, nw)``: where the noise enters the states and the outputs, and its derivative
         the outputs.
+    has_derivative : bool
+        False for L = 0.
     """
 
     plants: tuple[tuple[FloatArray, FloatArray], ...]
@@ -73,6 +75,7 @@ class PdTask:
     process: FloatArray
     sensor: FloatArray
     sensor_rate: FloatArray
+    has_derivative: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +118,8 @@ def solve(task: PdTask, *, solver: str) -> PdSolution:
     """
     n, ny = task.plants[0][1].shape[1], task.plants[0][1].shape[0]
     p3 = lmi.symmetric_variable(n) if task.theorem == 2 else lmi.matrix_variable(n, n)
-    found = _Variables(p3, lmi.matrix_variable(n, ny), lmi.matrix_variable(n, ny))
+    z = lmi.matrix_variable(n, ny) if task.has_derivative else np.zeros((n, ny))
+    found = _Variables(p3, lmi.matrix_variable(n, ny), z)
     own = [lmi.symmetric_variable(n) for _ in task.plants]
     constraints = [lmi.at_least(p3 + p3.T, 2.0)]
     for (a, c), p in zip(task.plants, own, strict=True):

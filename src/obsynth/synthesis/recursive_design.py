@@ -8,14 +8,17 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.time_varying import WARN_CONDITION, HorizonRanks, horizon_ranks
-from obsynth.errors import SpecError
+from obsynth.analysis.zeros import leading_names
+from obsynth.errors import PreconditionError, SpecError
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.models.time_varying import TimeVaryingDescriptorSystem
+from obsynth.numerics.covariances import covariance_factor
 from obsynth.observers.building import observer_from_options, plain_options
 from obsynth.observers.recursive import RecursiveObserver
-from obsynth.observers.schedule_facts import ScheduleFacts, schedule_facts
+from obsynth.observers.schedule_facts import STEPS_TO_CONTRACT, ScheduleFacts, schedule_facts
 from obsynth.results.design import Certificate
 from obsynth.synthesis.result import Synthesis
+from obsynth.synthesis.steady_filter import reached_condition
 
 #: Information on the parameters in a window below this share of their prior's is as good as none.
 LOST_EXCITATION = 1.0
@@ -64,7 +67,9 @@ def recursive_synthesis(plant: TimeVaryingDescriptorSystem, options: Mapping[str
         As for `obsynth.observers.building.observer_from_options`.
     """
     observer = observer_from_options(plant, options)
-    facts, ranks = schedule_facts(observer), horizon_ranks(plant)
+    ranks = horizon_ranks(plant, early=observer.early_constraints)
+    facts = schedule_facts(observer)
+    _require_contraction(observer, facts)
     claims = {
         "condition": ranks.condition,
         "condition_k": float(ranks.condition_k),
@@ -85,6 +90,23 @@ def recursive_synthesis(plant: TimeVaryingDescriptorSystem, options: Mapping[str
     )
 
 
+def _require_contraction(observer: RecursiveObserver, facts: ScheduleFacts) -> None:
+    """Raise `PreconditionError` where errors do not die out along the horizon."""
+    if facts.steps < STEPS_TO_CONTRACT or facts.contraction < 1.0:
+        return
+    names = leading_names(facts.survivors, observer.state_names)
+    kept = (
+        f"keeps the mean factor {facts.contraction:.6g} per step" if facts.contraction < float("inf")
+        else "grows without bound"
+    )  # fmt: skip
+    raise PreconditionError(
+        f"Errors do not die out: over {facts.steps} steps the product of L_k A_k {kept}, in "
+        f"{', '.join(map(repr, names))}. Either the outputs do not show these "
+        "states: measure more, or leave them out; or Q and initial_covariance claim that they are known exactly: give "
+        "them a variance.", condition="contraction", signals=names,
+    )  # fmt: skip
+
+
 def _notes(
     observer: RecursiveObserver, ranks: HorizonRanks, facts: ScheduleFacts, options: Mapping[str, Any]
 ) -> Iterator[str]:
@@ -96,9 +118,19 @@ def _notes(
             f"H_k has the condition number {ranks.condition:.3g} at k = {ranks.condition_k}: about "
             f"{np.log10(ranks.condition):.0f} digits of the estimate are lost there."
         )
+    if observer.plant.is_time_invariant and observer.Q.is_constant and observer.R.is_constant:
+        roots = covariance_factor(observer.Q.at(0), "Q"), covariance_factor(observer.R.at(0), "R")
+        reached = reached_condition(observer.plant, *roots)
+        if not reached.holds:
+            yield f"The filter has no steady state: {reached.detail}"
     adaptation = observer.adaptation
     if adaptation is None:
         return
+    if adaptation.window > facts.steps:
+        yield (
+            f"The window of {adaptation.window} samples is longer than the {facts.steps} steps of the horizon: "
+            "excitation is not watched."
+        )
     prior = float(np.linalg.eigvalsh(np.linalg.inv(adaptation.initial_covariance))[0])
     if facts.excitation < LOST_EXCITATION * prior:
         yield (

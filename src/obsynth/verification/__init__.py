@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from obsynth.errors import SpecError
+from obsynth.numerics.threads import one_thread_if_small
 from obsynth.results.report import VerificationReport
 
 if TYPE_CHECKING:
@@ -52,5 +53,5 @@ def verify(design: ObserverDesign, *, printed_digits: int | None = None) -> Veri
         raise SpecError(f"printed_digits is {printed_digits}: give 1 to 15 decimals.", path="printed_digits")
     checker = import_module(_CHECKERS[design.method])
     # A corrupted design may overflow; what is not a number fails its check, so no warning is needed.
-    with np.errstate(all="ignore"):
+    with np.errstate(all="ignore"), one_thread_if_small(design.plant.nx):
         return VerificationReport.of(tuple(checker.checks(design, printed_digits)))

@@ -18,8 +18,8 @@ import numpy as np
 
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.balls import Ball, block
-from obsynth.numerics.definiteness import DefinitenessProof, prove_positive_definite
+from obsynth.numerics.balls import Enclosed, block
+from obsynth.numerics.definiteness import DefinitenessProof, prove_positive_definite, unproved
 from obsynth.observers.linear import LinearObserver
 from obsynth.verification.error_system import LaggedPlant
 
@@ -60,15 +60,22 @@ def prove_bounded_real(
     # What follows the core must be a chain of delays: strictly lower triangular, hence stable.
     chain = np.triu(observer.Az[core:, core:])
     triangular = np.all(np.tril(factor, -1) == 0.0) and np.all(np.diag(factor) != 0.0)
-    if any(np.any(part != 0.0) for part in (*outside, chain)) or not triangular or not gain > 0.0:
-        return DefinitenessProof(False, -np.inf, 0.0)
+    if any(np.any(part != 0.0) for part in (*outside, chain)):
+        return unproved("the states after the core are no chain of delays, or act on the core or the fault estimate")
+    if not triangular or not gain > 0.0:
+        return unproved("the certificate is not triangular and nonsingular, or the gain is not positive")
     inverse = np.triu(np.linalg.inv(factor))
     if not np.all(np.isfinite(inverse)) or np.any(np.diag(inverse) == 0.0):
-        return DefinitenessProof(False, -np.inf, 0.0)
-    return prove_positive_definite(_formed(plant, observer, tracking, factor, inverse, gain, lag))
+        return unproved("the certificate cannot be inverted")
+
+    def formula(kind: type[Enclosed]) -> Enclosed:
+        return _formed(kind, plant, observer, tracking, factor, inverse, gain, lag)
+
+    return prove_positive_definite(formula)
 
 
 def _formed(
+    kind: type[Enclosed],
     plant: DescriptorSystem,
     observer: LinearObserver,
     tracking: FloatArray,
@@ -76,26 +83,27 @@ def _formed(
     inverse: FloatArray,
     gain: float,
     lag: int,
-) -> Ball:
+) -> Enclosed:
     """Return the matrix of the inequality with the bounds on the errors of forming it."""
+    exact = kind.exact
     core, nd = factor.shape[0], plant.nd
     bd = LaggedPlant.of(plant, lag).input(plant.Bd)
-    q, s = Ball.exact(factor), Ball.exact(inverse)
-    b = Ball.exact(tracking[:core]) @ Ball.exact(bd) - Ball.exact(observer.By[:core]) @ Ball.exact(plant.Dd)
-    qs, qms = q @ s, q @ (Ball.exact(observer.Az[:core, :core]) @ s)
-    cs = Ball.exact(observer.Cz[observer.fault_rows, :core]) @ s
-    d = Ball.exact(observer.Dy[observer.fault_rows]) @ Ball.exact(plant.Dd)
-    level = Ball.exact(gain * np.eye(nd)) @ Ball.exact(gain * np.eye(nd))
+    q, s = exact(factor), exact(inverse)
+    b = exact(tracking[:core]) @ exact(bd) - exact(observer.By[:core]) @ exact(plant.Dd)
+    qs, qms = q @ s, q @ (exact(observer.Az[:core, :core]) @ s)
+    cs = exact(observer.Cz[observer.fault_rows, :core]) @ s
+    d = exact(observer.Dy[observer.fault_rows]) @ exact(plant.Dd)
+    level = exact(np.eye(nd)).scaled(gain).scaled(gain)
     qb, nf = q @ b, cs.shape[0]
 
-    def zero(rows: int, columns: int) -> Ball:
-        return Ball.exact(np.zeros((rows, columns)))
+    def zero(rows: int, columns: int) -> Enclosed:
+        return exact(np.zeros((rows, columns)))
 
     return block(
         [
             [qs.T @ qs, zero(core, nd), qms.T, cs.T],
             [zero(nd, core), level, qb.T, -d.T],
-            [qms, qb, Ball.exact(np.eye(core)), zero(core, nf)],
-            [cs, -d, zero(nf, core), Ball.exact(np.eye(nf))],
+            [qms, qb, exact(np.eye(core)), zero(core, nf)],
+            [cs, -d, zero(nf, core), exact(np.eye(nf))],
         ]
     )

@@ -149,7 +149,7 @@ def _norm_rows(
         proof.proved,
         "Wang 2015, eq. (45)",
         "proved",
-        f"Cholesky with rounding bound {proof.error_bound:.1e}, on a unit diagonal",
+        proof.text,
     )
     if not plant.nd:
         return

@@ -13,8 +13,8 @@ from __future__ import annotations
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.balls import Ball, block
-from obsynth.numerics.definiteness import DefinitenessProof, prove_positive_definite
+from obsynth.numerics.balls import Enclosed, block
+from obsynth.numerics.definiteness import DefinitenessProof, prove_positive_definite, unproved
 
 
 def prove_stable(a: FloatArray, factor: FloatArray, dt: float) -> DefinitenessProof:
@@ -34,20 +34,23 @@ def prove_stable(a: FloatArray, factor: FloatArray, dt: float) -> DefinitenessPr
     DefinitenessProof
         ``proved`` is never true for a matrix that is not stable.
     """
-    nothing = DefinitenessProof(False, -np.inf, 0.0)
     if factor.shape != a.shape or not np.all(np.isfinite(factor)) or not np.all(np.isfinite(a)):
-        return nothing
+        return unproved("the certificate does not fit, or a number is not finite")
     if a.shape[0] == 0:
-        return DefinitenessProof(True, np.inf, 0.0)
+        return DefinitenessProof(True, np.inf, 0.0, "Cholesky")
     if np.any(np.tril(factor, -1) != 0.0) or np.any(np.diag(factor) == 0.0):
-        return nothing
+        return unproved("the certificate is not triangular and nonsingular")
     inverse = np.triu(np.linalg.inv(factor))
     if not np.all(np.isfinite(inverse)) or np.any(np.diag(inverse) == 0.0):
-        return nothing
-    q, s = Ball.exact(factor), Ball.exact(inverse)
-    whole, moved = q @ s, q @ (Ball.exact(a) @ s)
-    if dt > 0.0:
-        identity = Ball.exact(np.eye(a.shape[0]))
-        return prove_positive_definite(block([[whole.T @ whole, moved.T], [moved, identity]]))
-    half = whole.T @ moved
-    return prove_positive_definite(-(half + half.T))
+        return unproved("the certificate cannot be inverted")
+
+    def formula(kind: type[Enclosed]) -> Enclosed:
+        q, s = kind.exact(factor), kind.exact(inverse)
+        whole, moved = q @ s, q @ (kind.exact(a) @ s)
+        if dt > 0.0:
+            identity = kind.exact(np.eye(a.shape[0]))
+            return block([[whole.T @ whole, moved.T], [moved, identity]])
+        half = whole.T @ moved
+        return -(half + half.T)
+
+    return prove_positive_definite(formula)

@@ -23,8 +23,8 @@ import numpy as np
 
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.balls import Ball, block
-from obsynth.numerics.definiteness import DefinitenessProof, prove_positive_definite
+from obsynth.numerics.balls import Ball, Enclosed, block
+from obsynth.numerics.definiteness import DefinitenessProof, prove_positive_definite, unproved
 from obsynth.observers.linear import LinearObserver
 
 
@@ -45,11 +45,15 @@ def prove_shipped_stability(
         Claimed rate alpha.
     """
     size = observer.order
-    moving = Ball.exact(observer.Az) + Ball.exact(decay * np.eye(size))
-    estimate = Ball.exact(observer.Cz[:size])
-    x = Ball.exact(P3) @ estimate
-    p = estimate.T @ Ball.exact(P1) @ estimate
-    return _prove(moving, Ball.exact(np.eye(size)), x, p, delta)
+
+    def formula(kind: type[Enclosed]) -> Enclosed:
+        moving = kind.exact(observer.Az) + kind.exact(decay * np.eye(size))
+        estimate = kind.exact(observer.Cz[:size])
+        x = kind.exact(P3) @ estimate
+        p = estimate.T @ kind.exact(P1) @ estimate
+        return _inequality(moving.T @ x, x, p, delta)
+
+    return prove_positive_definite(formula)
 
 
 def prove_gains(
@@ -67,17 +71,21 @@ def prove_gains(
     decay : float, 1/seconds
         Claimed rate alpha.
     """
-    c = Ball.exact(C)
-    ae = Ball.exact(A) - Ball.exact(J) @ c
-    d = Ball.exact(np.eye(len(A))) + Ball.exact(L) @ c
-    moving = ae + Ball.exact(decay * np.eye(len(A))) @ d
-    return _prove(moving, d, Ball.exact(P3), Ball.exact(P1), delta)
+
+    def formula(kind: type[Enclosed]) -> Enclosed:
+        c, p3 = kind.exact(C), kind.exact(P3)
+        ae = kind.exact(A) - kind.exact(J) @ c
+        d = kind.exact(np.eye(len(A))) + kind.exact(L) @ c
+        moving = ae + d.scaled(decay)
+        return _inequality(moving.T @ p3, d.T @ p3, kind.exact(P1), delta)
+
+    return prove_positive_definite(formula)
 
 
 def prove_symmetric_positive(matrix: FloatArray) -> DefinitenessProof:
     """Try to prove that a matrix is symmetric, exactly, and positive definite."""
     if not np.array_equal(matrix, matrix.T):
-        return DefinitenessProof(False, -np.inf, 0.0)
+        return unproved("the matrix is not symmetric")
     return prove_positive_definite(matrix)
 
 
@@ -119,26 +127,26 @@ def prove_gain(a: FloatArray, b: Ball, c: FloatArray, P: FloatArray, gain: float
     gain : float
         Level.
     """
-    if not prove_symmetric_positive(P).proved:
-        return DefinitenessProof(False, -np.inf, 0.0)
+    positive = prove_symmetric_positive(P)
+    if not positive.proved:
+        return unproved(f"P itself: {positive.reason}")
     inputs, outputs = b.shape[1], c.shape[0]
-    through = Ball.exact(P) @ Ball.exact(a)
-    entering, shown = Ball.exact(P) @ b, Ball.exact(c)
-    level = Ball.exact(gain * np.eye(inputs)) @ Ball.exact(gain * np.eye(inputs))
-    none = Ball.exact(np.zeros((inputs, outputs)))
-    return prove_positive_definite(
-        block([
+
+    def formula(kind: type[Enclosed]) -> Enclosed:
+        p, shown = kind.exact(P), kind.exact(c)
+        through, entering = p @ kind.exact(a), p @ kind.of(b)
+        level = kind.exact(np.eye(inputs)).scaled(gain).scaled(gain)
+        none = kind.exact(np.zeros((inputs, outputs)))
+        return block([
             [-(through + through.T), -entering, shown.T],
             [-entering.T, level, none],
-            [shown, none.T, Ball.exact(np.eye(outputs))],
-        ])
-    )  # fmt: skip
+            [shown, none.T, kind.exact(np.eye(outputs))],
+        ])  # fmt: skip
+
+    return prove_positive_definite(formula)
 
 
-def _prove(moving: Ball, still: Ball, x: Ball, p: Ball, delta: float) -> DefinitenessProof:
-    """Prove that minus the inequality for the pencil ``moving - s still`` is positive definite."""
-    scale = Ball.exact(delta * np.eye(x.shape[0]))
-    first, second = moving.T @ x, still.T @ x
-    lower = p - second + scale @ (x.T @ moving)
-    upper_left, lower_right = first + first.T, scale @ (second + second.T)
-    return prove_positive_definite(block([[-upper_left, -lower.T], [-lower, lower_right]]))
+def _inequality(moving: Enclosed, still: Enclosed, p: Enclosed, delta: float) -> Enclosed:
+    """Return minus the inequality for a pencil ``M - s T``, from ``moving = M' X`` and ``still = T' X``."""
+    lower = p - still + moving.T.scaled(delta)
+    return block([[-(moving + moving.T), -lower.T], [-lower, (still + still.T).scaled(delta)]])

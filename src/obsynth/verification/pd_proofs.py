@@ -95,14 +95,14 @@ def _gain_row(design: ObserverDesign, kind: Literal["rate", "noise"], gain: floa
     claim = f"l2 gain from {source} to the fault error < {gain:.6g}"
     return Check(
         f"LMI, {kind}", claim, found.lower_bound, 0.0, found.lower_bound, found.proved, "ours: bounded real lemma",
-        "proved", f"Cholesky with rounding bound {found.error_bound:.1e}, on a unit diagonal",
+        "proved", found.text,
     )  # fmt: skip
 
 
 def _proof(name: str, claim: str, found: DefinitenessProof, label: str) -> Check:
     return Check(
         name, claim, found.lower_bound, 0.0, found.lower_bound, found.proved, f"Filasova et al., eq. {label}", "proved",
-        f"Cholesky with rounding bound {found.error_bound:.1e}, on a unit diagonal",
+        found.text,
     )  # fmt: skip
 
 
@@ -126,5 +126,5 @@ def _range_row(design: ObserverDesign) -> Check:
         "adaptation range", f"stable for every G = g I with g from {low:.6g} to {high:.6g}", worst.lower_bound, 0.0,
         worst.lower_bound, all(proof.proved for proof in proofs), "ours: the theorem at both ends, with common P3",
         "proved",
-        f"Cholesky with rounding bound {worst.error_bound:.1e}, on a unit diagonal",
+        worst.text,
     )  # fmt: skip

@@ -9,13 +9,14 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from obsynth.analysis.time_varying import horizon_ranks, recursive_conditions
+from obsynth.analysis.recursive_conditions import recursive_conditions
+from obsynth.analysis.time_varying import horizon_ranks
 from obsynth.errors import ObsynthError
 from obsynth.models.sequences import MatrixSequence
 from obsynth.models.time_varying import TimeVaryingDescriptorSystem
 from obsynth.observers.building import observer_from_options
 from obsynth.observers.recursive import RecursiveObserver
-from obsynth.observers.schedule_facts import ScheduleFacts, looked_at, schedule_facts
+from obsynth.observers.schedule_facts import STEPS_TO_CONTRACT, ScheduleFacts, looked_at, schedule_facts
 from obsynth.results.design import ObserverDesign
 from obsynth.results.report import Check, information, upper_bound_check
 from obsynth.verification.batch import batch_residuals
@@ -26,8 +27,6 @@ from obsynth.verification.plant import condition_rows
 CLAIM_TOLERANCE = 1e-6
 #: The recursion may differ from the batch solution by this much, relative to standard deviations, times cond H.
 BATCH_TOLERANCE = 1e-9
-#: On shorter horizons an error need not have shrunk yet, so that the contraction only informs.
-STEPS_TO_CONTRACT = 50
 
 _SOURCE = "Moussa Ali, Zhang 2013"
 
@@ -38,7 +37,11 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     form = None if observer.adaptation is None else observer.adaptation.form
     yield information("plant: steps", "length of the horizon (0: without end)", float(plant.horizon or 0),
                       source="the plant")  # fmt: skip
-    conditions = tuple(recursive_conditions(plant, parameters=form is not None, literal=form == "literal"))
+    conditions = tuple(
+        recursive_conditions(
+            plant, parameters=form is not None, literal=form == "literal", early=observer.early_constraints
+        )
+    )
     yield from condition_rows(conditions)
     if not all(condition.holds for condition in conditions):
         return
@@ -58,7 +61,8 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
 
 
 def _dynamic_rows(design: ObserverDesign, observer: RecursiveObserver, stated: RecursiveObserver) -> Iterator[Check]:
-    ranks, facts = horizon_ranks(observer.plant), schedule_facts(observer)
+    ranks = horizon_ranks(observer.plant, early=observer.early_constraints)
+    facts = schedule_facts(observer)
     yield information(
         "condition of H", "largest condition number of [E_k; C_k]", ranks.condition, source=f"{_SOURCE}, (6)",
         detail=f"at k = {ranks.condition_k}",
@@ -90,7 +94,7 @@ def _dynamic_rows(design: ObserverDesign, observer: RecursiveObserver, stated: R
 
 def _contraction_rows(facts: ScheduleFacts) -> Iterator[Check]:
     claim = "mean factor per step of the product of L_k A_k"
-    detail = f"{facts.steps} steps; an error grows at most by {facts.growth:.3g} on the way"
+    detail = f"{facts.steps} steps, {facts.span}; an error grows at most by {facts.growth:.3g} on the way"
     if facts.steps < STEPS_TO_CONTRACT:
         yield information("contraction", claim, facts.contraction, source=f"{_SOURCE}, (13)", detail=detail)
     else:

@@ -34,7 +34,7 @@ def stability_rows(design: ObserverDesign, poles: FloatArray, factor: FloatArray
         proof.proved,
         "Share Pasand, eq. (7)",
         "proved",
-        f"Cholesky with rounding bound {proof.error_bound:.1e}, on a unit diagonal",
+        proof.text,
     )
     claimed = [complex(*row) for row in poles]
     yield upper_bound_check(

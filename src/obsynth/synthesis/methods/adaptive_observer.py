@@ -11,6 +11,7 @@ Deviations:
 4. The covariance of theta is carried besides S, which is none (4.8 times too large in the audit's example).
 5. S is a triangle; a term ``(1 - lambda) M_reg`` or directional forgetting bounds it where excitation ends.
 6. Parameters may walk randomly instead (the augmented Kalman filter).
+7. Parameters that leave no trace, or none of their own, are refused: (26) cannot hold for them.
 """
 
 from __future__ import annotations
@@ -19,19 +20,22 @@ from collections.abc import Callable
 from typing import Any
 
 from obsynth.analysis.conditions import Condition, require_all
-from obsynth.analysis.time_varying import as_time_varying, recursive_conditions
+from obsynth.analysis.recursive_conditions import recursive_conditions
+from obsynth.analysis.time_varying import as_time_varying
 from obsynth.errors import SpecError
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.models.time_varying import TimeVaryingDescriptorSystem
+from obsynth.numerics.arguments import chosen, truth
+from obsynth.observers.recursive import FORMS
 from obsynth.synthesis.recursive_design import recursive_synthesis, with_stated_noise
 from obsynth.synthesis.result import Synthesis
 
 
 def conditions(
-    plant: DescriptorSystem | TimeVaryingDescriptorSystem, *, form: str = "innovation"
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem, *, form: str = "innovation", early_constraints: bool = False
 ) -> tuple[Condition, ...]:
     """Return the existence conditions; the list ends at the first failure."""
-    return tuple(recursive_conditions(plant, parameters=True, literal=form == "literal"))
+    return tuple(recursive_conditions(plant, parameters=True, literal=form == "literal", early=early_constraints))
 
 
 def synthesise(
@@ -53,6 +57,7 @@ def synthesise(
     reset: float = 0.0,
 ) -> Synthesis:
     """Put the observer together; see `obsynth.adaptive_observer` for the options, results and errors."""
+    literal = chosen(form, "form", FORMS) == "literal"
     if form == "random-walk" and random_walk is None:
         raise SpecError("form 'random-walk' needs random_walk, the variance of one step of each parameter.",
                         path="method.options.random_walk")  # fmt: skip
@@ -60,11 +65,11 @@ def synthesise(
         raise SpecError("random_walk belongs to form 'random-walk': the other forms forget instead.",
                         path="method.options.random_walk")  # fmt: skip
     progress("checking the existence conditions along the horizon")
-    require_all(conditions(plant, form=form))
+    require_all(conditions(plant, form=form, early_constraints=truth(early_constraints, "early_constraints")))
     options = with_stated_noise(plant, {
         "Q": Q, "R": R, "initial_state": initial_state, "initial_covariance": initial_covariance,
         "early_constraints": early_constraints, "form": form, "forgetting": forgetting,
-        "guard": guard or ("none" if form == "literal" else "regularise"),
+        "guard": ("none" if literal else "regularise") if guard is None else guard,
         "initial_parameters": initial_parameters, "initial_parameter_covariance": initial_parameter_covariance,
         "random_walk": random_walk, "window": window, "reset": reset,
     })  # fmt: skip

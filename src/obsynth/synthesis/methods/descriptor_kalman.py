@@ -9,7 +9,8 @@ Deviations:
 1. Square-root covariance step instead of (9)-(11): nothing is inverted but triangles, so Q, R and P_0 may be singular.
 2. The algebraic equations of step k + 1 may be used one step earlier (``early_constraints``).
 3. Missing samples; states that they leave undetermined are said to be so.
-4. (14) and (15) have misprints (indexes, a transpose); we need neither.
+4. Detectability is asked for before any gain: the paper's Lemma 3.1 takes a stable product of L_k A_k for granted.
+5. (14) and (15) have misprints (indexes, a transpose); we need neither.
 """
 
 from __future__ import annotations
@@ -18,16 +19,20 @@ from collections.abc import Callable
 from typing import Any
 
 from obsynth.analysis.conditions import Condition, require_all
-from obsynth.analysis.time_varying import as_time_varying, recursive_conditions
+from obsynth.analysis.recursive_conditions import recursive_conditions
+from obsynth.analysis.time_varying import as_time_varying
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.models.time_varying import TimeVaryingDescriptorSystem
+from obsynth.numerics.arguments import truth
 from obsynth.synthesis.recursive_design import recursive_synthesis, with_stated_noise
 from obsynth.synthesis.result import Synthesis
 
 
-def conditions(plant: DescriptorSystem | TimeVaryingDescriptorSystem) -> tuple[Condition, ...]:
+def conditions(
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem, *, early_constraints: bool = False
+) -> tuple[Condition, ...]:
     """Return the existence conditions; the list ends at the first failure."""
-    return tuple(recursive_conditions(plant, parameters=False))
+    return tuple(recursive_conditions(plant, parameters=False, early=early_constraints))
 
 
 def synthesise(
@@ -42,7 +47,7 @@ def synthesise(
 ) -> Synthesis:
     """Put the filter together; see `obsynth.descriptor_kalman` for the options, results and errors."""
     progress("checking the existence conditions along the horizon")
-    require_all(conditions(plant))
+    require_all(conditions(plant, early_constraints=truth(early_constraints, "early_constraints")))
     options = with_stated_noise(plant, {
         "Q": Q, "R": R, "initial_state": initial_state, "initial_covariance": initial_covariance,
         "early_constraints": early_constraints,

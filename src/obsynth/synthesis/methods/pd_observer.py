@@ -15,6 +15,8 @@ Our deviations
     7. What is shipped never differentiates the outputs (see `obsynth.synthesis.pd_realisation`).
     8. The inequality is proved for the shipped realisation; where the solver's certificate does not do, one is
        computed from the gains.
+    9. For hundreds of states the gains come from a smaller inequality or in closed form (see
+       `obsynth.synthesis.pd_reduced`), with L = 0.
 """
 
 from __future__ import annotations
@@ -59,7 +61,7 @@ def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **op
     g = asked.gain_matrix(work.nf)
     progress("solving the matrix inequalities")
     gains, records = design_gains(work, asked)
-    solver: dict[str, Any] = {"runs": records}
+    solver: dict[str, Any] = {"engine": gains.engine, "runs": records}
     if asked.delta_scan is not None:
         progress("scanning delta")
         scan = scan_delta(work, asked, np.ravel(asked.delta_scan), decay=gains.decay)
@@ -89,6 +91,7 @@ def _resolved(asked: PdOptions, gains: PdGains, g: FloatArray | None) -> dict[st
         "adaptation_gain": None if g is None else g.tolist(),
         "adaptation_range": None if asked.range_numbers is None else list(asked.range_numbers),
         "delta_scan": None if asked.delta_scan is None else np.ravel(asked.delta_scan).tolist(),
+        "engine": asked.engine,
         "solver": asked.solver,
     }
 
@@ -121,16 +124,34 @@ def notes(plant: DescriptorSystem, asked: PdOptions, gains: PdGains) -> tuple[st
     """Return what a user should know: how delta and the decay rate were chosen, slow or noisy estimates."""
     found = []
     if asked.delta is None:
-        found.append(f"delta = {gains.asked_delta:.4g} s was chosen, from the plant's fastest mode.")
+        less = ", or as much of it as the closed form serves" if gains.engine == "riccati" else ""
+        found.append(f"delta = {gains.asked_delta:.4g} s was chosen, from the plant's fastest mode{less}.")
     if asked.decay is None and gains.decay > 0.0:
         found.append(
             f"A decay rate of {gains.decay:.4g} 1/s was imposed: a tenth of the plant's fastest mode, or what of it is "
             "reachable with moderate gains; without it errors would die out more slowly. decay: 0 takes the smallest "
             "gains."
         )
-    if not np.any(gains.L):
-        found.append("The semidefinite solver failed: these gains come from a Riccati equation, with L = 0 and N = 0.")
+    found += _engine_notes(asked, gains, plant.nx + plant.nf)
     return (*found, *_noise_notes(plant, gains))
+
+
+_ENGINES = {"lmi": "the whole inequality", "reduced-lmi": "the smaller inequality", "riccati": "a Riccati equation"}
+
+
+def _engine_notes(asked: PdOptions, gains: PdGains, states: int) -> list[str]:
+    wanted = asked.engines_for(states)[0]
+    if gains.engine != wanted:
+        return [
+            f"The engine {wanted!r} failed: these gains come from {_ENGINES[gains.engine]} (engine {gains.engine!r}), "
+            "with L = 0 and N = 0."
+        ]
+    if asked.engine == "auto" and wanted != "lmi":
+        return [
+            f"With {states} unknown states the gains come from {_ENGINES[wanted]} (engine {wanted!r}), with L = 0 and "
+            "N = 0; engine 'lmi' may find smaller ones."
+        ]
+    return []
 
 
 def _noise_notes(plant: DescriptorSystem, gains: PdGains) -> list[str]:

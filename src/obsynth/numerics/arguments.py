@@ -1,0 +1,73 @@
+"""Single numbers and vectors that a caller gives, checked: never a raw TypeError, always the name of the argument."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.numerics.arrays import FloatArray
+
+
+def real_number(value: Any, name: str, what: str = "a number") -> float:
+    """Return a finite real number; raise `SpecError` naming the argument and ``what`` it should be."""
+    if not is_number(value) or not np.isfinite(value):
+        raise SpecError(f"{name} is {_shown(value)}: give {what}.", path=name)
+    return float(value)
+
+
+def whole_number(value: Any, name: str, what: str = "a whole number", *, least: int = 1) -> int:
+    """Return an integer that is ``least`` or more; raise `SpecError` naming the argument and ``what`` it should be."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
+        raise SpecError(f"{name} is {_shown(value)}: give {what}, at least {least}.", path=name)
+    return int(value)
+
+
+def truth(value: Any, name: str) -> bool:
+    """Return True or False; raise `SpecError` for anything else."""
+    if not isinstance(value, (bool, np.bool_)):
+        raise SpecError(f"{name} is {_shown(value)}: give True or False.", path=name)
+    return bool(value)
+
+
+def real_vector(value: Any, size: int, name: str) -> FloatArray:
+    """Return ``(size,)`` finite real numbers; a single one may be given as such."""
+    wanted = SpecError(f"{name} must be {size} finite number(s).", path=name)
+    try:
+        vector = np.atleast_1d(real_array(value, name))
+    except SpecError:
+        raise wanted from None
+    if vector.shape != (size,) or not np.isfinite(vector).all():
+        raise wanted
+    return vector
+
+
+def real_array(value: Any, name: str) -> FloatArray:
+    """Return real numbers of any shape, NaN and infinities among them; raise `SpecError` for anything else."""
+    try:
+        raw = np.asarray(value)
+    except (TypeError, ValueError):
+        raise SpecError(f"{name} has rows of different lengths.", path=name) from None
+    if raw.dtype.kind not in "fiu" and raw.size:
+        raise SpecError(f"{name} is {_shown(value)}: give real numbers.", path=name)
+    return np.asarray(raw, dtype=np.float64) if raw.size else np.zeros(raw.shape)
+
+
+def chosen(value: Any, name: str, choices: tuple[str, ...]) -> str:
+    """Return a text that is one of ``choices``; raise `SpecError` listing them."""
+    if not isinstance(value, str) or value not in choices:
+        raise SpecError(f"{name} is {_shown(value)}: use one of {', '.join(choices)}.", path=name)
+    return value
+
+
+def is_number(value: Any) -> bool:
+    """Whether ``value`` is a single real number, of Python or numpy."""
+    return isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
+
+
+def _shown(value: Any) -> str:
+    if value is None:
+        return "missing"
+    text = repr(value.item() if isinstance(value, np.generic) else value)
+    return text if len(text) <= 60 and "\n" not in text else f"a {type(value).__name__}"

@@ -1,0 +1,183 @@
+"""The ways to a PD observer: the whole inequality, the smaller one with its way back, and none at all."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.linalg
+
+import obsynth
+from obsynth.analysis.pd_augmentation import with_faults_as_states
+from obsynth.spec import load_spec
+from obsynth.synthesis import pd_design, pd_reduced
+from obsynth.synthesis.pd_options import MOST_STATES_FOR_LMI, PdOptions
+from obsynth.synthesis.pd_problem import PdTask, solve
+from obsynth.verification.pd_inequality import prove_gains, prove_symmetric_positive
+
+PLANT = load_spec(Path(__file__).parents[2] / "designs" / "filasova" / "spec.yaml").plant
+ENGINES = ("lmi", "reduced-lmi", "riccati")
+
+
+def task_of(plant: obsynth.DescriptorSystem, *, theorem: int, delta: float, decay: float) -> PdTask:
+    augmented = with_faults_as_states(plant)
+    empty = np.zeros((0, 0))
+    return PdTask(
+        plants=((augmented.A, augmented.C),), theorem=theorem, delta=delta, decay=decay, disk=None, gain_bound=None,
+        gain_unit=1.0, rate_gain=None, noise_gain=None, rate=empty, shown=empty, process=empty, sensor=empty,
+        sensor_rate=empty,
+    )  # fmt: skip
+
+
+def large_plant(nx: int, seed: int = 0) -> obsynth.DescriptorSystem:
+    rng = np.random.default_rng([nx, seed])
+    a = rng.normal(size=(nx, nx)) / np.sqrt(nx)
+    return obsynth.DescriptorSystem(
+        None, a, C=rng.normal(size=(nx // 4, nx)) / np.sqrt(nx), Bf=rng.normal(size=(nx, 2))
+    )
+
+
+class TestWayBack:
+    """What is lifted from the smaller inequality is a solution of the theorem itself, for the delta that was asked."""
+
+    @pytest.mark.parametrize("theorem", [1, 2])
+    @pytest.mark.parametrize("delta", [1e-2, 0.3, 5.0])
+    @pytest.mark.parametrize("decay", [0.0, 1.5])
+    def test_the_whole_inequality_holds(self, theorem: int, delta: float, decay: float) -> None:
+        task = task_of(PLANT, theorem=theorem, delta=delta, decay=decay)
+        found = pd_reduced.reduced_lmi(task, solver="CLARABEL")
+        a, c = task.plants[0]
+        assert prove_symmetric_positive(found.P1[0]).proved
+        if theorem == 2:
+            np.testing.assert_allclose(found.P3, found.P3.T, rtol=1e-12)
+        assert prove_gains(a, c, found.J, found.L, found.P1[0], found.P3, delta=delta, decay=decay).proved
+        assert not np.any(found.L)
+
+    @pytest.mark.parametrize("theorem", [1, 2])
+    def test_gains_are_in_proportion_to_those_of_the_whole_inequality(self, theorem: int) -> None:
+        """The general formula of the elimination lemma gives 40 to 100 times larger ones."""
+        task = task_of(PLANT, theorem=theorem, delta=0.1, decay=0.0)
+        whole, smaller = solve(task, solver="CLARABEL"), pd_reduced.reduced_lmi(task, solver="CLARABEL")
+        assert np.linalg.norm(smaller.J, 2) < 10.0 * np.linalg.norm(np.hstack([whole.J, whole.L]), 2)
+
+    def test_coordinates_in_which_the_last_states_are_the_outputs(self) -> None:
+        rng = np.random.default_rng(3)
+        a, c = rng.normal(size=(6, 6)), rng.normal(size=(2, 6))
+        c = np.vstack([c, c[0] - 2.0 * c[1]])  # a third output that says nothing new
+        found = pd_reduced.ReducedPlant.of(a, c)
+        assert found.hidden == 4
+        np.testing.assert_allclose(found.basis.T @ found.basis, np.eye(6), atol=1e-12)
+        np.testing.assert_allclose((c @ found.basis)[:, :4], 0.0, atol=1e-12)
+        np.testing.assert_allclose(found.inverse @ c @ found.basis, np.eye(2, 6, 4), atol=1e-12)
+        np.testing.assert_allclose(found.basis @ found.A @ found.basis.T, a, atol=1e-12)
+
+    def test_every_state_measured_leaves_nothing_to_solve(self) -> None:
+        plant = obsynth.DescriptorSystem(None, [[1.0]], C=[[1.0], [0.0]], Bf=[[0.0]], Df=[[0.0], [2.0]])
+        design = obsynth.pd_observer(plant, engine="reduced-lmi", decay=2.0)
+        assert design.report.passed
+        assert design.solver["runs"][0]["solver"] == "none needed"
+
+    def test_a_solution_that_is_none_is_refused(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        right = pd_reduced.solve
+
+        def wrong(task: PdTask, *, solver: str) -> object:
+            found = right(task, solver=solver)
+            return replace(found, J=-5.0 * found.J)
+
+        monkeypatch.setattr(pd_reduced, "solve", wrong)
+        with pytest.raises(obsynth.SolverError, match="smaller inequality"):
+            pd_reduced.reduced_lmi(task_of(PLANT, theorem=1, delta=0.1, decay=0.0), solver="CLARABEL")
+
+
+class TestClosedForm:
+    @pytest.mark.parametrize("theorem", [1, 2])
+    @pytest.mark.parametrize("decay", [0.0, 1.5])
+    def test_it_serves_below_its_delta(self, theorem: int, decay: float) -> None:
+        task = task_of(PLANT, theorem=theorem, delta=1e3, decay=decay)
+        found, delta = pd_reduced.closed_form(task, free_delta=True)
+        assert delta < 1e3
+        a, c = task.plants[0]
+        assert prove_gains(a, c, found.J, found.L, found.P1[0], found.P3, delta=delta, decay=decay).proved
+        np.testing.assert_array_equal(found.P3, found.P3.T)
+        smaller, same = pd_reduced.closed_form(replace(task, delta=0.1 * delta), free_delta=True)
+        assert same == 0.1 * delta
+        np.testing.assert_array_equal(smaller.J, found.J)
+
+    def test_a_delta_that_is_asked_is_kept(self) -> None:
+        """Theorem 1 has a solution for every delta; Theorem 2 with these gains has none above the limit."""
+        design = obsynth.pd_observer(PLANT, engine="riccati", delta=10.0, decay=0.0)
+        assert design.certificate.claims["delta"] == 10.0
+        with pytest.raises(obsynth.SolverError, match="smaller delta"):
+            obsynth.pd_observer(PLANT, engine="riccati", theorem=2, delta=10.0, decay=0.0)
+
+    def test_two_algorithms_for_the_riccati_equation_and_an_error(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        task = task_of(PLANT, theorem=1, delta=0.1, decay=0.0)
+        expected = pd_reduced.closed_form(task, free_delta=True)[0].J
+
+        def failing(*_: object, **__: object) -> None:
+            raise np.linalg.LinAlgError("broken")
+
+        monkeypatch.setattr(scipy.linalg, "schur", failing)
+        np.testing.assert_allclose(pd_reduced.closed_form(task, free_delta=True)[0].J, expected, rtol=1e-9, atol=1e-12)
+        monkeypatch.setattr(scipy.linalg, "solve_continuous_are", failing)
+        with pytest.raises(obsynth.SolverError, match="not solved") as caught:
+            pd_reduced.closed_form(task, free_delta=True)
+        assert caught.value.record["what"]
+
+
+class TestChoice:
+    @pytest.mark.parametrize("theorem", [1, 2])
+    @pytest.mark.parametrize("engine", ENGINES)
+    def test_each_engine_runs_and_the_result_says_so(self, engine: str, theorem: int) -> None:
+        design = obsynth.pd_observer(PLANT, engine=engine, theorem=theorem, decay=0.7)
+        assert (design.solver["engine"], design.options["engine"]) == (engine, engine)
+        assert design.report.passed
+        assert np.max(np.linalg.eigvals(design.observer.Az).real) < -0.7
+        assert np.any(design.gains["L"]) is np.bool_(engine == "lmi")
+
+    def test_small_plants_get_the_smallest_gains(self) -> None:
+        default = obsynth.pd_observer(PLANT)
+        assert default.solver["engine"] == "lmi"
+        np.testing.assert_array_equal(default.gains["J"], obsynth.pd_observer(PLANT, engine="lmi").gains["J"])
+
+    def test_large_plants_get_the_closed_form_with_a_note(self) -> None:
+        design = obsynth.pd_observer(large_plant(60))
+        assert design.report.passed
+        assert design.solver["engine"] == "riccati"
+        assert any("62 unknown states" in note for note in design.notes)
+
+    def test_where_the_closed_form_does_not_serve_the_smaller_inequality_does(self) -> None:
+        """Theorem 2 for a delta of many time constants: "auto" goes on, and says so."""
+        plant = large_plant(MOST_STATES_FOR_LMI)
+        design = obsynth.pd_observer(plant, theorem=2, delta=20.0, decay=0.0)
+        assert design.report.passed
+        assert design.solver["engine"] == "reduced-lmi"
+        assert any("'riccati' failed" in note for note in design.notes)
+
+    def test_what_is_asked_besides_takes_the_whole_inequality(self) -> None:
+        assert PdOptions(gain_bound=3.0).engines_for(10 * MOST_STATES_FOR_LMI) == ("lmi",)
+        assert obsynth.pd_observer(PLANT, fault_rate_gain=0.7).solver["engine"] == "lmi"
+        for engine in ("reduced-lmi", "riccati"):
+            with pytest.raises(obsynth.SpecError, match="stability and a decay rate alone") as caught:
+                obsynth.pd_observer(PLANT, engine=engine, gain_bound=30.0)
+            assert "gain_bound" in str(caught.value)
+        with pytest.raises(obsynth.SpecError, match="engine is 'sdp'"):
+            obsynth.pd_observer(PLANT, engine="sdp")
+
+    def test_adaptation_gain_and_scan_work_with_each(self) -> None:
+        for engine in ENGINES:
+            design = obsynth.pd_observer(PLANT, engine=engine, adaptation_gain=5.0, delta_scan=[0.05, 0.5])
+            assert design.report.passed
+            scan = obsynth.DeltaScan.from_dict(design.solver["delta_scan"])
+            assert set(scan.failures) == {""}
+
+    def test_the_spare_engine_is_named(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        def failing(*_: object, **__: object) -> None:
+            raise obsynth.SolverError("broken")
+
+        monkeypatch.setattr(pd_design, "reduced_lmi", failing)
+        design = obsynth.pd_observer(PLANT, engine="reduced-lmi")
+        assert design.solver["engine"] == "riccati"
+        assert any("'reduced-lmi' failed" in note and "Riccati" in note for note in design.notes)

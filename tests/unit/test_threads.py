@@ -1,0 +1,147 @@
+"""Designs and verifications of small plants run on one BLAS thread, and nothing of it stays behind."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import scipy.linalg  # noqa: F401 - its BLAS must be loaded to be seen
+from threadpoolctl import threadpool_info, threadpool_limits
+
+import obsynth
+from obsynth.numerics.threads import STATES_WORTH_THREADS, one_thread_if_small
+from obsynth.pipeline import designing
+from obsynth.synthesis.methods import pd_observer as method
+
+PLANT = obsynth.DescriptorSystem(None, [[0.5, 1.0], [0.0, -1.0]], C=[[1.0, 0.0]], Bf=[[0.0], [1.0]])
+
+LOADED = {library["filepath"] for library in threadpool_info() if library["user_api"] == "blas"}
+
+
+def blas_threads() -> set[int]:
+    """Of NumPy and SciPy; solvers that are loaded on the way may bring another BLAS."""
+    libraries = [library for library in threadpool_info() if library["user_api"] == "blas"]
+    found = {library["num_threads"] for library in libraries if library["filepath"] in LOADED}
+    assert found
+    return found
+
+
+@pytest.fixture(autouse=True)
+def two_threads() -> Iterator[None]:
+    with threadpool_limits(limits=2, user_api="blas"):
+        assert blas_threads() == {2}
+        yield
+
+
+def test_inside_there_is_one_thread_and_afterwards_what_there_was() -> None:
+    with one_thread_if_small(STATES_WORTH_THREADS - 1):
+        assert blas_threads() == {1}
+        with one_thread_if_small(3):
+            assert blas_threads() == {1}
+        assert blas_threads() == {1}
+    assert blas_threads() == {2}
+
+
+def test_large_problems_keep_their_threads() -> None:
+    with one_thread_if_small(STATES_WORTH_THREADS):
+        assert blas_threads() == {2}
+
+
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
+def test_an_error_puts_the_number_back(error: type[BaseException]) -> None:
+    with pytest.raises(error), one_thread_if_small(3):
+        raise error
+    assert blas_threads() == {2}
+
+
+TWO_AT_ONCE = """
+import threading
+import scipy.linalg
+from threadpoolctl import threadpool_info
+from obsynth.numerics.threads import one_thread_if_small
+
+first_is_in, second_is_in, first_is_out = threading.Event(), threading.Event(), threading.Event()
+
+def blas_threads():
+    return sorted({library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"})
+
+def first():
+    with one_thread_if_small(3):
+        print(blas_threads())
+        with one_thread_if_small(3):
+            first_is_in.set()
+        assert second_is_in.wait(20.0)
+    first_is_out.set()
+
+def second():
+    assert first_is_in.wait(20.0)
+    with one_thread_if_small(3):
+        second_is_in.set()
+        assert first_is_out.wait(20.0)
+
+before = blas_threads()
+both = [threading.Thread(target=work) for work in (first, second)]
+for thread in both:
+    thread.start()
+for thread in both:
+    thread.join(30.0)
+print(before == blas_threads())
+"""
+
+
+def test_two_python_threads_at_once_leave_nothing_behind() -> None:
+    """The first one in is the first one out: with limits of their own the second would restore what the first set."""
+    environment = {**os.environ, "OMP_NUM_THREADS": "2", "OPENBLAS_NUM_THREADS": "2"}
+    done = subprocess.run(
+        [sys.executable, "-c", TWO_AT_ONCE], capture_output=True, text=True, check=True, env=environment
+    )
+    assert done.stdout.splitlines() == ["[1]", "True"]
+
+
+def test_a_design_runs_on_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = []
+    right = designing.verify
+
+    def watched(design: obsynth.ObserverDesign) -> obsynth.VerificationReport:
+        seen.append(blas_threads())
+        return right(design)
+
+    monkeypatch.setattr(designing, "verify", watched)
+    made = obsynth.design(PLANT, "pd-observer", progress=lambda _: seen.append(blas_threads()))
+    assert made.report.passed
+    assert len(seen) >= 3
+    assert all(found == {1} for found in seen)
+    assert blas_threads() == {2}
+
+
+def test_a_design_that_fails_puts_the_number_back() -> None:
+    with pytest.raises(obsynth.PreconditionError):
+        obsynth.pd_observer(PLANT.replace(C=np.zeros((1, 2))))
+    assert blas_threads() == {2}
+
+
+def test_verification_alone_runs_on_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    from obsynth.verification import pd_observer as checker
+
+    made = obsynth.pd_observer(PLANT)
+    seen = []
+    right = checker.checks
+
+    def watched(design: obsynth.ObserverDesign, printed_digits: int | None) -> Iterator[object]:
+        seen.append(blas_threads())
+        yield from right(design, printed_digits)
+
+    monkeypatch.setattr(checker, "checks", watched)
+    assert obsynth.verify(made).passed
+    assert seen == [{1}]
+    assert blas_threads() == {2}
+
+
+def test_the_method_itself_leaves_the_threads_alone() -> None:
+    """The setting is at the door, once for every method."""
+    method.synthesise(PLANT, progress=lambda _: None)
+    assert blas_threads() == {2}
