@@ -154,7 +154,7 @@ class TestRefusals:
 
     def test_a_recursive_design_is_no_linear_one(self) -> None:
         design = obsynth.descriptor_kalman(varying(horizon=20), **NOISE)
-        with pytest.raises(SpecError, match="no linear time-invariant observer"):
+        with pytest.raises(SpecError, match="no constant realisation to hand on"):
             design.to_control()
         with pytest.raises(SpecError, match="no recursive observer"):
             _ = obsynth.load(linear_file()).recursive
