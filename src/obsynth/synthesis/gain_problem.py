@@ -101,6 +101,16 @@ class GainProblem:
         """Return the problem without its disturbance."""
         return replace(self, B=self.B[:, :0], D=self.D[:, :0], Zd=self.Zd[:, :0])
 
+    def with_state_noise(self, size: float) -> GainProblem:
+        """Return the problem with independent noise of this size on each state besides its own."""
+        n, m, q = self.order, self.measured, self.Z.shape[0]
+        return replace(
+            self,
+            Bn=np.hstack([self.Bn, size * np.eye(n)]),
+            Dn=np.hstack([self.Dn, np.zeros((m, n))]),
+            Zn=np.hstack([self.Zn, np.zeros((q, n))]),
+        )
+
     def closed_loop(self, solution: Injection) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Return ``(A, B, Z, Zd)`` of the error system d -> xi with the given gains."""
         r, v = solution.R, solution.V

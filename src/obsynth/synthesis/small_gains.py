@@ -25,6 +25,10 @@ MOST_STEPS = 24
 SLOWEST_DECAY = 0.999
 #: Up to so many states the whole inequality competes although nothing needs it.
 MOST_STATES_FOR_WHOLE = 12
+#: Noise on the states, relative to that of the plant, for filters that shall forget faster; and how much more variance
+#: than the least of such filters that may cost.
+STATE_NOISE = (1e-4, 1e-3, 1e-2, 1e-1)
+PRICE_OF_SPEED = 1.04
 #: Halvings of the step towards the filter of least noise, for few and for many states.
 LINE_STEPS = 7
 COARSE_LINE_STEPS = 3
@@ -72,8 +76,14 @@ def small_gain_design(
     central = [item for item in noise_weighted_filters(problem, gain) if goal.met(item)]
     if fresh.start_gain <= gain and goal.met(fresh.start):
         central.append(fresh.start)
-    central = [item for item in central if goal.is_fast(item)] or central
-    candidates += [_towards(goal, min(central, key=goal.cost), target)] if central else []
+    lively = [] if not goal.noisy or any(map(goal.is_fast, central)) else _lively_filters(goal)
+    if lively:
+        # The filter of least noise may forget slowly again: what was bought is not given back.
+        candidates.append(_towards(goal, lively[0], target, slowest=_radius(problem, lively[0])))
+        central += lively
+    else:
+        central = [item for item in central if goal.is_fast(item)] or central
+        candidates += [_towards(goal, min(central, key=goal.cost), target)] if central else []
     records.append({"what": "small gains", "solver": "central filter", "status": f"{len(central)} filters"})
     needed = problem.weight_limit is not None or not candidates or problem.order <= MOST_STATES_FOR_WHOLE
     if engine != "riccati" and needed:
@@ -86,7 +96,9 @@ def small_gain_design(
     # An inaccurate solution may be far from the least noise: the true cost decides, not the solver.
     fast = [item for item in candidates if goal.met_fast(item)]
     found = min(fast or candidates, key=goal.cost)
-    return (_towards(goal, found, target) if goal.noisy else found), records
+    if lively and goal.cost(candidates[0]) <= PRICE_OF_SPEED * goal.cost(found):
+        found = candidates[0]
+    return (_towards(goal, found, target) if goal.noisy and not lively else found), records
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,6 +133,24 @@ class _Goal:
         return float(np.linalg.norm(np.vstack([injection.R, injection.V])))
 
 
+def _lively_filters(goal: _Goal) -> list[Injection]:
+    """Return fast filters that meet the goal, the best first, where those that weigh the noise alone are slow.
+
+    Noise on every state makes a filter trust its measurements more.  Of those that cost little more noise than the
+    least, the one that forgets fastest is the best.
+    """
+    problem = goal.problem
+    size = float(np.linalg.norm(np.vstack([problem.Bn, problem.Dn]), 2))
+    found: list[Injection] = []
+    for share in STATE_NOISE:
+        noisier = problem.with_state_noise(share * size)
+        found += [item for item in noise_weighted_filters(noisier, goal.gain) if goal.met_fast(item)]
+    least = min(map(goal.cost, found), default=0.0)
+    return sorted(
+        (item for item in found if goal.cost(item) <= PRICE_OF_SPEED * least), key=lambda item: _radius(problem, item)
+    )
+
+
 def _by_inequality(
     goal: _Goal, least: LeastGain, fresh: NormalisedProblem, records: list[dict[str, Any]], *, solver: str
 ) -> list[Injection]:
@@ -144,10 +174,11 @@ def _by_inequality(
     return [item for item in candidates if goal.met(item)]
 
 
-def _towards(goal: _Goal, injection: Injection, target: Injection | None) -> Injection:
+def _towards(goal: _Goal, injection: Injection, target: Injection | None, *, slowest: float | None = None) -> Injection:
     """Go towards a cheaper filter as far as the true gain allows: one P for gain and noise leaves room."""
     if target is None:
         return injection
+    goal = goal if slowest is None else replace(goal, slowest=slowest)
     best, least, share, step = injection, goal.cost(injection), 0.0, 1.0
     judge = goal.met_fast if goal.met_fast(injection) else goal.met
     few = goal.problem.order <= FEW_STATES
