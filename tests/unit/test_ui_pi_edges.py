@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from obsynth import DescriptorSystem, ui_pi_observer
+from obsynth.errors import PreconditionError
+from obsynth.pipeline.designing import check
 
 TWO = [[-1.0, 1.0], [0.0, -2.0]]
 PLANTS = {
@@ -33,3 +35,23 @@ def test_it_is_designed_and_passes(name: str) -> None:
     assert design.report.passed
     assert design.report["decoupling"].value < 1e-8
     assert design.certificate.claims["decay"] > 0.0
+
+
+#: The plant of the paper, with a zero of (f, d) -> y at 1/2: the higher the order, the less is seen of a fault.
+PAPER = DescriptorSystem(
+    [[1, 0, 0], [0, 0, 1], [0, 0, 0]], [[-5, 0, 0], [0, -2, 0], [0, -3, -1]], C=[[1, 0, 0], [0, 1, 0]],
+    Bf=[[1], [1], [1]], Bd=[[1], [0], [-1]],
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("model", [{"polynomial": 10}, {"sum": ["step", {"sinusoid": 1e-6}]}])
+def test_stability_is_proved_where_no_lyapunov_equation_can_be_solved(model: object) -> None:
+    assert ui_pi_observer(PAPER, fault_model=model).report["stability"].passed
+
+
+def test_a_fault_model_that_is_lost_in_rounding_is_no_fixed_mode() -> None:
+    options = {"fault_model": {"polynomial": 12}}
+    with pytest.raises(PreconditionError, match=r"order 13.*Lower its order") as error:
+        ui_pi_observer(PAPER, **options)
+    assert error.value.mode == pytest.approx(0.5, rel=1e-2)
+    assert not check(PAPER, {"ui-pi-observer": options})["ui-pi-observer"].passed

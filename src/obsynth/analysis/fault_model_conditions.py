@@ -139,6 +139,34 @@ def order_conditions(plant: DescriptorSystem, model: Exosystem, units: PlantUnit
     ]
 
 
+def lost_in_rounding(model: Exosystem, fault_names: tuple[str, ...], mode: complex, order: int) -> Condition:
+    """Return the failing condition for a mode that seems fixed and unstable, against all other conditions.
+
+    Parameters
+    ----------
+    model : Exosystem
+        Of the faults.
+    fault_names : tuple of str
+        All faults.
+    mode : complex, 1/s (dimensionless for sampled plants)
+        What the augmented pencil seems to hide.
+    order : int
+        Number of states of plant and fault model.
+    """
+    return Condition(
+        "fault model in double precision",
+        "no mode of plant and fault model seems hidden by rounding alone",
+        False,
+        order - 1.0,
+        float(order),
+        "ours: observable on paper is not enough",
+        f"plant and fault model (order {model.order}) seem to hide an unstable mode at {number(mode)}, which the "
+        "conditions above exclude: in double precision the model is too long a chain. Lower its order.",
+        mode=mode,
+        signals=fault_names,
+    )
+
+
 def _masking(scaled: NDArray[Any], plant: DescriptorSystem, width: int, shares: FloatArray) -> tuple[str, ...]:
     """Return the disturbances of a null vector; none where states alone already hide the fault."""
     without = scaled[:, : plant.nx + width]
