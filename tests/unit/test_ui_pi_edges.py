@@ -44,6 +44,12 @@ PAPER = DescriptorSystem(
 )  # fmt: skip
 
 
+def test_faults_that_only_hide_together_are_named_together() -> None:
+    plant = DescriptorSystem(None, TWO, C=np.eye(2), Bf=[[1, 1], [0, 0]], fault_names=["leak", "clog"])
+    with pytest.raises(PreconditionError, match="a combination of the faults 'leak', 'clog' can persist"):
+        ui_pi_observer(plant)
+
+
 @pytest.mark.parametrize("model", [{"polynomial": 10}, {"sum": ["step", {"sinusoid": 1e-6}]}])
 def test_stability_is_proved_where_no_lyapunov_equation_can_be_solved(model: object) -> None:
     assert ui_pi_observer(PAPER, fault_model=model).report["stability"].passed

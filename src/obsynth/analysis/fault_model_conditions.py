@@ -71,9 +71,14 @@ def _model_condition(plant: DescriptorSystem, model: Exosystem, value: complex, 
         disturbances = _masking(scaled, plant, width, shares)
         signals = (*faults, *disturbances)
         masked = f" is masked by the unknown input {', '.join(map(repr, disturbances))}" if disturbances else ""
+        who = (
+            f"the fault {faults[0]!r}"
+            if len(faults) == 1
+            else f"a combination of the faults {', '.join(map(repr, faults))}"
+        )
         detail += (
-            f": at {where} the fault {', '.join(map(repr, faults))}{masked or ' can persist'} without showing in any "
-            "output, so no observer can estimate it. Measure another signal, or leave one of them out."
+            f": at {where} {who}{masked or ' can persist'} without showing in any output, so no observer can estimate "
+            f"{'it' if len(faults) == 1 else 'them'}. Measure another signal, or leave one of them out."
         )
     return Condition(
         f"(D3) fault model at {number(own)}",

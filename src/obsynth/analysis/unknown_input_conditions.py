@@ -30,6 +30,7 @@ from obsynth.analysis.unknown_input_pencils import (
     independent_disturbances,
     instability,
     number,
+    numbers,
     system_pencil,
 )
 from obsynth.analysis.unknown_inputs import AugmentedPlant
@@ -165,7 +166,7 @@ def _fixed_modes(plant: DescriptorSystem, model: Exosystem, units: PlantUnits) -
     below = np.vstack([inputs, np.zeros((model.order, inputs.shape[1]))])
     drops = finite_zeros(*system_pencil(augmented.E, augmented.A, below, augmented.C, direct)).values
     zeros = units.eigenvalues(drops)
-    text = ", ".join(number(complex(value)) for value in zeros if value.imag >= 0.0)
+    text = ", ".join(numbers(zeros))
     # Rounding scatters a multiple mode around its mean.  (D2) and (D3) exclude an unstable one: it is no mode at all.
     bound = 1.0 if plant.dt > 0.0 else 0.0
     means = [np.mean(drops[np.abs(drops - value) <= SCATTER * max(1.0, abs(value))]) for value in drops]

@@ -24,7 +24,7 @@ import numpy as np
 
 from obsynth.analysis.conditions import Condition, require_all
 from obsynth.analysis.unknown_input_conditions import existence
-from obsynth.analysis.unknown_input_pencils import number
+from obsynth.analysis.unknown_input_pencils import number, numbers
 from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.models.exosystems import Exosystem, exosystem
@@ -231,7 +231,7 @@ def _notes(problem: PlacementProblem, asked: UiPiOptions, dt: float) -> tuple[st
     found = []
     fixed = problem.fixed_modes
     if fixed.size:
-        text = ", ".join(number(complex(value)) for value in fixed if value.imag >= 0.0)
+        text = ", ".join(numbers(fixed))
         rates = decay_rates(fixed, dt)
         slow = asked.slowest_asked(dt)
         found.append(
