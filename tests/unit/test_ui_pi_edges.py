@@ -61,3 +61,18 @@ def test_a_fault_model_that_is_lost_in_rounding_is_no_fixed_mode() -> None:
         ui_pi_observer(PAPER, **options)
     assert error.value.mode == pytest.approx(0.5, rel=1e-2)
     assert not check(PAPER, {"ui-pi-observer": options})["ui-pi-observer"].passed
+
+
+@pytest.mark.parametrize("region", [{"damping": 0.7}, {"damping": 0.7, "decay": None}, {"radius": 50.0}])
+def test_a_region_without_a_decay_is_no_reason_to_be_slow(region: dict[str, float]) -> None:
+    slowest = ui_pi_observer(PAPER, region=region).certificate.claims["decay"]
+    default = ui_pi_observer(PAPER).certificate.claims["decay"]
+    assert 0.2 * default < slowest < 2.0 * default
+    # Asked for, it is what least noise makes of it.
+    assert ui_pi_observer(PAPER, region={**region, "decay": 0}).certificate.claims["decay"] < 1e-3 * default
+
+
+def test_a_small_radius_is_kept_without_a_decay() -> None:
+    poles = np.linalg.eigvals(ui_pi_observer(PAPER, region={"radius": 1.0}).observer.Az)
+    assert np.max(np.abs(poles)) <= 1.0
+    assert np.max(poles.real) < -0.4

@@ -17,7 +17,7 @@ Our deviations
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -34,13 +34,16 @@ from obsynth.observers.linear import LinearObserver
 from obsynth.results.design import Certificate
 from obsynth.synthesis.lyapunov import lyapunov_factor
 from obsynth.synthesis.placement.eigenstructure import place
-from obsynth.synthesis.placement.kalman import compromise
+from obsynth.synthesis.placement.kalman import KalmanProblem, compromise
 from obsynth.synthesis.placement.region import Region, region_gain
 from obsynth.synthesis.result import Synthesis
 from obsynth.synthesis.ui_pi_noise import NoiseWeights, kalman_problem
 from obsynth.synthesis.ui_pi_options import UiPiOptions, checked_poles, plain
 from obsynth.synthesis.ui_pi_problem import PlacementProblem, placement_problem, with_faults
 from obsynth.synthesis.ui_pi_realisation import ObserverGains, combinations_seen, realise
+
+#: A region with a radius and no decay asks for at most this share of its radius.
+RADIUS_SHARE = 0.5
 
 
 def conditions(plant: DescriptorSystem, *, fault_model: Any = "step") -> tuple[Condition, ...]:
@@ -112,7 +115,7 @@ def _chosen(
     claims: dict[str, float] = {}
     runs: tuple[Mapping[str, Any], ...] = ()
     if region is not None:
-        gain, record = region_gain(kalman, region.in_time(time), solver=asked.solver)
+        gain, record = _in_region(kalman, region.in_time(time), problem.rate, asked)
         runs = (record,)
     elif asked.decay is not None:
         found = kalman.gain(time * asked.decay)
@@ -128,6 +131,25 @@ def _chosen(
             raise SolverError("The Riccati equation has no usable solution: give poles= or a slow decay=.")
         gain, claims = fair.K, {"noise_price": fair.price}
     return _Chosen(gain, None, claims, runs)
+
+
+def _in_region(
+    kalman: KalmanProblem, region: Region, rate: float, asked: UiPiOptions
+) -> tuple[FloatArray, dict[str, Any]]:
+    """Return a gain for the region; one without a decay gets that of the default, as far as that can be had.
+
+    Least noise alone would make an observer that hardly moves.
+    """
+    if asked.region.get("decay") is None:
+        fair = compromise(kalman, rate)
+        most = np.inf if region.radius is None else RADIUS_SHARE * region.radius
+        wanted = replace(region, decay=float(min(fair.decay, most)) if fair is not None else 0.0)
+        try:
+            return region_gain(kalman, wanted, solver=asked.solver)
+        except SolverError:
+            # What was asked may be possible all the same.
+            pass
+    return region_gain(kalman, region, solver=asked.solver)
 
 
 def _require_all(found: Sequence[Condition]) -> None:
