@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from obsynth import DescriptorSystem, ui_pi_observer
-from obsynth.errors import PreconditionError
+from obsynth.errors import PreconditionError, SpecError
 from obsynth.pipeline.designing import check
 
 TWO = [[-1.0, 1.0], [0.0, -2.0]]
@@ -76,3 +76,13 @@ def test_a_small_radius_is_kept_without_a_decay() -> None:
     poles = np.linalg.eigvals(ui_pi_observer(PAPER, region={"radius": 1.0}).observer.Az)
     assert np.max(np.abs(poles)) <= 1.0
     assert np.max(poles.real) < -0.4
+
+
+def test_noise_is_given_in_order_or_by_name() -> None:
+    plant = DescriptorSystem(None, TWO, C=np.eye(2), Bf=[[0], [1]], output_names=["flow", "level"])
+    by_name = ui_pi_observer(plant, noise={"measurement": {"level": 0.1, "flow": 2.0}})
+    for listed in ([2.0, 0.1], np.array([2.0, 0.1])):
+        in_order = ui_pi_observer(plant, noise={"measurement": listed})
+        np.testing.assert_array_equal(in_order.gains["K_a"], by_name.gains["K_a"])
+    with pytest.raises(SpecError, match="one number for each output"):
+        ui_pi_observer(plant, noise={"measurement": [2.0]})

@@ -53,8 +53,9 @@ def ui_pi_observer(
         where there are many (20), those that a Kalman gain of this rate has inside already stay there.  Without
         ``decay``: that of the default, where it can be had (at most half the radius).
     noise : mapping, optional
-        Weights of the Kalman gain: ``measurement`` (standard deviation, one or by output; the plant's own noise by
-        default), ``process`` and ``fault`` (drive of states and fault models, relative to the default, dimensionless).
+        Weights of the Kalman gain: ``measurement`` (standard deviation: one, a list, or by output; the plant's own
+        noise by default), ``process`` and ``fault`` (drive of states and fault models, relative to the default,
+        dimensionless).
     objective : {"conditioning", "gain"}, optional
         What to make of the freedom that ``poles`` leaves.
     joint : bool, optional
