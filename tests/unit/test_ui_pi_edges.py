@@ -86,3 +86,17 @@ def test_noise_is_given_in_order_or_by_name() -> None:
         np.testing.assert_array_equal(in_order.gains["K_a"], by_name.gains["K_a"])
     with pytest.raises(SpecError, match="one number for each output"):
         ui_pi_observer(plant, noise={"measurement": [2.0]})
+
+
+@pytest.mark.parametrize("size", [1.0, 0.3, 1e-3, -1.0])
+def test_a_pseudoinverse_that_loses_an_equation_is_refused_for_it(size: float) -> None:
+    # A coil, a capacitor across an ideal source (index 2), and a second coil with an unknown voltage.
+    plant = DescriptorSystem(
+        np.diag([1e-3, 1e-5, 0, 2e-3]), [[-2, 1, 0, 0], [-1, 0, -1, -1], [0, 1, 0, 0], [0, 1, 0, -3]],
+        C=[[1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], Bf=[[1], [0], [0], [0]], Bd=[[0], [0], [0], [1]],
+    )  # fmt: skip
+    inverse = np.linalg.pinv(np.vstack([plant.E, plant.C]))
+    given = {"E_sharp": inverse[:, :4], "C_sharp": inverse[:, 4:], "G": size * np.ones((4, 3))}
+    with pytest.raises(PreconditionError, match="fixed and not stable: U has lost rank"):
+        ui_pi_observer(plant, **given)
+    assert ui_pi_observer(plant).report.passed
