@@ -22,6 +22,7 @@ from obsynth.report.page import html_report
 from obsynth.results.report import VerificationReport
 from obsynth.spec import load_spec
 from obsynth.verification import verify
+from obsynth.verification.fault_tracking import fault_response
 
 ROOT = Path(__file__).parents[2]
 VOID = {"meta", "img", "br", "link"}
@@ -245,3 +246,22 @@ class TestPictures:
     def test_a_recursive_design_has_none(self, recursive):
         with pytest.raises(SpecError, match="no linear time-invariant observer"):
             plot_gains(recursive)
+
+
+@pytest.mark.parametrize("dt", [0.0, 0.1])
+def test_a_plant_that_is_not_regular_has_its_page_and_its_gains(dt: float, tmp_path: Path) -> None:
+    # Two equations are missing; what is measured stands in for them.  The third state moves freely.
+    plant = obsynth.DescriptorSystem(
+        E=[[1e-3, 0, 0], [0, 0, 0], [0, 0, 0]], A=[[-0.5e-3 if dt == 0.0 else 0.9e-3, 2.0, 0], [0, 0, 0], [0, 0, 0]],
+        B=[[1.0], [0], [0]], C=np.eye(3), Bf=[[1.0], [0], [0]], dt=dt,
+    )  # fmt: skip
+    design = obsynth.ui_pi_observer(plant)
+    assert html_report(design, tmp_path / "page.html").read_text().count("data:image/png") >= 3
+    for to in ("faults", "states"):
+        found = estimate_gains(design, to=to)
+        # The same by the way of the verification, which asks for no state of the plant.
+        if to == "faults":
+            expected = np.abs(fault_response(design, found.frequencies)[:, 0, 0])
+            np.testing.assert_allclose(found.gains["faults"], expected, rtol=1e-6, atol=1e-9)
+        else:
+            assert np.all(np.isfinite(found.gains["faults"]))

@@ -102,7 +102,7 @@ class TestSplit:
 
     def test_a_mode_that_the_pair_shows_is_refused(self) -> None:
         f, c = np.diag([-1.0, -2.0]), np.array([[1.0, 1.0]])
-        with pytest.raises(PreconditionError, match="Rescale"):
+        with pytest.raises(PreconditionError, match="rescale the plant"):
             observable_split(f, c, np.array([-1.0 + 0j]))
 
 

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from obsynth import DescriptorSystem, ui_pi_observer
+from obsynth.errors import PreconditionError, SpecError
+from obsynth.pipeline.designing import check
 
 TWO = [[-1.0, 1.0], [0.0, -2.0]]
 PLANTS = {
@@ -33,3 +35,68 @@ def test_it_is_designed_and_passes(name: str) -> None:
     assert design.report.passed
     assert design.report["decoupling"].value < 1e-8
     assert design.certificate.claims["decay"] > 0.0
+
+
+#: The plant of the paper, with a zero of (f, d) -> y at 1/2: the higher the order, the less is seen of a fault.
+PAPER = DescriptorSystem(
+    [[1, 0, 0], [0, 0, 1], [0, 0, 0]], [[-5, 0, 0], [0, -2, 0], [0, -3, -1]], C=[[1, 0, 0], [0, 1, 0]],
+    Bf=[[1], [1], [1]], Bd=[[1], [0], [-1]],
+)  # fmt: skip
+
+
+def test_faults_that_only_hide_together_are_named_together() -> None:
+    plant = DescriptorSystem(None, TWO, C=np.eye(2), Bf=[[1, 1], [0, 0]], fault_names=["leak", "clog"])
+    with pytest.raises(PreconditionError, match="a combination of the faults 'leak', 'clog' can persist"):
+        ui_pi_observer(plant)
+
+
+@pytest.mark.parametrize("model", [{"polynomial": 10}, {"sum": ["step", {"sinusoid": 1e-6}]}])
+def test_stability_is_proved_where_no_lyapunov_equation_can_be_solved(model: object) -> None:
+    assert ui_pi_observer(PAPER, fault_model=model).report["stability"].passed
+
+
+def test_a_fault_model_that_is_lost_in_rounding_is_no_fixed_mode() -> None:
+    options = {"fault_model": {"polynomial": 12}}
+    with pytest.raises(PreconditionError, match=r"order 13.*Lower its order") as error:
+        ui_pi_observer(PAPER, **options)
+    assert error.value.mode == pytest.approx(0.5, rel=1e-2)
+    assert not check(PAPER, {"ui-pi-observer": options})["ui-pi-observer"].passed
+
+
+@pytest.mark.parametrize("region", [{"damping": 0.7}, {"damping": 0.7, "decay": None}, {"radius": 50.0}])
+def test_a_region_without_a_decay_is_no_reason_to_be_slow(region: dict[str, float]) -> None:
+    slowest = ui_pi_observer(PAPER, region=region).certificate.claims["decay"]
+    default = ui_pi_observer(PAPER).certificate.claims["decay"]
+    assert 0.2 * default < slowest < 2.0 * default
+    # Asked for, it is what least noise makes of it.
+    assert ui_pi_observer(PAPER, region={**region, "decay": 0}).certificate.claims["decay"] < 1e-3 * default
+
+
+def test_a_small_radius_is_kept_without_a_decay() -> None:
+    poles = np.linalg.eigvals(ui_pi_observer(PAPER, region={"radius": 1.0}).observer.Az)
+    assert np.max(np.abs(poles)) <= 1.0
+    assert np.max(poles.real) < -0.4
+
+
+def test_noise_is_given_in_order_or_by_name() -> None:
+    plant = DescriptorSystem(None, TWO, C=np.eye(2), Bf=[[0], [1]], output_names=["flow", "level"])
+    by_name = ui_pi_observer(plant, noise={"measurement": {"level": 0.1, "flow": 2.0}})
+    for listed in ([2.0, 0.1], np.array([2.0, 0.1])):
+        in_order = ui_pi_observer(plant, noise={"measurement": listed})
+        np.testing.assert_array_equal(in_order.gains["K_a"], by_name.gains["K_a"])
+    with pytest.raises(SpecError, match="one number for each output"):
+        ui_pi_observer(plant, noise={"measurement": [2.0]})
+
+
+@pytest.mark.parametrize("size", [1.0, 0.3, 1e-3, -1.0])
+def test_a_pseudoinverse_that_loses_an_equation_is_refused_for_it(size: float) -> None:
+    # A coil, a capacitor across an ideal source (index 2), and a second coil with an unknown voltage.
+    plant = DescriptorSystem(
+        np.diag([1e-3, 1e-5, 0, 2e-3]), [[-2, 1, 0, 0], [-1, 0, -1, -1], [0, 1, 0, 0], [0, 1, 0, -3]],
+        C=[[1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], Bf=[[1], [0], [0], [0]], Bd=[[0], [0], [0], [1]],
+    )  # fmt: skip
+    inverse = np.linalg.pinv(np.vstack([plant.E, plant.C]))
+    given = {"E_sharp": inverse[:, :4], "C_sharp": inverse[:, 4:], "G": size * np.ones((4, 3))}
+    with pytest.raises(PreconditionError, match="fixed and not stable: U has lost rank"):
+        ui_pi_observer(plant, **given)
+    assert ui_pi_observer(plant).report.passed

@@ -71,9 +71,14 @@ def _model_condition(plant: DescriptorSystem, model: Exosystem, value: complex, 
         disturbances = _masking(scaled, plant, width, shares)
         signals = (*faults, *disturbances)
         masked = f" is masked by the unknown input {', '.join(map(repr, disturbances))}" if disturbances else ""
+        who = (
+            f"the fault {faults[0]!r}"
+            if len(faults) == 1
+            else f"a combination of the faults {', '.join(map(repr, faults))}"
+        )
         detail += (
-            f": at {where} the fault {', '.join(map(repr, faults))}{masked or ' can persist'} without showing in any "
-            "output, so no observer can estimate it. Measure another signal, or leave one of them out."
+            f": at {where} {who}{masked or ' can persist'} without showing in any output, so no observer can estimate "
+            f"{'it' if len(faults) == 1 else 'them'}. Measure another signal, or leave one of them out."
         )
     return Condition(
         f"(D3) fault model at {number(own)}",
@@ -137,6 +142,34 @@ def order_conditions(plant: DescriptorSystem, model: Exosystem, units: PlantUnit
             signals=() if decision.full else plant.fault_names,
         )
     ]
+
+
+def lost_in_rounding(model: Exosystem, fault_names: tuple[str, ...], mode: complex, order: int) -> Condition:
+    """Return the failing condition for a mode that seems fixed and unstable, against all other conditions.
+
+    Parameters
+    ----------
+    model : Exosystem
+        Of the faults.
+    fault_names : tuple of str
+        All faults.
+    mode : complex, 1/s (dimensionless for sampled plants)
+        What the augmented pencil seems to hide.
+    order : int
+        Number of states of plant and fault model.
+    """
+    return Condition(
+        "fault model in double precision",
+        "no mode of plant and fault model seems hidden by rounding alone",
+        False,
+        order - 1.0,
+        float(order),
+        "ours: observable on paper is not enough",
+        f"plant and fault model (order {model.order}) seem to hide an unstable mode at {number(mode)}, which the "
+        "conditions above exclude: in double precision the model is too long a chain. Lower its order.",
+        mode=mode,
+        signals=fault_names,
+    )
 
 
 def _masking(scaled: NDArray[Any], plant: DescriptorSystem, width: int, shares: FloatArray) -> tuple[str, ...]:

@@ -21,7 +21,7 @@ import numpy as np
 
 from obsynth.analysis.conditions import Condition
 from obsynth.analysis.decoupling_condition import SOURCE, decoupling_data, decoupling_rank, disturbance_rank
-from obsynth.analysis.fault_model_conditions import model_conditions, order_conditions
+from obsynth.analysis.fault_model_conditions import lost_in_rounding, model_conditions, order_conditions
 from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.transformations import Transformation
 from obsynth.analysis.unknown_input_pencils import (
@@ -30,6 +30,7 @@ from obsynth.analysis.unknown_input_pencils import (
     independent_disturbances,
     instability,
     number,
+    numbers,
     system_pencil,
 )
 from obsynth.analysis.unknown_inputs import AugmentedPlant
@@ -38,6 +39,9 @@ from obsynth.models.descriptor import DescriptorSystem
 from obsynth.models.exosystems import Exosystem
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.pencils import finite_zeros
+
+#: Drops of the augmented pencil this close to each other, relative to their size or one, may be one multiple mode.
+SCATTER = 1e-2
 
 __all__ = ["Existence", "decoupling_rank", "existence"]
 
@@ -160,8 +164,17 @@ def _fixed_modes(plant: DescriptorSystem, model: Exosystem, units: PlantUnits) -
     augmented = AugmentedPlant.of(plant, model)
     inputs, direct = independent_disturbances(plant)
     below = np.vstack([inputs, np.zeros((model.order, inputs.shape[1]))])
-    zeros = units.eigenvalues(finite_zeros(*system_pencil(augmented.E, augmented.A, below, augmented.C, direct)).values)
-    text = ", ".join(number(complex(value)) for value in zeros if value.imag >= 0.0)
+    drops = finite_zeros(*system_pencil(augmented.E, augmented.A, below, augmented.C, direct)).values
+    zeros = units.eigenvalues(drops)
+    text = ", ".join(numbers(zeros))
+    # Rounding scatters a multiple mode around its mean.  (D2) and (D3) exclude an unstable one: it is no mode at all.
+    bound = 1.0 if plant.dt > 0.0 else 0.0
+    means = [np.mean(drops[np.abs(drops - value) <= SCATTER * max(1.0, abs(value))]) for value in drops]
+    unstable = [mean for mean in means if instability(complex(mean), plant.dt) >= bound]
+    if unstable:
+        return zeros, lost_in_rounding(
+            model, plant.fault_names, units.eigenvalue(complex(unstable[0])), augmented.order
+        )
     return zeros, Condition(
         "fixed modes",
         "every pole that no gain moves is stable",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -14,11 +15,23 @@ from obsynth.numerics.scaling import equilibrate_pencil
 
 #: At most this many signals of a kind are named in a failed condition.
 MOST_NAMES = 4
+#: An imaginary part below this share of an eigenvalue is not shown: it would not change its printed digits.
+UNSEEN = 5e-7
 
 
 def number(value: complex) -> str:
     """Return a real or complex eigenvalue as text, a pair by its upper half."""
-    return f"{value.real:.6g}" if value.imag == 0.0 else f"{value.real:.6g} +- {abs(value.imag):.6g}j"
+    return f"{value.real:.6g}" if _looks_real(value) else f"{value.real:.6g} +- {abs(value.imag):.6g}j"
+
+
+def numbers(values: Iterable[complex]) -> list[str]:
+    """Return eigenvalues as text, each pair once: one that rounding has made of a double real one as two numbers."""
+    listed = [complex(value) for value in values]
+    return [number(value) for value in listed if value.imag >= 0.0 or _looks_real(value)]
+
+
+def _looks_real(value: complex) -> bool:
+    return abs(value.imag) <= UNSEEN * abs(value)
 
 
 def instability(value: complex, dt: float) -> float:

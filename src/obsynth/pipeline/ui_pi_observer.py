@@ -50,10 +50,12 @@ def ui_pi_observer(
         A Kalman gain all of whose movable poles decay at this rate or faster; 0 is the plain Kalman gain.
     region : mapping, optional
         ``decay`` (1/s), ``radius`` (1/s), ``damping`` (ratio): movable poles by a matrix inequality, with little noise;
-        where there are many (20), those that a Kalman gain of this rate has inside already stay there.
+        where there are many (20), those that a Kalman gain of this rate has inside already stay there.  Without
+        ``decay``: that of the default, where it can be had (at most half the radius).
     noise : mapping, optional
-        Weights of the Kalman gain: ``measurement`` (standard deviation, one or by output; the plant's own noise by
-        default), ``process`` and ``fault`` (drive of states and fault models, relative to the default, dimensionless).
+        Weights of the Kalman gain: ``measurement`` (standard deviation: one, a list, or by output; the plant's own
+        noise by default), ``process`` and ``fault`` (drive of states and fault models, relative to the default,
+        dimensionless).
     objective : {"conditioning", "gain"}, optional
         What to make of the freedom that ``poles`` leaves.
     joint : bool, optional

@@ -7,9 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from obsynth.analysis.unknown_input_pencils import equilibrated
 from obsynth.errors import SpecError
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.numerics.pencils import pencil_structure
+from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.numerics.spectra import boundary_points, response
 from obsynth.observers.linear import LinearObserver
 from obsynth.plotting.panels import WIDTH, new_panels, plain_decades, tidy
@@ -112,8 +115,19 @@ def _delayed(observer: LinearObserver, points: ComplexArray) -> ComplexArray:
 
 
 def _state_response(plant: DescriptorSystem, b: FloatArray, points: ComplexArray) -> ComplexArray:
+    """Return a state for each input: of a plant that is not regular one of many, which its estimates cannot tell."""
     pencils = points[:, None, None] * plant.E - plant.A
-    return np.asarray(np.linalg.solve(pencils, np.broadcast_to(b.astype(complex), (len(points), *b.shape))))
+    if pencil_structure(plant.E, plant.A).regular:
+        return np.asarray(np.linalg.solve(pencils, np.broadcast_to(b.astype(complex), (len(points), *b.shape))))
+    return np.stack([_least_state(pencil, b) for pencil in pencils])
+
+
+def _least_state(pencil: ComplexArray, b: FloatArray) -> ComplexArray:
+    """Return the least ``x`` with ``pencil x = b``, where each row and column has a size near one."""
+    nx = pencil.shape[1]
+    scaled, columns = equilibrated(np.hstack([pencil, b]))
+    found = np.linalg.pinv(scaled[:, :nx], rcond=RANK_TOLERANCE) @ scaled[:, nx:]
+    return np.asarray(columns[:nx, None] * found / columns[nx:])
 
 
 def plot_gains(design: ObserverDesign, *, to: str = "faults", axes: Axes | None = None) -> Axes:

@@ -57,7 +57,7 @@ class PoleRegion(Section):
 class NoiseSection(Section):
     """What the Kalman filter believes."""
 
-    measurement: Positive | dict[Text, Positive] | None = None
+    measurement: Positive | list[Positive] | dict[Text, Positive] | None = None
     process: Positive = 1.0
     fault: Positive = 1.0
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from itertools import product
+from functools import partial
+from itertools import chain, product
 
 import numpy as np
 
@@ -34,8 +35,9 @@ def lyapunov_factor(a: FloatArray, dt: float) -> FloatArray:
     edge = abscissa(a, dt)
     if n == 0 or not edge < (1.0 if dt > 0.0 else 0.0):
         return best
-    for rounds, share in product(range(1, ROUNDS + 1), SHARES):
-        found = _factor(a, dt, share, rounds, edge)
+    ways = (partial(_factor, a, dt, share, rounds, edge) for rounds, share in product(range(1, ROUNDS + 1), SHARES))
+    for way in chain(ways, [partial(_modal_factor, a)]):
+        found = way()
         if found is None:
             continue
         best = found
@@ -67,6 +69,23 @@ def _factor(a: FloatArray, dt: float, share: float, rounds: int, edge: float) ->
         if not np.all(np.isfinite(values)) or values[0] <= 0.0:
             return None
         change = change @ (vectors / np.sqrt(values))
+    return _triangular(change)
+
+
+def _modal_factor(a: FloatArray) -> FloatArray | None:
+    """Return the factor whose coordinates are the modes, from no equation: its accuracy does not suffer from P's size.
+
+    Fault models of high order, or with eigenvalues close to each other, have a P beyond double precision otherwise.
+    """
+    balance = balancing_factors(a)
+    values, vectors = np.linalg.eig(a * balance / balance[:, None])
+    # A pair has the real and the imaginary part of its eigenvector as coordinates.
+    modes = [vectors[:, values.imag >= 0.0].real, vectors[:, values.imag > 0.0].imag]
+    return _triangular(balance[:, None] * np.hstack(modes))
+
+
+def _triangular(change: FloatArray) -> FloatArray | None:
+    """Return the triangular factor of the Lyapunov function that is the sum of squares in these coordinates."""
     try:
         factor = np.triu(np.linalg.qr(np.linalg.inv(change), mode="r"))
     except np.linalg.LinAlgError:

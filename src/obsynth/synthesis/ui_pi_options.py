@@ -87,6 +87,12 @@ class UiPiOptions:
             if key in given and not (_is_number(given[key]) and given[key] > 0.0):
                 problems.append(f"{key} is {given[key]!r}: give a positive number.")
         measurement = given.get("measurement")
+        if isinstance(measurement, (list, tuple, np.ndarray)):
+            if np.shape(measurement) != (len(output_names),):
+                problems.append(f"measurement has shape {np.shape(measurement)}: give one number for each output.")
+                measurement = None
+            else:
+                measurement = given["measurement"] = dict(zip(output_names, measurement, strict=True))
         if isinstance(measurement, Mapping):
             missing = [name for name in output_names if name not in measurement]
             unknown = [name for name in measurement if name not in output_names]
@@ -96,7 +102,7 @@ class UiPiOptions:
         else:
             values = [] if measurement is None else [measurement]
         if not all(_is_number(value) and value > 0.0 for value in values):
-            problems.append("measurement must be positive standard deviations.")
+            problems.append("measurement must be positive standard deviations: one number, a list, or by output.")
         if problems:
             raise SpecError("Option noise of ui-pi-observer:", path=f"{_PATH}.noise", problems=problems)
         return NoiseWeights(**given)

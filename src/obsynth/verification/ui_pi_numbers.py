@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from obsynth.analysis.unknown_input_pencils import number
+from obsynth.analysis.unknown_input_pencils import numbers
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.spectra import abscissa, decay_rates, eigenvalues, noise_covariance, spectrum_error
 from obsynth.results.design import ObserverDesign
@@ -87,7 +87,7 @@ def _scatter(claimed: list[complex], decay: float) -> float:
 
 
 def _some(poles: list[complex], most: int = 8) -> str:
-    shown = [number(pole) for pole in sorted(poles, key=lambda pole: -pole.real) if pole.imag >= 0.0]
+    shown = numbers(sorted(poles, key=lambda pole: -pole.real))
     return "slowest " + ", ".join(shown[:most]) if shown else "none"
 
 

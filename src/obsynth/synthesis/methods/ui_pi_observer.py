@@ -17,14 +17,15 @@ Our deviations
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from obsynth.analysis.conditions import Condition, require_all
 from obsynth.analysis.unknown_input_conditions import existence
-from obsynth.analysis.unknown_input_pencils import number
+from obsynth.analysis.unknown_input_pencils import number, numbers
+from obsynth.analysis.zeros import is_outside
 from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.models.exosystems import Exosystem, exosystem
@@ -34,13 +35,16 @@ from obsynth.observers.linear import LinearObserver
 from obsynth.results.design import Certificate
 from obsynth.synthesis.lyapunov import lyapunov_factor
 from obsynth.synthesis.placement.eigenstructure import place
-from obsynth.synthesis.placement.kalman import compromise
+from obsynth.synthesis.placement.kalman import KalmanProblem, compromise
 from obsynth.synthesis.placement.region import Region, region_gain
 from obsynth.synthesis.result import Synthesis
 from obsynth.synthesis.ui_pi_noise import NoiseWeights, kalman_problem
 from obsynth.synthesis.ui_pi_options import UiPiOptions, checked_poles, plain
 from obsynth.synthesis.ui_pi_problem import PlacementProblem, placement_problem, with_faults
 from obsynth.synthesis.ui_pi_realisation import ObserverGains, combinations_seen, realise
+
+#: A region with a radius and no decay asks for at most this share of its radius.
+RADIUS_SHARE = 0.5
 
 
 def conditions(plant: DescriptorSystem, *, fault_model: Any = "step") -> tuple[Condition, ...]:
@@ -60,7 +64,8 @@ def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **op
     working = found.plant
     progress("decoupling the unknown inputs")
     problem = placement_problem(working, model, found.fixed_modes, joint=asked.joint, given=asked.given_decoupling())
-    _require_stable(problem.fixed_modes, working.dt)
+    if asked.G is not None:
+        _require_stable(problem)
     progress("choosing the gains")
     chosen = _chosen(asked, problem, region, weights, plant.dt)
     progress("building the realisation and its certificate")
@@ -112,7 +117,7 @@ def _chosen(
     claims: dict[str, float] = {}
     runs: tuple[Mapping[str, Any], ...] = ()
     if region is not None:
-        gain, record = region_gain(kalman, region.in_time(time), solver=asked.solver)
+        gain, record = _in_region(kalman, region.in_time(time), problem.rate, asked)
         runs = (record,)
     elif asked.decay is not None:
         found = kalman.gain(time * asked.decay)
@@ -128,6 +133,25 @@ def _chosen(
             raise SolverError("The Riccati equation has no usable solution: give poles= or a slow decay=.")
         gain, claims = fair.K, {"noise_price": fair.price}
     return _Chosen(gain, None, claims, runs)
+
+
+def _in_region(
+    kalman: KalmanProblem, region: Region, rate: float, asked: UiPiOptions
+) -> tuple[FloatArray, dict[str, Any]]:
+    """Return a gain for the region; one without a decay gets that of the default, as far as that can be had.
+
+    Least noise alone would make an observer that hardly moves.
+    """
+    if asked.region.get("decay") is None:
+        fair = compromise(kalman, rate)
+        most = np.inf if region.radius is None else RADIUS_SHARE * region.radius
+        wanted = replace(region, decay=float(min(fair.decay, most)) if fair is not None else 0.0)
+        try:
+            return region_gain(kalman, wanted, solver=asked.solver)
+        except SolverError:
+            # What was asked may be possible all the same.
+            pass
+    return region_gain(kalman, region, solver=asked.solver)
 
 
 def _require_all(found: Sequence[Condition]) -> None:
@@ -147,9 +171,11 @@ def _require_all(found: Sequence[Condition]) -> None:
         ) from None
 
 
-def _require_stable(modes: ComplexArray, dt: float) -> None:
+def _require_stable(problem: PlacementProblem) -> None:
     """Raise when a mode that no gain moves is not stable: only a given ``E#`` or ``G`` can bring one in."""
-    unstable = [complex(value) for value in modes if not decay_rates([complex(value)], dt)[0] > 0.0]
+    # On the boundary within rounding is not stable either: an equation that is lost leaves a mode at zero.
+    modes = zip(problem.split.fixed_modes, problem.fixed_modes, strict=True)
+    unstable = [complex(own) for scaled, own in modes if is_outside(complex(scaled), problem.plant.dt)]
     if unstable:
         raise PreconditionError(
             f"With these E_sharp, C_sharp and G the mode {number(unstable[0])} is fixed and not stable: U has lost "
@@ -231,7 +257,7 @@ def _notes(problem: PlacementProblem, asked: UiPiOptions, dt: float) -> tuple[st
     found = []
     fixed = problem.fixed_modes
     if fixed.size:
-        text = ", ".join(number(complex(value)) for value in fixed if value.imag >= 0.0)
+        text = ", ".join(numbers(fixed))
         rates = decay_rates(fixed, dt)
         slow = asked.slowest_asked(dt)
         found.append(

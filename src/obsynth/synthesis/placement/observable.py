@@ -93,8 +93,8 @@ def observable_split(f: FloatArray, c: FloatArray, fixed_modes: ComplexArray) ->
         found = kernel.shape[1] // (2 if value.imag > 0.0 else 1)
         if found == 0 or found > len(cluster):
             raise PreconditionError(
-                f"The mode {value:.6g} is fixed by the plant's zeros, but the pair (U A, C) shows it: the data are too "
-                "badly scaled to tell. Rescale the plant, or lower the order of the fault model.",
+                f"By the zeros of plant and fault model {value:.6g} is a fixed mode, but the pair (U A, C) shows it: "
+                "double precision cannot tell. Lower the order of the fault model, or rescale the plant.",
                 condition="fixed modes",
                 mode=value,
             )
