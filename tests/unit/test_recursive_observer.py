@@ -100,6 +100,25 @@ class TestMissingSamples:
         np.testing.assert_allclose(found.parameter_covariances[-1], covariance[3:, 3:], rtol=0, atol=1e-10)
 
 
+def test_outputs_that_determine_the_state_end_a_gap_of_several_samples() -> None:
+    """A rectangular plant: one equation for two states, of which a gap leaves both open."""
+    plant = TimeVaryingDescriptorSystem(E=[[1, 0.5]], A=[["0.8 + 0.1 * cos(0.3 * k)", 0.1]], C=[[0, 1], [1, 1]], dt=1.0)
+    observer = observer_for(plant)
+    y = np.random.default_rng(5).standard_normal((12, 2))
+    y[8:10] = np.nan
+    found = observer.run(y)
+    assert np.isinf(found.state_deviations[8:10]).all()
+    # At k = 10 the state is what the outputs alone say, C^-1 y(10); from there the gap is forgotten.
+    np.testing.assert_allclose(found.states[10], np.linalg.solve(plant.C.at(10), y[10]), atol=1e-13)
+    alone = np.linalg.inv(plant.C.at(10)) @ observer.R.at(10) @ np.linalg.inv(plant.C.at(10)).T
+    np.testing.assert_allclose(found.state_deviations[10], np.sqrt(np.diag(alone)), rtol=1e-13)
+    H = np.vstack([plant.E.at(11), plant.C.at(11)])
+    A = plant.A.at(10)
+    before = np.block([[A @ alone @ A.T + observer.Q.at(10), np.zeros((1, 2))], [np.zeros((2, 1)), observer.R.at(11)]])
+    last = np.linalg.inv(H.T @ np.linalg.solve(before, H))
+    np.testing.assert_allclose(found.state_deviations[11], np.sqrt(np.diag(last)), rtol=1e-12)
+
+
 def test_steps_are_the_run() -> None:
     plant = varying()
     observer, (y, u) = observer_for(plant, adapt={"window": 3}), record(plant, SAMPLES)
