@@ -306,3 +306,13 @@ def test_early_constraints_and_parameters_that_stand_still() -> None:
     squares = observer_for(plant, adapt={"forgetting": 1.0}, early_constraints=True).run(*data)
     np.testing.assert_allclose(still.parameters, squares.parameters, rtol=0, atol=1e-12)
     np.testing.assert_allclose(still.states, squares.states, rtol=0, atol=1e-12)
+
+
+def test_a_masked_sample_is_a_missing_one() -> None:
+    observer, (y, u) = observer_for(varying()), record(varying(), SAMPLES)
+    masked = np.ma.masked_array(y, mask=np.zeros_like(y, dtype=bool))
+    masked[4], masked[6, 0] = np.ma.masked, np.ma.masked
+    y[4], y[6, 0] = np.nan, np.nan
+    np.testing.assert_array_equal(observer.run(masked, u).states, observer.run(y, u).states)
+    with pytest.raises(SpecError, match="u has nan in row 3"):
+        observer.run(y, np.ma.masked_array(u, mask=np.arange(SAMPLES)[:, None] == np.full((1, u.shape[1]), 2)))
