@@ -260,7 +260,7 @@ class TestRanks:
         np.testing.assert_allclose(again.estimate, exact[:3], atol=1e-14)
 
     def test_earlier_unknowns_alone_leave_nothing_open(self) -> None:
-        # Two earlier unknowns in one equation; the outputs determine x. What is left open is not in x, but for rounding.
+        # Two earlier unknowns in one equation; the outputs determine x: what is left open in it is rounding.
         H, S = np.array([[1.0, 0.5], [0, 1], [1, 1]]), np.eye(3)
         unknown = np.array([[0.7, 0.1], [0, 0], [0, 0]])
         found = rank_revealing_step(H, S, np.array([[0.3], [1.0], [2.0]]), unknown)

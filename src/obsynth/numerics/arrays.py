@@ -22,7 +22,9 @@ def read_only(array: FloatArray) -> FloatArray:
 
 def unmasked(value: Any) -> Any:
     """Return masked numbers with NaN for what lies under the mask, and anything else as it is."""
-    return value.astype(np.float64).filled(np.nan) if np.ma.isMaskedArray(value) and value.dtype.kind in "fiu" else value
+    if not np.ma.isMaskedArray(value) or value.dtype.kind not in "fiu":
+        return value
+    return np.where(np.ma.getmaskarray(value), np.nan, np.ma.getdata(value))
 
 
 def as_matrix(value: Any, name: str) -> FloatArray:
