@@ -316,3 +316,10 @@ class TestReset:
             observer_for(varying(), adapt={"form": "random-walk", "reset": 0.01})
         with pytest.raises(SpecError, match="run them one by one"):
             run_batch(observer_for(varying(), adapt={"reset": 0.01}), np.zeros((2, 5, 2)), np.zeros((5, 1)))
+
+
+def test_the_random_walk_has_no_regressors_to_report_an_excitation_of() -> None:
+    """Zero would say that nothing is excited."""
+    plant = varying()
+    found = observer_for(plant, adapt={"form": "random-walk", "walk": 1e-3 * np.eye(plant.nq)}).run(*record(plant, 9))
+    assert np.isnan(found.excitation).all()

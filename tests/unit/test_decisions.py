@@ -192,3 +192,22 @@ def test_a_reset_forgets_the_start_at_times_that_data_choose() -> None:
     with pytest.raises(SpecError, match="chi-square with reset"):
         decide(observer, found, nominal=[0.0, 0.0])
     assert decide(observer, found, nominal=[0.0, 0.0], statistic="glr", false_alarms=0.05).alarm is None
+
+
+def test_the_glr_where_excitation_dies_out() -> None:
+    """The information on a change sinks below what double precision holds; no warning, and no alarm."""
+    plant = TimeVaryingDescriptorSystem(None, [["0.5 + 0 * k"]], C=[[1]], Phi=[["exp(-k)"]], dt=1.0)
+    observer = observer_for(plant, adapt={})
+    y = np.random.default_rng(4).standard_normal((760, 1)) * 0.5
+    found = decide(observer, observer.run(y), statistic="glr")
+    assert found.alarm is None
+    assert np.isfinite(found.values).all()
+    assert found.values[:300].max() > 0.1
+    assert (found.values[-10:] == 0.0).all()
+
+
+def test_estimates_of_another_observer() -> None:
+    one, other = observer_for(varying(), adapt={}), observer_for(textbook(), adapt={})
+    found = other.run(np.zeros((5, other.plant.ny)), np.zeros((5, other.plant.nu)))
+    with pytest.raises(SpecError, match="other states or parameters"):
+        decide(one, found)

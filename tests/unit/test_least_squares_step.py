@@ -259,6 +259,14 @@ class TestRanks:
         exact = np.linalg.inv(np.hstack([np.eye(4)[:, :3], -np.vstack([found.diffuse, [[1.0]]])])) @ data
         np.testing.assert_allclose(again.estimate, exact[:3], atol=1e-14)
 
+    def test_earlier_unknowns_alone_leave_nothing_open(self) -> None:
+        # Two earlier unknowns in one equation; the outputs determine x: what is left open in it is rounding.
+        H, S = np.array([[1.0, 0.5], [0, 1], [1, 1]]), np.eye(3)
+        unknown = np.array([[0.7, 0.1], [0, 0], [0, 0]])
+        found = rank_revealing_step(H, S, np.array([[0.3], [1.0], [2.0]]), unknown)
+        assert found.diffuse.shape == (2, 0)
+        np.testing.assert_allclose(found.estimate[:, 0], [1.0, 1.0], atol=1e-14)
+
     def test_redundant_perfect_rows_are_dropped_when_they_agree(self) -> None:
         H = np.array([[1.0, 0], [0, 1], [1, 1], [2, 2]])
         S = np.diag([1.0, 1, 0, 0])

@@ -100,6 +100,25 @@ class TestMissingSamples:
         np.testing.assert_allclose(found.parameter_covariances[-1], covariance[3:, 3:], rtol=0, atol=1e-10)
 
 
+def test_outputs_that_determine_the_state_end_a_gap_of_several_samples() -> None:
+    """A rectangular plant: one equation for two states, of which a gap leaves both open."""
+    plant = TimeVaryingDescriptorSystem(E=[[1, 0.5]], A=[["0.8 + 0.1 * cos(0.3 * k)", 0.1]], C=[[0, 1], [1, 1]], dt=1.0)
+    observer = observer_for(plant)
+    y = np.random.default_rng(5).standard_normal((12, 2))
+    y[8:10] = np.nan
+    found = observer.run(y)
+    assert np.isinf(found.state_deviations[8:10]).all()
+    # At k = 10 the state is what the outputs alone say, C^-1 y(10); from there the gap is forgotten.
+    np.testing.assert_allclose(found.states[10], np.linalg.solve(plant.C.at(10), y[10]), atol=1e-13)
+    alone = np.linalg.inv(plant.C.at(10)) @ observer.R.at(10) @ np.linalg.inv(plant.C.at(10)).T
+    np.testing.assert_allclose(found.state_deviations[10], np.sqrt(np.diag(alone)), rtol=1e-13)
+    H = np.vstack([plant.E.at(11), plant.C.at(11)])
+    A = plant.A.at(10)
+    before = np.block([[A @ alone @ A.T + observer.Q.at(10), np.zeros((1, 2))], [np.zeros((2, 1)), observer.R.at(11)]])
+    last = np.linalg.inv(H.T @ np.linalg.solve(before, H))
+    np.testing.assert_allclose(found.state_deviations[11], np.sqrt(np.diag(last)), rtol=1e-12)
+
+
 def test_steps_are_the_run() -> None:
     plant = varying()
     observer, (y, u) = observer_for(plant, adapt={"window": 3}), record(plant, SAMPLES)
@@ -287,3 +306,13 @@ def test_early_constraints_and_parameters_that_stand_still() -> None:
     squares = observer_for(plant, adapt={"forgetting": 1.0}, early_constraints=True).run(*data)
     np.testing.assert_allclose(still.parameters, squares.parameters, rtol=0, atol=1e-12)
     np.testing.assert_allclose(still.states, squares.states, rtol=0, atol=1e-12)
+
+
+def test_a_masked_sample_is_a_missing_one() -> None:
+    observer, (y, u) = observer_for(varying()), record(varying(), SAMPLES)
+    masked = np.ma.masked_array(y, mask=np.zeros_like(y, dtype=bool))
+    masked[4], masked[6, 0] = np.ma.masked, np.ma.masked
+    y[4], y[6, 0] = np.nan, np.nan
+    np.testing.assert_array_equal(observer.run(masked, u).states, observer.run(y, u).states)
+    with pytest.raises(SpecError, match="u has nan in row 3"):
+        observer.run(y, np.ma.masked_array(u, mask=np.arange(SAMPLES)[:, None] == np.full((1, u.shape[1]), 2)))

@@ -117,3 +117,20 @@ def test_a_stack_is_nothing_for_a_plant_that_does_not_change(tmp_path: Path) -> 
     path.write_text(json.dumps(document))
     with pytest.raises(SpecError, match=r"plant.A: row 1, column 1 must be a number, not"):
         load_spec(path)
+
+
+class TestOneVariance:
+    """A number stands for that multiple of the identity, in a spec as from Python."""
+
+    def test_it_is_the_matrix(self, tmp_path: Path) -> None:
+        number = designed(spec(tmp_path, Q=0.3, R=0.2))
+        matrix = designed(spec(tmp_path, Q=[[0.3, 0], [0, 0.3]]))
+        y = np.random.default_rng(1).standard_normal((STEPS + 1, 2))
+        np.testing.assert_array_equal(number.observer.run(y).states, matrix.observer.run(y).states)
+
+    def test_zero_is_one_and_what_is_none_is_refused(self, tmp_path: Path) -> None:
+        assert load_spec(spec(tmp_path, Q=0)).options["Q"] == 0
+        with pytest.raises(SpecError) as caught:
+            load_spec(spec(tmp_path, Q=-1, R=True, window=3))
+        assert "method.options.Q: must be at least 0, not the number -1." in str(caught.value)
+        assert "method.options.R: must be a list of rows" in str(caught.value)

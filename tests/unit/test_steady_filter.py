@@ -122,3 +122,10 @@ def test_an_exact_output_may_hide_the_noise() -> None:
     with pytest.raises(PreconditionError, match="at z = 1 the noise does not act"):
         steady_state_filter(plant, Q=np.diag([0.0, 1]), R=[[0.0]])
     assert steady_state_filter(plant, Q=np.diag([0.0, 1]), R=[[1.0]]).rate < 1.0
+
+
+def test_a_number_is_that_multiple_of_the_identity() -> None:
+    plant = DescriptorSystem(E=np.eye(2), A=[[0.9, 0.1], [0.0, 0.5]], C=[[1.0, 0.0]], dt=1.0)
+    number = steady_state_filter(plant, Q=0.01, R=0.1)
+    matrix = steady_state_filter(plant, Q=0.01 * np.eye(2), R=[[0.1]])
+    np.testing.assert_array_equal(number.P, matrix.P)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import FloatArray, unmasked
 
 
 def real_number(value: Any, name: str, what: str = "a number") -> float:
@@ -45,9 +45,12 @@ def real_vector(value: Any, size: int, name: str) -> FloatArray:
 
 
 def real_array(value: Any, name: str) -> FloatArray:
-    """Return real numbers of any shape, NaN and infinities among them; raise `SpecError` for anything else."""
+    """Return real numbers of any shape, NaN and infinities among them; raise `SpecError` for anything else.
+
+    Masked entries become NaN: what lies under a mask is no number.
+    """
     try:
-        raw = np.asarray(value)
+        raw = np.asarray(unmasked(value))
     except (TypeError, ValueError):
         raise SpecError(f"{name} has rows of different lengths.", path=name) from None
     if raw.dtype.kind not in "fiu" and raw.size:

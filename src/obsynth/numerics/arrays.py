@@ -20,6 +20,13 @@ def read_only(array: FloatArray) -> FloatArray:
     return copy
 
 
+def unmasked(value: Any) -> Any:
+    """Return masked numbers with NaN for what lies under the mask, and anything else as it is."""
+    if not np.ma.isMaskedArray(value) or value.dtype.kind not in "fiu":
+        return value
+    return np.where(np.ma.getmaskarray(value), np.nan, np.ma.getdata(value))
+
+
 def as_matrix(value: Any, name: str) -> FloatArray:
     """Convert nested lists or an array to a finite, read-only matrix; raise `SpecError` naming it.
 
@@ -27,7 +34,7 @@ def as_matrix(value: Any, name: str) -> FloatArray:
     infinities are refused.
     """
     try:
-        raw = np.asarray(value)
+        raw = np.asarray(unmasked(value))
     except ValueError:
         raise SpecError(f"{name} has rows of different lengths: give a full matrix.", path=name) from None
     if raw.dtype.kind not in "fiu":

@@ -194,19 +194,23 @@ def rank_revealing_step(
     if rank and null.shape[1]:
         null[order[:rank]] = -solve_triangular(head, r[:rank, rank:])
     null[order[rank:]] = np.eye(null.shape[1])
-    back, null = back / lengths[:, None], null / lengths[:, None]
+    back = back / lengths[:, None]
     found, factor = back[:n, Y.shape[1] :], np.zeros((n, n))
     compact = qr(found.T, mode="r")[0][:n].T if found.size else found
     factor[:, : compact.shape[1]] = compact
-    return LeastSquaresStep(back[:n, : Y.shape[1]], factor, innovation, _basis(null[:n]))
+    return LeastSquaresStep(back[:n, : Y.shape[1]], factor, innovation, _basis(null, lengths[:n]))
 
 
-def _basis(null: FloatArray) -> FloatArray:
-    """Return an orthonormal basis of what the null space leaves open in x."""
+def _basis(null: FloatArray, lengths: FloatArray) -> FloatArray:
+    """Return an orthonormal basis of what the null space leaves open in x, beside the earlier unknowns.
+
+    Where those alone are left open, the part of x is rounding, which must not pass for a direction.
+    """
+    n = len(lengths)
     if not null.shape[1]:
-        return null
-    left, values, _ = np.linalg.svd(null, full_matrices=False)
-    return np.asarray(left[:, values > RANK_TOLERANCE * max(float(values[0]), np.finfo(np.float64).tiny)])
+        return np.zeros((n, 0))
+    left, values, _ = np.linalg.svd(np.linalg.qr(null)[0][:n], full_matrices=False)
+    return np.asarray(np.linalg.qr(left[:, values > RANK_TOLERANCE] / lengths[:, None])[0])
 
 
 def _whitened(

@@ -59,7 +59,8 @@ def decide(
     Raises
     ------
     SpecError
-        The statistic is unknown or does not go with the observer's form, or an option is out of range.
+        The statistic is unknown or does not go with the observer's form, an option is out of range, or the estimates
+        are of another observer.
     """
     adaptation = observer.adaptation
     chosen(statistic, "statistic", STATISTICS)
@@ -80,6 +81,9 @@ def decide(
     size = np.broadcast_to(size, (nq,)) if size.ndim == 0 else size
     if size.shape != (nq,) or not ((size > 0.0) & (size < np.inf)).all():
         raise SpecError(f"change must be one positive number, or {nq}.", path="change")
+    if (estimates.state_names, estimates.parameter_names) != (observer.state_names, observer.fault_names):
+        raise SpecError("The estimates are of other states or parameters than this observer's: give the run of this "
+                        "very observer.", path="estimates")  # fmt: skip
     if not len(estimates.states):
         return Decision(statistic, read_only(np.zeros(0)), read_only(np.zeros(0)), None)
     if statistic == "chi-square":

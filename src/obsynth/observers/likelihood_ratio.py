@@ -15,6 +15,8 @@ from obsynth.observers.recursive_estimates import RecursiveEstimates
 GLR_WINDOW = 40
 #: Correlated looks count as this share of independent ones: measured false-alarm rates stay below what is asked.
 GLR_LOOKS = 1.0 / 4.0
+#: Information below this (parameter units to the power -2) has lost digits to underflow: as good as none.
+SMALLEST_INFORMATION = float(np.finfo(np.float64).tiny / np.finfo(np.float64).eps)
 
 
 def pull_of_the_start(observer: RecursiveObserver, estimates: RecursiveEstimates, error: FloatArray) -> FloatArray:
@@ -88,8 +90,7 @@ def likelihood_ratio(
         information = np.concatenate([information, np.zeros((1, nq, nq))])[-GLR_WINDOW:] + G.transpose(0, 2, 1) @ G
         scores = np.concatenate([scores, np.zeros((1, nq))])[-GLR_WINDOW:] + gaps[k][: G.shape[1]] @ G
         signatures = gains.gain @ right
-        jumps = (np.linalg.pinv(information, hermitian=True) @ scores[:, :, None])[:, :, 0]
-        found = np.einsum("oq,oq->o", scores, jumps)
+        found = _doubled_log_ratios(information, scores)
         best = int(np.argmax(found))
         values[k] = found[best]
         if alarm is None and values[k] > threshold:
@@ -97,3 +98,16 @@ def likelihood_ratio(
             name = estimates.parameter_names[alone(scores[best], np.diag(information[best]))]
             alarm = Alarm(k, name, max(k + 1 - len(found), begin) + best, confidence, float(values[k]))
     return Decision("glr", read_only(values), read_only(np.full(samples, threshold)), alarm)
+
+
+def _doubled_log_ratios(information: FloatArray, scores: FloatArray) -> FloatArray:
+    """Return ``s' M^+ s`` of each onset; zero where a change leaves less than double precision resolves.
+
+    Each information is scaled first: where excitation dies out it underflows, and its inverse would overflow.
+    """
+    sizes = np.einsum("oqq->oq", information).max(axis=1, initial=0.0)
+    felt = sizes > SMALLEST_INFORMATION
+    squares = np.where(felt, sizes, np.inf)
+    scaled = scores / np.sqrt(squares)[:, None]
+    inverses = np.linalg.pinv(information / squares[:, None, None], hermitian=True)
+    return np.asarray(np.einsum("oq,oqr,or->o", scaled, inverses, scaled))

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import real_array
-from obsynth.numerics.arrays import FloatArray, as_matrix
+from obsynth.numerics.arrays import FloatArray, as_matrix, unmasked
 
 
 def require_horizon(horizon: int | None, samples: int, *, early: bool) -> None:
@@ -45,7 +45,7 @@ def checked_record(value: Any, columns: int, name: str) -> FloatArray:
     """Return a record ``(samples, columns)`` of finite numbers."""
     if value is None:
         raise SpecError(f"{name} is missing: the observer needs {columns} signal(s).", path=name)
-    raw = np.asarray(value)
+    raw = np.asarray(unmasked(value))
     array = np.zeros((len(raw), 0)) if raw.ndim == 2 and raw.shape[1] == 0 else None
     if array is None:
         array = as_matrix(raw.reshape(-1, 1) if raw.ndim == 1 and columns == 1 else raw, name)

@@ -43,7 +43,8 @@ class RecursiveEstimates:
         ``(samples,)``: its degrees of freedom, not counting the parameters.
     excitation : FloatArray
         ``(samples,)``: least eigenvalue of the information on the parameters in the last `window` samples, in
-        parameter units to the power -2; (26) asks that it stays above some alpha > 0.  Zero while the window fills.
+        parameter units to the power -2; (26) asks that it stays above some alpha > 0.  Zero while the window fills;
+        NaN for the random walk, which has no regressors (`certificate.claims` hold the least level).
     state_names, parameter_names : tuple of str
         Names of the columns.
     received : numpy.ndarray
@@ -90,6 +91,8 @@ class RecursiveEstimates:
             if window is None
             else excitation_levels(list(window), length)[-len(rows) :]
         )
+        if observer.adaptation is not None and observer.adaptation.form == "random-walk":
+            levels = np.full(len(rows), np.nan)
         nx, nq = observer.plant.nx, len(observer.fault_names)
         most = max((len(row.innovation) for row in rows), default=0)
         innovations, padded = np.full((len(rows), most), np.nan), np.full((len(rows), most, nq), np.nan)

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from obsynth.spec.schema import Matrix, Positive, Section, Text, VaryingMatrix
+from obsynth.spec.schema import Covariance, Matrix, Positive, Section, Text, VaryingCovariance
 
 
 class FaultEstimationFilterOptions(Section):
@@ -81,10 +81,10 @@ class UiPiObserverOptions(Section):
 class DescriptorKalmanOptions(Section):
     """Options of the method ``descriptor-kalman``."""
 
-    Q: VaryingMatrix | None = None
-    R: VaryingMatrix | None = None
+    Q: VaryingCovariance | None = None
+    R: VaryingCovariance | None = None
     initial_state: list[float] | None = None
-    initial_covariance: Matrix | None = None
+    initial_covariance: Covariance | None = None
     early_constraints: bool = False
 
 
@@ -94,9 +94,9 @@ class AdaptiveObserverOptions(DescriptorKalmanOptions):
     forgetting: Annotated[float, Field(gt=0.0, le=1.0)] = 0.98
     form: Literal["innovation", "literal", "random-walk"] = "innovation"
     guard: Literal["regularise", "directional", "none"] | None = None
-    random_walk: Matrix | None = None
+    random_walk: Covariance | None = None
     initial_parameters: list[float] | None = None
-    initial_parameter_covariance: Matrix | None = None
+    initial_parameter_covariance: Covariance | None = None
     window: Annotated[int, Field(ge=1)] = 50
     reset: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0
 

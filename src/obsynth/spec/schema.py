@@ -25,7 +25,7 @@ SCHEMA_VERSION = 1
 
 # Tags of unions appear in the locations of pydantic's errors; the bracket marks them for removal.
 _ROWS, _FILE, _PICK, _LIST, _INLINE, _VARYING = "<rows>", "<file>", "<pick>", "<list>", "<inline>", "<varying>"
-_ONE, _STACK = "<one>", "<stack>"
+_ONE, _STACK, _NUMBER = "<one>", "<stack>", "<number>"
 _NONLINEAR = "<dae>"
 
 
@@ -165,6 +165,26 @@ def _kind_of_varying(value: Any) -> str:
 
 
 VaryingMatrix = Annotated[VaryingRows | Stack | Annotated[VaryingFile, Tag(_FILE)], Discriminator(_kind_of_varying)]
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def _kind_of_covariance(value: Any) -> str:
+    return _NUMBER if _is_number(value) else _kind_without_pick(value)
+
+
+def _kind_of_varying_covariance(value: Any) -> str:
+    return _NUMBER if _is_number(value) else _kind_of_varying(value)
+
+
+Variance = Annotated[float, Field(ge=0.0), Tag(_NUMBER)]
+#: One variance stands for that multiple of the identity, as from Python.
+Covariance = Annotated[Variance | Rows | Annotated[MatrixFile, Tag(_FILE)], Discriminator(_kind_of_covariance)]
+VaryingCovariance = Annotated[
+    Variance | VaryingRows | Stack | Annotated[VaryingFile, Tag(_FILE)], Discriminator(_kind_of_varying_covariance)
+]
 
 
 class TransformSection(Section):

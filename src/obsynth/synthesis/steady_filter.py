@@ -65,7 +65,7 @@ def steady_state_filter(
     plant : DescriptorSystem or TimeVaryingDescriptorSystem
         Time-invariant, discrete; ``E (ne, nx)``, ``C (ny, nx)``.
     Q, R : array_like
-        ``(ne, ne)`` and ``(ny, ny)``; may be singular.
+        ``(ne, ne)`` and ``(ny, ny)``, may be singular; a number stands for that multiple of the identity.
 
     Returns
     -------
@@ -97,6 +97,10 @@ def steady_state_filter(
         raise SpecError("The plant changes with k: it has no steady state.", path="plant")
     require_all(recursive_conditions(varying, parameters=False))
     q, r = as_matrix(Q, "Q"), as_matrix(R, "R")
+    q, r = (
+        float(found[0, 0]) * np.eye(size) if np.ndim(given) == 0 else found
+        for given, found, size in ((Q, q, varying.ne), (R, r, varying.ny))
+    )
     for name, matrix, size in (("Q", q, varying.ne), ("R", r, varying.ny)):
         if matrix.shape != (size, size):
             raise SpecError(f"{name} is {matrix.shape}, but {(size, size)} is needed.", path=name)
