@@ -15,7 +15,7 @@ from obsynth.evaluation.parameter_rules import PARAMETER_KINDS, ParameterRule
 from obsynth.evaluation.residual_model import ResidualModel, residual_model
 from obsynth.evaluation.thresholds import scaled_inputs
 from obsynth.evaluation.watching import bounds_of, require_options
-from obsynth.evaluation.whitening import innovation_whitener, steady_mean, whitener_of, window_covariance
+from obsynth.evaluation.whitening import cusum_whitener, steady_mean, whitener_of, window_covariance
 from obsynth.models.names import index_of
 from obsynth.numerics.arguments import is_finite_number, require_kind, require_mapping
 from obsynth.numerics.arrays import FloatArray
@@ -168,11 +168,14 @@ def _whitened(
             f"{kind} needs to know what disturbances are to be expected: give a scenario (a spec with one), or use "
             "pointwise with disturbance bounds.", path="disturbances",
         )  # fmt: skip
-    covariance = window_covariance(model, window)
-    whitener = whitener_of(covariance) if kind == "chi-square" else innovation_whitener(covariance, len(model.C))
+    white = True
+    if kind == "chi-square":
+        whitener = whitener_of(window_covariance(model, window))
+    else:
+        whitener, white = cusum_whitener(model, window)
     return WhitenedRule(
         whitener, steady_mean(model), window=window, change=None if kind == "chi-square" else change,
-        false_alarms=false_alarms, dt=dt,
+        false_alarms=false_alarms, dt=dt, white=white,
     )  # fmt: skip
 
 
