@@ -300,6 +300,33 @@ def test_a_number_of_any_size_is_an_alarm_and_is_forgotten(noisy):
             assert found["threshold"][40:].notna().all()
 
 
+@pytest.mark.parametrize("spacing", ["as stated", "closer", "irregular"])
+@pytest.mark.parametrize("kind", ["pointwise", "window"])
+def test_noise_of_the_worst_signs_keeps_the_bound_at_any_stamps(spacing, kind):
+    plant = obsynth.DescriptorSystem(None, [[-1.0]], C=[[1.0]], Bf=[[1.0]], Dw=[[0.1]], Bw=[[0.0]])
+    design = obsynth.pd_observer(plant, decay=20.0)
+    observer, dt = design.linear[1], 0.05
+    rng = np.random.default_rng(0)
+    steps = {"as stated": np.full(80, dt), "closer": np.full(400, dt / 20), "irregular": rng.uniform(0.01, 1, 120) * dt}
+    times = np.concatenate([[0.0], np.cumsum(steps[spacing])])
+    # What each sample does to the last residual, backwards.
+    response, back = np.zeros(len(times)), observer.Cz[observer.residual_rows]
+    response[-1] = observer.Dy[observer.residual_rows][0, 0]
+    for k in range(len(times) - 1, 0, -1):
+        transition, constant, ramp = obsynth.observers.sampling.first_order_hold(
+            observer.Az, observer.By, float(times[k] - times[k - 1])
+        )
+        response[k] += (back @ ramp).item()
+        response[k - 1] += (back @ (constant - ramp)).item()
+        back = back @ transition
+    table = pd.DataFrame({"time": times, "y1": 0.1 * np.sign(response)})
+    monitor = obsynth.online_monitor(design, kind, noise_bound=1.0, initial_error=0.0, sample_time=dt, window=2)
+    found = run_on_data(design, table, monitor=monitor, warm_up=0.0, gap=1e3)
+    assert found.alarms == {}
+    if kind == "pointwise" and spacing != "irregular":
+        assert found.table["statistic"].iloc[-1] > 0.9 * found.table["threshold"].iloc[-1]
+
+
 # Recursive designs, and what is refused
 
 

@@ -10,11 +10,14 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
+from obsynth.evaluation.endless import EndlessBound
 from obsynth.evaluation.online import share_of_look
 from obsynth.numerics.arrays import FloatArray
 
 #: Share of an interval by which the data's sampling may differ from the one that a threshold is for.
 FITTING_SHARE = 0.01
+#: Share of an interval within which two of them are the same: stamps are rounded.
+SAME_SHARE = 1e-6
 #: What rounding may take from a number of samples, as a share of it.
 ROUNDING = 1e-9
 
@@ -32,10 +35,15 @@ class NormRule:
         Samples of which squares are summed up; 1 for the norm itself.
     dt : float, seconds
         Between samples.
+    irregular : EndlessBound, optional
+        Continuous designs: table and limit that hold where samples are not all ``dt`` apart.
     """
 
-    def __init__(self, table: FloatArray, limit: float, *, window: int, dt: float) -> None:
+    def __init__(
+        self, table: FloatArray, limit: float, *, window: int, dt: float, irregular: EndlessBound | None = None
+    ) -> None:
         self._table, self._limit, self._dt = table, limit, dt
+        self._other, self._regular = irregular, True
         self._norms: deque[float] = deque(maxlen=window)
         self._begin: float | None = None
         self._last: float | None = None
@@ -45,13 +53,16 @@ class NormRule:
     ) -> tuple[float, float, int | None]:
         """Return statistic and threshold; see `obsynth.evaluation.online.Rule`."""
         del evidence
-        fits = self._last is None or abs(time - self._last - self._dt) <= FITTING_SHARE * self._dt
+        away = 0.0 if self._last is None else abs(time - self._last - self._dt) / self._dt
+        fits = away <= FITTING_SHARE
+        self._regular &= away <= SAME_SHARE
         if self._norms.maxlen != 1 and not fits:
             # A window is a number of samples at the sampling that its bound is for.
             self._norms.clear()
         self._begin, self._last = (time if self._begin is None else self._begin), time
         k = math.floor((time - self._begin) / self._dt * (1.0 + ROUNDING))
-        threshold = float(self._table[k]) if k < len(self._table) else self._limit
+        table, limit = (self._table, self._limit) if self._regular or self._other is None else self._other
+        threshold = float(table[k]) if k < len(table) else limit
         if not deciding:
             return math.nan, threshold, None
         # Not squared: the square of a number of any size may be none.
@@ -63,17 +74,21 @@ class NormRule:
         """Begin again: the error at a new start is taken to be no larger than that at the first."""
         self._norms.clear()
         self._begin = self._last = None
+        self._regular = True
 
     def as_dict(self) -> dict[str, Any]:
         """Return what is carried from row to row, as data."""
-        return {"norms": list(self._norms), "begin": self._begin, "last": self._last, "limit": self._limit}
+        return {
+            "norms": list(self._norms), "begin": self._begin, "last": self._last, "limit": self._limit,
+            "regular": self._regular,
+        }  # fmt: skip
 
     def resume(self, data: Mapping[str, Any]) -> None:
         """Go on from what `as_dict` returned."""
         require_same(data["limit"], self._limit)
         self._norms.clear()
         self._norms.extend(data["norms"])
-        self._begin, self._last = data["begin"], data["last"]
+        self._begin, self._last, self._regular = data["begin"], data["last"], data["regular"]
 
 
 class WhitenedRule:
