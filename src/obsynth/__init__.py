@@ -33,11 +33,13 @@ if TYPE_CHECKING:
     from obsynth.models.fault_models import FaultModel, fault_model
     from obsynth.models.time_varying import TimeVaryingDescriptorSystem
     from obsynth.observers.alarms import Alarm, Decision
+    from obsynth.observers.batches import run_batch
     from obsynth.observers.dae import DAEObserver
+    from obsynth.observers.dae_batch import DAEBatchEstimates
     from obsynth.observers.dae_estimates import DAEEstimates
     from obsynth.observers.dae_running import RunningDAEObserver
     from obsynth.observers.decisions import decide
-    from obsynth.observers.gain_schedule import BatchEstimates, run_batch
+    from obsynth.observers.gain_schedule import BatchEstimates
     from obsynth.observers.linear import Estimates, LinearObserver, RunningObserver
     from obsynth.observers.recursive import Adaptation, RecursiveObserver
     from obsynth.observers.recursive_estimates import RecursiveEstimates
@@ -76,6 +78,7 @@ _HOMES = {
     "dae_adaptive_observer": "obsynth.pipeline.dae_adaptive_observer",
     "DAETrajectory": "obsynth.simulation.dae",
     "simulate_dae": "obsynth.simulation.dae",
+    "DAEBatchEstimates": "obsynth.observers.dae_batch",
     "DAEEstimates": "obsynth.observers.dae_estimates",
     "RunningDAEObserver": "obsynth.observers.dae_running",
     "DAEObserver": "obsynth.observers.dae",
@@ -147,7 +150,7 @@ _HOMES = {
     "pd_delta_scan": "obsynth.pipeline.pd_observer",
     "pd_observer": "obsynth.pipeline.pd_observer",
     "pd_observer_from_gains": "obsynth.pipeline.pd_observer",
-    "run_batch": "obsynth.observers.gain_schedule",
+    "run_batch": "obsynth.observers.batches",
     "run_on_data": "obsynth.data.run",
     "sample_observer": "obsynth.observers.sampling",
     "simulate": "obsynth.evaluation.simulating",
@@ -164,6 +167,7 @@ __all__ = [
     "BatchEstimates",
     "Certificate",
     "Check",
+    "DAEBatchEstimates",
     "DAEEstimates",
     "DAEModel",
     "DAEObserver",

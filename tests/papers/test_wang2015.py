@@ -221,13 +221,17 @@ def test_the_second_stage_at_five_percent(plant, expected) -> None:
     assert hinf_norm(a, b, c, d).upper == pytest.approx(stage.get("hinf", np.sqrt(2.0)), abs=5.1e-4)
 
 
-def test_what_is_shipped_by_default() -> None:
+@pytest.mark.parametrize(("engine", "key"), [("auto", "shipped"), ("lmi", "shipped_by_the_inequality")])
+def test_what_is_shipped(engine: str, key: str) -> None:
     """A little below the full 5 %, so that the claim has a well-conditioned proof."""
-    design, shipped = obsynth.fault_estimation_filter(PLANT), EXPECTED["shipped"]
+    design, shipped = obsynth.fault_estimation_filter(PLANT, engine=engine), EXPECTED[key]
     assert design.certificate.claims["gamma"] == pytest.approx(shipped["gamma"], abs=5.1e-6)
     assert design.report["H-infinity norm"].value == pytest.approx(shipped["hinf"], abs=5.1e-4)
     assert np.linalg.norm(design.gains["R"]) == pytest.approx(shipped["norm_R"], abs=5.1e-3)
     assert spectral_radius(design.observer.Az) == pytest.approx(shipped["spectral_radius"], abs=5.1e-3)
+
+
+def test_nothing_is_shipped_where_no_gain_is_needed() -> None:
     other = obsynth.fault_estimation_filter(PLANT_PSI)
     assert np.linalg.norm(other.gains["R"]) == 0.0
     stage = EXPECTED_PSI["truth"]["second_stage"]

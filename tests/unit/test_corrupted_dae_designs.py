@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Callable
 from functools import cache
 
+import casadi as ca
 import numpy as np
 import pytest
 from dae_plants import DESIGNS, ROD, exchanger, linear, pendulum
@@ -21,7 +22,9 @@ from obsynth import (
     dae_adaptive_observer,
     verify,
 )
-from obsynth.models.dae_step import ImplicitStep
+from obsynth.models.dae_step_graph import StepGraph
+from obsynth.observers import dae_algebra
+from obsynth.observers.dae_estimates import DAERow
 from obsynth.pipeline.designing import check
 
 FITS, CLAIMS, RUNS, NEES, NIS = "fits the plant", "claims", "runs", "NEES", "NIS"
@@ -131,35 +134,37 @@ def test_a_corrupted_design_fails(name: str) -> None:
         assert found == expected
 
 
+def with_graph(monkeypatch, change: Callable[[StepGraph], StepGraph]) -> ObserverDesign:
+    """The good design, as an implementation would run it whose implicit step is changed."""
+    right = dae_algebra.step_graph
+    monkeypatch.setattr(dae_algebra, "step_graph", lambda *arguments: change(right(*arguments)))
+    return good().replace(observer=dataclasses.replace(good().observer))
+
+
+def replaced(function: ca.Function, change: Callable[..., list]) -> ca.Function:
+    inputs = function.mx_in()
+    return ca.Function(function.name(), inputs, change(*function(*inputs)))
+
+
 def test_wrong_derivatives_are_found(monkeypatch) -> None:
-    """A step whose G has lost its dt, as the paper's step of one second would hide."""
-    right = ImplicitStep.sensitivities
+    """A step whose G has lost a part of its dt, as the paper's step of one second would hide."""
 
-    def wrong(self, *arguments):
-        local = right(self, *arguments)
-        return dataclasses.replace(local, G=1.01 * local.G)
+    def wrong(graph: StepGraph) -> StepGraph:
+        lost = replaced(graph.sensitivities, lambda F, G, noise, scaled: [F, 1.01 * G, noise, scaled])
+        return dataclasses.replace(graph, sensitivities=lost, small=False)
 
-    monkeypatch.setattr(ImplicitStep, "sensitivities", wrong)
-    assert {DERIVATIVES} <= failed(good())
+    assert {DERIVATIVES} <= failed(with_graph(monkeypatch, wrong))
 
 
 def test_steps_that_are_not_solved_are_found(monkeypatch) -> None:
-    right = ImplicitStep.solve
+    def wrong(graph: StepGraph) -> StepGraph:
+        return dataclasses.replace(graph, step=replaced(graph.step, lambda X, residual, _: [X, 1e-6, 1.0]))
 
-    def wrong(self, *arguments, **options):
-        return dataclasses.replace(right(self, *arguments, **options), residual=1e-6)
-
-    monkeypatch.setattr(ImplicitStep, "solve", wrong)
-    assert failed(good()) == {RESIDUAL}
+    assert failed(with_graph(monkeypatch, wrong)) == {RESIDUAL}
 
 
 def test_a_nearly_singular_step_is_found(monkeypatch) -> None:
-    right = ImplicitStep.sensitivities
-
-    def wrong(self, *arguments):
-        return dataclasses.replace(right(self, *arguments), condition=1e14)
-
-    monkeypatch.setattr(ImplicitStep, "sensitivities", wrong)
+    monkeypatch.setattr(DAERow, "conditions", property(lambda self: np.full(len(self.several.memory), 1e14)))
     assert failed(good()) == {CONDITION, CLAIMS}
 
 

@@ -401,7 +401,8 @@ TABLE: dict[str, tuple[str, Callable[[ObserverDesign], ObserverDesign], tuple[st
     "unstable gain, with disturbance": ("paper", with_unstable_gain, (RADIUS, LMI, NORM)),
     # The certificate.
     "tracking": (
-        "paper", certificate_entry("tracking", 0, 0, 0.9), (DYNAMICS, INPUTS, STATE, DECOUPLED, IN_STATE, REALISED)),
+        "paper", certificate_entry("tracking", 0, 0, 0.9),
+        (DYNAMICS, INPUTS, STATE, DECOUPLED, IN_STATE, REALISED, LMI)),
     "tracking, a delayed state": ("chain", certificate_entry("tracking", 6, 6, 1.0 + 1e-6), (DYNAMICS, REALISED)),
     "tracking zero": ("paper", certificate_times("tracking", 0.0), (*UNBIASED, INPUTS, *ESTIMATES, REALISED)),
     "tracking NaN": ("paper", certificate_entry("tracking", 1, 2, np.nan), (FITS,)),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from dae_plants import ROD, diode, exchanger, pendulum
@@ -10,6 +12,7 @@ from obsynth import DAEModel, SpecError, identifiability
 from obsynth.analysis.dae_index import index_report
 from obsynth.models.dae_functions import DAEFunctions
 from obsynth.models.dae_step import ImplicitStep
+from obsynth.pipeline.designing import check
 
 UNITS = dict.fromkeys(["a", "b", "go", "c", "seen"], "1")
 
@@ -40,6 +43,14 @@ def small(**changes) -> DAEModel:
         ({"outputs": {"seen": "b + go"}}, ["output depends on an input"]),
         ({"parameters": {"sin": 1.0}}, ["'sin'"]),
         ({"outputs": {}}, ["outputs is empty"]),
+        ({"equations": {"moves": "der(a) = -c * a if a > 0 else b", "holds": "b = go"}},
+         ["equations.moves", "where(a > b, c, d)"]),
+        ({"equations": {"moves": "der(a) = -c * a", "holds": "b <= go"}}, ["equations.holds", "where(a > b, c, d)"]),
+        ({"states": {"a": 1.0, "where": 1.0}}, ["'where'"]),
+        ({"units": {**UNITS, "c": ""}}, ["units", "'c'"]),
+        ({"outputs": {"seen": "2.0"}}, ["'seen'", "neither a state nor a parameter"]),
+        ({"equations": {"moves": "der(c) = -c * a + b", "holds": "b = go + 0.1 * a"}}, ["der(...)", "'moves'", "zero"]),
+        ({"equations": {"moves": "der(a) = -c * a + k", "holds": "b = go"}}, ["'der(a) = -c * a + k' uses 'k'"]),
     ],
 )  # fmt: skip
 def test_what_is_wrong_is_named(changes, words) -> None:
@@ -62,6 +73,54 @@ def test_an_if_on_a_state_is_refused_and_where_is_not() -> None:
     model = DAEModel(with_where, lambda x, theta: [x[0]], **fields)
     found = ImplicitStep(DAEFunctions(model), 0.5).solve(np.array([4.0]), np.zeros(0), np.zeros(0)).x[0]
     assert found == pytest.approx(((0.5 + np.sqrt(0.25 + 16.0)) / 2) ** 2, rel=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("equation", "words"),
+    [
+        (lambda r, x, u, t: [r[0] - (1.0 if x[0] > 0 else 2.0)], ["numpy.where"]),
+        (lambda r, x, u, t: [r[0] - max(x[0], 0.0)], ["numpy.maximum"]),
+        (lambda r, x, u, t: [r[0] - np.where(0.0 < x[0] < 1.0, 1.0, 2.0)], ["numpy.logical_and"]),
+        (lambda r, x, u, t: [r[0] - math.sqrt(x[0])], ["not a number", "in place of those of math"]),
+        (lambda r, x, u, t: [r[0] - float(x[0])], ["not a number"]),
+        (lambda r, x, u, t: [r[0] - int(x[0])], ["int(x)"]),
+        (lambda r, x, u, t: [r[0] - sum(1.0 for _ in range(x[0]))], ["TypeError", "range(x)"]),
+        (lambda r, x, u, t: [r[0] - x[1]], ["IndexError", "rates, x, u, theta"]),
+        (lambda r, x, u: [r[0] - x[0]], ["TypeError", "rates, x, u, theta"]),
+        (lambda r, x, u, t: ["x"], ["cannot be called on symbols"]),
+        (lambda r, x, u, t: [r[0], x[0]], ["2 equations for 1 states", "1 too many"]),
+        (lambda r, x, u, t: None, ["must return a list"]),
+    ],
+)  # fmt: skip
+def test_functions_that_cannot_be_used_say_what_to_use(equation, words) -> None:
+    fields = {"states": {"a": 1.0}, "units": {"a": "1", "y": "1"}, "output_names": ["y"]}
+    with pytest.raises(SpecError) as caught:
+        DAEModel(equation, lambda x, theta: [x[0]], **fields)
+    assert [word for word in words if word not in str(caught.value)] == []
+
+
+def test_where_in_a_text_is_where_in_a_function() -> None:
+    """A pump that stops above a level, and drains by a root that does not exist below zero."""
+    fields = {"states": {"a": 1.0}, "inputs": {"go": 1.0}, "parameters": {"c": 0.5}}
+    units = dict.fromkeys(["a", "go", "c", "seen"], "1")
+    text = DAEModel({"level": "der(a) = where(a <= 2, go, 0) - c * where(a > 0, sqrt(a), 0)"}, {"seen": "a"},
+                    units=units, **fields)  # fmt: skip
+
+    def level(rates, x, u, theta):
+        drained = np.where(x[0] > 0.0, np.sqrt(x[0]), 0.0)
+        return [rates[0] - np.where(x[0] <= 2.0, u[0], 0.0) + theta[0] * drained]
+
+    function = DAEModel(level, lambda x, theta: [x[0]], units=units, output_names=["seen"], **fields)
+    u, c = np.array([1.0]), np.array([0.5])
+    for start in (-1.0, 1.0, 3.0):
+        steps = [ImplicitStep(DAEFunctions(model), 1e-3) for model in (text, function)]
+        ends = [step.solve(np.array([start]), u, c).x[0] for step in steps]
+        slope = (1.0 if start <= 2.0 else 0.0) - 0.5 * np.sqrt(max(start, 0.0))
+        assert ends[0] == pytest.approx(start + 1e-3 * slope, abs=1e-6)
+        assert ends[0] == ends[1]
+        local = steps[0].sensitivities(steps[0].solve(np.array([start]), u, c), np.array([start]), u, c)
+        assert np.isfinite(local.F).all()
+    assert DAEModel(**text.as_dict()).as_dict() == text.as_dict()
 
 
 def test_functions_cannot_be_saved_and_texts_can() -> None:
@@ -177,3 +236,34 @@ def test_corrected_with_the_papers_inputs_the_bias_is_stored_energy() -> None:
     assert "psi" in found.unidentifiable
     assert any({"psi", "Energy"} <= set(direction) for direction in found.unseen)
     assert "phi" not in found.unidentifiable
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"dt": 0.0}, "dt is 0.0"), ({"R": [[0.0]]}, "R must be positive definite"),
+        ({"R": np.eye(2)}, r"R is \(2, 2\)"),
+        ({"parameter_scales": [0.0]}, "must be positive"), ({"u": np.ones((1, 1))}, "at least 2"),
+        ({"u": np.ones((9, 2))}, r"\(samples, 1\)"), ({"initial_state": [1.0, np.inf]}, r"initial_state\.b is inf"),
+    ],
+)  # fmt: skip
+def test_bad_questions_of_identifiability_are_named(arguments, words) -> None:
+    given = {"u": np.ones((9, 1)), "dt": 0.5, "R": [[1.0]], **arguments}
+    with pytest.raises(SpecError, match=words):
+        identifiability(small(), given.pop("u"), **given)
+
+
+@pytest.mark.parametrize(
+    ("model", "words"),
+    [
+        (exchanger(), ["tell every direction"]),
+        (printed(f"{FLUX} = 0"), ["do not tell", "phi (", "psi ("]),
+        (printed(f"{FLUX} + A ** 2 / R * (p1 - p2) = 0"), ["do not tell", "Energy (", "psi ("]),
+    ],
+)  # fmt: skip
+def test_the_check_before_any_design_says_what_the_outputs_do_not_tell(model, words) -> None:
+    report = check(model)["dae-adaptive-observer"]
+    assert report.passed
+    detail = report["exists: parameters"].detail
+    assert [word for word in words if word not in detail] == []
+    assert ("phi (" in detail) == ("phi (" in words)

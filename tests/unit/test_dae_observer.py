@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from dae_plants import exchanger, linear
 
-from obsynth import DAEObserver, SolverError, SpecError, simulate_dae
+from obsynth import DAEObserver, SolverError, SpecError, run_batch, simulate_dae
 from obsynth.models.dae_functions import DAEFunctions
 from obsynth.models.dae_step import ImplicitStep
 
@@ -67,10 +69,10 @@ def test_what_the_parameters_do_not_explain_decays_by_itself(weight) -> None:
             x = step.solve(x, u[k], theta).x
         y = step.functions.outputs(x, theta)[0]
         kept = np.eye(4) - running.K @ running.H
-        running.raw_step(y, u[k])
+        row = running.raw_step(y, u[k])
         z = x - running.x - running.Upsilon @ (theta - running.theta)
         if before is not None:
-            factor = running.local.F @ kept
+            factor = row.part("F") @ kept
             worst = max(worst, np.abs(z - factor @ before).max())
         before = z
     assert worst < 1e-13
@@ -136,23 +138,25 @@ def test_sample_by_sample_is_the_whole_record(form) -> None:
 @pytest.mark.parametrize("form", ["forgetting", "random-walk", "augmented-kalman"])
 def test_the_spreads_are_honest(form) -> None:
     """40 runs with errors drawn from P_0 and S_0: squared errors in units of the covariance are one on average."""
-    shipped = observer(form=form, forgetting=0.95, guard="none")
-    model, start, u = shipped.model, steady(), np.tile(exchanger().nominal_input, (80, 1))
-    squares = []
+    start, u = steady(), np.tile(exchanger().nominal_input, (80, 1))
+    shipped = observer(
+        form=form, forgetting=0.95, guard="none", initial_state=start,
+        initial_parameter_covariance=np.diag([0.02**2, 500.0**2]),
+    )  # fmt: skip
+    outputs, thetas = [], []
     for seed in range(40):
         rng = np.random.default_rng(100 + seed)
-        theta = np.array([1.0, 0.0]) + rng.standard_normal(2) * [0.02, 500.0]
-        truth = simulate_dae(model, u, dt=1.0, parameters=theta, initial_state=start, Q=shipped.Q, R=shipped.R,
-                             seed=seed, integration="backward-euler")  # fmt: skip
+        thetas.append(np.array([1.0, 0.0]) + rng.standard_normal(2) * [0.02, 500.0])
         off = start + rng.standard_normal(4) * [2e3, 2e3, 5.0, 5.0]
-        begun = observer(
-            form=form, forgetting=0.95, guard="none", initial_state=off,
-            initial_parameter_covariance=np.diag([0.02**2, 500.0**2]),
-        )  # fmt: skip
-        found = begun.run(truth.outputs, u)
+        truth = simulate_dae(shipped.model, u, dt=1.0, parameters=thetas[-1], initial_state=off, Q=shipped.Q,
+                             R=shipped.R, seed=seed, integration="backward-euler")  # fmt: skip
+        outputs.append(truth.outputs)
+    found = run_batch(shipped, outputs, u)
+    squares = []
+    for i, theta in enumerate(thetas):
         for k in (40, 79):
-            e = found.parameters[k] - theta
-            squares.append(e @ np.linalg.solve(found.parameter_covariances[k], e) / 2)
+            e = found.parameters[i, k] - theta
+            squares.append(e @ np.linalg.solve(found.parameter_covariances[i, k], e) / 2)
     # 160 squares of standard normal numbers: the mean is one within 5 sqrt(2 / 160).
     assert abs(np.mean(squares) - 1.0) < 5 * np.sqrt(2 / 160)
 
@@ -253,3 +257,57 @@ def test_saved_as_data_it_is_the_same() -> None:
     first = observer(integration="radau")
     second = DAEObserver.from_dict(first.as_dict())
     assert np.array_equal(first.run(y, u).states, second.run(y, u).states)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"dt": -1.0}, "dt is -1.0: give the seconds"), ({"dt": "1"}, "dt is '1'"), ({"window": 2.5}, "window is 2.5"),
+        ({"forgetting": "x"}, "forgetting is 'x'"), ({"largest_move": "x"}, "largest_move is 'x'"),
+        ({"R": np.diag([1e4, 0.0])}, "variance of 'temperature' is 0"),
+        ({"R": np.array([[1e4, 50.0], [50.0, 0.25]])}, "R must be positive definite, but it is singular"),
+        ({"upper": np.array([0.5, 1e3])}, r"bounds\.phi: the lower bound \(-inf\).*upper one \(0.5\)"),
+        ({"initial_state": np.array([np.nan, 1.0, 1.0, 1.0])}, r"initial_state\.p1 is nan"),
+        ({"initial_state": np.ones(3)}, "4 finite number.*p1, p2, T1, T2"),
+    ],
+)  # fmt: skip
+def test_bad_fields_are_named_with_their_signals(changes, words) -> None:
+    with pytest.raises(SpecError, match=words):
+        observer(**changes)
+
+
+def test_units_do_not_decide_whether_a_covariance_is_definite() -> None:
+    assert observer(initial_parameter_covariance=np.diag([1e-20, 1e14])).order == 6
+
+
+def test_bad_arguments_of_a_run_are_named() -> None:
+    y, u = record(samples=5)
+    for options, words in (({"compiled": "x"}, "compiled is 'x'"), ({"progress": 3}, "progress is 3")):
+        with pytest.raises(SpecError, match=words):
+            observer().run(y, u, **options)
+    with pytest.raises(SpecError, match="'m1' is nan at k = 0"):
+        observer().start().step(y[0], [np.nan, 450.0, 15150.0, 1.0])
+    with pytest.raises(SpecError, match="u must be 4 finite"):
+        observer().start().step(y[0], ["x", 450.0, 15150.0, 1.0])
+
+
+def test_an_observer_travels_to_another_process_after_it_has_run() -> None:
+    shipped = observer()
+    shipped.run(*record(samples=3))
+    assert set(shipped.__getstate__()) == {field.name for field in dataclasses.fields(shipped)}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"dt": 0.0}, "dt is 0.0: give the seconds"), ({"parameters": [np.nan, 0.0]}, r"parameters\.phi is nan"),
+        ({"parameters": np.ones((3, 2))}, r"parameters is \(3, 2\)"), ({"seed": -1}, "seed is -1"),
+        ({"initial_state": ["a", 1, 1, 1]}, "initial_state must be 4"), ({"Q": [[1.0]]}, "Q must be"),
+        ({"u": np.full((5, 4), np.nan)}, "'m1' is nan at k = 0"), ({"u": None}, "u is missing"),
+        ({"integration": "rk4"}, "'rk4'"),
+    ],
+)  # fmt: skip
+def test_bad_simulations_are_named(arguments, words) -> None:
+    given = {"u": np.tile(exchanger().nominal_input, (5, 1)), "dt": 1.0, **arguments}
+    with pytest.raises(SpecError, match=words):
+        simulate_dae(exchanger(), given.pop("u"), **given)

@@ -72,6 +72,20 @@ def test_a_diode_takes_large_steps_of_its_source(volts) -> None:
     assert found.residual < 1e-12
 
 
+def test_where_damped_newton_gives_up_the_homotopy_goes_on() -> None:
+    """A knee ten times as sharp: 25 iterations are not enough at once, and the input's last value is the way out."""
+    model = diode()
+    sharp = model.replace(constants={**model.constants, "VT": 0.002})
+    step, theta = ImplicitStep(DAEFunctions(sharp), 1e-3), model.nominal_parameters
+    x = step.solve(np.zeros(2), np.zeros(1), theta).x
+    with pytest.raises(SolverError, match="No solution"):
+        step.solve(x, np.array([300.0]), theta)
+    found = step.solve(x, np.array([300.0]), theta, before=np.zeros(1))
+    v, c = found.x
+    assert found.subsolves > 1
+    assert (300.0 - v - c) / 10.0 == pytest.approx(1e-12 * np.expm1(v / 0.002), rel=1e-6)
+
+
 def cubic() -> DAEModel:
     """z^3 - z = u: three roots for small u."""
     return DAEModel({"moves": "der(a) = -a * k", "fold": "z ** 3 - z = u"}, {"seen": "z"},

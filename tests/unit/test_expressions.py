@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -30,6 +31,11 @@ from obsynth.numerics.expressions import MAXIMUM_DEPTH, parse_expression
         ("step(k - 4) + step(k - 5)", 1.0),
         ("sqrt(abs(-k)) + pi", 2.0 + math.pi),
         ("floor(2.7) + ceil(2.2) + sign(-3)", 4.0),
+        (
+            "where(k > 3, 1, 2) + 10 * where(k >= 4, 1, 2) + 100 * where(k < 4, 1, 2) + 1000 * where(k <= 4, 1, 2)",
+            1211.0,
+        ),
+        ("where(k > 9, sqrt(-k), where(2 * k < 9, k, 0))", 4.0),
     ],
 )
 def test_values(text: str, value: float) -> None:
@@ -57,7 +63,13 @@ def test_arrays_and_names() -> None:
         ("__import__('os')", "not allowed"),
         ("k.real", "not allowed"),
         ("k[0]", "not allowed"),
-        ("k if k else 1", "not expected"),
+        ("k if k else 1", "where(a > b, c, d)"),
+        ("k > 1 and k < 2", "where(a > b, c, d)"),
+        ("k <= 1", "where(a > b, c, d)"),
+        ("where(k, 1, 2)", "needs a comparison"),
+        ("where(k > 1, 2)", "two values"),
+        ("where(k > 1, 2, 3, 4)", "not closed"),
+        ("where(1 < k < 2, 2, 3)", "two values"),
         ("lambda: 1", "not allowed"),
         ("k == 1", "not allowed"),
         ("1 // 2", "not expected"),
@@ -68,7 +80,7 @@ def test_arrays_and_names() -> None:
     ],
 )
 def test_what_is_no_arithmetic_is_refused(text: str, part: str) -> None:
-    with pytest.raises(SpecError, match=part.replace("(", r"\(")):
+    with pytest.raises(SpecError, match=re.escape(part)):
         parse_expression(text)
 
 

@@ -5,7 +5,14 @@ import numpy as np
 import pytest
 import slycot
 
-from obsynth.numerics.norms import frequency_response, hinf_norm, output_covariance, spectral_radius
+from obsynth.numerics.norms import (
+    frequency_response,
+    highest_gain_found,
+    hinf_norm,
+    norm_is_at_most,
+    output_covariance,
+    spectral_radius,
+)
 
 
 def system(a, b, c, d):
@@ -37,6 +44,29 @@ def random_system(rng, *, damping, scaled=False):
 def by_slicot(a, b, c, d):
     n, m, p = a.shape[0], b.shape[1], c.shape[0]
     return slycot.ab13dd("D", "I", "N", "D", n, m, p, a, np.eye(n), b, c, d, 1e-12)[0]
+
+
+class TestManyStates:
+    """From sixty states on a modal response and a Riccati equation take the place of the pencil."""
+
+    @pytest.mark.parametrize("damping", [0.3, 1e-2, 1e-4])
+    def test_against_slicot(self, damping):
+        rng = np.random.default_rng(11)
+        for _ in range(4):
+            a, b, c = rng.standard_normal((70, 70)), rng.standard_normal((70, 3)), rng.standard_normal((2, 70))
+            a *= (1.0 - damping) / np.max(np.abs(np.linalg.eigvals(a)))
+            realisation = a, b, c, rng.standard_normal((2, 3))
+            true = by_slicot(*realisation)
+            check_encloses(hinf_norm(*realisation), true, width=1.1e-3, slack=1e-8)
+            assert highest_gain_found(*realisation) == pytest.approx(true, rel=1e-4)
+            assert norm_is_at_most(*realisation, 1.002 * true)
+            assert not norm_is_at_most(*realisation, 0.999 * true)
+
+    def test_defective_dynamics(self):
+        """A chain of delays has one eigenvector: modal coordinates say nothing, and the norm is that of the taps."""
+        taps = np.linspace(1.0, 2.0, 80)
+        found = hinf_norm(np.eye(79, k=-1), np.eye(79)[:, :1], taps[None, 1:], taps[:1, None])
+        check_encloses(found, float(np.sum(taps)), width=1.1e-3, slack=1e-9)
 
 
 class TestHinfNorm:

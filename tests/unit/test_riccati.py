@@ -1,13 +1,16 @@
 """Riccati equations of filters: against SciPy's solver and against what the equation says."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
+from obsynth.numerics.doubling import compared_gain, doubled_riccati_solution, gain_is_below
 from obsynth.numerics.norms import hinf_norm, spectral_radius
-from obsynth.synthesis.central_filter import central_filter_at, central_injection, search_central_filter
+from obsynth.synthesis.central_equation import CentralEquation, central_injection
+from obsynth.synthesis.central_filter import central_filter_at, search_central_filter
 from obsynth.synthesis.gain_problem import GainProblem, Injection
-from obsynth.synthesis.riccati import doubled_riccati_solution, gain_is_below
 
 
 def random_problem(rng, n=5, m=2, q=1, nd=3, free_weight=False):
@@ -83,7 +86,7 @@ def test_the_equation_tells_levels_above_the_norm_from_levels_below(n):
 
 
 def test_many_states_are_judged_as_few_are():
-    problem = random_problem(np.random.default_rng(5), n=45, m=8, nd=6)
+    problem = random_problem(np.random.default_rng(5), n=70, m=8, nd=6)
     start = central_injection(problem, 1e6, noise=1e-1)
     best, bound = search_central_filter(problem, start)
     gain = problem.achieved_gain(best)
@@ -92,3 +95,50 @@ def test_many_states_are_judged_as_few_are():
     assert bound <= 1.005 * gain
     assert problem.reaches(best, 1.005 * gain)
     assert not problem.reaches(best, 0.999 * gain)
+
+
+@pytest.mark.parametrize("free_weight", [False, True])
+@pytest.mark.parametrize(("m", "nd"), [(1, 1), (2, 3), (5, 2)])
+def test_exact_measurements_need_fewer_states(free_weight, m, nd):
+    """Without the disturbance in a measurement, the small equation's solution is that of the one in all states."""
+    rng, noise = np.random.default_rng([6, m, nd]), 1e-3
+    for _ in range(5):
+        problem = random_problem(rng, n=6, m=m, nd=nd, free_weight=free_weight)
+        problem = replace(problem, D=np.zeros((m, nd)), Zd=np.zeros((1, nd)))
+        equation, level = CentralEquation.of(problem, noise=noise), 1e3 * problem.disturbance_size
+        assert equation.a.shape == (6 - m, 6 - m)
+        y = equation.solution(level)
+        assert y is not None
+        h = np.vstack([problem.C, problem.Z])
+        total = h @ y @ h.T - np.diag([0.0] * m + [level**2])
+        through = problem.A @ y @ h.T
+        process = problem.B @ problem.B.T + (noise * np.linalg.norm(problem.B, 2)) ** 2 * np.eye(6)
+        right = problem.A @ y @ problem.A.T - through @ np.linalg.solve(total, through.T) + process
+        assert np.linalg.norm(y - right) <= 1e-9 * np.linalg.norm(problem.A @ y @ problem.A.T)
+        found, margin = equation.filter_and_margin(level)
+        assert problem.achieved_gain(found) < level
+        assert 0.0 < margin < 1.0
+
+
+def test_the_margin_vanishes_at_the_least_level():
+    rng = np.random.default_rng(7)
+    for _ in range(5):
+        problem = random_problem(rng, n=6, m=2, nd=2)
+        problem = replace(problem, D=np.zeros((2, 2)), Zd=np.zeros((1, 2)))
+        equation = CentralEquation.of(problem, noise=1e-6)
+        _, least = search_central_filter(problem, central_injection(problem, 1e6, noise=1e-1))
+        margins = [equation.filter_and_margin(least * (1.0 + share))[1] for share in (1e-2, 1e-3, 1e-4)]
+        assert margins[0] == pytest.approx(10.0 * margins[1], rel=0.2)
+        assert margins[1] == pytest.approx(10.0 * margins[2], rel=0.2)
+        assert equation.filter_and_margin(least * (1.0 - 1e-4))[0] is None
+
+
+def test_a_level_far_below_the_norm_is_refuted_and_not_left_open():
+    rng = np.random.default_rng(8)
+    for _ in range(20):
+        a = rng.normal(size=(8, 8))
+        a *= 0.9 / spectral_radius(a)
+        b, c, d = rng.normal(size=(8, 3)), rng.normal(size=(2, 8)), rng.normal(size=(2, 3))
+        norm = hinf_norm(a, b, c, d).value
+        assert compared_gain(a, b, c, d, 1.01 * norm) is True
+        assert compared_gain(a, b, c, d, 0.5 * norm) is False

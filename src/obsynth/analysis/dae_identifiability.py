@@ -9,9 +9,11 @@ from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
 from obsynth.models.dae import DAEModel
+from obsynth.models.dae_checks import checked_inputs, finite_vector, step_length
 from obsynth.models.dae_functions import DAEFunctions
 from obsynth.models.dae_step import ImplicitStep
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
+from obsynth.numerics.covariances import covariance_factor, is_definite
 
 #: Singular values below this share of the largest are zero: the sensitivities carry rounding of 1e-16 times the
 #: condition of (7), which stays below 1e5 in models that can be used.
@@ -125,20 +127,26 @@ def identifiability(
     ----------
     .. [MoussaAliDAE2013] (26) asks for excitation; that the paper's own example has none is our finding.
     """
-    inputs = as_matrix(u, "u") if model.nu else np.zeros((len(np.asarray(u)), 0))
-    noise = as_matrix(R, "R")
+    inputs, noise, length = checked_inputs(model, u), as_matrix(R, "R"), step_length(dt)
     if len(inputs) < FEWEST_SAMPLES:
         raise SpecError(f"u has {len(inputs)} samples: a trajectory needs at least {FEWEST_SAMPLES}.", path="u")
-    if inputs.shape[1] != model.nu or noise.shape != (model.ny, model.ny):
-        raise SpecError(f"u must be (samples, {model.nu}) and R ({model.ny}, {model.ny}).", path="u")
-    x = _or(initial_state, model.nominal_state, "initial_state")
-    theta = _or(parameters, model.nominal_parameters, "parameters")
+    if noise.shape != (model.ny, model.ny):
+        raise SpecError(f"R is {noise.shape}, but ({model.ny}, {model.ny}) is needed.", path="R")
+    root = covariance_factor(noise, "R")
+    if not is_definite(noise, root):
+        raise SpecError("R must be positive definite: a sensor without noise would tell everything.", path="R")
+    x = finite_vector(initial_state, model.state_names, model.nominal_state, "initial_state")
+    theta = finite_vector(parameters, model.parameter_names, model.nominal_parameters, "parameters")
     sizes = np.where(theta != 0.0, np.abs(theta), 1.0)
-    scales = np.concatenate([_or(state_scales, model.state_scales, "state_scales"),
-                             _or(parameter_scales, sizes, "parameter_scales")])  # fmt: skip
-    step = ImplicitStep(DAEFunctions(model, method), dt)
+    scales = np.concatenate([
+        finite_vector(state_scales, model.state_names, model.state_scales, "state_scales"),
+        finite_vector(parameter_scales, model.parameter_names, sizes, "parameter_scales"),
+    ])  # fmt: skip
+    if not (scales > 0.0).all():
+        raise SpecError("state_scales and parameter_scales must be positive.", path="parameter_scales")
+    step = ImplicitStep(DAEFunctions(model, method), length)
     seen, free = _sensitivities(model, step, inputs, x, theta, scales[: model.nx])
-    whitened = np.linalg.solve(np.linalg.cholesky(noise), seen).reshape(-1, seen.shape[2])
+    whitened = np.linalg.solve(root, seen).reshape(-1, seen.shape[2])
     r = free.shape[1]
     whitened[:, r:] *= scales[model.nx :]
     to_signals = np.block([[free.T, np.zeros((r, model.nq))], [np.zeros((model.nq, model.nx)), np.eye(model.nq)]])
@@ -179,12 +187,3 @@ def _sensitivities(
         rows[:, free.shape[1] :] += L
         found.append(rows)
     return np.array(found), free
-
-
-def _or(value: ArrayLike | None, default: FloatArray, name: str) -> FloatArray:
-    if value is None:
-        return np.array(default)
-    vector = np.atleast_1d(np.asarray(value, dtype=np.float64))
-    if vector.shape != default.shape or not np.isfinite(vector).all():
-        raise SpecError(f"{name} must be {len(default)} finite number(s).", path=name)
-    return vector

@@ -69,23 +69,31 @@ def index_report(
         matrices.append(ScaledMatrix.of(jacobian, model.state_scales))
     conditions = tuple(matrix.condition for matrix in matrices)
     if not np.isfinite(conditions[0]) or conditions[0] > SINGULAR_CONDITION:
-        return IndexReport(0, conditions, *_involved(model, matrices[0]))
+        return IndexReport(0, conditions, *involved(model, matrices[0].matrix))
     decades = np.log10(SHORTENINGS[0] / SHORTENINGS[-1])
     slope = np.log10(min(conditions[-1], 1.0 / np.finfo(np.float64).eps) / conditions[0]) / decades
     index = 1 + max(0, round(float(slope)))
-    involved = ((), ()) if index == 1 else _involved(model, matrices[-1])
-    return IndexReport(index, conditions, *involved)
+    found = ((), ()) if index == 1 else involved(model, matrices[-1].matrix)
+    return IndexReport(index, conditions, *found)
 
 
-def _involved(model: DAEModel, scaled: ScaledMatrix) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return equations and states of the least singular direction."""
-    if not np.isfinite(scaled.matrix).all():
-        bad = [i for i, row in enumerate(scaled.matrix) if not np.isfinite(row).all()]
-        return tuple(model.equation_names[i] for i in bad), ()
-    left, _, right = np.linalg.svd(scaled.matrix)
+def involved(model: DAEModel, matrix: FloatArray) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return equations and states of the least singular direction.
+
+    Parameters
+    ----------
+    model : DAEModel
+        The model.
+    matrix : FloatArray
+        The equilibrated matrix of (7) ``(stages * nx, stages * nx)``.
+    """
+    if not np.isfinite(matrix).all():
+        bad = [i % model.nx for i, row in enumerate(matrix) if not np.isfinite(row).all()]
+        return tuple(model.equation_names[i] for i in sorted(set(bad))), ()
+    left, _, right = np.linalg.svd(matrix)
     return _named(left[:, -1], model.equation_names), _named(right[-1], model.state_names)
 
 
 def _named(vector: FloatArray, names: tuple[str, ...]) -> tuple[str, ...]:
-    sizes = np.abs(vector)
+    sizes = np.abs(vector).reshape(-1, len(names)).max(axis=0)
     return tuple(name for name, size in zip(names, sizes, strict=True) if size >= NAMED_SHARE * sizes.max())

@@ -15,7 +15,7 @@ from obsynth.analysis.fault_filter import prepare, with_sensor_faults_as_states
 from obsynth.analysis.zeros import Zero, fault_zeros, leading_names
 from obsynth.errors import PreconditionError
 from obsynth.models.descriptor import DescriptorSystem
-from obsynth.numerics.pencils import pencil_structure
+from obsynth.numerics.pencils import regularity
 from obsynth.numerics.ranks import decide_rank
 
 #: At most this many signals are named in a failed condition.
@@ -40,7 +40,7 @@ def fault_filter_conditions(plant: DescriptorSystem) -> tuple[Condition, ...]:
 
 
 def _form_conditions(plant: DescriptorSystem) -> list[Condition]:
-    structure = pencil_structure(plant.E, plant.A)
+    regular, normal_rank = regularity(plant.E, plant.A)
     return [
         Condition(
             "discrete time",
@@ -66,12 +66,12 @@ def _form_conditions(plant: DescriptorSystem) -> list[Condition]:
         Condition(
             "regularity",
             "a regular pencil (det(A - zE) not identically zero)",
-            structure.regular,
-            float(structure.normal_rank),
+            regular,
+            float(normal_rank),
             float(plant.nx),
             "definition of a descriptor plant",
-            f"normal rank {structure.normal_rank} of {plant.nx}"
-            + ("" if structure.regular else ": the equations do not determine the states. Add what is missing."),
+            f"normal rank {normal_rank} of {plant.nx}"
+            + ("" if regular else ": the equations do not determine the states. Add what is missing."),
         ),
     ]
 
@@ -120,21 +120,26 @@ def _rank_conditions(plant: DescriptorSystem) -> list[Condition]:
         ]
     outputs = decide_rank(work.C, expected=work.ny)
     stacked = np.vstack([work.E, work.C])
+    states = decide_rank(stacked, expected=work.nx)
     ranks += [
         rank_condition(
             "rank C",
             outputs,
             "some outputs repeat others: leave them out.",
             source="Wang 2015, below eq. (1)",
-            signals=leading_names(np.linalg.svd(work.C)[0][:, -1], plant.output_names, most=MOST_NAMES),
+            signals=()
+            if outputs.full
+            else leading_names(np.linalg.svd(work.C)[0][:, -1], plant.output_names, most=MOST_NAMES),
         ),
         rank_condition(
             "rank [E; C]",
-            decide_rank(stacked, expected=work.nx),
+            states,
             "not every state is either dynamic or measured. Measure more, or eliminate the algebraic states first "
             "(transform: {eliminate_algebraic_states: true} in a spec).",
             source="Wang 2015, eq. (2)",
-            signals=leading_names(np.linalg.svd(stacked)[2][-1], work.state_names, most=MOST_NAMES),
+            signals=()
+            if states.full
+            else leading_names(np.linalg.svd(stacked)[2][-1], work.state_names, most=MOST_NAMES),
         ),
     ]
     return ranks

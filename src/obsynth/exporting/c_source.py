@@ -2,33 +2,13 @@
 
 from __future__ import annotations
 
-import json
-import re
 from collections.abc import Iterator, Sequence
 
+from obsynth.exporting.c_words import comment, included, quoted
 from obsynth.exporting.realisation import Realisation
 from obsynth.numerics.arrays import FloatArray
 
-_KEYWORDS = frozenset(
-    {
-        "auto", "break", "case", "char", "const", "continue", "default", "do", "double", "else", "enum", "extern",
-        "float", "for", "goto", "if", "inline", "int", "long", "register", "restrict", "return", "short", "signed",
-        "sizeof", "static", "struct", "switch", "typedef", "union", "unsigned", "void", "volatile", "while",
-    }
-)  # fmt: skip
 _NUMBERS_PER_LINE = 4
-
-
-def c_identifier(text: str) -> str:
-    """Return a C identifier made of ``text``; one that C reserves, or that begins with a digit, gets a prefix.
-
-    Parameters
-    ----------
-    text : str
-        Such as the stem of a file.
-    """
-    name = re.sub(r"\W", "_", text, flags=re.ASCII)
-    return name if re.match(r"[A-Za-z]", name) and name not in _KEYWORDS else f"obs_{name}"
 
 
 def header_text(found: Realisation, prefix: str) -> str:
@@ -45,16 +25,16 @@ def header_text(found: Realisation, prefix: str) -> str:
     guard = f"{prefix.upper()}_H"
     before, after = found.operating_point
     lines = [
-        _comment(f"Observer {_quoted(found.design.name)} by {_quoted(found.design.method)}, written by obsynth."),
-        *([_comment(found.note)] if found.note else []), f"#ifndef {guard}", f"#define {guard}", "",
-        _comment("sha256 of the gain set"), f'#define {prefix.upper()}_SHA256 "{found.digest}"',
-        _comment("seconds between samples"), f"#define {prefix.upper()}_DT {observer.dt!r}",
+        comment(f"Observer {quoted(found.design.name)} by {quoted(found.design.method)}, written by obsynth."),
+        *([comment(found.note)] if found.note else []), f"#ifndef {guard}", f"#define {guard}", "",
+        comment("sha256 of the gain set"), f'#define {prefix.upper()}_SHA256 "{found.digest}"',
+        comment("seconds between samples"), f"#define {prefix.upper()}_DT {observer.dt!r}",
         "", "typedef struct {", f"    double z[{max(observer.order, 1)}];", f"}} {prefix}_state;", "",
-        _comment("Start where the design does." if found.start.any() else "Start at rest."),
+        comment("Start where the design does." if found.start.any() else "Start at rest."),
         f"void {prefix}_reset({prefix}_state *state);", "",
-        _comment("Take one sample of each signal, write the estimates at that sample, and advance."),
-        _comment("Signals are deviations from the operating point. Returns 0; or 1 if a sample is not finite:"),
-        _comment("the state and the estimates are left as they were then."),
+        comment("Take one sample of each signal, write the estimates at that sample, and advance."),
+        comment("Signals are deviations from the operating point. Returns 0; or 1 if a sample is not finite:"),
+        comment("the state and the estimates are left as they were then."),
         *_signal_comments("u", found.inputs[: len(observer.input_names)], before),
         *_signal_comments("y", observer.output_names, before[len(observer.input_names) :]),
         *_signal_comments("states", observer.state_names, after, observer.state_delays),
@@ -95,7 +75,7 @@ def source_text(found: Realisation, prefix: str, header: str) -> str:
     body = [line for target, _, parts in blocks for line in _product(target, parts)]
     copy = [f"    for (i = 0; i < {sizes['z']}; i++) {{", "        state->z[i] = next[i];", "    }"]
     return "\n".join([
-        _comment(f"sha256 of the gain set: {found.digest}"), f'#include "{_include(header)}"', "", "#include <math.h>",
+        comment(f"sha256 of the gain set: {found.digest}"), f'#include "{included(header)}"', "", "#include <math.h>",
         "", *tables, *_reset(found, prefix),
         _step_signature(found, prefix), "{", "    int i;", *(["    int j;"] if any(sizes.values()) else []),
         *([f"    double next[{sizes['z']}];"] if sizes["z"] else []),
@@ -169,17 +149,4 @@ def _signal_comments(
     for i, name in enumerate(names):
         at = f", operating point {float(point[i])!r}" if point is not None and point[i] else ""
         late = f", {delays[i]} sample(s) late" if delays and delays[i] else ""
-        yield _comment(f"{array}[{i}]: {_quoted(name)}{at}{late}")
-
-
-def _quoted(name: str) -> str:
-    """Return a name in quotes, in ASCII, that cannot end or begin a comment or form a trigraph."""
-    return json.dumps(name).replace("*/", "* /").replace("/*", "/ *").replace("??", "? ?").replace("??", "? ?")
-
-
-def _include(name: str) -> str:
-    return name.replace("\\", "/")
-
-
-def _comment(text: str) -> str:
-    return f"/* {text} */"
+        yield comment(f"{array}[{i}]: {quoted(name)}{at}{late}")

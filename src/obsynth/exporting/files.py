@@ -8,9 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.exporting.c_source import c_identifier, header_text, source_text
+from obsynth.exporting.c_source import header_text, source_text
+from obsynth.exporting.c_words import c_identifier
+from obsynth.exporting.dae_c_source import write_dae_c
 from obsynth.exporting.realisation import Realisation
 from obsynth.numerics.arguments import require_kind
+from obsynth.observers.dae import DAEObserver
 from obsynth.results.design import ObserverDesign
 from obsynth.results.serialise import write_atomically
 
@@ -30,7 +33,8 @@ def export(design: ObserverDesign, path: str | Path, *, sample_time: float | Non
         ``x0 (nz, 1)`` and ``Ts`` (seconds, 0 for continuous time) of the system from ``[u; y]`` to
         ``[xhat; fhat; r]``, as a State-Space block takes them, with ``input_names``, ``output_names``, ``delays``
         (samples, of states and faults), ``input_point``, ``output_point``, ``name``, ``method`` and ``sha256``.
-        ``.c``: a source file and the header beside it, with functions ``<stem>_reset`` and ``<stem>_step``.
+        ``.c``: a source file and the header beside it, with functions ``<stem>_reset`` and ``<stem>_step``; the only
+        one for an observer of a nonlinear DAE, which holds the implicit step with its homotopy.
     sample_time : float, optional, seconds
         Samples a continuous-time observer by a first-order hold; needed for C.
 
@@ -56,6 +60,8 @@ def export(design: ObserverDesign, path: str | Path, *, sample_time: float | Non
     suffix = target.suffix.lower()
     if suffix not in SUFFIXES:
         raise SpecError(f"{target} has an unknown suffix: use one of {', '.join(SUFFIXES)}.", path=str(target))
+    if isinstance(design, ObserverDesign) and isinstance(design.observer, DAEObserver):
+        return write_dae_c(design, target, sample_time)
     found = Realisation.of(design, sample_time)
     if suffix == ".c":
         return _write_c(found, target)

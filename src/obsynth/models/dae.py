@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from dataclasses import fields as fields_of
-from functools import partial
+from functools import cached_property, partial
 from types import MappingProxyType
 from typing import Any
 
@@ -130,7 +130,7 @@ class DAEModel:
         problems.raise_if_any()
         check_structure(self, problems)
         required = [*self.state_names, *self.input_names, *self.parameter_names, *self.output_names]
-        missing = [name for name in required if name not in units]
+        missing = [name for name in required if units.get(name, "") == ""]
         if missing:
             problems.collect(partial(_units_missing, missing))
         known = {*required, *self.constants, *self.definitions}
@@ -197,6 +197,11 @@ class DAEModel:
     def is_data(self) -> bool:
         """Whether the model is given as texts, so that it can be saved."""
         return not callable(self.equations)
+
+    @cached_property
+    def graphs(self) -> dict[tuple[Any, ...], Any]:
+        """CasADi functions that were made of the model, by what they were made for, so that each is made once."""
+        return {}
 
     def as_dict(self) -> dict[str, Any]:
         """Return every field as data, as the constructor takes it.

@@ -12,13 +12,14 @@ from obsynth.errors import SpecError
 from obsynth.models.dae_symbols import DAESymbols, symbols_of
 from obsynth.models.names import checked_names
 from obsynth.models.validation import Problems
-from obsynth.numerics.expressions import CONSTANTS, FUNCTIONS, FUNCTIONS_OF_TWO
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.expressions import CONSTANTS, DECIDING_WORDS, FUNCTIONS, FUNCTIONS_OF_TWO
 
 if TYPE_CHECKING:
     from obsynth.models.dae import DAEModel
 
 #: Names that mean something else in the language.
-RESERVED = frozenset({*CONSTANTS, *FUNCTIONS, *FUNCTIONS_OF_TWO, "der"})
+RESERVED = frozenset({*CONSTANTS, *FUNCTIONS, *FUNCTIONS_OF_TWO, *DECIDING_WORDS, "der", "where"})
 
 
 def checked_signals(values: Mapping[str, float] | None, what: str) -> dict[str, float]:
@@ -81,7 +82,7 @@ def check_structure(model: DAEModel, problems: Problems) -> None:
     """Note what is wrong with the equations as a whole: their number, empty ones, parameters that enter nothing."""
     symbols = problems.collect(lambda: symbols_of(model))
     problems.raise_if_any()
-    for check in (_square, _no_input_stored, _no_empty_equation, _every_parameter_used):
+    for check in (_square, _only_states_stored, _no_empty_equation, _every_parameter_used, _every_output_sees):
         problems.collect(partial(check, model, symbols))
 
 
@@ -100,7 +101,7 @@ def _square(model: DAEModel, symbols: DAESymbols) -> None:
                         path="outputs")  # fmt: skip
 
 
-def _no_input_stored(model: DAEModel, symbols: DAESymbols) -> None:
+def _only_states_stored(model: DAEModel, symbols: DAESymbols) -> None:
     found = _depends(symbols.stored, symbols.u)
     if found.any():
         name = model.input_names[int(np.argmax(found.any(axis=0)))]
@@ -108,6 +109,13 @@ def _no_input_stored(model: DAEModel, symbols: DAESymbols) -> None:
             f"der(...) is taken of the input {name!r}, whose derivative is not known: give the derivative as an input "
             "of its own, or write the balance with states only.", path="equations",
         )  # fmt: skip
+    still = ~_depends(symbols.stored, symbols.x).any(axis=1)
+    if still.any():
+        where = [name for name, row in zip(model.equation_names, _depends(symbols.equations, symbols.rates)[:, still],
+                                           strict=False) if row.any()]  # fmt: skip
+        told = f" in the equation {where[0]!r}" if where else ""
+        raise SpecError(f"der(...){told} is taken of what contains no state, and is zero: take it of a state.",
+                        path="equations")  # fmt: skip
 
 
 def _no_empty_equation(model: DAEModel, symbols: DAESymbols) -> None:
@@ -135,6 +143,77 @@ def _every_parameter_used(model: DAEModel, symbols: DAESymbols) -> None:
         if not enters:
             raise SpecError(f"The parameter {name!r} enters no equation and no output: remove it, or use it.",
                             path=f"parameters.{name}")  # fmt: skip
+
+
+def _every_output_sees(model: DAEModel, symbols: DAESymbols) -> None:
+    import casadi as ca
+
+    seen = _depends(symbols.outputs, ca.vertcat(symbols.x, symbols.theta)).any(axis=1)
+    for name, sees in zip(model.output_names, seen, strict=False):
+        if not sees:
+            raise SpecError(f"The output {name!r} contains neither a state nor a parameter: it tells nothing.",
+                            path=f"outputs.{name}")  # fmt: skip
+
+
+def step_length(dt: Any) -> float:
+    """Return the seconds between samples; raise `SpecError` unless they are a positive number."""
+    number = isinstance(dt, (int, float, np.integer, np.floating)) and not isinstance(dt, bool)
+    if not number or not (np.isfinite(dt) and dt > 0.0):
+        raise SpecError(f"dt is {dt!r}: give the seconds between samples, a positive number.", path="dt")
+    return float(dt)
+
+
+def checked_inputs(model: DAEModel, u: Any, samples: int | None = None) -> FloatArray:
+    """Return known inputs ``(samples, nu)``; raise `SpecError` naming the signal and k where one is not finite.
+
+    Parameters
+    ----------
+    model : DAEModel
+        Whose.
+    u : array_like or None
+        ``None`` where there are none, if ``samples`` is given.
+    samples : int, optional
+        How many there must be.
+    """
+    if u is None and (model.nu or samples is None):
+        raise SpecError(f"u is missing: the model has {model.nu} input(s), {', '.join(model.input_names)}.", path="u")
+    raw = np.zeros((samples or 0, 0)) if u is None else np.asarray(u)
+    if raw.ndim == 1 and model.nu == 1:
+        raw = raw[:, None]
+    if raw.dtype.kind in "OUSbc" or raw.ndim != 2 or raw.shape[1] != model.nu:
+        what = "no numbers" if raw.dtype.kind in "OUSbc" else f"of shape {raw.shape}"
+        raise SpecError(f"u is {what}, but (samples, {model.nu}) numbers are needed.", path="u")
+    array = raw.astype(np.float64)
+    require_known(model, array)
+    if samples is not None and len(array) != samples:
+        raise SpecError(f"u has {len(array)} samples and y has {samples}: give the same number.", path="u")
+    return array
+
+
+def require_known(model: DAEModel, u: FloatArray, first: int = 0) -> None:
+    """Raise `SpecError` naming signal and k where an input ``(samples, nu)`` that begins at ``first`` is not finite."""
+    if not np.isfinite(u).all():
+        k, i = np.argwhere(~np.isfinite(u))[0]
+        raise SpecError(
+            f"The input {model.input_names[i]!r} is {u[k, i]} at k = {first + k}: inputs must be known. Fill the gap, "
+            "or make the signal a state with a sensor.", path="u",
+        )  # fmt: skip
+
+
+def finite_vector(value: Any, names: Sequence[str], default: FloatArray, what: str) -> FloatArray:
+    """Return ``(len(names),)`` finite numbers, the default for ``None``; raise `SpecError` naming what is wrong."""
+    if value is None:
+        return np.array(default)
+    try:
+        vector = np.atleast_1d(np.asarray(value, dtype=np.float64))
+    except (TypeError, ValueError):
+        raise SpecError(f"{what} must be {len(names)} finite number(s).", path=what) from None
+    if vector.shape != (len(names),):
+        raise SpecError(f"{what} must be {len(names)} finite number(s): {', '.join(names)}.", path=what)
+    for name, entry in zip(names, vector, strict=True):
+        if not np.isfinite(entry):
+            raise SpecError(f"{what}.{name} is {entry}: give a finite number.", path=f"{what}.{name}")
+    return vector
 
 
 def _depends(expressions: Any, symbols: Any) -> Any:

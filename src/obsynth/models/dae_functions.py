@@ -28,23 +28,18 @@ class Compiled:
 
     Parameters
     ----------
-    name : str
-        For CasADi.
-    inputs, outputs : list of casadi.SX
-        Columns, and columns or matrices.
+    function : casadi.Function
+        Of columns, with dense results.
     """
 
-    def __init__(self, name: str, inputs: list[Any], outputs: list[Any]) -> None:
-        import casadi as ca
-
-        function = ca.Function(name, inputs, [ca.densify(output) for output in outputs])
+    def __init__(self, function: Any) -> None:
         # CasADi's own annotations of these two do not fit what they return.
         found: Any = function.buffer()
         self._buffer, self._run = found
-        self._arguments = [np.zeros(max(entry.numel(), 1)) for entry in inputs]
-        self._sizes = [entry.numel() for entry in inputs]
-        self._shapes = [output.shape for output in outputs]
-        self._results = [np.zeros(max(output.numel(), 1)) for output in outputs]
+        self._sizes = [function.numel_in(i) for i in range(function.n_in())]
+        self._arguments = [np.zeros(max(size, 1)) for size in self._sizes]
+        self._shapes = [function.size_out(i) for i in range(function.n_out())]
+        self._results = [np.zeros(max(rows * columns, 1)) for rows, columns in self._shapes]
         for i, argument in enumerate(self._arguments):
             self._buffer.set_arg(i, memoryview(argument.data))
         for i, result in enumerate(self._results):
@@ -55,6 +50,9 @@ class Compiled:
         for argument, size, value in zip(self._arguments, self._sizes, values, strict=True):
             argument[:size] = value
         self._run()
+        if self._buffer.ret():
+            # A factorisation inside met a singular matrix; what is in the buffers belongs to another call.
+            return tuple(np.full(shape, np.nan) for shape in self._shapes)
         return tuple(
             np.array(result[: shape[0] * shape[1]]).reshape(shape, order="F")
             for result, shape in zip(self._results, self._shapes, strict=True)
@@ -71,6 +69,14 @@ class DAEFunctions:
     method : {"backward-euler", "radau"}, optional
         The implicit method.
 
+    Attributes
+    ----------
+    residual_function, derivative_function : casadi.Function
+        From stages ``(stages * nx,)``, state before, input, parameters and dt to the residual and its Jacobian; and to
+        the Jacobians with respect to stages, state before and parameters.
+    output_function : casadi.Function
+        From state and parameters to y, H and L.
+
     Raises
     ------
     SpecError
@@ -78,24 +84,14 @@ class DAEFunctions:
     """
 
     def __init__(self, model: DAEModel, method: str = "backward-euler") -> None:
-        import casadi as ca
-
         if method not in BUTCHER:
             raise SpecError(f"The method of integration is {method!r}: use one of {', '.join(BUTCHER)}.", path="method")
         self.model, self.method, self.stages = model, method, len(BUTCHER[method])
-        symbols = symbols_of(model)
-        stages, start, dt = ca.SX.sym("X", model.nx, self.stages), ca.SX.sym("start", model.nx), ca.SX.sym("dt")
-        residual = _stage_equations(
-            symbols, stages, start, dt, np.asarray(np.linalg.inv(BUTCHER[method]), dtype=np.float64)
-        )
-        X = ca.vec(stages)
-        inputs = [X, start, symbols.u, symbols.theta, dt]
-        jacobians = [ca.jacobian(residual, X), ca.jacobian(residual, start), ca.jacobian(residual, symbols.theta)]
-        self.residual = Compiled("residual", inputs, [residual, jacobians[0]])
-        self.derivatives = Compiled("derivatives", inputs, [residual, *jacobians])
-        seen = [symbols.outputs, ca.jacobian(symbols.outputs, symbols.x),
-                ca.jacobian(symbols.outputs, symbols.theta)]  # fmt: skip
-        self._outputs = Compiled("outputs", [symbols.x, symbols.theta], seen)
+        if (method,) not in model.graphs:
+            model.graphs[(method,)] = _graphs(model, method)
+        self.residual_function, self.derivative_function, self.output_function = model.graphs[(method,)]
+        # Buffers belong to one user each, functions to all.
+        self.residual, self._outputs = Compiled(self.residual_function), Compiled(self.output_function)
 
     def outputs(self, x: FloatArray, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return ``y (ny,)``, ``H = dh/dx (ny, nx)`` and ``L = dh/dtheta (ny, nq)``.
@@ -107,6 +103,29 @@ class DAEFunctions:
         """
         y, H, L = self._outputs(x, theta)
         return y[:, 0], H, L
+
+
+def _graphs(model: DAEModel, method: str) -> tuple[Any, Any, Any]:
+    import casadi as ca
+
+    symbols = symbols_of(model)
+    stages = ca.SX.sym("X", model.nx, len(BUTCHER[method]))
+    start, dt = ca.SX.sym("start", model.nx), ca.SX.sym("dt")
+    weights = np.asarray(np.linalg.inv(BUTCHER[method]), dtype=np.float64)
+    residual, X = _stage_equations(symbols, stages, start, dt, weights), ca.vec(stages)
+    inputs = [X, start, symbols.u, symbols.theta, dt]
+    jacobians = [ca.jacobian(residual, X), ca.jacobian(residual, start), ca.jacobian(residual, symbols.theta)]
+    seen = [symbols.outputs, ca.jacobian(symbols.outputs, symbols.x), ca.jacobian(symbols.outputs, symbols.theta)]
+    return (
+        _dense("residual", inputs, [residual, jacobians[0]]), _dense("derivatives", inputs, jacobians),
+        _dense("outputs", [symbols.x, symbols.theta], seen),
+    )  # fmt: skip
+
+
+def _dense(name: str, inputs: list[Any], outputs: list[Any]) -> Any:
+    import casadi as ca
+
+    return ca.Function(name, inputs, [ca.densify(output) for output in outputs])
 
 
 def _stage_equations(symbols: DAESymbols, stages: Any, start: Any, dt: Any, weights: FloatArray) -> Any:

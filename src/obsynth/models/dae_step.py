@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from obsynth.errors import SolverError
-from obsynth.models.dae_functions import DAEFunctions
+from obsynth.models.dae_functions import Compiled, DAEFunctions
+from obsynth.models.dae_step_graph import StepGraph, step_graph
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.newton import NewtonResult, ScaledMatrix, newton
+from obsynth.numerics.newton import NewtonResult, condition_number, newton
 
 #: First fraction of a homotopy; it grows twofold after each success and is halved after each failure.
 FIRST_FRACTION = 0.125
@@ -82,6 +84,19 @@ class ImplicitStep:
         self.largest_move = np.inf if largest_move is None else largest_move
         self.sizes = np.tile(functions.model.state_scales, functions.stages)
 
+    @cached_property
+    def graph(self) -> StepGraph:
+        """The step as CasADi functions."""
+        return step_graph(self.functions, self.dt, self.largest_move)
+
+    @cached_property
+    def _fast(self) -> Compiled:
+        return Compiled(self.graph.step)
+
+    @cached_property
+    def _local(self) -> Compiled:
+        return Compiled(self.graph.sensitivities)
+
     def solve(
         self, x: FloatArray, u: FloatArray, theta: FloatArray, *, before: FloatArray | None = None, k: int = 0
     ) -> Solution:
@@ -97,6 +112,26 @@ class ImplicitStep:
             ``(nu,)`` during the step before, from where a homotopy may start.
         k : int, optional
             Number of the sample that is reached, for messages.
+
+        Raises
+        ------
+        SolverError
+            There is no solution within reach; k, iteration and worst equation are named.
+        """
+        stages, residual, trusted = self._fast(x, u, theta)
+        if trusted[0, 0] == 1.0:
+            return Solution(stages[-self.functions.model.nx :, 0], stages[:, 0], float(residual[0, 0]), 1)
+        return self.solve_carefully(x, u, theta, before=before, k=k)
+
+    def solve_carefully(
+        self, x: FloatArray, u: FloatArray, theta: FloatArray, *, before: FloatArray | None = None, k: int = 0
+    ) -> Solution:
+        """Return the state after one step, by damped Newton and by a homotopy where that is needed.
+
+        Parameters
+        ----------
+        x, u, theta, before, k
+            See `solve`, which comes here where plain Newton does not converge.
 
         Raises
         ------
@@ -128,16 +163,10 @@ class ImplicitStep:
         SolverError
             The matrix of (7) is singular.
         """
-        nx, stages = self.functions.model.nx, self.functions.stages
-        _, J, start, parameters = self.functions.derivatives(solution.stages, x, u, theta, np.array([self.dt]))
-        scaled = ScaledMatrix.of(J, self.sizes)
-        try:
-            moved = scaled.solve(np.hstack([-start, -parameters, np.tile(np.eye(nx), (stages, 1))]))[-nx:]
-        except np.linalg.LinAlgError:
-            raise SolverError("The matrix of (7), dF/dx' / dt + dF/dx, is singular: the step has no unique solution."
-                              ) from None  # fmt: skip
-        nq = parameters.shape[1]
-        return Sensitivities(moved[:, :nx], moved[:, nx : nx + nq], moved[:, nx + nq :], scaled.condition)
+        F, G, noise, scaled = self._local(solution.stages, x, u, theta)
+        if not (np.isfinite(F).all() and np.isfinite(G).all() and np.isfinite(noise).all()):
+            raise SolverError("The matrix of (7), dF/dx' / dt + dF/dx, is singular: the step has no unique solution.")
+        return Sensitivities(F, G, noise, condition_number(scaled))
 
     def _move(self, stages: FloatArray, start: FloatArray) -> float:
         return float(np.abs((stages - start) / self.sizes).max())
@@ -182,9 +211,10 @@ class ImplicitStep:
     def _error(self, found: NewtonResult, k: int, where: str) -> SolverError:
         model = self.functions.model
         name = model.equation_names[found.worst % model.nx]
+        defined = np.isfinite(found.residual)
+        worst = f"residual {found.residual:.3g} in sizes of the states" if defined else "which is not defined there"
         return SolverError(
             f"No solution at k = {k}{where}: Newton stopped after iteration {found.iterations}, and the worst equation "
-            f"is {name!r} (residual {found.residual:.3g} in sizes of the states). Check that input and state at this "
-            "k are possible, or take smaller steps.",
+            f"is {name!r} ({worst}). Check that input and state at this k are possible, or take smaller steps.",
             record={"k": k, "iteration": found.iterations, "equation": name, "residual": found.residual},
         )  # fmt: skip

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,6 +14,9 @@ from obsynth.numerics.expressions import Expression, parse_expression, step_func
 
 if TYPE_CHECKING:
     from obsynth.models.dae import DAEModel
+
+#: The sign between two sides, which is no part of a comparison.
+_EQUALS = re.compile("(?<![<>=])=(?!=)")
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,10 +110,11 @@ def _parsed(text: str, path: str, *, rates: bool = False) -> Expression:
 
 def _equation(text: str, path: str) -> Expression:
     """Parse ``left = right``, or an expression that is zero."""
-    left, sign, right = text.partition("=")
-    for side in (left, right) if sign else (left,):
+    sides = _EQUALS.split(text, maxsplit=1)
+    for side in sides:
         _parsed(side.strip(), path, rates=True)
-    return _parsed(f"({left}) - ({right})" if sign else left, path, rates=True)
+    whole = _parsed(f"({sides[0]}) - ({sides[1]})" if len(sides) > 1 else text, path, rates=True)
+    return replace(whole, text=text)
 
 
 def _value(expression: Expression, known: Mapping[str, Any], path: str) -> Any:
@@ -132,7 +137,8 @@ def _translation(operation: Callable[..., Any]) -> Callable[..., Any]:
         np.add: lambda a, b: ca.plus(a, b), np.subtract: lambda a, b: ca.minus(a, b), np.multiply: ca.times,
         np.divide: ca.rdivide, np.power: ca.power, np.negative: lambda a: -a, np.arcsin: ca.asin, np.arccos: ca.acos,
         np.arctan: ca.atan, np.abs: ca.fabs, np.minimum: ca.fmin, np.maximum: ca.fmax,
-        step_function: lambda a: ca.if_else(a >= 0.0, 1.0, 0.0),
+        step_function: lambda a: ca.if_else(a >= 0.0, 1.0, 0.0), np.where: ca.if_else, np.less: ca.lt,
+        np.less_equal: ca.le, np.greater: ca.gt, np.greater_equal: ca.ge,
     }  # fmt: skip
     found = special.get(operation) or getattr(ca, operation.__name__)
 
@@ -166,16 +172,40 @@ def _called(function: Callable[..., Any], columns: Sequence[Any], path: str) -> 
         if mode is not None:
             ca.GlobalOptions.setNumpyMode(1)
         found = function(*arguments)
-    except RuntimeError as error:
-        if "truth value" not in str(error):
-            raise
-        raise SpecError(
-            f"The function {path} decides with `if` (or `and`, `or`, `min`, `max`) on a state, which has no value yet: "
-            "use numpy.where(condition, a, b), numpy.minimum or numpy.maximum.", path=path,
-        ) from error  # fmt: skip
+        if isinstance(found, (list, tuple, np.ndarray, ca.SX)):
+            entries = ca.vertsplit(ca.vec(found)) if isinstance(found, ca.SX) else list(found)
+            column = ca.vertcat(*(ca.SX(entry) for entry in entries)) if entries else ca.SX(0, 1)
+        else:
+            raise SpecError(f"The function {path} must return a list with one expression for each entry.", path=path)
+    except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
+        if "truth value" in str(error):
+            raise SpecError(
+                f"The function {path} decides with `if` (or `and`, `or`, `min`, `max`) on a state, which has no value "
+                "yet: use numpy.where(condition, a, b), numpy.logical_and, numpy.minimum or numpy.maximum.", path=path,
+            ) from error  # fmt: skip
+        raise _not_symbolic(path, len(columns), f"{type(error).__name__}: {str(error).splitlines()[0]}") from error
     finally:
         if mode is not None:
             ca.GlobalOptions.setNumpyMode(mode)
-    if not isinstance(found, (list, tuple)):
-        raise SpecError(f"The function {path} must return a list with one expression for each entry.", path=path)
-    return ca.vertcat(*(ca.SX(entry) for entry in found)) if found else ca.SX(0, 1)
+    if _holds_nan(column, columns):
+        # A symbol made into a number, such as by the functions of `math`.
+        raise _not_symbolic(path, len(columns), "an expression is not a number")
+    return column
+
+
+def _not_symbolic(path: str, count: int, reason: str) -> SpecError:
+    taken = {4: "rates, x, u, theta", 2: "x, theta"}[count]
+    return SpecError(
+        f"The function {path} cannot be called on symbols: {reason}. It takes lists ({taken}), in the order of the "
+        "names, and returns a list; use numpy's functions (sqrt, where, minimum, ...) in place of those of math, and "
+        "no numbers that are made of a state, such as int(x) or range(x).", path=path,
+    )  # fmt: skip
+
+
+def _holds_nan(column: Any, columns: Sequence[Any]) -> bool:
+    import casadi as ca
+
+    function = ca.Function("found", list(columns), [column], {"allow_free": True})
+    constants = (function.instruction_constant(i) for i in range(function.n_instructions())
+                 if function.instruction_id(i) == ca.OP_CONST)  # fmt: skip
+    return any(np.isnan(constant) for constant in constants)

@@ -67,3 +67,19 @@ def covariance_factor(covariance: FloatArray, name: str) -> FloatArray:
             path=name,
         )
     return np.asarray(scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)))
+
+
+def is_definite(covariance: FloatArray, factor: FloatArray) -> bool:
+    """Return whether a covariance is positive definite, judged by its correlations so that units do not matter.
+
+    Parameters
+    ----------
+    covariance : FloatArray
+        ``(n, n)``.
+    factor : FloatArray
+        From `covariance_factor`.
+    """
+    variances = np.diag(covariance)
+    if not np.all(variances > 0.0):
+        return False
+    return not len(factor) or bool(np.linalg.matrix_rank(factor / np.sqrt(variances)[:, None]) == len(factor))

@@ -1,7 +1,7 @@
 """A small arithmetic language for data: parsed into a tree of known operations, never executed as code.
 
-Numbers, names, ``+ - * / **``, parentheses and a fixed list of functions; in equations of a DAE also ``der(...)``, the
-derivative with respect to time of any expression.
+Numbers, names, ``+ - * / **``, parentheses, a fixed list of functions, and ``where(a > b, c, d)``, which is c where
+a > b and d elsewhere; in equations of a DAE also ``der(...)``, the derivative with respect to time of any expression.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ MAXIMUM_DEPTH = 50
 Translation: TypeAlias = Callable[[Callable[..., Any]], Callable[..., Any]]
 Evaluator: TypeAlias = Callable[[Mapping[str, Any], Translation], Any]
 
-_TOKEN = re.compile(r"\s*(?:((?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)|([A-Za-z_]\w*)|(\*\*|[-+*/(),]))", re.ASCII)
+_TOKEN = re.compile(r"\s*(?:((?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)|([A-Za-z_]\w*)|(\*\*|[<>]=?|[-+*/(),]))", re.ASCII)
 
 
 def step_function(value: Any) -> Any:
@@ -40,6 +40,12 @@ FUNCTIONS: Mapping[str, Callable[[Any], Any]] = {
 #: Functions of two arguments.
 FUNCTIONS_OF_TWO: Mapping[str, Callable[[Any, Any], Any]] = {"min": np.minimum, "max": np.maximum}
 CONSTANTS: Mapping[str, float] = {"pi": float(np.pi)}
+#: What may stand in the first place of ``where``.
+COMPARISONS: Mapping[str, Callable[[Any, Any], Any]] = {
+    "<": np.less, "<=": np.less_equal, ">": np.greater, ">=": np.greater_equal,
+}  # fmt: skip
+#: Words that other languages decide with; names of these would be read as mistakes.
+DECIDING_WORDS = frozenset({"if", "else", "and", "or", "not"})
 
 
 def _as_it_is(operation: Callable[..., Any]) -> Callable[..., Any]:
@@ -145,9 +151,11 @@ class _Parser:
         return ""
 
     def error(self, reason: str) -> SpecError:
+        decides = " To decide, write where(a > b, c, d): c where a > b, d elsewhere."
+        hint = decides if DECIDING_WORDS.intersection(self.tokens) or COMPARISONS.keys() & set(self.tokens) else ""
         return SpecError(
             f"{self.text!r} is no valid expression: {reason}. Allowed are numbers, names, + - * / **, parentheses "
-            f"and the functions {', '.join([*FUNCTIONS, *FUNCTIONS_OF_TWO])}."
+            f"and the functions {', '.join([*FUNCTIONS, *FUNCTIONS_OF_TWO, 'where'])}.{hint}"
         )
 
     def sum(self) -> Evaluator:
@@ -181,7 +189,7 @@ class _Parser:
             self.close()
             return inner
         token = self.peek()
-        if not token or token in "**/+-(),":
+        if not token or token in DECIDING_WORDS or not (token[0].isalnum() or token[0] in "._"):
             raise self.error(f"{token!r} is not expected here" if token else "it ends too early")
         self.position += 1
         if token[0].isdigit() or token[0] == ".":
@@ -198,6 +206,8 @@ class _Parser:
     def function(self, name: str) -> Evaluator:
         if name == "der" and self.rates_allowed:
             return self.rate()
+        if name == "where":
+            return self.choice()
         first = self.sum()
         if name in FUNCTIONS:
             self.close()
@@ -209,6 +219,21 @@ class _Parser:
         second = self.sum()
         self.close()
         return _binary(FUNCTIONS_OF_TWO[name], first, second)
+
+    def choice(self) -> Evaluator:
+        """Read ``a > b, c, d)``; of the values that are not chosen none is wanted, so that they need not exist."""
+        left = self.sum()
+        operator = self.take(*COMPARISONS)
+        if not operator:
+            raise self.error("where needs a comparison (<, <=, >, >=) first")
+        condition = _binary(COMPARISONS[operator], left, self.sum())
+        values = []
+        for _ in range(2):
+            if not self.take(","):
+                raise self.error("where needs a comparison and two values")
+            values.append(self.sum())
+        self.close()
+        return _chosen(condition, *values)
 
     def rate(self) -> Evaluator:
         """Read what a derivative is taken of; it stands for a value of its own, found under its text."""
@@ -246,3 +271,9 @@ def _unary(operation: Callable[[Any], Any], inner: Evaluator) -> Evaluator:
 
 def _binary(operation: Callable[[Any, Any], Any], left: Evaluator, right: Evaluator) -> Evaluator:
     return lambda values, translate: translate(operation)(left(values, translate), right(values, translate))
+
+
+def _chosen(condition: Evaluator, first: Evaluator, second: Evaluator) -> Evaluator:
+    return lambda values, translate: translate(np.where)(
+        condition(values, translate), first(values, translate), second(values, translate)
+    )

@@ -70,10 +70,21 @@ class ScaledMatrix:
     @property
     def condition(self) -> float:
         """Condition number of the scaled matrix; infinite where it is singular."""
-        if not np.isfinite(self.matrix).all():
-            return float("inf")
-        values = np.linalg.svd(self.matrix, compute_uv=False)
-        return float(values[0] / values[-1]) if values[-1] > 0.0 else float("inf")
+        return condition_number(self.matrix)
+
+
+def condition_number(matrix: FloatArray) -> float:
+    """Return the condition number of a matrix; infinite where it is singular or not finite.
+
+    Parameters
+    ----------
+    matrix : FloatArray
+        ``(n, n)``.
+    """
+    if not np.isfinite(matrix).all():
+        return float("inf")
+    values = np.linalg.svd(matrix, compute_uv=False)
+    return float(values[0] / values[-1]) if values[-1] > 0.0 else float("inf")
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,12 +111,12 @@ class NewtonResult:
     @property
     def residual(self) -> float:
         """Largest scaled residual; infinite where there is no value."""
-        return float(np.nan_to_num(np.abs(self.residuals), nan=np.inf).max())
+        return float(np.where(np.isnan(self.residuals), np.inf, np.abs(self.residuals)).max())
 
     @property
     def worst(self) -> int:
         """Index of the equation with the largest residual."""
-        return int(np.argmax(np.nan_to_num(np.abs(self.residuals), nan=np.inf)))
+        return int(np.argmax(np.where(np.isnan(self.residuals), np.inf, np.abs(self.residuals))))
 
 
 def newton(

@@ -103,8 +103,7 @@ def pencil_structure(E: FloatArray, A: FloatArray) -> PencilStructure:
     """
     right, left = _reduce(equilibrate_pencil(E, A))
     rows, columns = E.shape
-    # Without right singular blocks a square pencil has no left ones either.
-    regular = rows == columns and right.nullities == right.ranks
+    regular = _is_regular(E, right)
     next_nullities = (*right.nullities[1:], 0)
     counts = [rank - following for rank, following in zip(right.ranks, next_nullities, strict=False)]
     sizes = tuple(size for size in range(len(counts), 0, -1) for _ in range(counts[size - 1]))
@@ -155,14 +154,63 @@ def _with_missed_zeros(found: ComplexArray, E: FloatArray, A: FloatArray, scales
     rows, columns = E.shape
     if rows == columns:
         return found
-    basis = np.linalg.svd(E)[0][:, :columns].T
+    basis = np.linalg.svd(E)[0]
+    square_e, square_a = basis[:, :columns].T @ E, basis[:, :columns].T @ A
+    if _clearly_without_zeros(square_e, square_a, basis[:, columns:].T @ A, scales):
+        return found
     zeros = list(found)
-    for candidate in _eigenvalues(basis @ E, basis @ A):
+    for candidate in _eigenvalues(square_e, square_a):
         values = np.linalg.svd(A - candidate * E, compute_uv=False)
         nullity = np.sum(values <= RANK_TOLERANCE * (scales[1] + abs(candidate) * scales[0]))
         if nullity > sum(abs(zero - candidate) <= CLUSTER_TOLERANCE * max(1.0, abs(candidate)) for zero in zeros):
             zeros.append(candidate)
     return _in_pairs(np.array(zeros, dtype=np.complex128))
+
+
+def _clearly_without_zeros(
+    square_e: FloatArray, square_a: FloatArray, rest: FloatArray, scales: tuple[float, float]
+) -> bool:
+    """Return whether ``[square_a - z square_e; rest]`` clearly has full rank at every z; false says nothing.
+
+    Suppose it maps ``x`` of unit norm to no more than t.  Let V hold eigenvectors of the square part, F their residual,
+    w_j be the rows of ``(square_e V)^-1``, and ``x = V y``.  Then ``|y_j| <= |w_j| (t + |F| |V^-1|) / |lambda_j - z|``.
+    So x is a multiple of the eigenvector v whose lambda is closest to z, but for r, the sum of these over the others,
+    and ``rest`` cannot map it to less than ``|rest v| (1 - r) - |rest| r``.  Where that is more than t for every v,
+    there is no z left to look at.  Ill-conditioned eigenvectors and close eigenvalues leave the question open.
+    """
+    # What overflows is not clear.
+    with np.errstate(all="ignore"):
+        try:
+            values, vectors = np.linalg.eig(np.linalg.solve(square_e, square_a))
+            weights = np.linalg.norm(np.linalg.inv(square_e @ vectors), axis=1)
+            spread = float(np.linalg.norm(np.linalg.inv(vectors)))
+        except np.linalg.LinAlgError:
+            return False
+        residual = float(np.linalg.norm(square_a @ vectors - square_e @ vectors * values))
+        tolerances = RANK_TOLERANCE * (scales[1] + np.abs(values) * scales[0])
+        apart = np.abs(values - values[:, None])
+        np.fill_diagonal(apart, np.inf)
+        # Closest to lambda_i means up to half way to the others.
+        away = (tolerances + residual * spread) * np.sum(2.0 * weights / apart, axis=1)
+        least = np.linalg.norm(rest @ vectors, axis=0) * (1.0 - away) - float(np.linalg.norm(rest)) * away
+    return bool(np.all(away < 1.0) and np.all(least > 2.0 * tolerances))
+
+
+def regularity(E: FloatArray, A: FloatArray) -> tuple[bool, int]:
+    """Return whether ``A - z E`` is regular, and its normal rank; what `pencil_structure` says without eigenvalues.
+
+    Parameters
+    ----------
+    E, A : FloatArray
+        ``(m, n)`` real matrices; they are not modified.
+    """
+    right, left = _reduce(equilibrate_pencil(E, A))
+    return _is_regular(E, right), _normal_rank(right, left)
+
+
+def _is_regular(E: FloatArray, right: _Deflation) -> bool:
+    # Without right singular blocks a square pencil has no left ones either.
+    return E.shape[0] == E.shape[1] and right.nullities == right.ranks
 
 
 def _reduce(pencil: EquilibratedPencil) -> tuple[_Deflation, _Deflation]:

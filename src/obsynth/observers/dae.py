@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,14 +12,16 @@ from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
 from obsynth.models.dae import DAEModel
+from obsynth.models.dae_checks import checked_inputs, finite_vector, step_length
 from obsynth.models.dae_functions import BUTCHER
-from obsynth.models.time_varying_checks import positive_dt
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
-from obsynth.numerics.covariances import covariance_factor
-from obsynth.observers.records import checked_record, measured_record
+from obsynth.numerics.covariances import covariance_factor, is_definite
+from obsynth.observers.records import measured_record
 
 if TYPE_CHECKING:
+    from obsynth.observers.dae_algebra import ObserverGraph
     from obsynth.observers.dae_estimates import DAEEstimates
+    from obsynth.observers.dae_library import DAELibrary
     from obsynth.observers.dae_running import RunningDAEObserver
 
 FORMS = ("forgetting", "random-walk", "augmented-kalman")
@@ -92,17 +95,25 @@ class DAEObserver:
     window: int = 50
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "dt", positive_dt(self.dt))
+        object.__setattr__(self, "dt", step_length(self.dt))
         for name, allowed in _CHOICES.items():
             if getattr(self, name) not in allowed:
                 raise SpecError(f"{name} is {getattr(self, name)!r}: use one of {', '.join(allowed)}.", path=name)
+        for name in ("forgetting", "largest_move"):
+            value = getattr(self, name)
+            if value is not None and not (isinstance(value, (int, float, np.number)) and not isinstance(value, bool)):
+                raise SpecError(f"{name} is {value!r}: give a number.", path=name)
         if not 0.0 < self.forgetting <= 1.0:
             raise SpecError(f"forgetting is {self.forgetting}: give lambda in (0, 1], such as 0.98.", path="forgetting")
-        if self.window < 1:
-            raise SpecError(f"window is {self.window}: give a number of samples, at least 1.", path="window")
+        if not isinstance(self.window, (int, np.integer)) or isinstance(self.window, bool) or self.window < 1:
+            raise SpecError(f"window is {self.window!r}: give a number of samples, at least 1.", path="window")
         if self.largest_move is not None and not self.largest_move > 0.0:
             raise SpecError(f"largest_move is {self.largest_move}: give a positive number.", path="largest_move")
         self._check_arrays()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what makes it again in another process: its functions and its library are made there anew."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def _check_arrays(self) -> None:
         nx, ny, nq = self.model.nx, self.model.ny, self.model.nq
@@ -112,18 +123,35 @@ class DAEObserver:
             if matrix.shape != (size, size):
                 raise SpecError(f"{name} is {matrix.shape}, but {(size, size)} is needed.", path=name)
             factor = covariance_factor(matrix, name)
-            if name in _DEFINITE and ((np.diag(matrix) <= 0.0).any() or np.linalg.matrix_rank(factor) < size):
-                raise SpecError(f"{name} must be positive definite.", path=name)
+            if name in _DEFINITE:
+                self._require_definite(name, matrix, factor)
             object.__setattr__(self, name, read_only(matrix))
-        for name, size in {"initial_state": nx, "initial_parameters": nq, "lower": nq, "upper": nq}.items():
+        model = self.model
+        for name, signals in (("initial_state", model.state_names), ("initial_parameters", model.parameter_names)):
+            object.__setattr__(self, name, read_only(finite_vector(getattr(self, name), signals, np.zeros(0), name)))
+        for name in ("lower", "upper"):
             vector = np.asarray(getattr(self, name), dtype=np.float64)
-            if vector.shape != (size,) or np.isnan(vector).any() or (size == nx and not np.isfinite(vector).all()):
-                raise SpecError(f"{name} must be {size} finite number(s).", path=name)
+            if vector.shape != (nq,) or np.isnan(vector).any():
+                raise SpecError(f"bounds: {name} must be {nq} number(s).", path="bounds")
             object.__setattr__(self, name, read_only(vector))
-        outside = (self.initial_parameters < self.lower) | (self.initial_parameters > self.upper)
-        if outside.any() or not (self.lower < self.upper).all():
-            raise SpecError("bounds: each lower bound must be below its upper one, and initial_parameters between.",
-                            path="bounds")  # fmt: skip
+        for name, low, start, high in zip(
+            model.parameter_names, self.lower, self.initial_parameters, self.upper, strict=True
+        ):
+            if not (low < high and low <= start <= high):
+                raise SpecError(
+                    f"bounds.{name}: the lower bound ({low:g}) must be below the upper one ({high:g}), and the start "
+                    f"({start:g}) between.", path=f"bounds.{name}",
+                )  # fmt: skip
+
+    def _require_definite(self, name: str, matrix: FloatArray, factor: FloatArray) -> None:
+        signals = self.model.output_names if name == "R" else self.model.parameter_names
+        variances = np.diag(matrix)
+        for signal, variance in zip(signals, variances, strict=True):
+            if not variance > 0.0:
+                raise SpecError(f"{name} must be positive definite, but the variance of {signal!r} is {variance:g}.",
+                                path=name)  # fmt: skip
+        if not is_definite(matrix, factor):
+            raise SpecError(f"{name} must be positive definite, but it is singular.", path=name)
 
     @property
     def state_names(self) -> tuple[str, ...]:
@@ -168,7 +196,30 @@ class DAEObserver:
 
         return RunningDAEObserver(self)
 
-    def run(self, y: ArrayLike, u: ArrayLike | None = None) -> DAEEstimates:
+    @cached_property
+    def graph(self) -> ObserverGraph:
+        """The steps of each sample as CasADi functions, built when they are first needed."""
+        from obsynth.observers.dae_algebra import observer_graph
+
+        return observer_graph(self)
+
+    @cached_property
+    def library(self) -> DAELibrary:
+        """The observer in C, compiled when it is first needed.
+
+        Raises
+        ------
+        SpecError
+            There is no compiler, or it fails.
+        """
+        from obsynth.observers.dae_library import DAELibrary
+
+        return DAELibrary(self)
+
+    def run(
+        self, y: ArrayLike, u: ArrayLike | None = None, *, compiled: bool | None = None,
+        progress: bool | Callable[[int], None] | None = None,
+    ) -> DAEEstimates:  # fmt: skip
         """Run over a whole record.
 
         Parameters
@@ -178,6 +229,12 @@ class DAEObserver:
         u : array_like, optional
             Known inputs ``(samples, nu)``; ``u(k)`` holds during the step that ends at k, and ``u(0)`` puts the
             initial state onto its constraint.  May be left out when there are none.
+        compiled : bool, optional
+            ``None`` runs whole stretches inside CasADi, ``False`` each sample by itself, and ``True`` the observer as C
+            (a compiler is needed, which takes about a second once for each observer).  The numbers are the same.
+        progress : bool or callable, optional
+            ``None`` shows a bar on a terminal in runs of more than two seconds, ``True`` everywhere, ``False`` never; a
+            function is called with the number of samples that are done.
 
         Returns
         -------
@@ -187,22 +244,14 @@ class DAEObserver:
         Raises
         ------
         SpecError
-            Shapes do not fit, or an input is not finite (k is named).
+            Shapes do not fit, or an input is not finite (k is named); there is no compiler, but one is needed.
         SolverError
             A step has no solution; k, iteration and worst equation are named.
         """
-        from obsynth.observers.dae_estimates import DAEEstimates
+        from obsynth.observers.dae_records import run_record
 
+        if compiled not in (None, True, False):
+            raise SpecError(f"compiled is {compiled!r}: give True, False or None.", path="compiled")
         outputs = measured_record(y, self.model.ny)
-        given = np.zeros((len(outputs), 0)) if u is None and not self.model.nu else np.asarray(u)
-        if given.dtype.kind == "f" and given.ndim == 2 and not np.isfinite(given).all():
-            k, i = np.argwhere(~np.isfinite(given))[0]
-            raise SpecError(
-                f"The input {self.model.input_names[i]!r} is {given[k, i]} at k = {k}: inputs must be known. Fill the "
-                "gap, or make the signal a state with a sensor.", path="u",
-            )  # fmt: skip
-        inputs = checked_record(given, self.model.nu, "u")
-        if len(inputs) != len(outputs):
-            raise SpecError(f"u has {len(inputs)} samples and y has {len(outputs)}: give the same number.", path="u")
-        running = self.start()
-        return DAEEstimates.of(self, [running.raw_step(outputs[k], inputs[k]) for k in range(len(outputs))])
+        inputs = checked_inputs(self.model, u, len(outputs))
+        return run_record(self, outputs, inputs, compiled=compiled, progress=progress)

@@ -9,6 +9,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.models.dae import DAEModel
+from obsynth.models.dae_checks import finite_vector
 from obsynth.models.names import index_of
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.observers.dae import DAEObserver
@@ -59,7 +60,7 @@ def dae_observer_from_options(model: DAEModel, options: Mapping[str, Any]) -> DA
             _default_parameter_variances(model, options["initial_parameter_covariance"]),
         ),
         random_walk=_covariance(options["random_walk"], parameters, "random_walk", np.zeros(model.nq)),
-        lower=bounds[:, 0], upper=bounds[:, 1], form=options["form"], forgetting=float(options["forgetting"]),
+        lower=bounds[:, 0], upper=bounds[:, 1], form=options["form"], forgetting=options["forgetting"],
         guard=options["guard"], weight=options["weight"], integration=options["integration"],
         largest_move=options["largest_move"], window=options["window"],
     )  # fmt: skip
@@ -97,7 +98,7 @@ def _covariance(value: Any, names: Sequence[str], what: str, default: FloatArray
     if isinstance(value, Mapping):
         variances = np.zeros(len(names))
         for name, variance in value.items():
-            variances[index_of(name, names, what=what)] = variance
+            variances[index_of(name, names, what=what)] = _number(variance, f"{what}.{name}")
         return np.diag(variances)
     matrix = as_matrix(value, what) if np.size(value) else np.zeros((0, 0))
     return float(matrix[0, 0]) * np.eye(len(names)) if np.ndim(value) == 0 else matrix
@@ -109,12 +110,15 @@ def _vector(value: Any, names: Sequence[str], default: FloatArray, what: str) ->
     if isinstance(value, Mapping):
         vector = np.array(default)
         for name, entry in value.items():
-            vector[index_of(name, names, what=what)] = entry
+            vector[index_of(name, names, what=what)] = _number(entry, f"{what}.{name}")
         return vector
-    try:
-        return np.atleast_1d(np.asarray(value, dtype=np.float64))
-    except (TypeError, ValueError):
-        raise SpecError(f"{what} must be {len(names)} finite number(s).", path=what) from None
+    return finite_vector(value, names, default, what)
+
+
+def _number(value: Any, path: str) -> float:
+    if not isinstance(value, (int, float, np.number)) or isinstance(value, bool):
+        raise SpecError(f"{path} is {value!r}: give a number.", path=path)
+    return float(value)
 
 
 def _bounds(value: Any, names: Sequence[str]) -> FloatArray:
@@ -124,11 +128,14 @@ def _bounds(value: Any, names: Sequence[str]) -> FloatArray:
         for name, pair in value.items():
             if np.shape(pair) != (2,):
                 raise SpecError(f"bounds.{name} must be [lower, upper].", path=f"bounds.{name}")
-            found[index_of(name, names, what="bounds")] = pair
+            found[index_of(name, names, what="bounds")] = [_number(bound, f"bounds.{name}") for bound in pair]
         return found
     if value is None:
         return found
-    rows = np.asarray(value, dtype=np.float64)
+    try:
+        rows = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        rows = np.zeros(0)
     if rows.shape != found.shape:
         raise SpecError(f"bounds must be {len(names)} pairs [lower, upper], or pairs by name.", path="bounds")
     return rows

@@ -2,53 +2,115 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
+from obsynth.analysis.dae_index import SINGULAR_CONDITION, involved
+from obsynth.errors import SolverError
 from obsynth.numerics.arrays import FloatArray, read_only
 
 if TYPE_CHECKING:
     from obsynth.observers.dae import DAEObserver
+    from obsynth.observers.dae_algebra import ObserverGraph
 
 
 @dataclass(frozen=True, eq=False)
 class DAERow:
-    """The estimates at one sample.
+    """What the graph of an observer gave at one sample, or (with a leading axis) at several in a row.
 
     Parameters
     ----------
-    x, theta : FloatArray
-        State after the measurement ``(nx,)`` and parameters ``(nq,)``.
-    covariance, parameter_covariance : FloatArray
-        Of their errors, ``(nx, nx)`` and ``(nq, nq)``.
-    innovation : FloatArray
-        ``(ny,)``, NaN where a sample is missing.
-    nis, degrees : float
-        Its square in units of its covariance, and degrees of freedom.
-    information : FloatArray
-        ``(nq, nq)``: what the sample says of the parameters.
-    residual, condition, contraction : float
-        Newton's scaled residual, the condition of (7), and the spectral radius of F (I - K H); zero, one and zero
-        at k = 0, where no step was taken.
+    graph : ObserverGraph
+        Which laid it out.
+    k : int
+        Number of the (first) sample.
+    memory, said : FloatArray
+        What is carried on, and what is said besides.
+    seen : numpy.ndarray
+        ``(ny,)``, of bool: which outputs were there.
     moved : FloatArray
         ``(nx,)``: how far the state was put onto its constraint; zeros but at k = 0.
     """
 
-    x: FloatArray
-    theta: FloatArray
-    covariance: FloatArray
-    parameter_covariance: FloatArray
-    innovation: FloatArray
-    nis: float
-    degrees: int
-    information: FloatArray
-    residual: float
-    condition: float
-    contraction: float
+    graph: ObserverGraph
+    k: int
+    memory: FloatArray
+    said: FloatArray
+    seen: NDArray[np.bool_]
     moved: FloatArray
+
+    def part(self, name: str) -> FloatArray:
+        """Return one array by its name in the layouts `obsynth.observers.dae_layout`.
+
+        Parameters
+        ----------
+        name : str
+            Such as ``theta``, ``spread``, ``F``.
+        """
+        layout, values = (self.graph.memory, self.memory) if name in self.graph.memory.shapes else (
+            self.graph.row, self.said)  # fmt: skip
+        return layout.part(values, name)
+
+    @property
+    def x(self) -> FloatArray:
+        """The state after the measurement ``(nx,)``."""
+        return self.part("posterior")
+
+    @property
+    def theta(self) -> FloatArray:
+        """The parameters ``(nq,)``."""
+        return self.part("theta")
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance of `x` ``(nx, nx)``."""
+        return self.part("covariance")
+
+    @property
+    def parameter_covariance(self) -> FloatArray:
+        """Covariance of `theta` ``(nq, nq)``."""
+        return self.part("spread")
+
+    @property
+    def innovation(self) -> FloatArray:
+        """Outputs without what was predicted of them ``(ny,)``; NaN where a sample is missing."""
+        return np.where(self.seen, self.part("innovation"), np.nan)
+
+    @property
+    def nis(self) -> FloatArray:
+        """Square of the innovation in units of its covariance, a number."""
+        return self.part("nis")[..., 0]
+
+    @property
+    def degrees(self) -> int:
+        """Number of outputs that are there, of one sample."""
+        return int(self.seen.sum())
+
+    @property
+    def several(self) -> DAERow:
+        """The same with a leading axis of samples."""
+        if self.memory.ndim == 2:
+            return self
+        return DAERow(self.graph, self.k, self.memory[None], self.said[None], self.seen[None], self.moved)
+
+    @property
+    def conditions(self) -> FloatArray:
+        """Condition number of the equilibrated matrix of (7) at each sample; one at k = 0, where no step was taken."""
+        rows = self.several
+        matrices, found = rows.part("scaled"), np.ones(len(rows.memory))
+        stepped = np.arange(self.k, self.k + len(matrices)) > 0
+        values = np.linalg.svd(matrices[stepped], compute_uv=False)
+        with np.errstate(divide="ignore"):
+            found[stepped] = values[:, 0] / values[:, -1]
+        return found
+
+    @property
+    def contractions(self) -> FloatArray:
+        """Spectral radius of F (I - K H) at each sample; zero at k = 0."""
+        return np.asarray(np.abs(np.linalg.eigvals(self.several.part("kept"))).max(axis=1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,44 +164,98 @@ class DAEEstimates:
         """Standard deviations of the parameters ``(samples, nq)``."""
         return np.asarray(np.sqrt(np.einsum("kii->ki", self.parameter_covariances)))
 
-    @classmethod
-    def of(
-        cls, observer: DAEObserver, rows: Sequence[DAERow], *, informations: Sequence[FloatArray] | None = None
-    ) -> DAEEstimates:
-        """Return the estimates in what a running observer gave.
+
+class GatheredRows:
+    """What `DAEEstimates` keeps of the rows of a record, while it is being run.
+
+    Parameters
+    ----------
+    observer : DAEObserver
+        Whose rows they are.
+    """
+
+    def __init__(self, observer: DAEObserver) -> None:
+        self.observer = observer
+        self.parts: list[dict[str, FloatArray]] = []
+        self.projection = np.zeros(observer.model.nx)
+
+    def add(self, rows: DAERow) -> None:
+        """Keep some rows.
 
         Parameters
         ----------
-        observer : DAEObserver
-            Whose rows they are.
-        rows : sequence of DAERow
-            At least one.
-        informations : sequence of FloatArray, optional
-            Of the latest samples, when only the last row is given.
+        rows : DAERow
+            Of one sample or of several.
         """
-        seen = [row.information for row in rows] if informations is None else list(informations)
-        levels = _excitation(observer, seen)[-len(rows) :]
-        variances = np.array([np.diag(row.covariance) for row in rows])
-        nq = observer.model.nq
-        return cls(
-            read_only(np.array([row.x for row in rows])), read_only(np.sqrt(np.maximum(variances, 0.0))),
-            read_only(np.array([row.theta for row in rows]).reshape(-1, nq)),
-            read_only(np.array([row.parameter_covariance for row in rows]).reshape(-1, nq, nq)),
-            read_only(np.array([row.innovation for row in rows])), read_only(np.array([row.nis for row in rows])),
-            read_only(np.array([float(row.degrees) for row in rows])), read_only(levels),
-            read_only(np.array([row.residual for row in rows])), read_only(np.array([row.condition for row in rows])),
-            read_only(np.array([row.contraction for row in rows])), read_only(rows[0].moved),
-            observer.state_names, observer.fault_names,
+        if rows.k == 0:
+            self.projection = rows.moved
+        # Copies, so that what is not kept can go.
+        self.parts.append({name: np.array(value) for name, value in _columns(rows.several).items()})
+
+    def add_regular(self, rows: DAERow) -> None:
+        """Keep some rows, unless the matrix of (7) was singular to working precision in one of them.
+
+        Parameters
+        ----------
+        rows : DAERow
+            Of one sample or of several.
+
+        Raises
+        ------
+        SolverError
+            It was; k, equations and states are named.
+        """
+        self.add(rows)
+        conditions = self.parts[-1]["conditions"]
+        if len(conditions) and conditions.max() > SINGULAR_CONDITION:
+            raise _singular(self.observer, rows.several, int(np.argmax(conditions > SINGULAR_CONDITION)))
+
+    def estimates(self, informations: FloatArray | None = None) -> DAEEstimates:
+        """Return what was gathered.
+
+        Parameters
+        ----------
+        informations : FloatArray, optional
+            ``(any, nq, nq)``: of the latest samples, when only the last row was.
+        """
+        whole = {name: np.concatenate([part[name] for part in self.parts]) for name in self.parts[0]}
+        seen = whole.pop("information")
+        levels = _excitation(self.observer, seen if informations is None else informations)
+        whole["excitation"] = levels[len(levels) - len(whole["nis"]) :]
+        return DAEEstimates(
+            **{name: read_only(value) for name, value in whole.items()}, projection=read_only(self.projection),
+            state_names=self.observer.state_names, parameter_names=self.observer.fault_names,
         )  # fmt: skip
 
 
-def _excitation(observer: DAEObserver, informations: Sequence[FloatArray]) -> FloatArray:
-    levels = np.zeros(len(informations))
-    if not observer.model.nq:
+def _singular(observer: DAEObserver, rows: DAERow, i: int) -> SolverError:
+    equations, states = involved(observer.model, rows.part("scaled")[i])
+    k, condition = rows.k + i, float(rows.conditions[i])
+    return SolverError(
+        f"The matrix of (7), dF/dx' / dt + dF/dx, is singular at k = {k} (condition {condition:.3g}): the equations "
+        f"{', '.join(map(repr, equations))} do not determine {', '.join(map(repr, states))} there.",
+        record={"k": k, "condition": condition},
+    )
+
+
+def _columns(rows: DAERow) -> dict[str, FloatArray]:
+    """Return what `DAEEstimates` keeps of some samples."""
+    variances = np.einsum("kii->ki", rows.part("covariance"))
+    return {
+        "states": rows.x, "state_deviations": np.sqrt(np.maximum(variances, 0.0)),
+        "parameters": rows.theta, "parameter_covariances": rows.parameter_covariance,
+        "innovations": rows.innovation, "nis": rows.nis,
+        "nis_degrees": rows.seen.sum(axis=1).astype(np.float64), "residuals": rows.part("residual")[:, 0],
+        "conditions": rows.conditions, "contraction": rows.contractions, "information": rows.part("information"),
+    }  # fmt: skip
+
+
+def _excitation(observer: DAEObserver, informations: FloatArray) -> FloatArray:
+    levels, window = np.zeros(len(informations)), observer.window
+    if not observer.model.nq or len(informations) < window:
         return levels
     root = np.linalg.cholesky(observer.initial_parameter_covariance)
-    total = np.cumsum([root.T @ information @ root for information in informations], axis=0)
-    for k in range(observer.window - 1, len(informations)):
-        before = total[k - observer.window] if k >= observer.window else 0.0
-        levels[k] = max(float(np.linalg.eigvalsh(total[k] - before)[0]), 0.0)
+    total = np.cumsum(root.T @ informations @ root, axis=0)
+    total[window:] -= total[:-window].copy()
+    levels[window - 1 :] = np.maximum(np.linalg.eigvalsh(total[window - 1 :])[:, 0], 0.0)
     return levels

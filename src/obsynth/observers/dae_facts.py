@@ -8,10 +8,10 @@ import numpy as np
 
 from obsynth.analysis.dae_identifiability import Identifiability, identifiability
 from obsynth.analysis.dae_index import IndexReport, index_report
-from obsynth.models.dae_functions import DAEFunctions
-from obsynth.models.dae_step import ImplicitStep
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.dae import DAEObserver
+from obsynth.observers.dae_estimates import GatheredRows
+from obsynth.observers.dae_records import advanced
 
 #: Steps of the nominal run.
 NOMINAL_STEPS = 100
@@ -88,9 +88,10 @@ def dae_facts(observer: DAEObserver) -> DAEFacts:
     model, running = observer.model, observer.start()
     u = np.array(model.nominal_input)
     truth = _nominal_outputs(observer, u)
-    rows = [running.raw_step(y, u) for y in truth]
-    conditions = np.array([row.condition for row in rows])
-    covariance = rows[-1].parameter_covariance
+    gathered = GatheredRows(observer)
+    advanced(running, truth, np.tile(u, (len(truth), 1)), gathered.add)
+    found = gathered.estimates()
+    covariance = found.parameter_covariances[-1]
     deviations = np.sqrt(np.diag(covariance))
     safe = np.where(deviations > 0.0, deviations, 1.0)
     identifiable = identifiability(
@@ -99,20 +100,19 @@ def dae_facts(observer: DAEObserver) -> DAEFacts:
         parameter_scales=np.sqrt(np.diag(observer.initial_parameter_covariance)),
     )  # fmt: skip
     return DAEFacts(
-        index_report(model, observer.dt, x=rows[-1].x, u=u, theta=rows[-1].theta),
-        float(conditions.max()), int(np.argmax(conditions)), max(row.residual for row in rows),
-        rows[-1].contraction, read_only(deviations), read_only(covariance / np.outer(safe, safe)),
-        read_only(rows[0].moved), identifiable, read_only(running.K), read_only(running.Upsilon),
+        index_report(model, observer.dt, x=found.states[-1], u=u, theta=found.parameters[-1]),
+        float(found.conditions.max()), int(np.argmax(found.conditions)), float(found.residuals.max()),
+        float(found.contraction[-1]), read_only(deviations), read_only(covariance / np.outer(safe, safe)),
+        found.projection, identifiable, read_only(running.K), read_only(running.Upsilon),
     )  # fmt: skip
 
 
-def _nominal_outputs(observer: DAEObserver, u: FloatArray) -> list[FloatArray]:
+def _nominal_outputs(observer: DAEObserver, u: FloatArray) -> FloatArray:
     """Return the outputs of the model from the observer's initial state, without noise."""
-    functions = DAEFunctions(observer.model, observer.integration)
-    step = ImplicitStep(functions, observer.dt, largest_move=observer.largest_move)
+    step = observer.start().implicit
     x, theta = np.array(observer.initial_state), np.array(observer.initial_parameters)
     outputs = []
     for k in range(NOMINAL_STEPS + 1):
         x = step.solve(x, u, theta, k=k).x
-        outputs.append(functions.outputs(x, theta)[0])
-    return outputs
+        outputs.append(step.functions.outputs(x, theta)[0])
+    return np.array(outputs)

@@ -1,24 +1,35 @@
-"""An observer of a DAE in motion: the eleven steps of each sample, in the order that makes (12)-(23) explicit."""
+"""An observer of a DAE in motion: sample by sample, or whole stretches inside CasADi."""
 
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.errors import SpecError
-from obsynth.models.dae_functions import DAEFunctions
-from obsynth.models.dae_step import ImplicitStep, Sensitivities
+from obsynth.errors import SolverError, SpecError
+from obsynth.models.dae_checks import require_known
+from obsynth.models.dae_functions import Compiled, DAEFunctions
+from obsynth.models.dae_step import ImplicitStep
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae import DAEObserver
-from obsynth.observers.dae_estimates import DAEEstimates, DAERow
+from obsynth.observers.dae_estimates import DAEEstimates, DAERow, GatheredRows
+from obsynth.observers.dae_layout import initial_memory
 from obsynth.observers.records import measured_record
 
 #: A step of backward Euler this much shorter than dt puts a state onto its constraint and moves it no further.
 PROJECTION_SHARE = 1e-6
 #: Smaller moves, in sizes of the states, are the motion during that step and no projection.
 PROJECTION_NOTICE = 1e-5
+
+
+def _remembered(name: str, text: str) -> property:
+    def get(self: RunningDAEObserver) -> FloatArray:
+        return self.graph.memory.part(self.memory, name)
+
+    return property(get, doc=text)
 
 
 class RunningDAEObserver:
@@ -30,26 +41,23 @@ class RunningDAEObserver:
         The observer at rest.
     """
 
+    posterior = _remembered("posterior", "The state after the measurement ``(nx,)``.")
+    x = _remembered("x", "The state before it, with the parameters as they are estimated now ``(nx,)``.")
+    theta = _remembered("theta", "The parameters ``(nq,)``.")
+    P = _remembered("P", "Covariance of `x` without what the parameters add ``(nx, nx)``.")
+    S = _remembered("S", "S of (17)-(19) ``(nq, nq)``; not of form ``augmented-kalman``.")
+    spread = _remembered("spread", "Covariance of the parameters ``(nq, nq)``.")
+    Upsilon = _remembered("Upsilon", "``(nx, nq)``.")
+    K = _remembered("K", "``(nx, ny)``.")
+    H = _remembered("H", "``(ny, nx)``.")
+    L = _remembered("L", "``(ny, nq)``.")
+
     def __init__(self, observer: DAEObserver) -> None:
-        self.observer = observer
-        self.functions = DAEFunctions(observer.model, observer.integration)
-        self.implicit = ImplicitStep(self.functions, observer.dt, largest_move=observer.largest_move)
-        nx, ny, nq = observer.model.nx, observer.model.ny, observer.model.nq
-        self.k = 0
-        self.joint = observer.form == "augmented-kalman"
-        self.x = np.array(observer.initial_state)
-        self.posterior = self.x
-        self.theta = np.array(observer.initial_parameters)
-        self.P = np.array(observer.initial_covariance)
-        self.S = np.array(observer.initial_parameter_covariance)
-        self.spread = self.S.copy()
-        self.cross = np.zeros((nx, nq))
-        self.Upsilon = np.zeros((nx, nq))
-        self.K = np.zeros((nx, ny))
-        self.H, self.L = np.zeros((ny, nx)), np.zeros((ny, nq))
-        self.u = np.zeros(observer.model.nu)
+        self.observer, self.graph = observer, observer.graph
+        self.implicit = ImplicitStep(self.graph.functions, observer.dt, largest_move=observer.largest_move)
+        self.memory = initial_memory(observer, observer.initial_state)
+        self.k, self.u = 0, np.zeros(observer.model.nu)
         self.informations: deque[FloatArray] = deque(maxlen=observer.window)
-        self.local: Sensitivities | None = None
 
     def step(self, y: ArrayLike, u: ArrayLike = ()) -> DAEEstimates:
         """Take one sample and return the estimates at that sample.
@@ -66,15 +74,26 @@ class RunningDAEObserver:
         SpecError
             A sample has the wrong length, or an input is not finite; nothing is changed then.
         SolverError
-            The step has no solution; k, iteration and worst equation are named.
+            The step has no solution; k, iteration and worst equation are named, and nothing is changed.
         """
         model = self.observer.model
         outputs = measured_record(np.atleast_2d(np.asarray(y)), model.ny)[0]
-        inputs = np.asarray(u, dtype=np.float64)
-        if inputs.shape != (model.nu,) or not np.isfinite(inputs).all():
+        try:
+            inputs = np.atleast_1d(np.asarray(u, dtype=np.float64))
+        except (TypeError, ValueError):
+            inputs = np.zeros((0, 0))
+        if inputs.shape != (model.nu,):
             raise SpecError(f"u must be {model.nu} finite number(s) at k = {self.k}.", path="u")
+        require_known(model, inputs[None], self.k)
+        before = self.memory, self.u, self.k, self.informations.copy()
         row = self.raw_step(outputs, inputs)
-        return DAEEstimates.of(self.observer, [row], informations=list(self.informations))
+        found = GatheredRows(self.observer)
+        try:
+            found.add_regular(row)
+        except SolverError:
+            self.memory, self.u, self.k, self.informations = before
+            raise
+        return found.estimates(np.array(self.informations))
 
     def raw_step(self, y: FloatArray, u: FloatArray) -> DAERow:
         """Advance without checking the sample.
@@ -84,139 +103,76 @@ class RunningDAEObserver:
         y, u : FloatArray
             ``(ny,)`` and ``(nu,)``.
         """
-        observer, seen = self.observer, ~np.isnan(y)
-        residual, condition, contraction = 0.0, 1.0, 0.0
-        moved = np.zeros_like(self.x)
+        seen = ~np.isnan(y)
+        heard, moved = np.where(seen, y, 0.0), np.zeros(self.observer.model.nx)
         if self.k == 0:
-            moved = self._project(u)
+            memory, moved = self.projected(u)
+            after, said = self._first(memory, heard, seen)
         else:
-            residual, condition, contraction = self._predict(u)
-        predicted, H, L = self.functions.outputs(self.x, self.theta)
-        e = (y - predicted)[seen]
-        H, L = H[seen], L[seen]
-        Sigma = H @ self.P @ H.T + observer.R[np.ix_(seen, seen)]
-        Omega = H @ self.Upsilon + L
-        nis = self._nis(e, H, L, Sigma, Omega)
-        information = Omega.T @ np.linalg.solve(Sigma, Omega)
-        if self.joint:
-            self._update_joint(e, H, L, seen)
-        else:
-            self._update_parameters(e, Sigma, Omega, seen)
-            self._correct(y, seen)
-        self.u, self.k = u, self.k + 1
-        self.informations.append(information)
-        innovation = np.full(len(y), np.nan)
-        innovation[seen] = e
-        return DAERow(
-            self.posterior.copy(), self.theta.copy(), self._covariance(), self.spread.copy(), innovation, nis,
-            int(seen.sum()), information, residual, condition, contraction, moved,
-        )  # fmt: skip
+            after, said = self._whole(self.memory, np.concatenate([u, heard, seen]))
+            if said[-1, 0] != 1.0:
+                after, said = self._carefully(heard, seen, u)
+        if not np.isfinite(after).all():
+            raise SolverError(
+                f"The matrix of (7), dF/dx' / dt + dF/dx, is singular at k = {self.k}, or the model is not defined "
+                "there: the step has no unique solution.", record={"k": self.k},
+            )  # fmt: skip
+        row = DAERow(self.graph, self.k, after[:, 0], said[:, 0], seen, moved)
+        self.memory, self.u, self.k = after[:, 0], u, self.k + 1
+        self.informations.append(row.part("information"))
+        return row
 
-    def _project(self, u: FloatArray) -> FloatArray:
-        """Put the initial state onto the algebraic equations; return how far it moved."""
+    def stretch(self, y: FloatArray, u: FloatArray, run: Callable[..., tuple[FloatArray, ...]]) -> DAERow:
+        """Advance over samples until a step is not solved; return what was reached, which may be nothing.
+
+        Parameters
+        ----------
+        y, u : FloatArray
+            ``(samples, ny)`` and ``(samples, nu)``.
+        run : callable
+            `ObserverGraph.whole` over that many samples.
+        """
+        seen = ~np.isnan(y)
+        arriving = np.hstack([u, np.where(seen, y, 0.0), seen])
+        after, said = (found.T for found in run(self.memory, arriving.ravel()))
+        good = (said[:, -1] == 1.0) & np.isfinite(after).all(axis=1)
+        taken = len(y) if good.all() else int(np.argmin(good))
+        rows = DAERow(self.graph, self.k, after[:taken], said[:taken], seen[:taken], np.zeros(0))
+        if taken:
+            self.memory, self.u, self.k = after[taken - 1].copy(), u[taken - 1], self.k + taken
+            self.informations.extend(rows.part("information"))
+        return rows
+
+    def projected(self, u: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Put the initial state onto the algebraic equations; return the memory and how far it moved.
+
+        Parameters
+        ----------
+        u : FloatArray
+            ``(nu,)`` at k = 0.
+        """
         model, start = self.observer.model, self.x
         short = ImplicitStep(DAEFunctions(model), PROJECTION_SHARE * self.observer.dt)
-        found = short.solve(start, u, self.theta).x
+        found = short.solve_carefully(start, u, self.theta).x
         if np.abs((found - start) / model.state_scales).max() <= PROJECTION_NOTICE:
-            return np.zeros_like(start)
-        self.x = self.posterior = found
-        return found - start
+            return self.memory, np.zeros_like(start)
+        return initial_memory(self.observer, found), found - start
 
-    def _predict(self, u: FloatArray) -> tuple[float, float, float]:
-        """Steps 1 to 5: from the corrected state to the prediction and its covariance, with K, H and L of k - 1."""
-        observer = self.observer
-        solution = self.implicit.solve(self.posterior, u, self.theta, before=self.u, k=self.k)
-        local = self.implicit.sensitivities(solution, self.posterior, u, self.theta)
-        added = local.noise @ observer.Q @ local.noise.T
-        kept = np.eye(len(self.x)) - self.K @ self.H
-        if self.joint:
-            moved = local.F @ self.cross + local.G @ self.spread
-            self.P = (
-                local.F @ self.P @ local.F.T + local.F @ self.cross @ local.G.T
-                + local.G @ self.cross.T @ local.F.T + local.G @ self.spread @ local.G.T + added
-            )  # fmt: skip
-            self.cross, self.spread = moved, self.spread + observer.random_walk
-        else:
-            self.P = local.F @ (kept @ self.P @ kept.T + self.K @ observer.R @ self.K.T) @ local.F.T + added
-        self.P = 0.5 * (self.P + self.P.T)
-        self.Upsilon = local.F @ kept @ self.Upsilon + local.G - local.F @ self.K @ self.L
-        self.x, self.local = solution.x, local
-        radius = float(np.abs(np.linalg.eigvals(local.F @ kept)).max())
-        return solution.residual, local.condition, radius
+    def _carefully(self, y: FloatArray, seen: FloatArray, u: FloatArray) -> tuple[FloatArray, ...]:
+        """Take a step that needs damping or a homotopy: solved outside the graph, and all else in it."""
+        solution = self.implicit.solve_carefully(self.posterior, u, self.theta, before=self.u, k=self.k)
+        after, said = self._sample(self.memory, solution.stages, u, y, seen)
+        said[-2:, 0] = solution.residual, 1.0
+        return after, said
 
-    def _nis(self, e: FloatArray, H: FloatArray, L: FloatArray, Sigma: FloatArray, Omega: FloatArray) -> float:
-        if self.joint:
-            cross = H @ self.cross @ L.T
-            whole = Sigma + cross + cross.T + L @ self.spread @ L.T
-        else:
-            whole = Sigma + Omega @ self.spread @ Omega.T
-        return float(e @ np.linalg.solve(whole, e))
+    @cached_property
+    def _first(self) -> Compiled:
+        return Compiled(self.graph.first)
 
-    def _update_parameters(self, e: FloatArray, Sigma: FloatArray, Omega: FloatArray, seen: FloatArray) -> None:
-        """Steps 6 to 9 and 11: (17)-(19) from the innovation before any update; y(0) corrects the state only."""
-        observer = self.observer
-        if self.k == 0 or not seen.any():
-            return
-        before = self.theta
-        prior = self._remembered()
-        weight = observer.R[np.ix_(seen, seen)] if observer.weight == "paper" else Sigma
-        gain = np.linalg.solve(weight + Omega @ prior @ Omega.T, Omega @ prior).T
-        self.S = prior - gain @ Omega @ prior
-        self.S = 0.5 * (self.S + self.S.T)
-        kept = np.eye(len(before)) - gain @ Omega
-        walked = self.spread + observer.random_walk if observer.form == "random-walk" else self.spread
-        self.spread = kept @ walked @ kept.T + gain @ Sigma @ gain.T
-        self.theta = np.clip(before + gain @ e, observer.lower, observer.upper)
-        self.x = self.x + self.Upsilon @ (self.theta - before)
+    @cached_property
+    def _sample(self) -> Compiled:
+        return Compiled(self.graph.sample)
 
-    def _remembered(self) -> FloatArray:
-        """Return S / lambda, or its walk, or what is left of the information beside that of S_0."""
-        observer = self.observer
-        if observer.form == "random-walk":
-            return np.asarray(self.S + observer.random_walk)
-        if observer.guard == "none":
-            return np.asarray(self.S / observer.forgetting)
-        start = np.linalg.inv(observer.initial_parameter_covariance)
-        kept = observer.forgetting * np.linalg.inv(self.S) + (1.0 - observer.forgetting) * start
-        return np.asarray(np.linalg.inv(kept))
-
-    def _correct(self, y: FloatArray, seen: FloatArray) -> None:
-        """Step 10: the gain at the updated estimate, and the state after the measurement."""
-        predicted, self.H, self.L = self.functions.outputs(self.x, self.theta)
-        H = self.H[seen]
-        self.K = np.zeros_like(self.K)
-        self.K[:, seen] = np.linalg.solve(H @ self.P @ H.T + self.observer.R[np.ix_(seen, seen)], H @ self.P).T
-        self.posterior = self.x + self.K[:, seen] @ (y - predicted)[seen]
-
-    def _update_joint(self, e: FloatArray, H: FloatArray, L: FloatArray, seen: FloatArray) -> None:
-        """Update states and parameters together, in Joseph's form; y(0) corrects the state only, as above."""
-        observer, nx = self.observer, len(self.x)
-        whole = np.block([[self.P, self.cross], [self.cross.T, self.spread]])
-        rows, noise = np.hstack([H, L]), observer.R[np.ix_(seen, seen)]
-        if self.k == 0:
-            gain = np.zeros((len(whole), len(e)))
-            gain[:nx] = np.linalg.solve(H @ self.P @ H.T + noise, H @ self.P).T
-        else:
-            gain = np.linalg.solve(rows @ whole @ rows.T + noise, rows @ whole).T
-        kept = np.eye(len(whole)) - gain @ rows
-        whole = kept @ whole @ kept.T + gain @ noise @ gain.T
-        self.P, self.cross, self.spread = whole[:nx, :nx], whole[:nx, nx:], whole[nx:, nx:]
-        theta = self.theta + gain[nx:] @ e
-        self.theta = np.clip(theta, observer.lower, observer.upper)
-        self.x = self.posterior = self.x + gain[:nx] @ e
-        self._state_gain(H, seen, gain[:nx])
-
-    def _state_gain(self, H: FloatArray, seen: FloatArray, gain: FloatArray) -> None:
-        """Keep the gain of the state for the regressor and the rate of contraction."""
-        _, self.H, self.L = self.functions.outputs(self.x, self.theta)
-        self.K = np.zeros_like(self.K)
-        self.K[:, seen] = gain
-
-    def _covariance(self) -> FloatArray:
-        """Return the covariance of the state after the measurement, with what the parameters add to it."""
-        if self.joint:
-            return self.P
-        kept = np.eye(len(self.x)) - self.K @ self.H
-        through = kept @ self.Upsilon - self.K @ self.L
-        own = kept @ self.P @ kept.T + self.K @ self.observer.R @ self.K.T
-        return np.asarray(own + through @ self.spread @ through.T)
+    @cached_property
+    def _whole(self) -> Compiled:
+        return Compiled(self.graph.whole)

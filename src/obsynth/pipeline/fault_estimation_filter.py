@@ -50,9 +50,10 @@ def fault_estimation_filter(
     S : array_like, optional
         The paper's free matrix ``(nx, nx + ny)`` in (17); by default T is nonsingular by construction.
     engine : {"auto", "riccati", "lmi"}, optional
-        Who finds the gains: Riccati equations alone, which serve hundreds of states; or the matrix inequality, started
-        from them; or, up to 20 states, both, and the better one is shipped.  The result's ``solver["engine"]`` says
-        which ran.  The inequality is what is verified in each case.
+        Who finds the gains: Riccati equations alone, which serve hundreds of states; or the matrix inequality as well,
+        started from them, for the last digits of gamma and, with up to 12 states, somewhat smaller gains.  By default
+        the equations, and the inequality where ``residual_weight_limit`` is given, which they do not cover.  The
+        result's ``solver["engine"]`` says which ran.  The inequality is what is verified in each case.
     solver : {"CLARABEL", "SCS"}, optional
         Semidefinite solver, for the inequality and for proofs that a gamma cannot be reached.
     tolerance : float, optional

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
 from obsynth.models.dae import DAEModel
-from obsynth.models.dae_functions import DAEFunctions
+from obsynth.models.dae_checks import checked_inputs, finite_vector, step_length
+from obsynth.models.dae_functions import Compiled, DAEFunctions
 from obsynth.models.dae_step import ImplicitStep
-from obsynth.models.time_varying_checks import positive_dt
+from obsynth.models.dae_stretches import take_samples
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.covariances import covariance_factor
 
@@ -82,33 +84,88 @@ def simulate_dae(
     SolverError
         A step has no solution; k, iteration and worst equation are named.
     """
-    inputs = as_matrix(u, "u") if model.nu else np.zeros((len(np.asarray(u)), 0))
-    theta = model.nominal_parameters if parameters is None else np.asarray(parameters, dtype=np.float64)
-    theta = np.tile(theta, (len(inputs), 1)) if theta.ndim == 1 else theta
-    x = np.array(model.nominal_state if initial_state is None else initial_state, dtype=np.float64)
-    if inputs.shape[1] != model.nu or theta.shape != (len(inputs), model.nq) or x.shape != (model.nx,):
-        raise SpecError(
-            f"u must be (samples, {model.nu}), parameters ({model.nq},) or (samples, {model.nq}), and initial_state "
-            f"({model.nx},).", path="u",
-        )  # fmt: skip
+    inputs, length = checked_inputs(model, u), step_length(dt)
+    theta = _parameters(model, parameters, len(inputs))
+    x = finite_vector(initial_state, model.state_names, model.nominal_state, "initial_state")
+    if not isinstance(seed, (int, np.integer)) or isinstance(seed, bool) or seed < 0:
+        raise SpecError(f"seed is {seed!r}: give a whole number, not negative.", path="seed")
     rng = np.random.default_rng(seed)
     pushed = _noise(Q, model.nx, "Q", rng, len(inputs))
     heard = _noise(R, model.ny, "R", rng, len(inputs))
-    functions = DAEFunctions(model, integration)
-    step = ImplicitStep(functions, positive_dt(dt))
-    states, outputs, residuals = [x], [functions.outputs(x, theta[0])[0]], [0.0]
-    for k in range(1, len(inputs)):
-        solution = step.solve(x, inputs[k], theta[k], before=inputs[k - 1], k=k)
+    run = _Run(ImplicitStep(DAEFunctions(model, integration), length), inputs, theta, pushed)
+    run.start(x)
+    take_samples(1, len(inputs), run.together, run.alone)
+    return DAETrajectory(read_only(run.states), read_only(run.outputs + heard), read_only(run.residuals))
+
+
+def _parameters(model: DAEModel, value: ArrayLike | None, samples: int) -> FloatArray:
+    """Return the parameters at each sample ``(samples, nq)``."""
+    if value is None or np.ndim(value) < 2:
+        theta = finite_vector(value, model.parameter_names, model.nominal_parameters, "parameters")
+        return np.tile(theta, (samples, 1))
+    theta = as_matrix(value, "parameters")
+    if theta.shape != (samples, model.nq):
+        raise SpecError(f"parameters is {theta.shape}, but ({model.nq},) or ({samples}, {model.nq}) is needed.",
+                        path="parameters")  # fmt: skip
+    return theta
+
+
+class _Run:
+    """A record while it is being filled."""
+
+    def __init__(self, step: ImplicitStep, inputs: FloatArray, theta: FloatArray, pushed: FloatArray) -> None:
+        self.step, self.inputs, self.theta, self.pushed = step, inputs, theta, pushed
+        model, samples = step.functions.model, len(inputs)
+        self.states, self.outputs = np.zeros((samples, model.nx)), np.zeros((samples, model.ny))
+        self.residuals, self.calls = np.zeros(samples), dict[int, Compiled]()
+
+    def start(self, x: FloatArray) -> None:
+        """Begin at a state."""
+        if len(self.inputs):
+            self._note(slice(0, 1), x[None])
+
+    def together(self, k: int, length: int) -> int:
+        """Take several steps in one call; return how many of them were solved."""
+        if length not in self.calls:
+            functions = self.step.functions
+            graphs, key = functions.model.graphs, ("simulated", functions.method, self.step.dt, length)
+            if key not in graphs:
+                graphs[key] = _simulated(self.step).mapaccum(length)
+            self.calls[length] = Compiled(graphs[key])
+        kept = slice(k, k + length)
+        arriving = np.hstack([self.inputs[kept], self.theta[kept], self.pushed[kept]])
+        after, said = (found.T for found in self.calls[length](self.states[k - 1], arriving.ravel()))
+        good = (said[:, 1] == 1.0) & np.isfinite(after).all(axis=1)
+        taken = length if good.all() else int(np.argmin(good))
+        self._note(slice(k, k + taken), after[:taken], said[:taken, 0])
+        return taken
+
+    def alone(self, k: int) -> None:
+        """Take one step that needs care."""
+        x, u, theta = self.states[k - 1], self.inputs[k], self.theta[k]
+        solution = self.step.solve(x, u, theta, before=self.inputs[k - 1], k=k)
         moved = solution.x
-        if Q is not None:
-            moved = moved + step.sensitivities(solution, x, inputs[k], theta[k]).noise @ pushed[k]
-        x = moved
-        states.append(x)
-        outputs.append(functions.outputs(x, theta[k])[0])
-        residuals.append(solution.residual)
-    return DAETrajectory(
-        read_only(np.array(states)), read_only(np.array(outputs) + heard), read_only(np.array(residuals))
-    )
+        if self.pushed[k].any():
+            moved = moved + self.step.sensitivities(solution, x, u, theta).noise @ self.pushed[k]
+        self._note(slice(k, k + 1), moved[None], solution.residual)
+
+    def _note(self, kept: slice, states: FloatArray, residuals: FloatArray | float = 0.0) -> None:
+        self.states[kept], self.residuals[kept] = states, residuals
+        for k in range(kept.start, kept.stop):
+            self.outputs[k] = self.step.functions.outputs(self.states[k], self.theta[k])[0]
+
+
+def _simulated(step: ImplicitStep) -> Any:
+    """Return one step with noise: from a state and ``[u; theta; noise]`` to a state, and residual and verdict."""
+    import casadi as ca
+
+    model = step.functions.model
+    x, arriving = ca.MX.sym("x", model.nx), ca.MX.sym("arriving", model.nu + model.nq + model.nx)
+    u, theta, noise = ca.vertsplit(arriving, [0, model.nu, model.nu + model.nq, arriving.shape[0]])
+    stages, residual, trusted = step.graph.step(x, u, theta)
+    effect = step.graph.sensitivities(stages, x, u, theta)[2]
+    moved = stages[stages.shape[0] - model.nx :] + effect @ noise
+    return ca.Function("simulated", [x, arriving], [moved, ca.vertcat(residual, trusted)])
 
 
 def _noise(value: ArrayLike | None, size: int, name: str, rng: np.random.Generator, samples: int) -> FloatArray:

@@ -9,6 +9,9 @@ from obsynth.synthesis.central_filter import central_filter_at
 from obsynth.synthesis.gain_problem import GainProblem, Injection
 from obsynth.synthesis.gain_search import LeastGain, coordinates
 
+#: The bracket ends at this share of the width asked for: the filter in hand is at its upper end.
+BRACKET_SHARE = 0.1
+
 
 def bisected_gain(
     problem: GainProblem, start: Injection, *, tolerance: float, solver: str, polish: bool
@@ -33,7 +36,7 @@ def bisected_gain(
     """
     best, high, low = start, problem.achieved_gain(start), 0.0
     records = []
-    while high - low > tolerance * high:
+    while high - low > BRACKET_SHARE * tolerance * high:
         middle = 0.5 * (low + high)
         better = central_filter_at(problem, middle)
         if better is None and polish:
@@ -50,7 +53,7 @@ def bisected_gain(
 def search_by_bisection(problem: GainProblem, *, tolerance: float, solver: str, polish: bool = True) -> LeastGain:
     """Minimise the gain by bisection (the paper's Algorithm 1, made to end)."""
     normalised = coordinates(problem, solver=solver)
-    gain = problem.achieved_gain(normalised.start)
+    gain = normalised.start_gain
     if problem.measured == 0 or gain == 0.0:
         return LeastGain(gain, normalised, normalised.start, gain, (gain, gain))
     start = normalised.contracted(normalised.start)
@@ -58,10 +61,9 @@ def search_by_bisection(problem: GainProblem, *, tolerance: float, solver: str, 
         normalised.problem, start, tolerance=tolerance, solver=solver, polish=polish
     )
     injection = normalised.restore(found)
-    better = coordinates(problem, solver=solver, start=injection)
     return LeastGain(
         problem.achieved_gain(injection),
-        better,
+        normalised,
         injection,
         gain,
         (low * normalised.gain, high * normalised.gain),

@@ -83,30 +83,37 @@ class _Inequality:
         return Injection(np.asarray(np.linalg.solve(solution, lmi.value_of(self.y))), lmi.value_of(self.v))
 
 
-def _inequality(problem: GainProblem, squared: Any) -> _Inequality:
+def _inequality(problem: GainProblem, squared: Any, *, ceiling: float) -> _Inequality:
     """Return the eliminated form, or the full one where the weight has a limit."""
     p = lmi.symmetric_variable(problem.order)
     if problem.weight_limit is None:
-        return _Inequality(p, None, None, _eliminated_constraints(problem, p, squared))
-    return _full_inequality(problem, p, squared)
+        return _Inequality(p, None, None, _eliminated_constraints(problem, p, squared, ceiling=ceiling))
+    return _full_inequality(problem, p, squared, ceiling=ceiling)
 
 
-def _eliminated_constraints(problem: GainProblem, p: Any, squared: Any) -> list[Any]:
+def _eliminated_constraints(problem: GainProblem, p: Any, squared: Any, *, ceiling: float) -> list[Any]:
     n, nd = problem.order, problem.disturbances
     outputs = np.hstack([problem.Z, problem.Zd])
     basis = null_basis(np.hstack([problem.C, problem.D]))
     top, bottom, image = basis[:n], basis[n:], np.hstack([problem.A, problem.B]) @ basis
-    constraints = [lmi.at_least(p, P_FLOOR), lmi.at_most(p, P_CEILING)]
+    # Each cone costs its size to the sixth: the trace bounds P from above, and P > Z'Z from below where it is asked.
+    constraints = [lmi.at_most(lmi.scalar_block(lmi.trace(p)), ceiling * n)] if n else []
     if basis.shape[1]:
         reduced = top.T @ p @ top - image.T @ p @ image - (outputs @ basis).T @ (outputs @ basis)
         constraints.append(lmi.at_least(reduced + squared * (bottom.T @ bottom) if nd else reduced, MARGIN))
-    if not problem.weight_is_free:
+    if problem.weight_is_free:
+        constraints.append(lmi.at_least(p, P_FLOOR))
+    elif not np.any(problem.Zd):
+        constraints.append(lmi.at_least(p - problem.Z.T @ problem.Z, MARGIN))
+    else:
         weight = lmi.symmetric_blocks([[p], [np.zeros((nd, n)), squared * np.eye(nd)]])
         constraints.append(lmi.at_least(weight - outputs.T @ outputs, MARGIN))
     return constraints
 
 
-def _full_inequality(problem: GainProblem, p: Any, squared: Any, *, decay: float = 1.0) -> _Inequality:
+def _full_inequality(
+    problem: GainProblem, p: Any, squared: Any, *, ceiling: float = P_CEILING, decay: float = 1.0
+) -> _Inequality:
     n, m, q, nd = problem.order, problem.measured, problem.Z.shape[0], problem.disturbances
     y = lmi.matrix_variable(n, m)
     v = lmi.matrix_variable(q, m) if problem.weight_is_free else np.zeros((q, m))
@@ -118,7 +125,7 @@ def _full_inequality(problem: GainProblem, p: Any, squared: Any, *, decay: float
             [problem.Z + v @ problem.C, problem.Zd + v @ problem.D, np.zeros((q, n)), np.eye(q)],
         ]
     )
-    constraints = [lmi.at_least(p, P_FLOOR), lmi.at_most(p, P_CEILING), lmi.at_least(whole, MARGIN)]
+    constraints = [lmi.at_least(p, P_FLOOR), lmi.at_most(p, ceiling), lmi.at_least(whole, MARGIN)]
     limit = problem.weight_limit
     if limit is not None:
         weight = limit.fixed / limit.bound + v @ (limit.free / limit.bound)
@@ -160,7 +167,7 @@ def least_gain(problem: GainProblem, *, solver: str, ceiling: float = P_CEILING)
     problem : GainProblem
         Normalised.
     ceiling : float, optional
-        Bound on P, besides the general one.
+        Bound on P: on its mean eigenvalue in the eliminated form.
     solver : str
         Name of the solver.
 
@@ -170,8 +177,7 @@ def least_gain(problem: GainProblem, *, solver: str, ceiling: float = P_CEILING)
         No usable answer.
     """
     squared = lmi.scalar_variable()
-    inequality = _inequality(problem, squared)
-    inequality.constraints.append(lmi.at_most(inequality.p, ceiling))
+    inequality = _inequality(problem, squared, ceiling=ceiling)
     record = lmi.minimise(squared, inequality.constraints, what="least gain", solver=solver)
     gain = float(np.sqrt(max(float(lmi.value_of(squared)), 0.0)))
     return GainSolution(gain, lmi.value_of(inequality.p), inequality.gains(problem, gain), record)
@@ -185,7 +191,7 @@ def feasible_point(problem: GainProblem, gain: float, *, solver: str) -> GainSol
     """
     slack = lmi.scalar_variable()
     # A slack of t is the same as asking for the level g^2 - t in the disturbance block.
-    inequality = _inequality(problem, gain**2 - slack)
+    inequality = _inequality(problem, gain**2 - slack, ceiling=P_CEILING)
     try:
         record = lmi.minimise(-slack, inequality.constraints, what=f"feasibility at {gain:.6g}", solver=solver)
         level = float(np.sqrt(max(gain**2 - float(lmi.value_of(slack)), 0.0)))

@@ -7,16 +7,11 @@ import warnings
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.doubling import doubled_riccati_solution
 from obsynth.numerics.norms import spectral_radius
 
 #: Relative sizes of the fictitious process and measurement noise, tried in turn, that make the equation regular.
 REGULARISATIONS = (1e-6, 1e-4, 1e-2, 1.0)
-#: Doubling stops when a step changes the solution by less than this, relative to it; each step squares the error.
-DOUBLING_TOLERANCE = 1e-14
-STAGNATION = 1e-9
-#: Residual of a Riccati equation that counts as solved, relative to its terms.
-EQUATION_TOLERANCE = 1e-8
-MOST_DOUBLINGS = 60
 #: A starting filter with this spectral radius forgets fast enough.
 FAST_ENOUGH = 0.999
 #: Eigenvalues of a normalising matrix are kept above this fraction of the largest.
@@ -91,37 +86,6 @@ def bounded_real_matrix(
     return p if np.all(np.isfinite(p)) and float(np.linalg.eigvalsh(p)[0]) > 0.0 else None
 
 
-def gain_is_below(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, level: float) -> bool:
-    """Return whether a Riccati equation says that the H-infinity norm of a stable system is at most ``level``.
-
-    Any symmetric solution with ``W = level^2 I - D'D - B'PB > 0`` factors ``level^2 I - G~G`` as ``M~ W M >= 0``; its
-    residual is judged against what it is made of.
-
-    Parameters
-    ----------
-    a, b, c, d : FloatArray
-        ``(n, n)``, ``(n, m)``, ``(p, n)``, ``(p, m)``, ``a`` Schur stable.
-    level : float
-        Positive.
-    """
-    process, cross = c.T @ c, c.T @ d
-    gap = d.T @ d - level**2 * np.eye(b.shape[1])
-    with np.errstate(all="ignore"):
-        p = doubled_riccati_solution(a.T, b.T, process, gap, cross)
-        if p is None:
-            return False
-        through = a.T @ p @ b + cross
-        left = -(gap + b.T @ p @ b)
-        try:
-            np.linalg.cholesky(left)
-            added = through @ np.linalg.solve(left, through.T)
-        except np.linalg.LinAlgError:
-            return False
-        moved = a.T @ p @ a
-        sizes = float(np.linalg.norm(p)) + float(np.linalg.norm(moved)) + float(np.linalg.norm(added))
-        return float(np.linalg.norm(p - moved - process - added)) <= EQUATION_TOLERANCE * sizes
-
-
 def _lyapunov_solution(a: FloatArray, weight: FloatArray) -> FloatArray | None:
     from scipy.linalg import solve_discrete_lyapunov
 
@@ -141,7 +105,7 @@ def riccati_solution(
     Parameters
     ----------
     a, h, process, weight, cross : FloatArray
-        As for `doubled_riccati_solution`.
+        As for `obsynth.numerics.doubling.doubled_riccati_solution`.
     """
     from scipy.linalg import solve_discrete_are
 
@@ -160,51 +124,3 @@ def normalising_change(p: FloatArray) -> FloatArray:
     values, vectors = np.linalg.eigh(0.5 * (p + p.T))
     floor = CONDITION_LIMIT * max(float(values[-1]), np.finfo(np.float64).tiny)
     return np.asarray(vectors / np.sqrt(np.maximum(values, floor)))
-
-
-def doubled_riccati_solution(
-    a: FloatArray, h: FloatArray, process: FloatArray, weight: FloatArray, cross: FloatArray
-) -> FloatArray | None:
-    """Return the stabilising solution of a filtering Riccati equation with an indefinite weight, by doubling.
-
-    ``Y = A Y A' - (A Y H' + S) (W + H Y H')^-1 (A Y H' + S)' + Q``; matrix products and solves alone, so that hundreds
-    of states take a fraction of a second.
-
-    Parameters
-    ----------
-    a, h : FloatArray
-        ``(n, n)`` and ``(p, n)``.
-    process, weight, cross : FloatArray
-        Q ``(n, n)``, W ``(p, p)`` nonsingular, S ``(n, p)``.
-
-    Returns
-    -------
-    FloatArray or None
-        Symmetric ``(n, n)``; ``None`` when the doubling breaks down or does not settle.
-
-    Notes
-    -----
-    Structure-preserving doubling of Chu, Fan, Lin and Wang (2004); it needs no definite weight, but may break down.
-    """
-    n = a.shape[0]
-    inverse = np.linalg.inv(weight)
-    power = (a - cross @ inverse @ h).T
-    back, solution = h.T @ inverse @ h, process - cross @ inverse @ cross.T
-    error = np.inf
-    with np.errstate(over="ignore", invalid="ignore"):
-        for _ in range(MOST_DOUBLINGS):
-            between = np.linalg.inv(np.eye(n) + back @ solution)
-            step = power @ between
-            change = power.T @ solution @ between @ power
-            back = back + step @ back @ power.T
-            power = step @ power
-            solution = solution + 0.5 * (change + change.T)
-            back = 0.5 * (back + back.T)
-            size = float(np.linalg.norm(solution))
-            if not np.isfinite(size):
-                return None
-            error, last = float(np.linalg.norm(change)) / max(size, np.finfo(np.float64).tiny), error
-            # Rounding leaves changes that shrink no more; small ones are as good as none.
-            if error <= DOUBLING_TOLERANCE or last <= error <= STAGNATION:
-                return solution
-    return None

@@ -5,7 +5,7 @@ No number of a solver is believed: the true gain, the true variance and the spec
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ import numpy as np
 from obsynth.errors import SolverError
 from obsynth.numerics.norms import spectral_radius
 from obsynth.synthesis import gain_design
-from obsynth.synthesis.central_filter import least_noise_filter, noise_weighted_filters
+from obsynth.synthesis.central_filter import FEW_STATES, least_noise_filter, noise_weighted_filters
 from obsynth.synthesis.gain_problem import GainProblem, Injection, NormalisedProblem
 from obsynth.synthesis.gain_search import LeastGain, coordinates
 
@@ -23,8 +23,11 @@ MOST_STEPS = 24
 #: The error shall be forgotten at least this fast (spectral radius), or half as fast as the starting filter does: the
 #: smallest gains alone would leave an observable mode at the very edge of stability.
 SLOWEST_DECAY = 0.999
-#: Halvings of the step towards the filter of least noise.
-LINE_STEPS = 20
+#: Up to so many states the whole inequality competes although nothing needs it.
+MOST_STATES_FOR_WHOLE = 12
+#: Halvings of the step towards the filter of least noise, for few and for many states.
+LINE_STEPS = 7
+COARSE_LINE_STEPS = 3
 #: A step counts when its level is met to this relative accuracy.
 LEVEL_ACCURACY = 1e-6
 
@@ -47,8 +50,8 @@ def small_gain_design(
         Level asked for.
     solver : str
         Name of the solver.
-    engine : {"riccati", "lmi", "both"}
-        Who competes.
+    engine : {"riccati", "lmi"}
+        Whether the inequality may compete.
 
     Raises
     ------
@@ -59,18 +62,22 @@ def small_gain_design(
     if problem.measured == 0:
         return least.injection, records
     nothing = Injection(np.zeros_like(least.injection.R), np.zeros_like(least.injection.V))
-    fresh = coordinates(problem, solver=solver)
+    fresh = least.first
     goal = _Goal(problem, gain, max(SLOWEST_DECAY, 0.5 + 0.5 * _radius(problem, fresh.start)))
     if not goal.noisy and goal.met_fast(nothing):
         # Without a noise model the objective is the size of the gains themselves, and zero is least.
         return nothing, records
     candidates: list[Injection] = []
     target = least_noise_filter(problem) if goal.noisy else nothing
-    if engine != "lmi":
-        central = [item for item in (*noise_weighted_filters(problem, gain), fresh.start) if goal.met(item)]
-        candidates += [_towards(goal, item, target) for item in central]
-        records.append({"what": "small gains", "solver": "central filter", "status": f"{len(central)} filters"})
-    if engine != "riccati":
+    central = [item for item in noise_weighted_filters(problem, gain) if goal.met(item)]
+    if fresh.start_gain <= gain and goal.met(fresh.start):
+        central.append(fresh.start)
+    central = [item for item in central if goal.is_fast(item)] or central
+    candidates += [_towards(goal, min(central, key=goal.cost), target)] if central else []
+    records.append({"what": "small gains", "solver": "central filter", "status": f"{len(central)} filters"})
+    needed = problem.weight_limit is not None or not candidates or problem.order <= MOST_STATES_FOR_WHOLE
+    if engine != "riccati" and needed:
+        # The eliminated inequality has no gains to make small: this takes the whole one.
         candidates += _by_inequality(goal, least, fresh, records, solver=solver)
     if not candidates and goal.met(least.injection):
         candidates.append(least.injection)
@@ -89,6 +96,7 @@ class _Goal:
     problem: GainProblem
     gain: float
     slowest: float
+    judged: dict[int, tuple[Injection, bool]] = field(default_factory=dict, repr=False)
 
     @property
     def noisy(self) -> bool:
@@ -96,10 +104,16 @@ class _Goal:
         return bool(np.any(self.problem.Bn) or np.any(self.problem.Zn))
 
     def met(self, injection: Injection) -> bool:
-        return _reaches(self.problem, injection, self.gain)
+        # A filter is asked for more than once, and for many states each answer takes a Riccati equation.
+        if id(injection) not in self.judged:
+            self.judged[id(injection)] = (injection, _reaches(self.problem, injection, self.gain))
+        return self.judged[id(injection)][1]
+
+    def is_fast(self, injection: Injection) -> bool:
+        return _radius(self.problem, injection) <= self.slowest
 
     def met_fast(self, injection: Injection) -> bool:
-        return _radius(self.problem, injection) <= self.slowest and self.met(injection)
+        return self.is_fast(injection) and self.met(injection)
 
     def cost(self, injection: Injection) -> float:
         if self.noisy:
@@ -110,12 +124,11 @@ class _Goal:
 def _by_inequality(
     goal: _Goal, least: LeastGain, fresh: NormalisedProblem, records: list[dict[str, Any]], *, solver: str
 ) -> list[Injection]:
-    """Return what the inequality gives, in different coordinates until one run is optimal and fast enough."""
+    """Return what the inequality gives, in different coordinates until one is good and fast enough."""
     problem, gain = goal.problem, goal.gain
     candidates: list[Injection] = []
-    attempts = (
-        (least.normalised, 1.0), (fresh, 1.0), (None, 1.0), (least.normalised, goal.slowest), (fresh, goal.slowest),
-    )  # fmt: skip
+    close = coordinates(problem, solver=solver, start=least.injection, gain=least.gain)
+    attempts = ((close, 1.0), (fresh, 1.0), (None, 1.0), (close, goal.slowest), (fresh, goal.slowest))
     for normalised, decay in attempts:
         if normalised is None:
             injection = _small_gains_step_by_step(problem, fresh, gain, records, solver=solver)
@@ -123,11 +136,11 @@ def _by_inequality(
             injection = _small_gains_in(problem, normalised, gain, records, solver=solver, decay=decay)
         if injection is not None and goal.met(injection):
             candidates.append(injection)
-            if records[-1]["status"] == "optimal" and goal.met_fast(injection):
+            if goal.met_fast(injection):
                 break
     if not candidates and problem.disturbances:
-        centre = gain_design.feasible_point(least.normalised.problem, gain / least.normalised.gain, solver=solver)
-        candidates = [] if centre is None else [least.normalised.restore(centre.injection)]
+        centre = gain_design.feasible_point(close.problem, gain / close.gain, solver=solver)
+        candidates = [] if centre is None else [close.restore(centre.injection)]
     return [item for item in candidates if goal.met(item)]
 
 
@@ -137,7 +150,10 @@ def _towards(goal: _Goal, injection: Injection, target: Injection | None) -> Inj
         return injection
     best, least, share, step = injection, goal.cost(injection), 0.0, 1.0
     judge = goal.met_fast if goal.met_fast(injection) else goal.met
-    for _ in range(LINE_STEPS):
+    few = goal.problem.order <= FEW_STATES
+    if not few and not goal.noisy:
+        step = 0.5  # without noise the target is no filter of this gain
+    for _ in range(LINE_STEPS if few else COARSE_LINE_STEPS):
         tried = share + step
         mixed = Injection(*((1.0 - tried) * a + tried * b for a, b in zip(injection.parts, target.parts, strict=True)))
         if tried <= 1.0 and judge(mixed) and (cost := goal.cost(mixed)) <= least:

@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 
 from obsynth.analysis.conditions import Condition
-from obsynth.analysis.structure import analyse_structure
+from obsynth.analysis.zeros import are_outside
 from obsynth.models.descriptor import DescriptorSystem
+from obsynth.numerics.pencils import FiniteZeros, pencil_structure
 from obsynth.results.report import Check, information
 
 
 def plant_information(plant: DescriptorSystem) -> Iterator[Check]:
     """Yield rows on regularity, index, eigenvalues and stability of the plant; they inform and never fail."""
-    structure = analyse_structure(plant)
+    structure = pencil_structure(plant.E, plant.A)
     source = "the plant"
     yield information("plant: regular", "det(A - zE) is not identically zero", float(structure.regular), source=source)
     if not structure.regular:
@@ -35,11 +36,14 @@ def plant_information(plant: DescriptorSystem) -> Iterator[Check]:
         source=source,
         detail=f"block sizes {list(structure.infinite_block_sizes)}" if structure.infinite_block_sizes else "",
     )
-    verdict = "admissible" if structure.admissible else "not admissible: an observer may exist all the same"
+    poles = FiniteZeros(structure.finite_eigenvalues, structure.normal_rank, structure.decisions)
+    stable = not any(are_outside(plant.E, plant.A, poles, plant.dt))
+    admissible = stable and (structure.index or 0) <= 1
+    verdict = "admissible" if admissible else "not admissible: an observer may exist all the same"
     yield information(
         "plant: admissible",
         "regular, impulse-free and stable",
-        float(structure.admissible),
+        float(admissible),
         source=source,
         detail=verdict,
     )

@@ -30,6 +30,7 @@ from obsynth.models.dae import DAEModel
 from obsynth.observers.dae import DAEObserver
 from obsynth.observers.dae_building import dae_observer_from_options, resolved_options
 from obsynth.observers.dae_facts import NOMINAL_STEPS, DAEFacts, dae_facts
+from obsynth.observers.dae_running import PROJECTION_NOTICE
 from obsynth.results.design import Certificate
 from obsynth.synthesis.result import Synthesis
 
@@ -73,8 +74,9 @@ DEFAULTS: dict[str, Any] = {
 
 def _notes(observer: DAEObserver, facts: DAEFacts) -> Iterator[str]:
     if np.any(facts.projection):
-        moved = [f"{name} by {move:.4g}" for name, move in zip(observer.state_names, facts.projection, strict=True)
-                 if move != 0.0]  # fmt: skip
+        sizes = PROJECTION_NOTICE * observer.model.state_scales
+        moved = [f"{name} by {move:.4g}" for name, move, size in
+                 zip(observer.state_names, facts.projection, sizes, strict=True) if abs(move) > size]  # fmt: skip
         yield f"The initial state does not meet the algebraic equations; it is moved onto them: {', '.join(moved)}."
     for direction in facts.identifiable.faint:
         shares = ", ".join(f"{name} ({share:+.3g})" for name, share in direction.items())

@@ -31,6 +31,7 @@ from obsynth.errors import InfeasibleError, SpecError
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.norms import spectral_radius
+from obsynth.numerics.ranks import SLOW_ZERO_RADIUS
 from obsynth.observers.linear import LinearObserver
 from obsynth.results.design import Certificate
 from obsynth.synthesis import gain_search
@@ -44,9 +45,8 @@ from obsynth.synthesis.lmi import SOLVER_SETTINGS
 from obsynth.synthesis.result import Synthesis
 from obsynth.synthesis.small_gains import small_gain_design
 
-#: Who finds the gains: Riccati equations, the matrix inequality started from them, or both up to so many states.
+#: Who finds the gains: Riccati equations, or the matrix inequality started from them.
 ENGINES = ("auto", "riccati", "lmi")
-MOST_STATES_FOR_BOTH = 20
 #: Fictitious noise on the measurements, relative to the given one, so that no direction of the gains is free of cost.
 BACKGROUND_NOISE = 1e-3
 #: Asking for a gain above this multiple of the starting filter's adds nothing but bad scaling.
@@ -126,18 +126,20 @@ def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **op
     """Design the filter; see `obsynth.fault_estimation_filter` for the options, results and errors."""
     asked = FilterOptions(**options)
     progress("checking the existence conditions")
-    require_all(conditions(plant))
+    held = conditions(plant)
+    require_all(held)
     s = None if asked.S is None else as_matrix(asked.S, "S")
     prepared = prepare(plant, s)
     limit = asked.residual_weight_limit
     free = asked.free_residual_weight if asked.free_residual_weight is not None else plant.nw > 0 or limit is not None
     problem, parts = gain_problem(prepared, free_weight=free)
     if limit is not None:
-        problem = _with_weight_limit(problem, prepared, parts, limit)
+        problem = with_weight_limit(problem, prepared, parts, limit)
     size = max(problem.disturbance_size, NOMINAL_GAIN)
     engine = asked.engine
     if engine == "auto":
-        engine = "both" if problem.order <= MOST_STATES_FOR_BOTH else "riccati"
+        # Riccati equations do not cover a limit on the weight.
+        engine = "riccati" if problem.weight_limit is None else "lmi"
     progress("searching the least gain")
     least = _least_gain(problem, asked, engine)
     if problem.disturbances and least.starting_gain <= ROUNDING_GAIN * problem.disturbance_size:
@@ -175,7 +177,7 @@ def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **op
         observer,
         Certificate({"P_factor": factor, "tracking": tracking}, claims),
         {"engine": engine, "runs": [*least.records, *records]},
-        notes(plant, prepared.detectability, observer),
+        notes(plant, prepared.detectability, observer, largest_zero=held[-1].value),
     )
 
 
@@ -224,7 +226,9 @@ def gain_problem(prepared: PreparedPlant, *, free_weight: bool) -> tuple[GainPro
     measure, na = v.T, prepared.TA.shape[0]
     if prepared.Bw.shape[1]:
         size = BACKGROUND_NOISE * max(
-            float(np.linalg.norm(measure @ prepared.Dw)), float(np.linalg.norm(w0 @ prepared.Dw))
+            float(np.linalg.norm(measure @ prepared.Dw)),
+            # In units of the outputs: W may be large.
+            float(np.linalg.norm(w0 @ prepared.Dw) / np.linalg.norm(w0)),
         )
         background = size if size > 0.0 else BACKGROUND_NOISE
         bn = np.hstack([prepared.Bw - l0 @ prepared.Dw, np.zeros((na, v.shape[1]))])
@@ -289,7 +293,7 @@ def _gains(prepared: PreparedPlant, parts: _Parts, chosen: Injection) -> dict[st
     }
 
 
-def _with_weight_limit(problem: GainProblem, prepared: PreparedPlant, parts: _Parts, bound: float) -> GainProblem:
+def with_weight_limit(problem: GainProblem, prepared: PreparedPlant, parts: _Parts, bound: float) -> GainProblem:
     """Return the problem with the norm of W bounded, in the user's output units.
 
     Raises
@@ -309,9 +313,18 @@ def _with_weight_limit(problem: GainProblem, prepared: PreparedPlant, parts: _Pa
     return replace(problem, weight_limit=WeightLimit(parts.W0 * outputs, parts.V.T * outputs, bound))
 
 
-def notes(plant: DescriptorSystem, detectability: FaultDetectability, observer: LinearObserver) -> tuple[str, ...]:
-    """Return what a user should know: slow zeros, ill-conditioned faults, amplified noise, slow filters."""
-    found = list(sampling_zero_warnings(plant))
+def notes(
+    plant: DescriptorSystem,
+    detectability: FaultDetectability,
+    observer: LinearObserver,
+    *,
+    largest_zero: float = np.inf,
+) -> tuple[str, ...]:
+    """Return what a user should know: slow zeros, ill-conditioned faults, amplified noise, slow filters.
+
+    ``largest_zero`` is the largest modulus of a fault zero, where that is known already.
+    """
+    found = list(sampling_zero_warnings(plant)) if largest_zero > SLOW_ZERO_RADIUS else []
     if detectability.condition_number > WARN_CONDITION:
         found.append(
             f"Upsilon has condition number {detectability.condition_number:.3g}: some combination of faults is "

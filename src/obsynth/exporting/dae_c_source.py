@@ -1,0 +1,123 @@
+"""The observer of a nonlinear DAE as C99: one header, one source, no allocation, no library but that of C.
+
+CasADi writes the equations; the loop of Newton around them, its damping and its homotopy are those of
+`obsynth.observers.dae_c_code`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from obsynth.errors import SpecError
+from obsynth.exporting.c_words import c_identifier, comment, included, quoted
+from obsynth.models.dae import DAEModel
+from obsynth.observers.dae_c_code import observer_code
+from obsynth.results.design import ObserverDesign
+from obsynth.results.serialise import design_as_dict, write_atomically
+
+_STEP = r"""
+void PREFIX_reset(PREFIX_state *state)
+{
+    reset(state);
+}
+
+int PREFIX_step(PREFIX_state *state, ARGUMENTSconst double y[NY], PREFIX_estimates *estimates)
+{
+    double after[MEMORY];
+    double said[ROW];
+    int i, failed;
+NOTHING    failed = advance(state, INPUT, y, after, said);
+    if (failed) {
+        return failed;
+    }
+    copy(estimates->states, after + AT_POSTERIOR, NX);
+    copy(estimates->parameters, after + AT_THETA, NQ);
+    for (i = 0; i < NX; i++) {
+        estimates->state_deviations[i] = sqrt(fmax(said[AT_COVARIANCE + i * (NX + 1)], 0.0));
+    }
+    for (i = 0; i < NQ; i++) {
+        estimates->parameter_deviations[i] = sqrt(fmax(after[AT_SPREAD + i * (NQ + 1)], 0.0));
+    }
+    for (i = 0; i < NY; i++) {
+        estimates->innovations[i] = isnan(y[i]) ? NAN : said[AT_INNOVATION + i];
+    }
+    estimates->nis = said[AT_NIS];
+    estimates->residual = said[AT_RESIDUAL];
+    return 0;
+}
+"""
+
+
+def write_dae_c(design: ObserverDesign, target: Path, sample_time: float | None) -> tuple[Path, ...]:
+    """Write source and header.
+
+    Parameters
+    ----------
+    design : ObserverDesign
+        Of a nonlinear plant.
+    target : Path
+        The source; the header stands beside it.
+    sample_time : float or None
+        Must be left out: the observer is sampled.
+
+    Raises
+    ------
+    SpecError
+        The model is made of Python functions, which have no digest; the suffix is not ``.c``; a sample time is given;
+        or a file cannot be written.
+    """
+    if target.suffix.lower() != ".c":
+        raise SpecError(f"{target}: the observer of a nonlinear plant is no matrices; it is exported as C (.c).",
+                        path=str(target))  # fmt: skip
+    _, observer = design.nonlinear
+    if sample_time is not None:
+        raise SpecError(f"The design is sampled already (dt = {observer.dt:g} s): leave the sample time out.",
+                        path="sample_time")  # fmt: skip
+    digest, prefix, header = str(design_as_dict(design)["sha256"]), c_identifier(target.stem), target.with_suffix(".h")
+    source = "\n".join([
+        comment(f"sha256 of the gain set: {digest}"), f'#include "{included(header.name)}"', "",
+        "#define OBSERVER_IS_DECLARED", f"#define observer {prefix}_observer", "", observer_code(observer),
+        _step_text(prefix, design.nonlinear[0]),
+    ])  # fmt: skip
+    # The source is refused first if it cannot be written, so that no header stays behind alone.
+    written = write_atomically(target, source)
+    return written, write_atomically(header, "\n".join(_header(design, prefix, digest)) + "\n")
+
+
+def _step_text(prefix: str, model: DAEModel) -> str:
+    """Return the two functions of the header; without inputs, C has no array for them."""
+    arguments, given, nothing = ("const double u[NU], ", "u", "") if model.nu else (
+        "", "nothing", "    static const double nothing[1] = {0.0};\n")  # fmt: skip
+    text = _STEP.replace("PREFIX", prefix).replace("ARGUMENTS", arguments)
+    return text.replace("NOTHING", nothing).replace("INPUT", given)
+
+
+def _header(design: ObserverDesign, prefix: str, digest: str) -> Iterator[str]:
+    model, observer = design.nonlinear
+    guard, upper = f"{prefix.upper()}_H", prefix.upper()
+    sizes = {"states": model.nx, "state_deviations": model.nx, "parameters": model.nq,
+             "parameter_deviations": model.nq, "innovations": model.ny}  # fmt: skip
+    yield comment(f"Observer {quoted(design.name)} by {quoted(design.method)}, written by obsynth.")
+    yield from (f"#ifndef {guard}", f"#define {guard}", "", comment("sha256 of the gain set"))
+    yield from (f'#define {upper}_SHA256 "{digest}"', comment("seconds between samples"))
+    yield from (f"#define {upper}_DT {observer.dt!r}", "", f"struct {prefix}_observer {{")
+    yield from (f"    double memory[{observer.graph.memory.size}];", f"    double u[{max(model.nu, 1)}];")
+    yield from ("    int started;", "};", f"typedef struct {prefix}_observer {prefix}_state;", "")
+    yield comment("States after the measurement, parameters, their standard deviations; innovations (NaN where y is);")
+    yield comment("their square in units of their covariance; the residual of the step in sizes of the states.")
+    yield "typedef struct {"
+    yield from (f"    double {name}[{max(size, 1)}];" for name, size in sizes.items())
+    yield from ("    double nis;", "    double residual;", f"}} {prefix}_estimates;", "")
+    yield from (comment("Start as the design does."), f"void {prefix}_reset({prefix}_state *state);", "")
+    yield comment("Take one sample: y at this sample, NaN where it is missing, and u during the step that ends at it.")
+    yield comment("Returns 0; 1 if an input is not finite or an output infinite; 2 if the step has no solution:")
+    yield comment("state and estimates are left as they were then.")
+    for array, names in (("u", model.input_names), ("y", model.output_names), ("states", model.state_names),
+                         ("parameters", model.parameter_names)):  # fmt: skip
+        yield from (comment(f"{array}[{i}]: {quoted(name)}, {quoted(model.units[name])}") for i, name in
+                    enumerate(names))  # fmt: skip
+    taken = [f"{prefix}_state *state", f"const double y[{model.ny}]", f"{prefix}_estimates *estimates"]
+    taken[1:1] = [f"const double u[{model.nu}]"] if model.nu else []
+    yield f"int {prefix}_step({', '.join(taken)});"
+    yield from ("", "#endif")

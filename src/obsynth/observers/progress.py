@@ -1,0 +1,89 @@
+"""A bar on the terminal for runs that take long."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from obsynth.errors import SpecError
+
+if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
+
+#: Seconds after which a bar appears.
+PATIENCE = 2.0
+
+
+@contextmanager
+def shown_progress(
+    progress: bool | Callable[[int], None] | None, total: int, what: str
+) -> Iterator[Callable[[int], None]]:
+    """Show how much of a long run is done.
+
+    Parameters
+    ----------
+    progress : bool, callable or None
+        ``None`` shows a bar on stderr after `PATIENCE` seconds if that is a terminal, ``True`` wherever it is,
+        ``False`` never; a callable is called with the number of what is done.
+    total : int
+        How many there are.
+    what : str
+        Of what, for the bar.
+
+    Yields
+    ------
+    callable
+        To be called with the number of what is done.
+
+    Raises
+    ------
+    SpecError
+        ``progress`` is something else.
+    """
+    if callable(progress):
+        yield progress
+        return
+    if progress not in (None, True, False):
+        raise SpecError(f"progress is {progress!r}: give True, False, None, or a function.", path="progress")
+    if progress is False or (progress is None and not sys.stderr.isatty()):
+        yield _nothing
+        return
+    bar = _Bar(total, what)
+    try:
+        yield bar.update
+    finally:
+        bar.close()
+
+
+def _nothing(_: int) -> None:
+    """Progress that nobody watches."""
+
+
+class _Bar:
+    """A bar that appears late, and is gone at the end."""
+
+    def __init__(self, total: int, what: str) -> None:
+        self.total, self.what, self.begin = total, what, time.monotonic()
+        self.shown: tuple[Progress, TaskID] | None = None
+
+    def update(self, done: int) -> None:
+        """Show what is done."""
+        if self.shown is None:
+            if time.monotonic() - self.begin < PATIENCE:
+                return
+            from rich.console import Console
+            from rich.progress import Progress
+
+            bar = Progress(console=Console(stderr=True), transient=True)
+            self.shown = bar, bar.add_task(self.what, total=self.total)
+            bar.start()
+        bar, task = self.shown
+        bar.update(task, completed=done)
+
+    def close(self) -> None:
+        """Take the bar away."""
+        if self.shown is not None:
+            self.shown[0].stop()
