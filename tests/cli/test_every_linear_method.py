@@ -13,16 +13,12 @@ import obsynth
 from obsynth.cli.main import main
 
 ROOT = Path(__file__).parents[2]
-#: Scenarios for specs that have none of their own, and shorter ones for specs whose own are long.
+#: Shorter scenarios for specs whose own are long.
 SCENARIOS = {
     "filasova/spec.yaml": "horizon: 4",
     "smib/spec.yaml": "horizon: 2",
     "kundur/spec.yaml": "horizon: 2",
-    "smib/pd_observer.yaml": """
-  horizon: 2
-  sample_time: 0.02
-  faults: {tm GENCLS 1: {kind: step, size: 0.1, start: 1}}
-""",
+    "smib/pd_observer.yaml": "horizon: 2",
 }
 PAPERS_AND_NETWORKS = (
     "wang2015/spec.yaml", "smib/spec.yaml", "filasova/spec.yaml", "smib/pd_observer.yaml", "sharepasand/spec.yaml",
@@ -61,11 +57,8 @@ def spec_of(name: str, folder: Path) -> Path:
     text = source.read_text(encoding="utf-8").split("scenario:")[0]
     own = source.read_text(encoding="utf-8").partition("scenario:")[2]
     target = folder / source.name
-    if "\n" in SCENARIOS[name]:
-        target.write_text(f"{text}\nscenario:{SCENARIOS[name]}", encoding="utf-8")
-    else:
-        lines = [f"  {SCENARIOS[name]}" if line.lstrip().startswith("horizon:") else line for line in own.splitlines()]
-        target.write_text("\n".join([text, "scenario:", *lines, ""]), encoding="utf-8")
+    lines = [f"  {SCENARIOS[name]}" if line.lstrip().startswith("horizon:") else line for line in own.splitlines()]
+    target.write_text("\n".join([text, "scenario:", *lines, ""]), encoding="utf-8")
     return target
 
 

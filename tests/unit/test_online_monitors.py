@@ -257,6 +257,76 @@ def test_a_continuous_design_on_a_log(machine):
         obsynth.online_monitor(machine, "pointwise", disturbance_bounds={"load": 0.5}, noise_bound=5.0)
 
 
+def test_cumulative_sums_of_a_residual_that_a_window_does_not_whiten(machine):
+    """A load of white noise leaves a residual that remembers for seconds: a window of one sample predicts nothing."""
+    scenario = obsynth.Scenario(
+        horizon=40, sample_time=0.02, noise=1, disturbances={"load": obsynth.Gaussian(deviation=1.0)}
+    )
+    for window in (1, 3):
+        watched = obsynth.monitor(machine, scenario, "cusum", window=window, change=0.5, false_alarms=0.05)
+        assert obsynth.evaluate(machine, scenario, runs=60, monitor=watched).false_alarm_rate.value <= 0.05
+        online = obsynth.online_monitor(
+            machine, "cusum", scenario=scenario, window=window, change=0.5, false_alarms=0.05
+        )
+        assert run_on_data(machine, log_of(obsynth.simulate(machine, scenario)), monitor=online).alarms == {}
+
+
+def test_the_correlation_that_is_left_is_that_of_all_lags(machine):
+    from obsynth.evaluation.residual_model import residual_model
+    from obsynth.evaluation.whitening import correlation_left, innovation_whitener, window_covariance
+
+    model = residual_model(machine, obsynth.Scenario(horizon=4, sample_time=0.2, noise=1))
+    window, lags, count = 3, 150, len(model.C)
+    covariance = window_covariance(model, window + lags)
+    span = window * count
+    whitener = innovation_whitener(covariance[:span, :span], count)
+    summed = sum(
+        np.linalg.norm(whitener @ covariance[j * count : j * count + span, :span] @ whitener.T, 2)
+        for j in range(1, lags)
+    )
+    assert correlation_left(model, window, whitener) == pytest.approx(summed, rel=1e-6)
+
+
+def test_a_number_of_any_size_is_an_alarm_and_is_forgotten(noisy):
+    scenario = obsynth.Scenario(horizon=60, noise=1)
+    table = log_of(obsynth.simulate(noisy, scenario))
+    for size in (1e200, -1e307):
+        table.loc[40, "y2"] = size
+        for kind in ("pointwise", "window", "chi-square", "cusum"):
+            bounds = {"noise_bound": 6.0, "disturbance_bounds": {"d1": 0.0}} if kind in ("pointwise", "window") else {}
+            monitor = obsynth.online_monitor(noisy, kind, scenario=scenario, window=3, **bounds)
+            found = run_on_data(noisy, table, monitor=monitor).table
+            assert found["alarm"][40:43].str.startswith(kind).any()
+            assert found["threshold"][40:].notna().all()
+
+
+@pytest.mark.parametrize("spacing", ["as stated", "closer", "irregular"])
+@pytest.mark.parametrize("kind", ["pointwise", "window"])
+def test_noise_of_the_worst_signs_keeps_the_bound_at_any_stamps(spacing, kind):
+    plant = obsynth.DescriptorSystem(None, [[-1.0]], C=[[1.0]], Bf=[[1.0]], Dw=[[0.1]], Bw=[[0.0]])
+    design = obsynth.pd_observer(plant, decay=20.0)
+    observer, dt = design.linear[1], 0.05
+    rng = np.random.default_rng(0)
+    steps = {"as stated": np.full(80, dt), "closer": np.full(400, dt / 20), "irregular": rng.uniform(0.01, 1, 120) * dt}
+    times = np.concatenate([[0.0], np.cumsum(steps[spacing])])
+    # What each sample does to the last residual, backwards.
+    response, back = np.zeros(len(times)), observer.Cz[observer.residual_rows]
+    response[-1] = observer.Dy[observer.residual_rows][0, 0]
+    for k in range(len(times) - 1, 0, -1):
+        transition, constant, ramp = obsynth.observers.sampling.first_order_hold(
+            observer.Az, observer.By, float(times[k] - times[k - 1])
+        )
+        response[k] += (back @ ramp).item()
+        response[k - 1] += (back @ (constant - ramp)).item()
+        back = back @ transition
+    table = pd.DataFrame({"time": times, "y1": 0.1 * np.sign(response)})
+    monitor = obsynth.online_monitor(design, kind, noise_bound=1.0, initial_error=0.0, sample_time=dt, window=2)
+    found = run_on_data(design, table, monitor=monitor, warm_up=0.0, gap=1e3)
+    assert found.alarms == {}
+    if kind == "pointwise" and spacing != "irregular":
+        assert found.table["statistic"].iloc[-1] > 0.9 * found.table["threshold"].iloc[-1]
+
+
 # Recursive designs, and what is refused
 
 

@@ -118,3 +118,16 @@ def test_a_networks_bus_voltages_are_there():
     assert len(done.recovered) == 30
     shown = {name for name in done.table.columns if name.startswith("xhat[")}
     assert shown == {f"xhat[{name}]" for name in spec.transformation.source.state_names}
+
+
+def test_a_number_that_overflows_there_is_no_warning():
+    A = SOURCE.A.copy()
+    A[4, 1] = 300.0  # leak = 300 flux, which nothing feels
+    whole = obsynth.eliminate_algebraic_states(SOURCE.replace(A=A))
+    whole = whole.then(obsynth.discretise(whole.plant, 0.1))
+    design = obsynth.design(whole.plant, recovery=whole.recovery)
+    table = simulated(design, 0.1)[0]
+    table.loc[30, "flux"] = 1e307
+    found = run_on_data(design, table).table
+    assert not np.isfinite(found["xhat[leak]"][30:33]).all()
+    assert np.isfinite(found["xhat[leak]"][200:]).all()

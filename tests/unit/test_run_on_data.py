@@ -416,6 +416,21 @@ def test_options_are_checked(sampled, continuous):
         run_on_data(continuous, table, thresholds={"fhat[fault]": -1.0})
 
 
+@pytest.mark.parametrize("dt", [0.0, 0.5])
+def test_a_plant_without_known_inputs_goes_on_from_a_saved_state(tmp_path, dt):
+    """There is nothing to remember of the inputs, in as many samples as the estimates lag."""
+    A = [[-0.5, 1.0], [-2.0, -0.8]] if dt == 0.0 else [[0.7, 0.1], [0.0, 0.5]]
+    plant = obsynth.DescriptorSystem(None, A, C=np.eye(2), Bf=[[0.0], [1.0]], dt=dt)
+    design = obsynth.ui_pi_observer(plant) if dt == 0.0 else obsynth.fault_estimation_filter(plant)
+    log = random_log(design, np.arange(60) * 0.5)
+    log.loc[20:24, plant.output_names[0]] = np.nan
+    whole = run_on_data(design, log).table
+    for cut in (1, 2, 10, 22, 26, 59):
+        state = tmp_path / f"{cut}.json"
+        parts = [run_on_data(design, part, state=state).table for part in (log[:cut], log[cut:])]
+        pd.testing.assert_frame_equal(pd.concat(parts, ignore_index=True), whole, check_exact=True)
+
+
 def test_equal_intervals_are_equal_in_spite_of_rounding():
     stamps = [0.1 * k for k in range(1000)]
     assert {interval(a, b) for a, b in pairwise(stamps)} == {0.1}

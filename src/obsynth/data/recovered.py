@@ -88,7 +88,8 @@ class RecoveredStates:
             return np.full(len(self.names), np.nan)
         rows = np.array(self._rows)[::-1]
         estimates = np.where(self._used, rows[self._ages, self._columns], 0.0)
-        return np.asarray(self._map @ estimates + self._inputs @ rows[self.delay, len(self._columns) :])
+        with np.errstate(over="ignore", invalid="ignore"):
+            return np.asarray(self._map @ estimates + self._inputs @ rows[self.delay, len(self._columns) :])
 
     def as_dict(self) -> dict[str, Any]:
         """Return what is carried from row to row, as data."""

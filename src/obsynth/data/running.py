@@ -231,7 +231,7 @@ class DataObserver(LinearSignals):
         return {
             "last": self.clock.last, "longest": self.clock.longest, "z": self.z, "v": self.v, "row": self.row,
             "model": self.model, "fault": self.fault, "settled_at": self.settled_at, "phase": self.phase,
-            "inputs": np.array(list(self.inputs)).reshape(-1, self.nu), "measured": self.measured,
+            "inputs": np.array(list(self.inputs)).reshape(len(self.inputs), self.nu), "measured": self.measured,
             "warm_up": self.warm_up, "gap": self.clock.gap,
         }  # fmt: skip
 

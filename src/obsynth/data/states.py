@@ -12,7 +12,7 @@ from obsynth.results.design import ObserverDesign
 from obsynth.results.serialise import design_as_dict, digest_of, plain, restored, write_atomically
 
 KIND = "obsynth run state"
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 
 
 def digest_of_gains(design: ObserverDesign) -> str:

@@ -15,7 +15,7 @@ from obsynth.evaluation.parameter_rules import PARAMETER_KINDS, ParameterRule
 from obsynth.evaluation.residual_model import ResidualModel, residual_model
 from obsynth.evaluation.thresholds import scaled_inputs
 from obsynth.evaluation.watching import bounds_of, require_options
-from obsynth.evaluation.whitening import innovation_whitener, steady_mean, whitener_of, window_covariance
+from obsynth.evaluation.whitening import cusum_whitener, steady_mean, whitener_of, window_covariance
 from obsynth.models.names import index_of
 from obsynth.numerics.arguments import is_finite_number, require_kind, require_mapping
 from obsynth.numerics.arrays import FloatArray
@@ -27,6 +27,7 @@ from obsynth.simulation.scenario import Scenario
 
 _FORGOTTEN = ", once the error at the start, which is not stated, is forgotten (else give a longer warm-up)"
 _AFTER_A_GAP = " (after a gap, too, while the error there is no larger than stated for the start)"
+_NOT_CLOSER = "; rows must not be closer than the stated sample time, as noise drives the plant itself"
 _ANY_LENGTH = " (the run may have any length)"
 _PARAMETER_STATEMENTS = {
     "chi-square": "distance of the parameters from their nominal values in the metric of their covariance: passed in a "
@@ -112,11 +113,15 @@ def online_monitor(
         bounds = np.where(np.array(stated, dtype=bool), bounds, np.inf)
     start = 0.0 if initial_error is None else float(initial_error)
     rule: Rule
+    irregular = None
     if kind in ("pointwise", "window", "paper"):
         if kind == "paper":
             table, limit = endless_paper(model, bounds, start, gamma)
         else:
             table, limit = endless_bound(kind, model, scaled_inputs(model, bounds, noise_bound), start, window)
+            if model.flow is not None:
+                inputs = scaled_inputs(model, bounds, noise_bound, any_stamps=True)
+                irregular = endless_bound(kind, model, inputs, start, window)
         if not limit > 0.0:
             raise SpecError(
                 "As stated, no disturbance and no noise reaches the residual: its bound would be zero, which rounding "
@@ -124,11 +129,15 @@ def online_monitor(
                 "(thresholds).",
                 path="noise_bound",
             )  # fmt: skip
-        rule = NormRule(table, limit, window=window if kind == "window" else 1, dt=dt)
+        rule = NormRule(table, limit, window=window if kind == "window" else 1, dt=dt, irregular=irregular)
         ending = _FORGOTTEN if initial_error is None else _AFTER_A_GAP
     else:
         rule = _whitened(kind, model, bounds if scenario is None else None, window, change, false_alarms, dt)
         ending = _ANY_LENGTH
+    if kind in ("pointwise", "window") and model.sensor_noise is not None:
+        # The noise of the plant itself is what is gathered between samples: the closer they are, the less, but in all
+        # the more of it that is of one sign.
+        ending += _NOT_CLOSER if model.Bw[:, model.sensor_noise[0].shape[1] :].any() else ""
     statement = statement_of(kind, continuous=model.flow is not None) + ending
     return OnlineMonitor(
         kind, statement, rule, residuals=len(model.C), fault_names=design.linear[1].fault_names,
@@ -168,11 +177,14 @@ def _whitened(
             f"{kind} needs to know what disturbances are to be expected: give a scenario (a spec with one), or use "
             "pointwise with disturbance bounds.", path="disturbances",
         )  # fmt: skip
-    covariance = window_covariance(model, window)
-    whitener = whitener_of(covariance) if kind == "chi-square" else innovation_whitener(covariance, len(model.C))
+    white = True
+    if kind == "chi-square":
+        whitener = whitener_of(window_covariance(model, window))
+    else:
+        whitener, white = cusum_whitener(model, window)
     return WhitenedRule(
         whitener, steady_mean(model), window=window, change=None if kind == "chi-square" else change,
-        false_alarms=false_alarms, dt=dt,
+        false_alarms=false_alarms, dt=dt, white=white,
     )  # fmt: skip
 
 

@@ -138,7 +138,8 @@ class OnlineMonitor:
             self._rule.restart()
         self._decided = deciding
         statistic, threshold, which = self._rule.take(time, residuals, evidence, deciding=deciding)
-        if not (math.isfinite(statistic) and math.isfinite(threshold)):
+        # A statistic that has overflowed has passed any threshold.
+        if math.isnan(statistic) or not math.isfinite(threshold):
             return UNDECIDED
         if statistic <= threshold:
             return Seen(statistic, threshold, False, "")

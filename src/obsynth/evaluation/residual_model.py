@@ -41,6 +41,9 @@ class ResidualModel:
         Of a continuous design: A and Bd in continuous time.
     start_noise : FloatArray, optional
         Of a continuous design, ``(n, any)``: what the noise w of the first sample (its first signals) adds to e there.
+    sensor_noise : tuple of FloatArray, optional
+        Of a continuous design: what the noise of the sensors (the first signals of w), drawn as straight lines between
+        samples, does to e' and r.
     """
 
     A: FloatArray
@@ -60,6 +63,7 @@ class ResidualModel:
     steady: tuple[bool, ...]
     flow: tuple[FloatArray, FloatArray] | None = None
     start_noise: FloatArray | None = None
+    sensor_noise: tuple[FloatArray, FloatArray] | None = None
 
     @property
     def initial_error(self) -> float:
@@ -129,14 +133,16 @@ def residual_model(design: ObserverDesign, scenario: Scenario) -> ResidualModel:
     shown, _, direct_d, direct_w = errors.residual_output
     faults, _, faults_d, faults_w = errors.fault_output
     bounds, means, deviations, steady = _disturbances(scenario, plant.disturbance_names, drive.steps, drive.dt)
-    a, driven, noise, flow, start_noise = errors.Az, errors.disturbance, errors.noise, None, None
+    a, driven, noise, flow, start_noise, heard = errors.Az, errors.disturbance, errors.noise, None, None, None
     if not plant.is_discrete:
         held, flow = sampled_errors(noisy, observer, found, drive.dt), (errors.Az, errors.disturbance)
         a, driven, noise, start_noise = held.A, held.Bd, held.Bw, held.start
+        sensors = noisy.Dw.any(axis=0)
+        heard = errors.noise[:, sensors], direct_w[:, sensors]
         direct_w, faults_w = held.direct(observer.residual_rows), held.direct(observer.fault_rows)
     return ResidualModel(
         a, -shown, driven, direct_d, noise, direct_w, -faults, faults_d, faults_w,
-        drive.steps, initial, bounds, means, deviations, steady, flow, start_noise,
+        drive.steps, initial, bounds, means, deviations, steady, flow, start_noise, heard,
     )  # fmt: skip
 
 

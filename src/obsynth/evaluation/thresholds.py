@@ -21,7 +21,7 @@ class ScaledInputs(NamedTuple):
     B, D : FloatArray
         Inputs that change from sample to sample, ``(n, m)`` and ``(nr, m)``.
     constant : float
-        What disturbances of any shape in continuous time add to the norm of the residual, at most.
+        What signals of any shape in continuous time add to the norm of the residual, at most.
     start : FloatArray
         ``(n, any)``: inputs of the first sample alone, straight to the error.
     """
@@ -32,7 +32,9 @@ class ScaledInputs(NamedTuple):
     start: FloatArray
 
 
-def scaled_inputs(model: ResidualModel, bounds: FloatArray, noise_bound: float | None) -> ScaledInputs:
+def scaled_inputs(
+    model: ResidualModel, bounds: FloatArray, noise_bound: float | None, *, any_stamps: bool = False
+) -> ScaledInputs:
     """Return what drives the residual, with every input scaled to at most one in absolute value.
 
     Parameters
@@ -43,6 +45,9 @@ def scaled_inputs(model: ResidualModel, bounds: FloatArray, noise_bound: float |
         ``(nd,)``, of the disturbances.
     noise_bound : float or None
         What the noise never exceeds, in its standard deviations.
+    any_stamps : bool, optional
+        Whether samples of a continuous design may come closer than the model's: noise of the sensors then counts as a
+        signal of any shape, which the straight lines between any samples are.
 
     Raises
     ------
@@ -69,6 +74,13 @@ def scaled_inputs(model: ResidualModel, bounds: FloatArray, noise_bound: float |
         )  # fmt: skip
     a, driven = model.flow
     peaks = peak_gain(a, driven * sizes, model.C) + np.linalg.norm(model.Dd * sizes, axis=0)
+    if any_stamps and model.sensor_noise is not None:
+        into, direct = model.sensor_noise
+        count = into.shape[1]
+        peaks = np.concatenate([peaks, factor * (peak_gain(a, into, model.C) + np.linalg.norm(direct, axis=0))])
+        return ScaledInputs(
+            factor * model.Bw[:, count:], factor * model.Dw[:, count:], float(np.sum(peaks)), np.zeros((len(a), 0))
+        )
     noisy = np.zeros((len(a), 0)) if model.start_noise is None else factor * model.start_noise
     return ScaledInputs(factor * model.Bw, factor * model.Dw, float(np.sum(peaks)), noisy)
 

@@ -12,7 +12,7 @@ from obsynth.evaluation.bench import Bench, make_bench
 from obsynth.evaluation.monitors import KINDS, Monitor, statement_of
 from obsynth.evaluation.residual_model import ResidualModel, residual_model
 from obsynth.evaluation.thresholds import paper_threshold, pointwise_threshold, scaled_inputs, window_threshold
-from obsynth.evaluation.whitening import innovation_whitener, settled, steady_mean, whitener_of, window_covariance
+from obsynth.evaluation.whitening import cusum_whitener, settled, steady_mean, whitener_of, window_covariance
 from obsynth.models.names import index_of
 from obsynth.numerics.arguments import is_finite_number, require_kind, require_mapping
 from obsynth.numerics.arrays import FloatArray
@@ -108,9 +108,13 @@ def monitor(
             else window_threshold(model, inputs, start, window)
         )
     else:
-        covariance = window_covariance(model, window)
-        whitener = whitener_of(covariance) if kind == "chi-square" else innovation_whitener(covariance, len(model.C))
-        mean, threshold = steady_mean(model), _statistical(kind, model, len(whitener), start, window, false_alarms)
+        white = True
+        if kind == "chi-square":
+            whitener = whitener_of(window_covariance(model, window))
+        else:
+            whitener, white = cusum_whitener(model, window)
+        mean = steady_mean(model)
+        threshold = _statistical(kind, model, len(whitener), start, window, false_alarms, white=white)
     bench = make_bench(design, scenario)
     if model.flow is not None:
         threshold = threshold + _straight_lines(design, scenario, model, kind, window)
@@ -156,9 +160,13 @@ def bounds_of(design: ObserverDesign, model: ResidualModel, given: Mapping[str, 
 
 
 def _statistical(
-    kind: str, model: ResidualModel, degrees: int, start: float, window: int, false_alarms: float
-) -> FloatArray:
-    """Return thresholds by Bonferroni's inequality over all looks (chi-square), or Ville's over all sums (cusum)."""
+    kind: str, model: ResidualModel, degrees: int, start: float, window: int, false_alarms: float,
+    *, white: bool,
+) -> FloatArray:  # fmt: skip
+    """Return thresholds by Bonferroni's inequality over all looks (chi-square), or Ville's over all sums (cusum).
+
+    Ville's is for white residuals; sums of others are counted one by one, from each start to each end.
+    """
     from scipy.special import chdtri
 
     threshold = np.full(model.steps, np.inf)
@@ -168,7 +176,8 @@ def _statistical(
         threshold[first:] = float(chdtri(degrees, false_alarms / looks))
     else:
         # Two signs for each component; a sum may start at every look.
-        threshold[first:] = math.log(2 * degrees * looks / false_alarms)
+        sums = looks if white else looks * (looks + 1) / 2
+        threshold[first:] = math.log(2 * degrees * sums / false_alarms)
     return threshold
 
 

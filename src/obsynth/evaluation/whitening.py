@@ -12,6 +12,10 @@ from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
 
 #: The start counts as forgotten when its effect on the residual is below this share of the residual's deviation.
 START_SHARE = 0.05
+#: Whitened residuals count as white when their correlations sum up to no more than this.
+WHITE_SHARE = 0.01
+#: What may be left of a correlation, relative to where it began, when its sum ends; and after how many samples at most.
+CORRELATION_LEFT, MOST_LAGS = 1e-9, 200_000
 
 
 def window_covariance(model: ResidualModel, window: int) -> FloatArray:
@@ -88,6 +92,73 @@ def innovation_whitener(covariance: FloatArray, count: int) -> FloatArray:
     if not kept.any():
         raise SpecError("The newest residual follows from the older ones: nothing is new in it.", path="window")
     return np.asarray((vectors[:, kept] / np.sqrt(sizes[kept])).T @ error)
+
+
+def correlation_left(model: ResidualModel, window: int, whitener: FloatArray) -> float:
+    """Return the norms of all correlations, at every lag, that whitened residuals still have, summed up.
+
+    Of a residual that remembers more than a window, a prediction from the window is not the best one.
+
+    Parameters
+    ----------
+    model : ResidualModel
+        The residual's, stable.
+    window : int
+        Samples.
+    whitener : FloatArray
+        From `innovation_whitener`.
+
+    Raises
+    ------
+    SpecError
+        The residual remembers for too long.
+    """
+    count, n = len(model.C), len(model.A)
+    covariance = window_covariance(model, 2 * window)
+    span = window * count
+    near = [
+        whitener @ covariance[j * count : j * count + span, :span] @ whitener.T for j in range(1, window)
+    ]  # fmt: skip
+    total = float(sum(np.linalg.norm(part, 2) for part in near))
+    # Later ones are P A^k Q, k = 0, 1, ...
+    b = np.hstack([model.Bd * model.deviations, model.Bw])
+    d = np.hstack([model.Dd * model.deviations, model.Dw])
+    spread = output_covariance(model.A, b, np.eye(n), np.zeros((n, b.shape[1])))
+    ahead = model.A @ spread @ model.C.T + b @ d.T
+    blocks = [whitener[:, i * count : (i + 1) * count] for i in range(window)]
+    shown, driven = np.zeros((len(whitener), n)), np.zeros((n, len(whitener)))
+    for newest, oldest in zip(reversed(blocks), blocks, strict=True):
+        shown = shown @ model.A + newest @ model.C
+        driven = model.A @ driven + ahead @ oldest.T
+    left = CORRELATION_LEFT * float(np.linalg.norm(driven))
+    for _ in range(MOST_LAGS):
+        total += float(np.linalg.norm(shown @ driven, 2))
+        driven = model.A @ driven
+        if float(np.linalg.norm(driven)) <= left:
+            return total
+    raise SpecError("The residual remembers for too long to be whitened: use kind='chi-square'.", path="kind")
+
+
+def cusum_whitener(model: ResidualModel, window: int) -> tuple[FloatArray, bool]:
+    """Return what cumulative sums add up, and whether it is white.
+
+    Where correlation is left, it is scaled down so that no sum of n samples has more variance than n.
+
+    Parameters
+    ----------
+    model : ResidualModel
+        The residual's.
+    window : int
+        Samples.
+
+    Raises
+    ------
+    SpecError
+        The newest residuals follow exactly from the older ones, or the residual remembers for too long.
+    """
+    whitener = innovation_whitener(window_covariance(model, window), len(model.C))
+    left = correlation_left(model, window, whitener)
+    return whitener / np.sqrt(1.0 + 2.0 * left), left <= WHITE_SHARE
 
 
 def steady_mean(model: ResidualModel) -> FloatArray:

@@ -142,7 +142,11 @@ def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **op
         engine = "riccati" if problem.weight_limit is None else "lmi"
     progress("searching the least gain")
     least = _least_gain(problem, asked, engine)
-    if problem.disturbances and least.starting_gain <= ROUNDING_GAIN * problem.disturbance_size:
+    unfelt = problem.disturbances and least.starting_gain <= ROUNDING_GAIN * problem.disturbance_size
+    if unfelt and plant.nw and limit is None:
+        # Against the noise, gains may take up measurements that feel the disturbance: it stays in the problem.
+        least = replace(least, starting_gain=NOMINAL_GAIN * size)
+    elif unfelt:
         # What is left of the disturbance in the estimates is rounding: nothing to minimise.
         problem = problem.without_disturbance()
         least = replace(_least_gain(problem, asked, engine), gain=least.starting_gain)
