@@ -52,8 +52,9 @@ def fault_estimation_filter(
     engine : {"auto", "riccati", "lmi"}, optional
         Who finds the gains: Riccati equations alone, which serve hundreds of states; or the matrix inequality as well,
         started from them, for the last digits of gamma and, with up to 12 states, somewhat smaller gains.  By default
-        the equations, and the inequality where ``residual_weight_limit`` is given, which they do not cover.  The
-        result's ``solver["engine"]`` says which ran.  The inequality is what is verified in each case.
+        the equations; the inequality where ``residual_weight_limit`` is given, which they do not cover, and where up
+        to 12 states have no filter of theirs.  The result's ``solver["engine"]`` says which ran.  The inequality is
+        what is verified in each case.
     solver : {"CLARABEL", "SCS"}, optional
         Semidefinite solver, for the inequality and for proofs that a gamma cannot be reached.
     tolerance : float, optional

@@ -80,7 +80,10 @@ class _Inequality:
             return injection_for(problem, solution, level)
         if problem.measured == 0:
             return Injection(np.zeros((problem.order, 0)), lmi.value_of(self.v))
-        return Injection(np.asarray(np.linalg.solve(solution, lmi.value_of(self.y))), lmi.value_of(self.v))
+        v, limit = lmi.value_of(self.v), problem.weight_limit
+        return Injection(
+            np.asarray(np.linalg.solve(solution, lmi.value_of(self.y))), v if limit is None else limit.kept(v)
+        )
 
 
 def _inequality(problem: GainProblem, squared: Any, *, ceiling: float) -> _Inequality:

@@ -22,6 +22,8 @@ from obsynth.synthesis.riccati import bounded_real_matrix, normalising_change, s
 
 #: The normalising Riccati solution is taken at this multiple of the starting filter's norm.
 NORMALISING_LEVEL = 1.3
+#: A share that norms are certain to, and no one misses.
+ROUNDING = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +41,13 @@ class WeightLimit:
     fixed: FloatArray
     free: FloatArray
     bound: float
+
+    def kept(self, v: FloatArray) -> FloatArray:
+        """Return V, drawn towards zero by as much as a solver's rounding has let the weight out of the bound."""
+        least, found = (float(np.linalg.norm(self.fixed + part, 2)) for part in (0.0, v @ self.free))
+        if found <= self.bound or least >= self.bound:
+            return v
+        return np.asarray((1.0 - ROUNDING) * (self.bound - least) / (found - least) * v)
 
 
 @dataclass(frozen=True, eq=False)

@@ -54,8 +54,8 @@ def small_gain_design(
         Level asked for.
     solver : str
         Name of the solver.
-    engine : {"riccati", "lmi"}
-        Whether the inequality may compete.
+    engine : {"auto", "riccati", "lmi"}
+        Whether the inequality may compete; "auto" lets it where a small problem has no central filter.
 
     Raises
     ------
@@ -85,11 +85,16 @@ def small_gain_design(
         central = [item for item in central if goal.is_fast(item)] or central
         candidates += [_towards(goal, min(central, key=goal.cost), target)] if central else []
     records.append({"what": "small gains", "solver": "central filter", "status": f"{len(central)} filters"})
-    needed = problem.weight_limit is not None or not candidates or problem.order <= MOST_STATES_FOR_WHOLE
-    if engine != "riccati" and needed:
+    small = problem.order <= MOST_STATES_FOR_WHOLE
+    wanted = {
+        "auto": small and not candidates,
+        "riccati": False,
+        "lmi": small or problem.weight_limit is not None or not candidates,
+    }
+    if wanted[engine]:
         # The eliminated inequality has no gains to make small: this takes the whole one.
         candidates += _by_inequality(goal, least, fresh, records, solver=solver)
-    if not candidates and goal.met(least.injection):
+    if (wanted[engine] or not candidates) and goal.met(least.injection):
         candidates.append(least.injection)
     if not candidates:
         raise SolverError(f"No filter with gain {gain:.6g} was found: nothing is known.", record=records[-1])

@@ -136,10 +136,8 @@ def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **op
     if limit is not None:
         problem = with_weight_limit(problem, prepared, parts, limit)
     size = max(problem.disturbance_size, NOMINAL_GAIN)
-    engine = asked.engine
-    if engine == "auto":
-        # Riccati equations do not cover a limit on the weight.
-        engine = "riccati" if problem.weight_limit is None else "lmi"
+    # Riccati equations do not cover a limit on the weight.
+    engine = "lmi" if asked.engine == "auto" and limit is not None else asked.engine
     progress("searching the least gain")
     least = _least_gain(problem, asked, engine)
     unfelt = problem.disturbances and least.starting_gain <= ROUNDING_GAIN * problem.disturbance_size
@@ -180,7 +178,7 @@ def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **op
         gains,
         observer,
         Certificate({"P_factor": factor, "tracking": tracking}, claims),
-        {"engine": engine, "runs": [*least.records, *records]},
+        {"engine": _engine_of(engine, records), "runs": [*least.records, *records]},
         notes(plant, prepared.detectability, observer, largest_zero=held[-1].value),
     )
 
@@ -256,8 +254,15 @@ def gain_problem(prepared: PreparedPlant, *, free_weight: bool) -> tuple[GainPro
     return problem, _Parts(l0, w0, v)
 
 
+def _engine_of(asked: str, records: list[dict[str, Any]]) -> str:
+    """Return which engine ran: by default the inequality comes in only where nothing else was found."""
+    if asked != "auto":
+        return asked
+    return "lmi" if any(record.get("solver") in SOLVER_SETTINGS for record in records) else "riccati"
+
+
 def _least_gain(problem: GainProblem, asked: FilterOptions, engine: str) -> gain_search.LeastGain:
-    polish = engine != "riccati"
+    polish = engine == "lmi"
     if asked.gamma_search == "direct":
         return gain_search.search_least_gain(problem, solver=asked.solver, polish=polish)
     return search_by_bisection(problem, tolerance=asked.tolerance, solver=asked.solver, polish=polish)
