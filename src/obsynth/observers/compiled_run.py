@@ -128,11 +128,13 @@ class _Record:
         most = int(self.degrees.max(initial=0.0))
         innovations = self.innovations[:, :most]
         samples, nq = self.parameters.shape
+        # Without parameters there is nothing to excite; with a random walk no window is watched.
+        excitation = np.full(samples, 0.0 if observer.adaptation is None else np.nan)
         return RecursiveEstimates(
             read_only(self.states), read_only(self.deviations), read_only(self.parameters),
             read_only(self.covariances), read_only(innovations), read_only(np.full((samples, most, nq), np.nan)),
             read_only(np.nansum(innovations * innovations, axis=1)), read_only(self.degrees),
-            read_only(np.zeros(samples)), observer.state_names, observer.fault_names, received_in(y),
+            read_only(excitation), observer.state_names, observer.fault_names, received_in(y),
         )  # fmt: skip
 
 

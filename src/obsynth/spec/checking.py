@@ -227,9 +227,10 @@ def _position(numbers: Sequence[int], words: Sequence[str]) -> str:
 def _known_keys(location: Sequence[str | int]) -> list[str]:
     """Return the keys that the section around the last part of ``location`` may have."""
     from obsynth.spec import schema
+    from obsynth.spec.schema_values import MatrixFile
 
     by_tag: dict[str, type[BaseModel]] = {
-        "<file>": schema.MatrixFile,
+        "<file>": MatrixFile,
         "<inline>": schema.PlantSection,
         "<varying>": schema.TimeVaryingSection,
         "<dae>": schema.DAESection,

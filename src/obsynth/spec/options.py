@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from obsynth.spec.schema import Covariance, Matrix, Positive, Section, Text, VaryingCovariance
+from obsynth.spec.schema_values import Covariance, Matrix, Positive, Section, Text, VaryingCovariance
 
 
 class FaultEstimationFilterOptions(Section):

@@ -5,63 +5,25 @@ This module imports pydantic, so it is imported only when a spec is read.
 
 from __future__ import annotations
 
-import math
 from typing import Annotated, Any, Literal
 
-from pydantic import (
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Discriminator,
-    Field,
-    Tag,
-    ValidationError,
-    ValidatorFunctionWrapHandler,
-    WrapValidator,
+from pydantic import Discriminator, Field, Tag
+
+from obsynth.spec.schema_values import (
+    EquationMatrix,
+    Matrix,
+    Names,
+    OutputMatrix,
+    Positive,
+    Section,
+    Text,
+    VaryingMatrix,
 )
-from pydantic_core import InitErrorDetails, PydanticCustomError
 
 SCHEMA_VERSION = 1
 
 # Tags of unions appear in the locations of pydantic's errors; the bracket marks them for removal.
-_ROWS, _FILE, _PICK, _LIST, _INLINE, _VARYING = "<rows>", "<file>", "<pick>", "<list>", "<inline>", "<varying>"
-_ONE, _STACK, _NUMBER = "<one>", "<stack>", "<number>"
-_NONLINEAR = "<dae>"
-
-
-def _rectangular(rows: Any, check_entries: ValidatorFunctionWrapHandler) -> Any:
-    """Check that rows have one length, besides their entries, so that both kinds of problem are reported."""
-    listed = [(i, len(row)) for i, row in enumerate(rows, 1) if isinstance(row, list)] if isinstance(rows, list) else []
-    ragged = next(((i, length) for i, length in listed if length != listed[0][1]), None)
-    if ragged is None:
-        return check_entries(rows)
-    problem = PydanticCustomError(
-        "ragged_rows", "row {row} has {found} entries, but row {first} has {expected}",
-        {"row": ragged[0], "found": ragged[1], "first": listed[0][0], "expected": listed[0][1]},
-    )  # fmt: skip
-    others: list[InitErrorDetails] = []
-    try:
-        check_entries(rows)
-    except ValidationError as error:
-        others = [
-            InitErrorDetails(type=item["type"], loc=item["loc"], input=item["input"], ctx=item.get("ctx", {}))
-            for item in error.errors()
-        ]
-    raise ValidationError.from_exception_data("matrix", [*others, InitErrorDetails(type=problem, input=None)])
-
-
-def _kind_of_matrix(value: Any) -> str:
-    if isinstance(value, dict):
-        return _FILE if "file" in value or not value else _PICK
-    return _ROWS
-
-
-def _kind_without_pick(value: Any) -> str:
-    return _FILE if isinstance(value, dict) else _ROWS
-
-
-def _kind_of_names(value: Any) -> str:
-    return _FILE if isinstance(value, dict) else _LIST
+_FILE, _LIST, _INLINE, _VARYING, _ONE, _NONLINEAR = "<file>", "<list>", "<inline>", "<varying>", "<one>", "<dae>"
 
 
 def _kind_of_plant(value: Any) -> str:
@@ -70,121 +32,6 @@ def _kind_of_plant(value: Any) -> str:
     if isinstance(value, dict) and value.get("kind") == "dae":
         return _NONLINEAR
     return _FILE if isinstance(value, dict) and "file" in value else _INLINE
-
-
-class Section(BaseModel):
-    """A part of a document: strict types, no unknown keys, finite numbers."""
-
-    model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, frozen=True)
-
-
-Text = Annotated[str, Field(min_length=1)]
-Positive = Annotated[float, Field(gt=0.0)]
-Rows = Annotated[
-    list[Annotated[list[float], Field(min_length=1)]], Field(min_length=1), WrapValidator(_rectangular), Tag(_ROWS)
-]
-
-
-class MatrixFile(Section):
-    """A matrix in a file: ``{file: A.mtx}``, or ``{file: plant.mat, variable: A}``."""
-
-    file: Text
-    variable: Text | None = None
-
-
-class NamesFile(Section):
-    """Names in a JSON file: ``{file: names.json}``."""
-
-    file: Text
-
-
-class OutputPick(Section):
-    """Outputs by state name: ``{outputs: [omega 1, v 3]}``."""
-
-    outputs: Annotated[list[Text], Field(min_length=1)]
-
-
-class StatePick(Section):
-    """Equations by state name: ``{states: [tm 1]}``."""
-
-    states: Annotated[list[Text], Field(min_length=1)]
-
-
-Matrix = Annotated[Rows | Annotated[MatrixFile, Tag(_FILE)], Discriminator(_kind_without_pick)]
-EquationMatrix = Annotated[
-    Rows | Annotated[MatrixFile, Tag(_FILE)] | Annotated[StatePick, Tag(_PICK)], Discriminator(_kind_of_matrix)
-]
-OutputMatrix = Annotated[
-    Rows | Annotated[MatrixFile, Tag(_FILE)] | Annotated[OutputPick, Tag(_PICK)], Discriminator(_kind_of_matrix)
-]
-Names = Annotated[Annotated[list[Text], Tag(_LIST)] | Annotated[NamesFile, Tag(_FILE)], Discriminator(_kind_of_names)]
-
-
-def _number_or_expression(value: Any) -> Any:
-    """Check one entry of a matrix that may change with k; expressions are parsed later, with the plant's constants."""
-    if isinstance(value, bool) or not isinstance(value, (int, float, str)):
-        raise PydanticCustomError("entry_of_k", "must be a number or an expression in k")
-    if isinstance(value, float) and not math.isfinite(value):
-        raise PydanticCustomError("finite_number", "must be finite")
-    return value
-
-
-VaryingRows = Annotated[
-    list[Annotated[list[Annotated[Any, BeforeValidator(_number_or_expression)]], Field(min_length=1)]],
-    Field(min_length=1), WrapValidator(_rectangular), Tag(_ROWS),
-]  # fmt: skip
-
-
-def _same_shapes(stack: Any, check_entries: ValidatorFunctionWrapHandler) -> Any:
-    """Check that the matrices of a stack have as many rows and columns as the first one."""
-    checked = check_entries(stack)
-    shapes = [(len(matrix), len(matrix[0])) for matrix in checked]
-    k = next((k for k, shape in enumerate(shapes) if shape != shapes[0]), None)
-    if k is None:
-        return checked
-    raise PydanticCustomError(
-        "stack_shapes", "matrix {number} of the stack is {rows} by {columns}, but the first is {wanted}",
-        {"number": k + 1, "rows": shapes[k][0], "columns": shapes[k][1], "wanted": "{} by {}".format(*shapes[0])},
-    )  # fmt: skip
-
-
-Stack = Annotated[list[Rows], Field(min_length=1), WrapValidator(_same_shapes), Tag(_STACK)]
-
-
-class VaryingFile(MatrixFile):
-    """A matrix, or a stack of them, in a file; ``stack: 60`` tells that 60 matrices stand one below the other."""
-
-    stack: Annotated[int, Field(ge=1)] | None = None
-
-
-def _kind_of_varying(value: Any) -> str:
-    if isinstance(value, dict):
-        return _FILE
-    first = value[0] if isinstance(value, list) and value else None
-    return _STACK if isinstance(first, list) and first and isinstance(first[0], list) else _ROWS
-
-
-VaryingMatrix = Annotated[VaryingRows | Stack | Annotated[VaryingFile, Tag(_FILE)], Discriminator(_kind_of_varying)]
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
-
-
-def _kind_of_covariance(value: Any) -> str:
-    return _NUMBER if _is_number(value) else _kind_without_pick(value)
-
-
-def _kind_of_varying_covariance(value: Any) -> str:
-    return _NUMBER if _is_number(value) else _kind_of_varying(value)
-
-
-Variance = Annotated[float, Field(ge=0.0), Tag(_NUMBER)]
-#: One variance stands for that multiple of the identity, as from Python.
-Covariance = Annotated[Variance | Rows | Annotated[MatrixFile, Tag(_FILE)], Discriminator(_kind_of_covariance)]
-VaryingCovariance = Annotated[
-    Variance | VaryingRows | Stack | Annotated[VaryingFile, Tag(_FILE)], Discriminator(_kind_of_varying_covariance)
-]
 
 
 class TransformSection(Section):
