@@ -189,14 +189,12 @@ def _monitor(design: ObserverDesign, options: argparse.Namespace) -> OnlineMonit
     scenario = None
     if options.system is not None:
         from obsynth.cli.commands import require_same_signals
+        from obsynth.cli.simulating import required_scenario
         from obsynth.spec import load_spec
 
         spec = load_spec(options.system)
         require_same_signals(design, options.gains, spec)
-        scenario = spec.scenario
-        if scenario is None:
-            raise SpecError(f"{options.system} has no scenario, which would tell what is to be expected.",
-                            path="scenario")  # fmt: skip
+        scenario = required_scenario(spec)
     return online_monitor(
         design, options.monitor, scenario=scenario, disturbance_bounds=numbers_of(options.disturbance),
         noise_bound=options.noise_bound, initial_error=options.initial_error, window=options.window,

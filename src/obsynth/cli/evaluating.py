@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from obsynth.cli.data_arguments import add_monitor_arguments
 from obsynth.cli.output import print_json, progress, stdout_console
+from obsynth.cli.simulating import required_scenario
 from obsynth.errors import SpecError
 
 if TYPE_CHECKING:
@@ -72,9 +73,7 @@ def run_evaluate(options: argparse.Namespace) -> int:
     with progress(quiet=options.quiet) as report_stage:
         report_stage(f"reading {options.system}")
         spec = load_spec(options.system)
-        if spec.scenario is None:
-            raise SpecError(f"{spec.path} has no scenario: add one, for example scenario: {{horizon: 100}}.",
-                            path="scenario")  # fmt: skip
+        scenario = required_scenario(spec)
         design = designed_or_loaded(spec, options.gains, report_stage)
         report_stage("running")
         from obsynth.evaluation.monte_carlo import evaluate
@@ -85,7 +84,7 @@ def run_evaluate(options: argparse.Namespace) -> int:
         watched: Monitor | ParameterMonitor | None = None
         if options.monitor is not None and isinstance(design.observer, LinearObserver):
             watched = monitor(
-                design, spec.scenario, options.monitor, disturbance_bounds=numbers_of(options.disturbance),
+                design, scenario, options.monitor, disturbance_bounds=numbers_of(options.disturbance),
                 noise_bound=options.noise_bound, initial_error=options.initial_error, window=options.window,
                 false_alarms=options.false_alarms, change=options.change,
             )  # fmt: skip
@@ -93,7 +92,7 @@ def run_evaluate(options: argparse.Namespace) -> int:
             watched = ParameterMonitor(options.monitor, false_alarms=options.false_alarms, change=options.change)
         with _executor(options.jobs) as executor:
             found = evaluate(
-                design, spec.scenario, runs=options.runs, monitor=watched, executor=executor,
+                design, scenario, runs=options.runs, monitor=watched, executor=executor,
                 progress=lambda done, total: report_stage(f"{done} of {total} runs"), confidence=options.confidence,
             )  # fmt: skip
     from obsynth.report.evaluation import described, evaluation_report

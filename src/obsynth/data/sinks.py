@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import csv
 import os
-import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Protocol, TextIO
 
 from obsynth.data.sources import check_suffix
-from obsynth.errors import SpecError
+from obsynth.results.files import replacement_of
 
 
 class Sink(Protocol):
@@ -119,11 +118,7 @@ def file_sink(path: Path, header: Sequence[str], texts: set[str]) -> Iterator[Si
         The suffix is unknown, the folder does not exist, the path is a folder, or the system refuses.
     """
     check_suffix(path)
-    if path.is_dir():
-        raise SpecError(f"{path} is a folder: give the name of a file.", path=str(path))
-    temporary = None
-    try:
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
+    with replacement_of(path) as (handle, temporary):
         if path.suffix.lower() == ".parquet":
             os.close(handle)
             sink = ParquetSink(temporary, header, texts)
@@ -134,12 +129,3 @@ def file_sink(path: Path, header: Sequence[str], texts: set[str]) -> Iterator[Si
         else:
             with os.fdopen(handle, "w", encoding="utf-8", newline="") as stream:
                 yield TextSink(stream, header)
-        mask = os.umask(0)
-        os.umask(mask)
-        os.chmod(temporary, 0o666 & ~mask)
-        os.replace(temporary, path)
-    except OSError as error:
-        raise SpecError(f"{path} cannot be written: {error.strerror}.", path=str(path)) from error
-    finally:
-        if temporary is not None and os.path.exists(temporary):
-            os.unlink(temporary)

@@ -9,7 +9,8 @@ from typing import Any
 from obsynth.data.job import Job
 from obsynth.errors import SpecError
 from obsynth.results.design import ObserverDesign
-from obsynth.results.serialise import design_as_dict, digest_of, plain, restored, write_atomically
+from obsynth.results.files import write_atomically
+from obsynth.results.serialise import design_as_dict, digest_of, plain, restored
 
 KIND = "obsynth run state"
 SCHEMA_VERSION = 3

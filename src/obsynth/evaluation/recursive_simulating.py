@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from obsynth.evaluation.columns import named_columns, write_columns
+from obsynth.evaluation.columns import SignalTable, named_columns, projected_note
 from obsynth.evaluation.recursive_bench import RowEstimates, make_recursive_bench
 from obsynth.evaluation.simulating import root_mean_square
-from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae import DAEObserver
 from obsynth.observers.recursive import RecursiveObserver
 from obsynth.results.design import ObserverDesign
@@ -22,7 +21,7 @@ BAND_WIDTH = 1.96
 
 
 @dataclass(frozen=True, eq=False)
-class RecursiveSimulation:
+class RecursiveSimulation(SignalTable):
     """A plant with parameters and its observer over a scenario, one row per sample; arrays are read-only.
 
     Parameters
@@ -55,11 +54,6 @@ class RecursiveSimulation:
     parameter_columns: tuple[int, ...]
     inconsistency: float
     notes: tuple[str, ...]
-
-    def __post_init__(self) -> None:
-        for field in fields(self):
-            if isinstance(getattr(self, field.name), np.ndarray):
-                object.__setattr__(self, field.name, read_only(getattr(self, field.name)))
 
     @property
     def parameter_errors(self) -> FloatArray:
@@ -110,21 +104,6 @@ class RecursiveSimulation:
         )  # fmt: skip
         return named_columns(self.time, groups)
 
-    def write_csv(self, path: str | Path) -> Path:
-        """Write `columns` as comma-separated text, atomically, floats with all their digits.
-
-        Parameters
-        ----------
-        path : str or Path
-            Where; an existing file is replaced.
-
-        Raises
-        ------
-        SpecError
-            The file cannot be written.
-        """
-        return write_columns(self.columns(), path)
-
 
 def simulate_recursive(design: ObserverDesign, scenario: Scenario) -> RecursiveSimulation:
     """Simulate the plant of a recursive design over a scenario: what `simulate` does for it.
@@ -156,10 +135,7 @@ def simulate_recursive(design: ObserverDesign, scenario: Scenario) -> RecursiveS
     else:
         notes.append("The model begins with y(1): the first row of the outputs is empty.")
     if change > 0.0:
-        notes.append(
-            f"The initial state did not satisfy the algebraic equations: it was projected, a change of {change:.3g} "
-            "(norm)."
-        )
+        notes.append(projected_note(change))
     return RecursiveSimulation(
         time=bench.drive.dt * np.arange(bench.drive.steps, dtype=np.float64), states=runs.states[:, 0],
         outputs=runs.outputs[:, 0], inputs=runs.inputs, parameters=runs.parameters, estimates=runs.estimates[0],

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from pathlib import Path
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from obsynth.evaluation.bench import Bench, make_bench
-from obsynth.evaluation.columns import named_columns, write_columns
+from obsynth.evaluation.columns import SignalTable, named_columns, projected_note
 from obsynth.numerics.arguments import require_kind
-from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear import Estimates, LinearObserver
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario
@@ -26,7 +25,7 @@ CONSISTENCY_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
-class Simulation:
+class Simulation(SignalTable):
     """A plant and its observer over a scenario, one row per sample; arrays are read-only.
 
     Parameters
@@ -63,11 +62,6 @@ class Simulation:
     state_warm_up: int | None
     fault_warm_up: int | None
     notes: tuple[str, ...]
-
-    def __post_init__(self) -> None:
-        for field in fields(self):
-            if isinstance(getattr(self, field.name), np.ndarray):
-                object.__setattr__(self, field.name, read_only(getattr(self, field.name)))
 
     @property
     def fault_errors(self) -> FloatArray:
@@ -108,21 +102,6 @@ class Simulation:
             ("fhat[{}]", shown.fault_names, shown.faults), ("r[{}]", shown.residual_names, shown.residuals),
         )  # fmt: skip
         return named_columns(self.time, groups)
-
-    def write_csv(self, path: str | Path) -> Path:
-        """Write `columns` as comma-separated text, atomically, floats with all their digits.
-
-        Parameters
-        ----------
-        path : str or Path
-            Where; an existing file is replaced.
-
-        Raises
-        ------
-        SpecError
-            The file cannot be written.
-        """
-        return write_columns(self.columns(), path)
 
 
 def simulate(design: ObserverDesign, scenario: Scenario) -> Simulation | RecursiveSimulation:
@@ -248,8 +227,5 @@ def _notes(bench: Bench, inconsistency: float, *, continuous: bool) -> tuple[str
             "include it."
         )
     if inconsistency > CONSISTENCY_TOLERANCE * max(1.0, float(np.linalg.norm(bench.initial_state))):
-        notes.append(
-            f"The initial state did not satisfy the algebraic equations: it was projected, a change of "
-            f"{inconsistency:.3g} (norm)."
-        )
+        notes.append(projected_note(inconsistency))
     return tuple(notes)

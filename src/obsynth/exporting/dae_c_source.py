@@ -14,7 +14,8 @@ from obsynth.exporting.c_words import c_identifier, comment, included, quoted
 from obsynth.models.dae import DAEModel
 from obsynth.observers.dae_c_code import observer_code
 from obsynth.results.design import ObserverDesign
-from obsynth.results.serialise import design_as_dict, write_atomically
+from obsynth.results.files import write_atomically
+from obsynth.results.serialise import design_as_dict
 
 _STEP = r"""
 void PREFIX_reset(PREFIX_state *state)

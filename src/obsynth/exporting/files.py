@@ -15,7 +15,7 @@ from obsynth.exporting.realisation import Realisation
 from obsynth.numerics.arguments import require_kind
 from obsynth.observers.dae import DAEObserver
 from obsynth.results.design import ObserverDesign
-from obsynth.results.serialise import write_atomically
+from obsynth.results.files import write_atomically
 
 SUFFIXES = (".mat", ".npz", ".c")
 

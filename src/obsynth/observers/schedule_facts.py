@@ -10,6 +10,7 @@ import numpy as np
 
 from obsynth.analysis.time_varying import STEPS_WITHOUT_HORIZON
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.norms import spectral_radius
 from obsynth.numerics.ranks import BOUNDARY_TOLERANCE
 from obsynth.observers.gain_schedule import GainStep, gain_steps
 from obsynth.observers.recursive import RecursiveObserver
@@ -153,7 +154,7 @@ def _contraction(schedule: Sequence[GainStep], nx: int) -> Contraction:
     whole = float(np.exp(last / steps))
     # In units far apart, or where errors grow before they shrink, a slow mode may take longer than the horizon to make
     # an error smaller than it was: then errors must shrink over the second half, as a whole and along every mode.
-    radius = float(np.max(np.abs(np.linalg.eigvals(late))))
+    radius = spectral_radius(late)
     slowest = max(last - middle, late_logarithm + float(np.log(radius)) if radius else -np.inf)
     second = float(np.exp(slowest / (steps - steps // 2)))
     if whole >= 1.0 and second < 1.0 - BOUNDARY_TOLERANCE:

@@ -6,7 +6,6 @@ import hashlib
 import json
 import math
 import os
-import tempfile
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
@@ -23,6 +22,7 @@ from obsynth.observers.dae import DAEObserver
 from obsynth.observers.linear import LinearObserver
 from obsynth.observers.recursive import RecursiveObserver
 from obsynth.results.design import Certificate, ObserverDesign
+from obsynth.results.files import write_atomically
 from obsynth.results.report import VerificationReport
 
 SCHEMA_VERSION = 1
@@ -102,37 +102,6 @@ def _tag(design: ObserverDesign) -> dict[str, str]:
     """Return the entry that tells of which kind plant and observer are."""
     kinds = [kind for kind, (_, observer) in _KINDS.items() if isinstance(design.observer, observer)]
     return {"kind": kinds[0]} if kinds and kinds[0] is not None else {}
-
-
-def write_atomically(path: str | Path, content: str | bytes) -> Path:
-    """Write ``content`` (text as UTF-8) to ``path`` so that the file is there whole or not at all.
-
-    Raises
-    ------
-    SpecError
-        The folder does not exist, the path is a folder, or the system refuses.
-    """
-    if not isinstance(path, (str, os.PathLike)):
-        raise SpecError(f"path is {path!r}: give the name of a file.", path="path")
-    target = Path(path)
-    if target.is_dir():
-        raise SpecError(f"{target} is a folder: give the name of a file.", path=str(target))
-    temporary = None
-    try:
-        handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=".part")
-        with os.fdopen(handle, "wb") as stream:
-            stream.write(content.encode() if isinstance(content, str) else content)
-        # mkstemp makes private files; a result should have the permissions of any new file.
-        mask = os.umask(0)
-        os.umask(mask)
-        os.chmod(temporary, 0o666 & ~mask)
-        os.replace(temporary, target)
-    except OSError as error:
-        raise SpecError(f"{target} cannot be written: {error.strerror}.", path=str(target)) from error
-    finally:
-        if temporary is not None and os.path.exists(temporary):
-            os.unlink(temporary)
-    return target
 
 
 def save(design: ObserverDesign, path: str | Path) -> Path:

@@ -21,6 +21,8 @@ from pydantic import (
 )
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
+from obsynth.numerics.arguments import is_number
+
 # Tags of unions appear in the locations of pydantic's errors; the bracket marks them for removal.
 _ROWS, _FILE, _PICK, _LIST, _STACK, _NUMBER = "<rows>", "<file>", "<pick>", "<list>", "<stack>", "<number>"
 
@@ -155,16 +157,12 @@ def _kind_of_varying(value: Any) -> str:
 VaryingMatrix = Annotated[VaryingRows | Stack | Annotated[VaryingFile, Tag(_FILE)], Discriminator(_kind_of_varying)]
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
-
-
 def _kind_of_covariance(value: Any) -> str:
-    return _NUMBER if _is_number(value) else _kind_without_pick(value)
+    return _NUMBER if is_number(value) else _kind_without_pick(value)
 
 
 def _kind_of_varying_covariance(value: Any) -> str:
-    return _NUMBER if _is_number(value) else _kind_of_varying(value)
+    return _NUMBER if is_number(value) else _kind_of_varying(value)
 
 
 Variance = Annotated[float, Field(ge=0.0), Tag(_NUMBER)]

@@ -77,9 +77,11 @@ def small_gain_design(
     if fresh.start_gain <= gain and goal.met(fresh.start):
         central.append(fresh.start)
     lively = [] if not goal.noisy or any(map(goal.is_fast, central)) else _lively_filters(goal)
+    quick = None
     if lively:
         # The filter of least noise may forget slowly again: what was bought is not given back.
-        candidates.append(_towards(goal, lively[0], target, slowest=_radius(problem, lively[0])))
+        quick = _towards(goal, lively[0], target, slowest=_radius(problem, lively[0]))
+        candidates.append(quick)
         central += lively
     else:
         central = [item for item in central if goal.is_fast(item)] or central
@@ -101,9 +103,9 @@ def small_gain_design(
     # An inaccurate solution may be far from the least noise: the true cost decides, not the solver.
     fast = [item for item in candidates if goal.met_fast(item)]
     found = min(fast or candidates, key=goal.cost)
-    if lively and goal.cost(candidates[0]) <= PRICE_OF_SPEED * goal.cost(found):
-        found = candidates[0]
-    return (_towards(goal, found, target) if goal.noisy and not lively else found), records
+    if quick is not None and goal.cost(quick) <= PRICE_OF_SPEED * goal.cost(found):
+        found = quick
+    return (_towards(goal, found, target) if goal.noisy and quick is None else found), records
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,6 +17,7 @@ from obsynth.models.time_varying import TimeVaryingDescriptorSystem
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.covariances import covariance_factor
 from obsynth.numerics.least_squares_step import least_squares_step, rank_revealing_step
+from obsynth.numerics.norms import spectral_radius
 from obsynth.numerics.pencils import finite_zeros
 from obsynth.numerics.ranks import BOUNDARY_TOLERANCE, CANCELLATION_TOLERANCE, decide_rank
 from obsynth.observers.step_model import stacked_noise
@@ -115,7 +116,9 @@ def steady_state_filter(
     if not _is_fixed(P, found):
         raise SolverError("The solution of the Riccati equation (16) fails its own residual. Run the filter instead.")
     L, K = gain[:, : varying.ne], gain[:, varying.ne :]
-    return SteadyState(read_only(P), read_only(A @ P @ A.T + q), read_only(L), read_only(K), _radius(L @ A) ** 2)
+    return SteadyState(
+        read_only(P), read_only(A @ P @ A.T + q), read_only(L), read_only(K), spectral_radius(L @ A) ** 2
+    )
 
 
 def reached_condition(plant: TimeVaryingDescriptorSystem, Q_root: FloatArray, R_root: FloatArray) -> Condition:
@@ -178,7 +181,7 @@ def _from_recursion(E: FloatArray, A: FloatArray, C: FloatArray, noise: FloatArr
     P, ne = np.eye(E.shape[1]), len(E)
     gain, following = _step(E, A, C, noise, _root(P))
     for _ in range(MOST_STEPS):
-        if _radius(gain[:, :ne] @ A) < 1.0:
+        if spectral_radius(gain[:, :ne] @ A) < 1.0:
             break
         P = following
         gain, following = _step(E, A, C, noise, _root(P))
@@ -211,7 +214,3 @@ def _root(P: FloatArray) -> FloatArray:
     """Return a square root of a covariance that rounding may have left slightly indefinite."""
     values, vectors = np.linalg.eigh(P)
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
-
-
-def _radius(matrix: FloatArray) -> float:
-    return float(np.max(np.abs(np.linalg.eigvals(matrix)), initial=0.0))
