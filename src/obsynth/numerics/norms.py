@@ -8,6 +8,7 @@ import numpy as np
 
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.doubling import compared_gain, gain_is_below
+from obsynth.numerics.modal_response import MANY_STATES, ModalResponse
 
 #: Relative gap between the attained value and the certified level of an H-infinity norm.
 NORM_TOLERANCE = 1e-9
@@ -16,13 +17,12 @@ NORM_TOLERANCE = 1e-9
 CIRCLE_TOLERANCE = 1e-3
 #: Points of the starting frequency grid.
 GRID_POINTS = 33
-#: From so many states on, peaks are searched in modal coordinates and a Riccati equation takes the pencil's place.
-MANY_STATES = 60
-#: Relative gaps at which it is asked, in turn; angles looked at, steps of power iteration, and rounds of refinement.
+#: Relative difference of modal and true response from which modal coordinates are not believed.
+MODAL_ERROR = 1e-3
+#: From `MANY_STATES` on a Riccati equation takes the pencil's place: relative gaps at which it is asked, in turn, and
+#: points of the grid.
 WIDER_TOLERANCES = (1e-4, 1e-3)
 MANY_GRID_POINTS = 257
-POWER_STEPS = 8
-REFINEMENTS = 6
 #: Each round at least squares the relative error near the peak; more than this means trouble.
 MAXIMUM_ROUNDS = 40
 #: Variance of a state in the rest of an infinite sum, relative to what is summed, below which the sum is complete.
@@ -89,16 +89,15 @@ def hinf_norm(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> Hin
         return HinfNorm(0.0, 0.0, 0.0, np.inf)
     if not all(np.all(np.isfinite(part)) for part in (a, b, c, d)):
         return HinfNorm(np.inf, np.inf, np.nan, 0.0)
-    poles = np.linalg.eigvals(a) if a.size else np.zeros(0, dtype=complex)
-    if np.any(np.abs(poles) >= 1.0):
-        return HinfNorm(np.inf, np.inf, np.nan, 0.0)
     a, b, c = balanced_realisation(a, b, c)
+    modes = _modes(a)
+    if np.any(np.abs(modes[0]) >= 1.0):
+        return HinfNorm(np.inf, np.inf, np.nan, 0.0)
     if a.shape[0] >= MANY_STATES:
-        found = _norm_of_many_states(a, b, c, d)
+        found = _norm_of_many_states(a, b, c, d, modes)
         if found is not None:
             return found
-    angles = np.concatenate([np.linspace(0.0, np.pi, GRID_POINTS), np.abs(np.angle(poles))])
-    best, angle = _peak(a, b, c, d, angles)
+    best, angle = _highest_peak(a, b, c, d, modes)
     if best == 0.0 or not np.isfinite(best) or a.shape[0] == 0:
         return HinfNorm(best, best, angle, np.inf)
     distance = 0.0
@@ -150,18 +149,28 @@ def highest_gain_found(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArra
     """
     if a.shape[0] < MANY_STATES or b.shape[1] == 0 or c.shape[0] == 0 or not np.all(np.isfinite(a)):
         return hinf_norm(a, b, c, d).upper
-    if spectral_radius(a) >= 1.0:
+    a, b, c = balanced_realisation(a, b, c)
+    modes = _modes(a)
+    if np.any(np.abs(modes[0]) >= 1.0):
         return float("inf")
-    best, _ = _modal_peak(*balanced_realisation(a, b, c), d)
+    best, _ = _modal_peak(a, b, c, d, modes, points=MANY_GRID_POINTS)
     return best if np.isfinite(best) else hinf_norm(a, b, c, d).upper
 
 
-def _norm_of_many_states(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> HinfNorm | None:
+def _modes(a: FloatArray) -> tuple[ComplexArray, ComplexArray]:
+    """Return the eigenvalues ``(n,)`` of ``a`` and its eigenvectors ``(n, n)``."""
+    values, vectors = np.linalg.eig(a)
+    return np.asarray(values, dtype=np.complex128), np.asarray(vectors, dtype=np.complex128)
+
+
+def _norm_of_many_states(
+    a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, modes: tuple[ComplexArray, ComplexArray]
+) -> HinfNorm | None:
     """Return the norm from the highest peak of a modal response and a Riccati equation just above it.
 
     ``None`` where the equation has no solution there: the peak was missed, or the data are too hard for doubling.
     """
-    best, angle = _modal_peak(a, b, c, d)
+    best, angle = _modal_peak(a, b, c, d, modes, points=MANY_GRID_POINTS)
     if not np.isfinite(best) or best == 0.0:
         return None
     for tolerance in WIDER_TOLERANCES:
@@ -170,42 +179,36 @@ def _norm_of_many_states(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatAr
     return None
 
 
-def _modal_peak(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> tuple[float, float]:
-    """Return the largest gain found, and where; infinite where there is no basis of eigenvectors."""
-    try:
-        angle = _modal_peak_angle(a, b, c, d)
-    except np.linalg.LinAlgError:
-        return np.inf, np.nan
-    return _peak(a, b, c, d, np.array([angle]))
+def _modal_peak(
+    a: FloatArray,
+    b: FloatArray,
+    c: FloatArray,
+    d: FloatArray,
+    modes: tuple[ComplexArray, ComplexArray],
+    *,
+    points: int,
+) -> tuple[float, float]:
+    """Return the largest gain found in modal coordinates, and where; infinite where they are not to be believed."""
+    with np.errstate(all="ignore"):
+        response = ModalResponse.of(*modes, b, c, d)
+        if response is None:
+            return np.inf, np.nan
+        angles = response.peaks(points)
+        believed = float(np.max(response.gains(angles)))
+    best, angle = _peak(a, b, c, d, angles)
+    return (best, angle) if abs(best - believed) <= MODAL_ERROR * best else (np.inf, np.nan)
 
 
-def _modal_peak_angle(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> float:
-    """Return where the largest singular value peaks, as far as power iteration in modal coordinates tells."""
-    poles, vectors = np.linalg.eig(a)
-    shown, driven = c @ vectors, np.linalg.solve(vectors, b.astype(complex))
-    near = poles[(poles.imag >= 0.0) & (np.abs(poles) > 0.5)]
-    angles = np.unique(np.concatenate([np.linspace(0.0, np.pi, MANY_GRID_POINTS), np.angle(near)]))
-    start = np.random.default_rng(0).normal(size=(b.shape[1], 1)) + 0j
-    width = np.pi / (MANY_GRID_POINTS - 1)
-
-    def gains(where: FloatArray) -> FloatArray:
-        factors = 1.0 / (np.exp(1j * where) - poles[:, None])
-        u = np.repeat(start, len(where), axis=1)
-        size = np.zeros(len(where))
-        for _ in range(POWER_STEPS):
-            u = u / np.maximum(np.linalg.norm(u, axis=0), np.finfo(np.float64).tiny)
-            y = shown @ (factors * (driven @ u)) + d @ u
-            size = np.linalg.norm(y, axis=0)
-            u = driven.conj().T @ (factors.conj() * (shown.conj().T @ y)) + d.T @ y
-        return np.asarray(np.where(np.isfinite(size), size, 0.0))
-
-    sizes = gains(angles)
-    centres = angles[np.argsort(sizes)[-3:]]
-    for _ in range(REFINEMENTS):
-        tried = np.clip(np.concatenate([centre + width * np.linspace(-1.0, 1.0, 9) for centre in centres]), 0.0, np.pi)
-        centres = tried[np.argsort(gains(tried))[-3:]]
-        width /= 4.0
-    return float(centres[-1])
+def _highest_peak(
+    a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, modes: tuple[ComplexArray, ComplexArray]
+) -> tuple[float, float]:
+    """Return the largest gain found, and where, of modal peaks or of a plain grid with the angles of the poles."""
+    if a.shape[0]:
+        best, angle = _modal_peak(a, b, c, d, modes, points=GRID_POINTS)
+        if np.isfinite(best):
+            return best, angle
+    grid = np.linspace(0.0, np.pi, GRID_POINTS)
+    return _peak(a, b, c, d, np.concatenate([grid, np.abs(np.angle(modes[0]))]))
 
 
 def balanced_realisation(a: FloatArray, b: FloatArray, c: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
