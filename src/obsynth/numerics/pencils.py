@@ -14,11 +14,12 @@ References
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
 from obsynth.numerics.arrays import ComplexArray, FloatArray
-from obsynth.numerics.ranks import CLUSTER_TOLERANCE, RANK_TOLERANCE, RankDecision, decide_rank
+from obsynth.numerics.ranks import CLUSTER_TOLERANCE, RANK_TOLERANCE, RankDecision, rank_from
 from obsynth.numerics.scaling import EquilibratedPencil, equilibrate_pencil
 
 
@@ -84,6 +85,17 @@ class _Deflation:
     decisions: tuple[RankDecision, ...]
 
 
+class _Reduction(NamedTuple):
+    """Both passes of the staircase, and the norms of E and A that its ranks were decided by."""
+
+    right: _Deflation
+    left: _Deflation
+    scales: tuple[float, float]
+
+
+_Svd: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
+
+
 def pencil_structure(E: FloatArray, A: FloatArray) -> PencilStructure:
     """Return the structure of ``A - z E`` for matrices ``(m, n)`` of any size, including zero.
 
@@ -101,7 +113,7 @@ def pencil_structure(E: FloatArray, A: FloatArray) -> PencilStructure:
     ----------
     .. [VanDooren1979] Algorithms 3.1 and 4.1.
     """
-    right, left = _reduce(equilibrate_pencil(E, A))
+    right, left, _ = _reduce(equilibrate_pencil(E, A))
     rows, columns = E.shape
     regular = _is_regular(E, right)
     next_nullities = (*right.nullities[1:], 0)
@@ -138,9 +150,9 @@ def finite_zeros(E: FloatArray, A: FloatArray) -> FiniteZeros:
     """
     # A tall pencil leaves the long chains to the second pass, whose findings can be checked below.
     tall = equilibrate_pencil(E, A) if E.shape[0] >= E.shape[1] else equilibrate_pencil(E.T, A.T)
-    right, left = _reduce(tall)
+    right, left, scales = _reduce(tall)
     values = _eigenvalues(left.E, left.A)
-    values = _with_missed_zeros(values, right.E, right.A, (_norm(tall.E), _norm(tall.A)))
+    values = _with_missed_zeros(values, right.E, right.A, scales)
     return FiniteZeros(values, _normal_rank(right, left), right.decisions + left.decisions)
 
 
@@ -204,7 +216,7 @@ def regularity(E: FloatArray, A: FloatArray) -> tuple[bool, int]:
     E, A : FloatArray
         ``(m, n)`` real matrices; they are not modified.
     """
-    right, left = _reduce(equilibrate_pencil(E, A))
+    right, left, _ = _reduce(equilibrate_pencil(E, A))
     return _is_regular(E, right), _normal_rank(right, left)
 
 
@@ -213,46 +225,60 @@ def _is_regular(E: FloatArray, right: _Deflation) -> bool:
     return E.shape[0] == E.shape[1] and right.nullities == right.ranks
 
 
-def _reduce(pencil: EquilibratedPencil) -> tuple[_Deflation, _Deflation]:
+def _reduce(pencil: EquilibratedPencil) -> _Reduction:
     """Deflate the infinite and right singular part, then the left singular part (transposed)."""
-    scales = (_norm(pencil.E), _norm(pencil.A))
-    right = _deflate(pencil.E, pencil.A, scales, most_nullity=pencil.E.shape[1])
+    first = _svd(pencil.E)
+    scales = (float(np.max(first[1], initial=0.0)), _norm(pencil.A))
+    right = _deflate(pencil.E, pencil.A, scales, most_nullity=pencil.E.shape[1], first=first)
     # E now has full column rank, so the ranks of E in the second pass follow from its shape.
     surplus = right.E.shape[0] - right.E.shape[1]
     left = _deflate(right.E.T, right.A.T, scales, most_nullity=surplus)
-    return right, left
+    return _Reduction(right, left, scales)
 
 
-def _deflate(E: FloatArray, A: FloatArray, scales: tuple[float, float], *, most_nullity: int) -> _Deflation:
+def _deflate(
+    E: FloatArray, A: FloatArray, scales: tuple[float, float], *, most_nullity: int, first: _Svd | None = None
+) -> _Deflation:
+    """Deflate step by step; ``first`` is the singular value decomposition of E, where it is known."""
     nullities: list[int] = []
     ranks: list[int] = []
     decisions: list[RankDecision] = []
-    while True:
+    while most_nullity > 0:
         rows, columns = E.shape
-        _, decision, right = _decided_svd(E, scale=scales[0], expected=columns)
+        if first is None and columns > rows:
+            first = _svd(E)
+        # Most often nothing is left to deflate after the first step: bases are then not needed.
+        values = _singular_values(E) if first is None else first[1]
+        decision = rank_from(values, scale=scales[0], expected=columns)
         # Rows were removed from a matrix of full column rank: this bounds the loss, whatever the tolerance says.
         rank = max(decision.rank, columns - most_nullity)
         if max(columns - rows, 0) < most_nullity:
             decisions.append(decision)
         if rank == columns:
-            return _Deflation(E, A, tuple(nullities), tuple(ranks), tuple(decisions))
-        kernel, complement = right[rank:].T, right[:rank].T
-        left, decision, _ = _decided_svd(A @ kernel, scale=scales[1], expected=columns - rank)
+            break
+        right = (_svd(E) if first is None else first)[2]
+        kernel, complement, first = right[rank:].T, right[:rank].T, None
+        left, values, _ = _svd(A @ kernel)
+        decision = rank_from(values, scale=scales[1], expected=columns - rank)
         decisions.append(decision)
         rest = left[:, decision.rank :].T
         E, A = rest @ E @ complement, rest @ A @ complement
         nullities.append(columns - rank)
         ranks.append(decision.rank)
         most_nullity = decision.rank
+    return _Deflation(E, A, tuple(nullities), tuple(ranks), tuple(decisions))
 
 
-def _decided_svd(matrix: FloatArray, *, scale: float, expected: int) -> tuple[FloatArray, RankDecision, FloatArray]:
-    """Return the full left and right singular bases and the rank decided relative to ``scale``."""
+def _svd(matrix: FloatArray) -> _Svd:
+    """Return the full left basis, the singular values and the full right basis."""
     if matrix.size == 0:
-        left, values, right = np.eye(matrix.shape[0]), np.zeros(0), np.eye(matrix.shape[1])
-    else:
-        left, values, right = np.linalg.svd(matrix)
-    return left, decide_rank(np.diag(values), expected=expected, scale=scale, equilibrated=False), right
+        return np.eye(matrix.shape[0]), np.zeros(0), np.eye(matrix.shape[1])
+    left, values, right = np.linalg.svd(matrix)
+    return left, values, right
+
+
+def _singular_values(matrix: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.svd(matrix, compute_uv=False)) if matrix.size else np.zeros(0)
 
 
 def _normal_rank(right: _Deflation, left: _Deflation) -> int:
