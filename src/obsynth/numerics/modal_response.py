@@ -12,8 +12,8 @@ from obsynth.numerics.arrays import ComplexArray, FloatArray
 NEAR = 0.5
 #: How many peaks are refined, by how many points on either side, and how often.
 MOST_PEAKS = 2
-POINTS_BESIDE = 3
-REFINEMENTS = 4
+POINTS_BESIDE = 4
+REFINEMENTS = 3
 #: Rows or columns up to which the largest singular value has a formula.
 TWO = 2
 #: From so many states on, steps of power iteration take the place of eigenvalues.

@@ -8,13 +8,11 @@ import numpy as np
 
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.doubling import compared_gain, gain_is_below
+from obsynth.numerics.level_crossings import level_crossings
 from obsynth.numerics.modal_response import MANY_STATES, ModalResponse
 
 #: Relative gap between the attained value and the certified level of an H-infinity norm.
 NORM_TOLERANCE = 1e-9
-#: Eigenvalues of the symplectic pencil this close to the unit circle are looked at as crossings: a false one costs
-#: one more look, a missed one would cost the bound.
-CIRCLE_TOLERANCE = 1e-3
 #: Points of the starting frequency grid.
 GRID_POINTS = 33
 #: Relative difference of modal and true response from which modal coordinates are not believed.
@@ -103,7 +101,7 @@ def hinf_norm(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> Hin
     distance = 0.0
     for _ in range(MAXIMUM_ROUNDS):
         level = best * (1.0 + NORM_TOLERANCE)
-        crossings, distance = _crossings(a, b, c, d, level)
+        crossings, distance = level_crossings(a, b, c, d, level)
         if not crossings.size:
             return HinfNorm(best, level, angle, distance)
         ordered = np.sort(np.concatenate([[0.0], crossings, [np.pi]]))
@@ -236,32 +234,6 @@ def _peak(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, angles: Fl
     gains = np.linalg.svd(response, compute_uv=False)[:, 0]
     top = int(np.argmax(gains))
     return float(gains[top]), float(angles[top])
-
-
-def _crossings(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, level: float) -> tuple[FloatArray, float]:
-    """Angles in [0, pi] at which a singular value equals ``level``, and the distance of the closest miss.
-
-    The transfer function has the singular value g at e^{jw} exactly when the pencil
-    ``z [I 0; C'C + C'D R^-1 D'C, A' + C'D R^-1 B'] - [A + B R^-1 D'C, B R^-1 B'; 0 I]``, with
-    ``R = g^2 I - D'D``, is singular at z = e^{jw}.
-    """
-    from scipy.linalg import eigvals
-
-    root = np.sqrt(level)
-    b, c, d = b / root, c / root, d / level
-    n = a.shape[0]
-    weight = np.eye(d.shape[1]) - d.T @ d
-    solved = np.linalg.solve(weight, np.hstack([d.T @ c, b.T]))
-    through, back = solved[:, :n], solved[:, n:]
-    left = np.block([[np.eye(n), np.zeros((n, n))], [c.T @ c + c.T @ d @ through, a.T + c.T @ d @ back]])
-    right = np.block([[a + b @ through, b @ back], [np.zeros((n, n)), np.eye(n)]])
-    alpha, beta = eigvals(right, left, homogeneous_eigvals=True)
-    size = np.abs(alpha) + np.abs(beta)
-    # |alpha| and |beta| are compared, not divided: infinite eigenvalues need no special case.
-    miss = np.abs(np.abs(alpha) - np.abs(beta)) / np.where(size == 0.0, 1.0, 0.5 * size)
-    miss[size == 0.0] = 0.0
-    near = miss < CIRCLE_TOLERANCE
-    return np.abs(np.angle(alpha[near] * np.conj(beta[near]))), float(np.min(miss))
 
 
 def output_covariance(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> FloatArray:
