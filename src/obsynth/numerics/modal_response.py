@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,6 +20,32 @@ TWO = 2
 #: From so many states on, steps of power iteration take the place of eigenvalues.
 MANY_STATES = 60
 POWER_STEPS = 8
+
+
+class Modes(NamedTuple):
+    """Eigenvalues and eigenvectors of a matrix.
+
+    Parameters
+    ----------
+    values : ComplexArray
+        ``(n,)``.
+    vectors : ComplexArray
+        ``(n, n)``, as columns.
+    """
+
+    values: ComplexArray
+    vectors: ComplexArray
+
+    @classmethod
+    def of(cls, a: FloatArray) -> Modes:
+        """Return those of ``a (n, n)``."""
+        values, vectors = np.linalg.eig(a)
+        return cls(np.asarray(values, dtype=np.complex128), np.asarray(vectors, dtype=np.complex128))
+
+    @property
+    def radius(self) -> float:
+        """Largest modulus of an eigenvalue; 0 for no states."""
+        return float(np.max(np.abs(self.values), initial=0.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,16 +68,16 @@ class ModalResponse:
     direct: FloatArray
 
     @classmethod
-    def of(
-        cls, poles: ComplexArray, vectors: ComplexArray, b: FloatArray, c: FloatArray, d: FloatArray
-    ) -> ModalResponse | None:
+    def of(cls, modes: Modes, b: FloatArray, c: FloatArray, d: FloatArray) -> ModalResponse | None:
         """Return the response; ``None`` where the eigenvectors are no basis."""
         try:
-            driven = np.asarray(np.linalg.solve(vectors, b.astype(np.complex128)), dtype=np.complex128)
+            driven = np.asarray(np.linalg.solve(modes.vectors, b.astype(np.complex128)), dtype=np.complex128)
         except np.linalg.LinAlgError:
             return None
         return (
-            cls(poles, np.asarray(c @ vectors, dtype=np.complex128), driven, d) if np.all(np.isfinite(driven)) else None
+            cls(modes.values, np.asarray(c @ modes.vectors, dtype=np.complex128), driven, d)
+            if np.all(np.isfinite(driven))
+            else None
         )
 
     def gains(self, angles: FloatArray) -> FloatArray:
