@@ -46,7 +46,7 @@ def fault_estimation_filter(
     free_residual_weight : bool, optional
         Whether W is free within ``W Upsilon = I``.  By default yes when the plant states noise, else no.
     residual_weight_limit : float, optional
-        Bound on the spectral norm of W (implies a free W).
+        Bound on the spectral norm of W (implies a free W; not with engine "riccati").
     S : array_like, optional
         The paper's free matrix ``(nx, nx + ny)`` in (17); by default T is nonsingular by construction.
     engine : {"auto", "riccati", "lmi"}, optional

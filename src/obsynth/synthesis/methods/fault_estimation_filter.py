@@ -220,7 +220,7 @@ def _gain_to_ship(asked: FilterOptions, problem: GainProblem, least: gain_search
         return max((1.0 + asked.gamma_margin) * least.gain, least.starting_gain)
     if asked.gamma is None:
         return max((1.0 + asked.gamma_margin) * least.gain, floor)
-    require_reachable(problem, least.gain, asked.gamma, solver=asked.solver)
+    require_reachable(problem, least, asked.gamma, solver=asked.solver)
     ceiling = LARGEST_USEFUL_GAIN * least.starting_gain
     return min(asked.gamma, ceiling) if ceiling > 0.0 else asked.gamma
 
