@@ -121,7 +121,10 @@ def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **op
         observer,
         Certificate({"P_factor": factor, "tracking": tracking}, claims),
         {"engine": _engine_of(engine, records), "runs": [*least.records, *records]},
-        notes(plant, prepared.detectability, observer, largest_zero=held[-1].value),
+        (
+            *_gamma_notes(asked.gamma, level if plant.nd else np.inf),
+            *notes(plant, prepared.detectability, observer, largest_zero=held[-1].value),
+        ),
     )
 
 
@@ -223,6 +226,15 @@ def _gain_to_ship(asked: FilterOptions, problem: GainProblem, least: gain_search
     require_reachable(problem, least.gain, asked.gamma, solver=asked.solver)
     ceiling = LARGEST_USEFUL_GAIN * least.starting_gain
     return min(asked.gamma, ceiling) if ceiling > 0.0 else asked.gamma
+
+
+def _gamma_notes(asked: float | None, shipped: float) -> tuple[str, ...]:
+    """Return a note where less is shipped than was asked for."""
+    if asked is None or shipped >= asked:
+        return ()
+    return (
+        f"gamma = {asked:.6g} was asked for, and {shipped:.6g} is proved: gains for more would only be scaled worse.",
+    )
 
 
 def _gains(prepared: PreparedPlant, parts: _Parts, chosen: Injection) -> dict[str, FloatArray]:
