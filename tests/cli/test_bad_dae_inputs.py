@@ -83,7 +83,8 @@ def test_the_good_one_is_designed_saved_and_verified(tmp_path, capsys) -> None:
         ("method/options/integration", "euler", 2, ["'backward-euler'"]),
         ("method/id", "adaptive-observer", 2, ["method.options"]),
         ("plant/equations/valve", "level = c", 3, ["index 2", "valve"]),
-        ("plant/equations/balance", "2 * outflow - inflow = 2 * c * sqrt(level) - inflow", 3, ["not independent", "'balance'"]),
+        ("plant/equations/balance", "2 * outflow - inflow = 2 * c * sqrt(level) - inflow", 3,
+         ["not independent", "'balance'"]),
         ("plant/equations/balance", "outflow = 2 * c * sqrt(level) + inflow", 5, ["No solution at k = 0", "equation"]),
     ],
 )  # fmt: skip
