@@ -13,7 +13,7 @@ import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.doubling import continuous_riccati_solution, doubled_riccati_solution
-from obsynth.numerics.spectra import abscissa, noise_covariance
+from obsynth.numerics.spectra import abscissa, decay_rates, eigenvalues, noise_covariance
 
 #: The default pays at most this factor in noise, against the quietest Kalman filter, for being fast.
 NOISE_PRICE = 10.0
@@ -25,8 +25,13 @@ ROUNDS = 2
 SILENT = 1e-8
 #: From so many states on the Riccati equation is solved by doubling first.
 MANY_STATES = 40
+#: Deviations that differ by more than this share from one choice of states to another are rounding.
+SAME_DEVIATION = 0.1
+#: A rate that cannot be had at once is gone to in steps of this factor, from one that is at most so many below.
+RATE_FACTOR = 4.0
+MOST_STEPS = 12
 #: Halvings of the default rate before the quietest filter is taken as it is.
-MOST_HALVINGS = 12
+MOST_HALVINGS = 40
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,16 +63,47 @@ class KalmanProblem:
     estimates: FloatArray
     dt: float
 
-    def gain(self, decay: float) -> FloatArray | None:
+    def gain(self, decay: float, *, persistent: bool = False) -> FloatArray | None:
         """Return the gain whose poles all decay at ``decay`` (1/s) or faster; ``None`` when the equation has none.
+
+        Parameters
+        ----------
+        decay : float, 1/s
+            Not negative.
+        persistent : bool, optional
+            Where the equation cannot be solved as it stands, since the wanted rate is far above those of the pair, go
+            there from slower rates, each solved in the coordinates of the one before.
 
         References
         ----------
         .. [AndersonMoore1971] B. D. O. Anderson, J. B. Moore, "Linear optimal control", 1971, section 4.
         """
-        n = self.F.shape[0]
-        if n == 0:
-            return np.zeros((0, self.C.shape[0]))
+        plain = np.eye(self.F.shape[0])
+        best, change = self.solved(decay, plain)
+        if best is not None or not persistent:
+            return best
+        slower = [decay]
+        while best is None and len(slower) <= MOST_STEPS:
+            slower.append(slower[-1] / RATE_FACTOR)
+            best, change = self.solved(slower[-1], plain)
+        for rate in reversed(slower[:-1]):
+            if best is None:
+                break
+            best, change = self.solved(rate, change)
+        return best
+
+    def solved(self, decay: float, change: FloatArray) -> tuple[FloatArray | None, FloatArray]:
+        """Return the gain of a rate, and coordinates in which its error covariance is the identity.
+
+        Parameters
+        ----------
+        decay : float, 1/s
+            Not negative.
+        change : FloatArray
+            ``(n, n)``: the equation is first solved in states ``change^-1 e``.
+        """
+        if not self.F.size:
+            return np.zeros((0, self.C.shape[0])), change
         # The part of the process noise that the measurements carry is taken out first.
         measured = self.D @ self.D.T + self.background @ self.background.T
         direct = np.linalg.solve(measured, self.D @ self.B.T).T
@@ -76,7 +112,6 @@ class KalmanProblem:
         rest = 0.5 * (rest + rest.T)
         bound = float(np.exp(-decay * self.dt)) if self.dt > 0.0 else -decay
         best: FloatArray | None = None
-        change = np.eye(n)
         for _ in range(ROUNDS):
             found = _filtered(free, self.C, rest, measured, (bound, self.dt), change)
             if found is None:
@@ -86,13 +121,26 @@ class KalmanProblem:
             if abscissa(self.F - total @ self.C, self.dt) < bound:
                 best = total
             change = found[1]
-        return best
+        return best, change
 
-    def deviations(self, gain: FloatArray) -> FloatArray:
-        """Return the standard deviation of each estimate under the noise that counts (for unit intensity, dt = 0)."""
-        entering = self.B - gain @ self.D
+    def deviations(self, gain: FloatArray, change: FloatArray) -> FloatArray:
+        """Return the standard deviation of each estimate under the noise that counts (for unit intensity, dt = 0).
+
+        Parameters
+        ----------
+        gain : FloatArray
+            ``(n, ny)``.
+        change : FloatArray
+            ``(n, n)``: states ``change^-1 e`` in which the computation is well conditioned.
+        """
+        entering = np.asarray(np.linalg.solve(change, self.B - gain @ self.D), dtype=np.float64)
+        moved = np.asarray(np.linalg.solve(change, (self.F - gain @ self.C) @ change), dtype=np.float64)
         direct = np.zeros((self.estimates.shape[0], entering.shape[1]))
-        covariance = noise_covariance(self.F - gain @ self.C, entering, self.estimates, direct, self.dt)
+        bound = 1.0 if self.dt > 0.0 else 0.0
+        if not abscissa(moved, self.dt) < bound:
+            # Stable in some coordinates and not in others: only rounding tells.
+            return np.full(len(direct), np.inf)
+        covariance = noise_covariance(moved, entering, self.estimates @ change, direct, self.dt)
         return np.asarray(np.sqrt(np.maximum(np.diag(covariance), 0.0)))
 
 
@@ -198,30 +246,37 @@ def compromise(problem: KalmanProblem, rate: float) -> Compromise | None:
     rate : float, 1/s
         As fast as makes sense for the plant.
     """
-    plain = problem.gain(0.0)
+    start = np.eye(problem.F.shape[0])
+    plain, change = problem.solved(0.0, start)
     if plain is None:
         return None
     # Each estimate by itself: they have units of their own.
-    quietest = problem.deviations(plain)
+    quietest = problem.deviations(plain, change)
     silent = SILENT * np.linalg.norm(problem.estimates, axis=1) * float(np.linalg.norm(problem.D))
-    counted = (quietest > silent) & np.isfinite(quietest)
+    # A deviation that depends on the coordinates it is computed in is rounding, too.
+    again = problem.deviations(plain, start)
+    counted = (quietest > silent) & np.isclose(quietest, again, rtol=SAME_DEVIATION, atol=0.0) & np.isfinite(quietest)
     best = Compromise(plain, 0.0, 1.0)
 
     def attempt(decay: float) -> Compromise | None:
-        gain = problem.gain(decay)
+        gain, change = problem.solved(decay, start)
         if gain is None:
             return None
-        ratios = problem.deviations(gain)[counted] / quietest[counted]
+        ratios = problem.deviations(gain, change)[counted] / quietest[counted]
         price = float(np.max(ratios)) if ratios.size else 1.0
         return Compromise(gain, decay, price) if price <= NOISE_PRICE else None
 
     high = rate
+    slowest = float(np.min(decay_rates(eigenvalues(problem.F - plain @ problem.C), problem.dt), initial=np.inf))
     for _ in range(MOST_HALVINGS):
         found = attempt(high)
         if found is not None:
             best = found
             break
         high /= 2.0
+        if high <= slowest:
+            # The quietest filter is as fast as that by itself.
+            break
     if best.decay in (0.0, rate):
         return best
     low, high = best.decay, 2.0 * best.decay
