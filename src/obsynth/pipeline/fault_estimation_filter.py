@@ -21,7 +21,7 @@ def fault_estimation_filter(
     residual_weight_limit: float | None = None,
     S: ArrayLike | None = None,
     engine: str = "auto",
-    solver: str = "CLARABEL",
+    solver: str = "auto",
     tolerance: float = 1e-6,
     name: str = "design",
 ) -> ObserverDesign:

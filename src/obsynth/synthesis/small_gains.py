@@ -32,6 +32,9 @@ PRICE_OF_SPEED = 1.04
 #: Halvings of the step towards the filter of least noise, for few and for many states.
 LINE_STEPS = 7
 COARSE_LINE_STEPS = 3
+#: Further solutions of the inequality at most, and the ratio of costs below which another one is worth its time.
+MOST_REPETITIONS = 3
+WORTH_REPEATING = 0.95
 #: A step counts when its level is met to this relative accuracy.
 LEVEL_ACCURACY = 1e-6
 
@@ -161,7 +164,11 @@ def _lively_filters(goal: _Goal) -> list[Injection]:
 def _by_inequality(
     goal: _Goal, least: LeastGain, fresh: NormalisedProblem, records: list[dict[str, Any]], *, solver: str
 ) -> list[Injection]:
-    """Return what the inequality gives, in different coordinates until one is good and fast enough."""
+    """Return what the inequality gives, in different coordinates until one is good and fast enough.
+
+    The bounds on P mean something else in other coordinates, and those of the least gain can be extreme: as long as that
+    gains much, the inequality is solved again in the coordinates of what it gave.
+    """
     problem, gain = goal.problem, goal.gain
     candidates: list[Injection] = []
     close = coordinates(problem, solver=solver, start=least.injection, gain=least.gain)
@@ -174,11 +181,30 @@ def _by_inequality(
         if injection is not None and goal.met(injection):
             candidates.append(injection)
             if goal.met_fast(injection):
+                candidates += _again(goal, injection, records, solver=solver, decay=decay)
                 break
     if not candidates and problem.disturbances:
         centre = gain_design.feasible_point(close.problem, gain / close.gain, solver=solver)
         candidates = [] if centre is None else [close.restore(centre.injection)]
     return [item for item in candidates if goal.met(item)]
+
+
+def _again(
+    goal: _Goal, injection: Injection, records: list[dict[str, Any]], *, solver: str, decay: float
+) -> list[Injection]:
+    """Return what the inequality gives in the coordinates of its own answer, while that costs much less each time."""
+    found: list[Injection] = []
+    before, cost = np.inf, goal.cost(injection)
+    for _ in range(MOST_REPETITIONS):
+        if found and cost > WORTH_REPEATING * before:
+            break
+        normalised = coordinates(goal.problem, solver=solver, start=injection)
+        better = _small_gains_in(goal.problem, normalised, goal.gain, records, solver=solver, decay=decay)
+        if better is None or not goal.met_fast(better):
+            break
+        found.append(better)
+        injection, before, cost = better, cost, goal.cost(better)
+    return found
 
 
 def _towards(goal: _Goal, injection: Injection, target: Injection | None, *, slowest: float | None = None) -> Injection:

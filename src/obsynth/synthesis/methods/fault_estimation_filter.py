@@ -42,7 +42,7 @@ from obsynth.synthesis.gain_bisection import search_by_bisection
 from obsynth.synthesis.gain_bound import require_reachable
 from obsynth.synthesis.gain_design import null_basis
 from obsynth.synthesis.gain_problem import GainProblem, Injection, WeightLimit
-from obsynth.synthesis.lmi import SOLVER_SETTINGS
+from obsynth.synthesis.lmi import FILTER_SOLVERS
 from obsynth.synthesis.result import Synthesis
 from obsynth.synthesis.small_gains import small_gain_design
 
@@ -200,7 +200,7 @@ def _engine_of(asked: str, records: list[dict[str, Any]]) -> str:
     """Return which engine ran: by default the inequality comes in only where nothing else was found."""
     if asked != "auto":
         return asked
-    return "lmi" if any(record.get("solver") in SOLVER_SETTINGS for record in records) else "riccati"
+    return "lmi" if any(record.get("solver") in FILTER_SOLVERS for record in records) else "riccati"
 
 
 def _least_gain(problem: GainProblem, asked: FilterOptions, engine: str) -> gain_search.LeastGain:
