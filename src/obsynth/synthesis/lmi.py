@@ -224,7 +224,11 @@ def _solved_by_schur_complement(problem: cvxpy.Problem) -> dict[str, Any]:
 def _version(solver: str) -> str:
     from importlib.metadata import PackageNotFoundError, version
 
+    if solver == SCHUR:
+        from obsynth import __version__
+
+        return __version__
     try:
-        return version("obsynth" if solver == SCHUR else solver.lower())
+        return version(solver.lower())
     except PackageNotFoundError:
         return "unknown"

@@ -22,7 +22,7 @@ class NormalEquations:
     Raises
     ------
     numpy.linalg.LinAlgError
-        The columns depend on each other, as far as rounding lets see.
+        The columns depend on each other, as far as rounding lets see, or are not finite.
     """
 
     def __init__(self, columns: FloatArray) -> None:
@@ -32,13 +32,15 @@ class NormalEquations:
         matrix = columns @ columns.T
         self._unit = 1.0 / np.sqrt(np.maximum(np.diag(matrix), np.finfo(np.float64).tiny))
         matrix *= np.outer(self._unit, self._unit)
+        if not np.all(np.isfinite(matrix)):
+            raise np.linalg.LinAlgError("the normal equations are not finite")
         for shift in SHIFTS:
             try:
                 self._factor = cho_factor(matrix + shift * np.eye(len(matrix)), overwrite_a=True, check_finite=False)
                 return
             except np.linalg.LinAlgError:
                 continue
-        raise np.linalg.LinAlgError("the Schur complement is not positive definite")
+        raise np.linalg.LinAlgError("the normal equations are not positive definite")
 
     def solution(self, right: FloatArray) -> FloatArray:
         """Return the solution ``(n,)``, refined with the columns themselves."""

@@ -120,7 +120,7 @@ def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **op
         gains,
         observer,
         Certificate({"P_factor": factor, "tracking": tracking}, claims),
-        {"engine": _engine_of(engine, records), "runs": [*least.records, *records]},
+        {"engine": _engine_of([*least.records, *records]), "runs": [*least.records, *records]},
         notes(plant, prepared.detectability, observer, largest_zero=held[-1].value),
     )
 
@@ -196,10 +196,8 @@ def gain_problem(prepared: PreparedPlant, *, free_weight: bool) -> tuple[GainPro
     return problem, _Parts(l0, w0, v)
 
 
-def _engine_of(asked: str, records: list[dict[str, Any]]) -> str:
-    """Return which engine ran: by default the inequality comes in only where nothing else was found."""
-    if asked != "auto":
-        return asked
+def _engine_of(records: list[dict[str, Any]]) -> str:
+    """Return which engine ran: the inequality comes in only where it may and where there is something to find."""
     return "lmi" if any(record.get("solver") in FILTER_SOLVERS for record in records) else "riccati"
 
 
