@@ -34,6 +34,8 @@ MARGIN = 1e-9
 #: Bounds on P in normalised coordinates: they keep P away from singular and the gains from running away.
 P_FLOOR = 1e-4
 P_CEILING = 1e4
+#: Relative room in P and in the squared level for the gains of the eliminated form.
+RECOVERY_ROOM = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +83,10 @@ class _Inequality:
         v = None if self.v is None else lmi.value_of(self.v)
         v = limit.kept(v) if limit is not None and v is not None else v
         if self.y is None:
-            return injection_for(problem, solution, level, v=v)
+            # Both conditions stay true, strictly, when P and g^2 grow by the same factor: the gains stay of a natural
+            # size where a solution lies on the boundary.
+            room = 1.0 + RECOVERY_ROOM
+            return injection_for(problem, room * solution, float(np.sqrt(room)) * level, v=v)
         if problem.measured == 0:
             return Injection(np.zeros((problem.order, 0)), v)
         return Injection(np.asarray(np.linalg.solve(solution, lmi.value_of(self.y))), v)
