@@ -33,27 +33,28 @@ class SemidefiniteBlock:
         self.order, self.size = order, order * (order + 1) // 2
         self.part = slice(first, first + self.size)
         self._rows, self._columns = np.tril_indices(order)
+        self._places = order * self._rows + self._columns
+        self._entries = np.empty((order, order), dtype=np.intp)
+        self._entries[self._rows, self._columns] = self._entries[self._columns, self._rows] = np.arange(self.size)
         self._weights = np.where(self._rows == self._columns, 1.0, np.sqrt(2.0))
         self._factor = self._inverse = np.eye(order)
         self._values = np.ones(order)
 
     def vector(self, matrix: FloatArray) -> FloatArray:
         """Return matrices ``(..., order, order)`` as vectors."""
-        return np.asarray(matrix[..., self._rows, self._columns] * self._weights)
+        flat = matrix.reshape(*matrix.shape[:-2], self.order**2)
+        return np.asarray(np.take(flat, self._places, axis=-1) * self._weights)
 
     def matrix(self, vector: FloatArray) -> FloatArray:
         """Return vectors ``(..., size)`` as matrices."""
-        entries = vector / self._weights
-        matrix = np.empty((*vector.shape[:-1], self.order, self.order))
-        matrix[..., self._rows, self._columns] = entries
-        matrix[..., self._columns, self._rows] = entries
-        return matrix
+        return np.take(vector / self._weights, self._entries, axis=-1)
 
     def scaled(self, s: FloatArray) -> FloatArray:
-        """Return directions of s ``(count, size)`` in the scaling."""
-        found, length = np.empty_like(s), max(1, PART // self.order**2)
-        for first in range(0, len(s), length):
-            part = slice(first, first + length)
+        """Return directions of s ``(count, size)`` in the scaling; most are zero where a block has unknowns of its own."""
+        found, length = np.zeros_like(s), max(1, PART // self.order**2)
+        there = np.flatnonzero(np.any(s, axis=1))
+        for first in range(0, len(there), length):
+            part = there[first : first + length]
             found[part] = self.vector(self._inverse @ (self.matrix(s[part]) @ self._inverse.T))
         return found
 

@@ -33,7 +33,7 @@ PRICE_OF_SPEED = 1.04
 LINE_STEPS = 7
 COARSE_LINE_STEPS = 3
 #: Further solutions of the inequality at most, and the ratio of costs below which another one is worth its time.
-MOST_REPETITIONS = 3
+MOST_REPETITIONS = 2
 WORTH_REPEATING = 0.95
 #: A step counts when its level is met to this relative accuracy.
 LEVEL_ACCURACY = 1e-6
