@@ -18,6 +18,10 @@ NOTHING = 1e-18
 #: Residual of a Riccati equation that counts as solved, relative to its terms.
 EQUATION_TOLERANCE = 1e-8
 MOST_DOUBLINGS = 60
+#: Eigenvalues that are smaller than the largest by more than this share do not set the rate of a Cayley transform.
+WIDEST_SPECTRUM = 1e-3
+#: Keeps that rate off an eigenvalue, which a single one would be.
+RATE_OFFSET = 1.3
 #: Share of the size of its terms by which a sign must be wrong.
 REFUTED = 1e-6
 #: Keeps a division by the size of a zero solution from failing.
@@ -59,11 +63,63 @@ def doubled_riccati_solution(
     if n == 0:
         return np.zeros((0, 0))
     solved = np.linalg.solve(weight, np.hstack([h, cross.T]))
-    # The transposed power: C order, so that its transpose is what LAPACK works on in place.
-    power = a - cross @ solved[:, :n]
-    back: FloatArray
-    solution: FloatArray
-    back, solution = h.T @ solved[:, :n], process - cross @ solved[:, n:]
+    start = a - cross @ solved[:, :n], h.T @ solved[:, :n], process - cross @ solved[:, n:]
+    return _doubled(*start, possible=possible)
+
+
+def continuous_riccati_solution(
+    a: FloatArray, c: FloatArray, process: FloatArray, measured: FloatArray
+) -> FloatArray | None:
+    """Return the stabilising solution of the Kalman filter's Riccati equation in continuous time, by doubling.
+
+    ``A Y + Y A' - Y C' R^-1 C Y + Q = 0``.
+
+    Parameters
+    ----------
+    a, c : FloatArray
+        ``(n, n)`` and ``(p, n)``.
+    process, measured : FloatArray
+        Q ``(n, n)`` semidefinite, R ``(p, p)`` definite.
+
+    Returns
+    -------
+    FloatArray or None
+        Symmetric ``(n, n)``; ``None`` when the doubling breaks down or does not settle.
+
+    Notes
+    -----
+    A Cayley transform makes it an equation in discrete time with the same solution (Chu, Fan and Lin 2005).
+    """
+    n, one = a.shape[0], np.eye(a.shape[0])
+    if n == 0:
+        return np.zeros((0, 0))
+    sizes = np.abs(np.linalg.eigvals(a))
+    # In the middle of the eigenvalues, on a logarithmic scale: both ends are as slow.
+    largest = max(float(sizes.max()), SMALLEST)
+    rate = RATE_OFFSET * math.sqrt(largest * max(float(sizes.min()), WIDEST_SPECTRUM * largest))
+    shown = c.T @ np.linalg.solve(measured, c)
+    try:
+        inverse = np.linalg.inv(a.T - rate * one)
+        outer = np.linalg.inv((a - rate * one) + process @ inverse @ shown)
+    except np.linalg.LinAlgError:
+        return None
+    power = np.ascontiguousarray(one + 2.0 * rate * outer)
+    back, solution = inverse @ shown @ outer, outer @ process @ inverse
+    return _doubled(power, np.asarray(2.0 * rate * back), np.asarray(2.0 * rate * solution))
+
+
+def _doubled(
+    power: FloatArray,
+    back: FloatArray,
+    solution: FloatArray,
+    *,
+    possible: Callable[[FloatArray], bool] | None = None,
+) -> FloatArray | None:
+    """Double an equation without cross term and ``back = H' W^-1 H`` from its first step; see the callers.
+
+    ``power`` (transposed in the papers) is in C order, so that its transpose is what LAPACK works on in place.
+    """
+    n = len(power)
     back, solution = 0.5 * (back + back.T), 0.5 * (solution + solution.T)
     error = np.inf
     with np.errstate(over="ignore", invalid="ignore"):

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.doubling import continuous_riccati_solution, doubled_riccati_solution
 from obsynth.numerics.spectra import abscissa, noise_covariance
 
 #: The default pays at most this factor in noise, against the quietest Kalman filter, for being fast.
@@ -22,6 +23,8 @@ RATE_STEP = 1.05
 ROUNDS = 2
 #: Estimates with less than this share of the outputs' noise have none but rounding.
 SILENT = 1e-8
+#: From so many states on the Riccati equation is solved by doubling first.
+MANY_STATES = 40
 #: Halvings of the default rate before the quietest filter is taken as it is.
 MOST_HALVINGS = 12
 
@@ -112,34 +115,55 @@ def _filtered(
     change : FloatArray
         ``(n, n)``: the equation is solved in states ``change^-1 e``.
     """
-    import control
-
-    (bound, dt), n = asked, len(f)
+    bound, dt = asked
     with warnings.catch_warnings(), np.errstate(all="ignore"):
-        # What a badly conditioned equation gives is judged by its poles; by scipy, so that no gain depends on whether
-        # slycot is there.
+        # What a badly conditioned equation gives is judged by its poles.
         warnings.simplefilter("ignore")
         try:
             inverse = np.linalg.inv(change)
             moved, noise = inverse @ f @ change, inverse @ driven @ inverse.T
+            moved = moved / bound if dt > 0.0 else moved - bound * np.eye(len(f))
             noise = 0.5 * (noise + noise.T)
-            if dt > 0.0:
-                found, covariance, _ = control.dlqe(
-                    moved / bound, np.eye(n), c @ change, noise, measured, method="scipy"
-                )
-                found = bound * np.asarray(found)
-            else:
-                found, covariance, _ = control.lqe(
-                    moved - bound * np.eye(n), np.eye(n), c @ change, noise, measured, method="scipy"
-                )
-            values, vectors = np.linalg.eigh(0.5 * (covariance + np.asarray(covariance).T))
+            for equation in (_by_doubling, _by_the_library) if len(f) >= MANY_STATES else (_by_the_library,):
+                found, covariance = equation(moved, c @ change, noise, measured, dt)
+                gain = change @ (bound * found if dt > 0.0 else found)
+                values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
+                if np.all(np.isfinite(gain)) and abscissa(f - gain @ c, dt) < bound:
+                    break
         except (np.linalg.LinAlgError, ValueError, ArithmeticError):
             return None
-    gain = change @ found
     if not np.all(np.isfinite(gain)) or not np.all(np.isfinite(values)) or values[-1] <= 0.0:
         return None
     floor = float(np.finfo(np.float64).eps) * values[-1]
     return np.asarray(gain), np.asarray(change @ (vectors * np.sqrt(np.maximum(values, floor))))
+
+
+def _by_doubling(
+    f: FloatArray, c: FloatArray, noise: FloatArray, measured: FloatArray, dt: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return gain and error covariance of a Kalman filter; NaN where the doubling breaks down."""
+    nothing = np.full((len(f), len(c)), np.nan)
+    if dt > 0.0:
+        y = doubled_riccati_solution(f, c, noise, measured, np.zeros_like(nothing))
+        if y is None:
+            return nothing, np.eye(len(f))
+        return np.asarray(np.linalg.solve(c @ y @ c.T + measured, c @ y @ f.T).T), y
+    y = continuous_riccati_solution(f, c, noise, measured)
+    if y is None:
+        return nothing, np.eye(len(f))
+    return np.asarray(np.linalg.solve(measured, c @ y).T), y
+
+
+def _by_the_library(
+    f: FloatArray, c: FloatArray, noise: FloatArray, measured: FloatArray, dt: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return the same by the QZ algorithm, which takes several times as long and hardly ever breaks down."""
+    import control
+
+    # By scipy, so that no gain depends on whether slycot is there.
+    solve = control.dlqe if dt > 0.0 else control.lqe
+    found, covariance, _ = solve(f, np.eye(len(f)), c, noise, measured, method="scipy")
+    return np.asarray(found), np.asarray(covariance)
 
 
 @dataclass(frozen=True, eq=False)
