@@ -6,6 +6,7 @@ the own solver agrees with Clarabel on the same problem, and the eliminated form
 
 from __future__ import annotations
 
+import itertools
 import warnings
 
 import cvxpy
@@ -70,9 +71,7 @@ def whole_inequality(problem: GainProblem) -> float:
     return float(np.sqrt(squared.value))
 
 
-CASES = [
-    (weight, feedthrough, nd) for weight in ("fixed", "free", "limited") for feedthrough in (False, True) for nd in (3, 5)
-]
+CASES = list(itertools.product(("fixed", "free", "limited"), (False, True), (3, 5)))
 
 
 @pytest.mark.parametrize(("weight", "feedthrough", "nd"), CASES)

@@ -12,9 +12,9 @@ G = [A B], H = [Z Zd]):
 .. math:: N^T(\mathrm{diag}(P, g^2 I) - G^T P G - H^T H) N > 0, \quad
           \mathrm{diag}(P, g^2 I) - (H + VM)^T (H + VM) > 0,
 
-where V is zero when the weight is fixed, a variable when it has a limit, and eliminated as well when it is free, which
-leaves P > 0 of the second condition.  The gains come in closed form, so that nothing is lost: they minimise the residual
-in the Loewner order.
+where V is zero when the weight is fixed, a variable when it has a limit, and eliminated as well when it is free,
+which leaves P > 0 of the second condition.  The gains come in closed form, so that nothing is lost: they minimise the
+residual in the Loewner order.
 """
 
 from __future__ import annotations
@@ -80,13 +80,14 @@ class _Inequality:
     def gains(self, problem: GainProblem, level: float) -> Injection:
         """Return the gains that the solved variables stand for."""
         solution, limit = lmi.value_of(self.p), problem.weight_limit
-        v = None if self.v is None else lmi.value_of(self.v)
-        v = limit.kept(v) if limit is not None and v is not None else v
+        v = np.zeros((problem.Z.shape[0], problem.measured)) if self.v is None else lmi.value_of(self.v)
+        v = v if limit is None else limit.kept(v)
         if self.y is None:
             # Both conditions stay true, strictly, when P and g^2 grow by the same factor: the gains stay of a natural
             # size where a solution lies on the boundary.
             room = 1.0 + RECOVERY_ROOM
-            return injection_for(problem, room * solution, float(np.sqrt(room)) * level, v=v)
+            given = None if self.v is None else v
+            return injection_for(problem, room * solution, float(np.sqrt(room)) * level, v=given)
         if problem.measured == 0:
             return Injection(np.zeros((problem.order, 0)), v)
         return Injection(np.asarray(np.linalg.solve(solution, lmi.value_of(self.y))), v)

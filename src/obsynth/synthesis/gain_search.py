@@ -28,7 +28,7 @@ NEGLIGIBLE_GAIN = 1e-6
 #: A shipped gain is never asked to be smaller than this fraction of the starting filter's.
 SMALLEST_USEFUL_GAIN = 1e-3
 #: Why the inequality was not asked, or not again.
-NOTHING_TO_POLISH = "reached: the disturbance does as much before any measurement can help, so there is nothing to polish"
+NOTHING_TO_POLISH = "reached: the disturbance does as much before any measurement can help; nothing to polish"
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,7 @@ with K a product of cones of semidefinite matrices, stored as in `SemidefiniteBl
 a matrix of order one.
 
 General solvers factor a matrix as large as the cones, n(n + 1)/2 for a block of order n, which for the dense blocks of
-our inequalities costs n^6.  Here only the unknowns are left over (the Schur complement).  A Nesterov-Todd scaling R of a
+our inequalities costs n^6.  Here only the unknowns are left (the Schur complement).  A Nesterov-Todd scaling R of a
 block has ``R^-1 S R^-T = R'ZR = diag(l)``; with a tilde for ``R^-1 U R^-T`` (for z: ``R'UR``), ``G`` the columns of A
 after it, ``r_x = A'z + c``, ``r_s = A x + s - b`` and ``q`` from the linearised ``s z = sigma mu``, Newton's equations
 
@@ -120,7 +120,7 @@ class _Programme:
     blocks: tuple[SemidefiniteBlock, ...]
 
     def start(self) -> FloatArray:
-        """Set the blocks to a starting pair, and return x: the least s and z of the equations, moved inside the cone."""
+        """Set the blocks to the least s and z of the equations, moved inside the cone, and return x."""
         normal = NormalEquations(self.columns)
         x = normal.solution(self.columns @ self.b)
         s, z = self.b - self.columns.T @ x, -self.columns.T @ normal.solution(self.c)
@@ -140,10 +140,11 @@ class _Programme:
         s, z = (_joined(points) for points in zip(*(block.points() for block in self.blocks), strict=True))
         dual, primal = self.columns @ z + self.c, self.columns.T @ x + s - self.b
         size = max(abs(float(self.c @ x)), abs(float(self.b @ z)), SMALLEST_OBJECTIVE)
-        worst = max(np.linalg.norm(r) / max(1.0, np.linalg.norm(d)) for r, d in ((dual, self.c), (primal, self.b)))
+        pairs = ((dual, self.c), (primal, self.b))
+        worst = max(float(np.linalg.norm(r)) / max(1.0, float(np.linalg.norm(data))) for r, data in pairs)
         below = -float(self.b @ z)
         ray = float(np.linalg.norm(dual - self.c)) / below if below > 0.0 else np.inf
-        return _State(x, z, dual, primal, float(s @ z) / size, float(worst), ray)
+        return _State(x, z, dual, primal, float(s @ z) / size, worst, ray)
 
     def step(self, now: _State) -> tuple[FloatArray, float]:
         """Take Mehrotra's step, or where that is short a plain one; return the next x and the shorter length."""

@@ -18,8 +18,8 @@ class SemidefiniteBlock:
     ``diag(values) + dz = L2 L2'`` and ``L2'L1 = U diag(new) V'`` the next one is ``R L1 V diag(new)^-1/2``, and its
     inverse ``diag(new)^-1/2 U'L2' R^-1``.
 
-    A matrix is stored as its lower triangle, row by row, with off-diagonal entries times sqrt(2), so that inner products
-    are kept.
+    A matrix is stored as its lower triangle, row by row, with off-diagonal entries times sqrt(2), so that inner
+    products are kept.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ class SemidefiniteBlock:
         return np.take(vector / self._weights, self._entries, axis=-1)
 
     def scaled(self, s: FloatArray) -> FloatArray:
-        """Return directions of s ``(count, size)`` in the scaling; most are zero where a block has unknowns of its own."""
+        """Return directions of s ``(count, size)`` in the scaling; unknowns of other blocks have none."""
         found, length = np.zeros_like(s), max(1, PART // self.order**2)
         there = np.flatnonzero(np.any(s, axis=1))
         for first in range(0, len(there), length):
