@@ -42,7 +42,7 @@ from obsynth.synthesis.gain_bisection import search_by_bisection
 from obsynth.synthesis.gain_bound import require_reachable
 from obsynth.synthesis.gain_design import null_basis
 from obsynth.synthesis.gain_problem import GainProblem, Injection, WeightLimit
-from obsynth.synthesis.lmi import SOLVER_SETTINGS
+from obsynth.synthesis.lmi import FILTER_SOLVERS
 from obsynth.synthesis.result import Synthesis
 from obsynth.synthesis.small_gains import small_gain_design
 
@@ -120,7 +120,7 @@ def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **op
         gains,
         observer,
         Certificate({"P_factor": factor, "tracking": tracking}, claims),
-        {"engine": _engine_of(engine, records), "runs": [*least.records, *records]},
+        {"engine": _engine_of([*least.records, *records]), "runs": [*least.records, *records]},
         (
             *_gamma_notes(asked.gamma, level if plant.nd else np.inf),
             *notes(plant, prepared.detectability, observer, largest_zero=held[-1].value),
@@ -172,11 +172,9 @@ def gain_problem(prepared: PreparedPlant, *, free_weight: bool) -> tuple[GainPro
     return problem, _Parts(l0, w0, v)
 
 
-def _engine_of(asked: str, records: list[dict[str, Any]]) -> str:
-    """Return which engine ran: by default the inequality comes in only where nothing else was found."""
-    if asked != "auto":
-        return asked
-    return "lmi" if any(record.get("solver") in SOLVER_SETTINGS for record in records) else "riccati"
+def _engine_of(records: list[dict[str, Any]]) -> str:
+    """Return which engine ran: the inequality comes in only where it may and where there is something to find."""
+    return "lmi" if any(record.get("solver") in FILTER_SOLVERS for record in records) else "riccati"
 
 
 def _least_gain(problem: GainProblem, asked: FilterOptions, engine: str) -> gain_search.LeastGain:
