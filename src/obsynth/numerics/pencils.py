@@ -258,7 +258,7 @@ def _safe_inverse(E: FloatArray) -> FloatArray | None:
         inverse = np.linalg.inv(E)
     except np.linalg.LinAlgError:
         return None
-    return inverse if float(np.linalg.norm(E) * np.linalg.norm(inverse)) <= SAFE_CONDITION else None
+    return np.asarray(inverse) if float(np.linalg.norm(E) * np.linalg.norm(inverse)) <= SAFE_CONDITION else None
 
 
 def _in_pairs(values: ComplexArray) -> ComplexArray:
