@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
@@ -46,7 +48,7 @@ def fault_estimation_filter(
     free_residual_weight : bool, optional
         Whether W is free within ``W Upsilon = I``.  By default yes when the plant states noise, else no.
     residual_weight_limit : float, optional
-        Bound on the spectral norm of W (implies a free W).
+        Bound on the spectral norm of W (implies a free W; not with engine "riccati").
     S : array_like, optional
         The paper's free matrix ``(nx, nx + ny)`` in (17); by default T is nonsingular by construction.
     engine : {"auto", "riccati", "lmi"}, optional
@@ -118,6 +120,7 @@ def fault_estimation_filter_from_gains(
     L: ArrayLike,
     W: ArrayLike,
     gamma: float | None = None,
+    indexes: Sequence[int] | None = None,
     name: str = "design from gains",
 ) -> ObserverDesign:
     """Put gains from a paper or another program into a design, with its report; nothing is refused.
@@ -130,6 +133,10 @@ def fault_estimation_filter_from_gains(
         ``(nx, nx)``, ``(nx, ny)``, ``(nx, ny)``, ``(nf, ny)`` of eq. (23).
     gamma : float, optional, dimensionless
         Claimed bound on the l2 gain; needed when the plant has disturbances.
+    indexes : sequence of int, optional
+        Detectability index ``rho_i`` of each fault (19): samples by which its estimate lags.  Found from T by default,
+        which needs all of its digits: where an index is above one, ``C T f_i`` must vanish, and with a rounded T it
+        does not.
     name : str, optional
         Name of the design.
 
@@ -142,7 +149,7 @@ def fault_estimation_filter_from_gains(
     Raises
     ------
     SpecError
-        A gain has the wrong shape, or gamma is missing.
+        A gain has the wrong shape, gamma is missing, or ``indexes`` are not one positive number for each fault.
     PreconditionError
         No filter exists for this plant.
 
@@ -150,12 +157,12 @@ def fault_estimation_filter_from_gains(
     ----------
     .. [Wang2015] Fault estimation filter design for discrete-time descriptor systems, eq. (23).
     """
-    from obsynth.synthesis.methods.fault_estimation_filter import synthesis_from_gains
+    from obsynth.synthesis.given_filter_gains import synthesis_from_gains
 
     if plant.nd and gamma is None:
         raise SpecError(
             "gamma is needed: the plant has disturbances, and a gain set claims a bound on them.", path="gamma"
         )
-    found = synthesis_from_gains(plant, T=T, N=N, L=L, W=W, gamma=gamma)
+    found = synthesis_from_gains(plant, T=T, N=N, L=L, W=W, gamma=gamma, indexes=indexes)
     draft = draft_of(plant, "fault-estimation-filter", found, name=name)
     return draft.replace(report=verify(draft))

@@ -46,13 +46,17 @@ def stabilising_gain(a: FloatArray, c: FloatArray, noise_a: FloatArray, noise_c:
         q = process + epsilon * process_size * np.eye(n)
         size = float(np.linalg.norm(c @ q @ c.T, 2)) + float(np.linalg.norm(measured, 2))
         r = measured + epsilon * size * np.eye(m)
-        x = riccati_solution(a, c, q, r, cross)
-        if x is None:
-            continue
-        gain = np.linalg.solve(c @ x @ c.T + r, c @ x @ a.T + cross.T).T
-        radius = spectral_radius(a - gain @ c) if np.all(np.isfinite(gain)) else np.inf
-        if radius < least:
-            best, least = np.asarray(gain), radius
+        # Far outside the circle doubling may settle on what is no solution: its poles tell.
+        for solve in (riccati_solution, _riccati_solution_by_qz):
+            x = solve(a, c, q, r, cross)
+            if x is None:
+                continue
+            gain = np.linalg.solve(c @ x @ c.T + r, c @ x @ a.T + cross.T).T
+            radius = spectral_radius(a - gain @ c) if np.all(np.isfinite(gain)) else np.inf
+            if radius < least:
+                best, least = np.asarray(gain), radius
+            if radius < 1.0:
+                break
         if least <= FAST_ENOUGH:
             break
     return best
@@ -145,8 +149,6 @@ def riccati_solution(
     impossible : callable, optional
         Called with the solutions over 2, 4, 8, ... steps; true says that there is no solution to look for.
     """
-    from scipy.linalg import solve_discrete_are
-
     ended = False
 
     def possible(found: FloatArray) -> bool:
@@ -159,8 +161,21 @@ def riccati_solution(
             # An ill-conditioned equation only makes a worse filter or certificate, which is then not taken.
             warnings.simplefilter("ignore")
             doubled = doubled_riccati_solution(a, h, process, weight, cross, possible=possible)
-            if ended or doubled is not None:
-                return None if ended else doubled
+    except np.linalg.LinAlgError:
+        doubled = None
+    if ended or doubled is not None:
+        return None if ended else doubled
+    return _riccati_solution_by_qz(a, h, process, weight, cross)
+
+
+def _riccati_solution_by_qz(
+    a: FloatArray, h: FloatArray, process: FloatArray, weight: FloatArray, cross: FloatArray
+) -> FloatArray | None:
+    from scipy.linalg import solve_discrete_are
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
             return np.asarray(solve_discrete_are(a.T, h.T, process, weight, s=cross))
     except (np.linalg.LinAlgError, ValueError):
         return None

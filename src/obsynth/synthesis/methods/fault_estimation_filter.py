@@ -23,11 +23,11 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.conditions import Condition, require_all
-from obsynth.analysis.fault_detectability import WARN_CONDITION, FaultDetectability, fault_detectability
-from obsynth.analysis.fault_filter import PreparedPlant, prepare, with_sensor_faults_as_states
+from obsynth.analysis.fault_detectability import WARN_CONDITION, FaultDetectability
+from obsynth.analysis.fault_filter import PreparedPlant, prepare
 from obsynth.analysis.fault_filter_conditions import examine_fault_filter, fault_filter_conditions
 from obsynth.analysis.transformations import sampling_zero_warnings
-from obsynth.errors import InfeasibleError, SpecError
+from obsynth.errors import InfeasibleError
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.norms import spectral_radius
@@ -121,34 +121,10 @@ def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **op
         observer,
         Certificate({"P_factor": factor, "tracking": tracking}, claims),
         {"engine": _engine_of(engine, records), "runs": [*least.records, *records]},
-        notes(plant, prepared.detectability, observer, largest_zero=held[-1].value),
-    )
-
-
-def synthesis_from_gains(plant: DescriptorSystem, *, T: Any, N: Any, L: Any, W: Any, gamma: float | None) -> Synthesis:
-    """Return the realisation and certificate of given gains; see `obsynth.fault_estimation_filter_from_gains`."""
-    require_all(conditions(plant))
-    work = with_sensor_faults_as_states(plant)
-    gains = {name: as_matrix(value, name) for name, value in (("T", T), ("N", N), ("L", L), ("W", W))}
-    shapes = {"T": (work.nx, work.nx), "N": (work.nx, work.ny), "L": (work.nx, work.ny), "W": (work.nf, work.ny)}
-    for name, shape in shapes.items():
-        if gains[name].shape != shape:
-            raise SpecError(f"{name} is {gains[name].shape}, but {shape} is needed.", path=name)
-    detectability = fault_detectability(gains["T"] @ work.A, work.C, gains["T"] @ work.Bf)
-    if not detectability.finite:
-        raise SpecError("With this T some fault never reaches the outputs.", path="T")
-    gains |= {"Psi": detectability.Psi, "Upsilon": detectability.Upsilon}
-    observer, tracking, lag = realise_filter(plant, work, gains, detectability)
-    level = 1.0 if gamma is None else gamma
-    factor = bounded_real_certificate(plant, observer, tracking, level, core=work.nx, lag=lag)
-    claims = {"state_lag": float(lag)} | ({"gamma": level} if plant.nd else {})
-    return Synthesis(
-        {"from_gains": True, "gamma": gamma},
-        gains,
-        observer,
-        Certificate({"P_factor": factor, "tracking": tracking}, claims),
-        {"runs": []},
-        notes(plant, detectability, observer),
+        (
+            *_gamma_notes(asked.gamma, level if plant.nd else np.inf),
+            *notes(plant, prepared.detectability, observer, largest_zero=held[-1].value),
+        ),
     )
 
 
@@ -220,9 +196,18 @@ def _gain_to_ship(asked: FilterOptions, problem: GainProblem, least: gain_search
         return max((1.0 + asked.gamma_margin) * least.gain, least.starting_gain)
     if asked.gamma is None:
         return max((1.0 + asked.gamma_margin) * least.gain, floor)
-    require_reachable(problem, least.gain, asked.gamma, solver=asked.solver)
+    require_reachable(problem, least, asked.gamma, solver=asked.solver)
     ceiling = LARGEST_USEFUL_GAIN * least.starting_gain
     return min(asked.gamma, ceiling) if ceiling > 0.0 else asked.gamma
+
+
+def _gamma_notes(asked: float | None, shipped: float) -> tuple[str, ...]:
+    """Return a note where less is shipped than was asked for."""
+    if asked is None or shipped >= asked:
+        return ()
+    return (
+        f"gamma = {asked:.6g} was asked for, and {shipped:.6g} is proved: gains for more would only be scaled worse.",
+    )
 
 
 def _gains(prepared: PreparedPlant, parts: _Parts, chosen: Injection) -> dict[str, FloatArray]:
