@@ -54,8 +54,9 @@ def fault_estimation_filter(
     engine : {"auto", "riccati", "lmi"}, optional
         Who finds the gains: Riccati equations alone, which serve hundreds of states; or the matrix inequality as well,
         started from them, for the last digits of gamma and, with up to 12 states, somewhat smaller gains.  By default
-        the equations; the inequality where ``residual_weight_limit`` is given, which they do not cover, and where up
-        to 12 states have no filter of theirs.  The result's ``solver["engine"]`` says which ran: "riccati" also where
+        the equations; the inequality where ``residual_weight_limit`` is given, which they do not cover, where ``gamma``
+        is below what they found or less than 1e-4 above (up to 64 states), and where up to 12 states have no filter of
+        theirs.  The result's ``solver["engine"]`` says which ran: "riccati" also where
         "lmi" was asked for and the gain is at a lower bound already, see ``solver["runs"]``.  The inequality is what is
         verified in each case.
     solver : {"auto", "SCHUR", "CLARABEL", "SCS"}, optional

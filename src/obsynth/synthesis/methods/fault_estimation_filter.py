@@ -58,6 +58,11 @@ ROUNDING_GAIN = 1e-11
 #: Level of the certificate, relative to the same, when no disturbance reaches the fault estimate at all.
 NOMINAL_GAIN = 1e-3
 
+#: A gamma between these multiples of the least gain found by the equations calls the inequality by default, up to so
+#: many states: far below the least no polish helps, and far above none is needed.
+BELOW_LEAST, ABOVE_LEAST = 0.95, 1.0 + 1e-4
+MOST_STATES_TO_POLISH = 64
+
 
 def conditions(plant: DescriptorSystem) -> tuple[Condition, ...]:
     """Return the existence conditions; the list ends at the first failure."""
@@ -90,6 +95,11 @@ def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **op
         # What is left of the disturbance in the estimates is rounding: nothing to minimise.
         problem = problem.without_disturbance()
         least = replace(_least_gain(problem, asked, engine), gain=least.starting_gain)
+    elif asked.engine == "auto" and asked.gamma is not None and _leaves_little(asked.gamma, least.gain, problem):
+        progress("polishing the least gain")
+        polished = _least_gain(problem, asked, "lmi")
+        records = [*least.records, *polished.records]
+        least = replace(min(least, polished, key=lambda found: found.gain), records=records)
     gamma = _gain_to_ship(asked, problem, least, noisy=plant.nw > 0)
     progress("choosing small gains")
     inner = gamma - min(CERTIFICATE_SHARE * (gamma - least.gain), CERTIFICATE_MARGIN * gamma)
@@ -182,6 +192,12 @@ def _least_gain(problem: GainProblem, asked: FilterOptions, engine: str) -> gain
     if asked.gamma_search == "direct":
         return gain_search.search_least_gain(problem, solver=asked.solver, polish=polish)
     return search_by_bisection(problem, tolerance=asked.tolerance, solver=asked.solver, polish=polish)
+
+
+def _leaves_little(gamma: float, least: float, problem: GainProblem) -> bool:
+    """Whether a gamma leaves less room above the least gain found than the inequality may still find."""
+    near = BELOW_LEAST * least <= gamma <= ABOVE_LEAST * least
+    return near and 0 < problem.disturbances and problem.order <= MOST_STATES_TO_POLISH
 
 
 def _gain_to_ship(asked: FilterOptions, problem: GainProblem, least: gain_search.LeastGain, *, noisy: bool) -> float:
