@@ -197,7 +197,7 @@ def _least_gain(problem: GainProblem, asked: FilterOptions, engine: str) -> gain
 def _leaves_little(gamma: float, least: float, problem: GainProblem) -> bool:
     """Whether a gamma leaves less room above the least gain found than the inequality may still find."""
     near = BELOW_LEAST * least <= gamma <= ABOVE_LEAST * least
-    return near and 0 < problem.disturbances and problem.order <= MOST_STATES_TO_POLISH
+    return near and problem.disturbances > 0 and problem.order <= MOST_STATES_TO_POLISH
 
 
 def _gain_to_ship(asked: FilterOptions, problem: GainProblem, least: gain_search.LeastGain, *, noisy: bool) -> float:
