@@ -4,9 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.linalg import solve_discrete_are
+from scipy.linalg import solve_continuous_are, solve_discrete_are
 
-from obsynth.numerics.doubling import compared_gain, doubled_riccati_solution, gain_is_below
+from obsynth.numerics.doubling import (
+    compared_gain,
+    continuous_riccati_solution,
+    doubled_riccati_solution,
+    gain_is_below,
+)
 from obsynth.numerics.norms import hinf_norm, spectral_radius
 from obsynth.synthesis.central_equation import CentralEquation, central_injection
 from obsynth.synthesis.central_filter import central_filter_at, search_central_filter
@@ -41,6 +46,23 @@ def test_doubling_agrees_with_scipy(level):
         expected = solve_discrete_are(a.T, h.T, b @ b.T, weight, s=b @ k.T)
         assert found is not None
         assert np.linalg.norm(found - expected) <= 1e-8 * np.linalg.norm(expected)
+
+
+@pytest.mark.parametrize("n", [1, 4, 40])
+def test_doubling_agrees_with_scipy_in_continuous_time(n):
+    rng = np.random.default_rng(n)
+    for _ in range(10):
+        a, c, b = rng.normal(size=(n, n)), rng.normal(size=(max(n // 2, 1), n)), rng.normal(size=(n, n))
+        measured = 10.0 ** rng.uniform(-1.0, 1.0) * np.eye(len(c))
+        found = continuous_riccati_solution(a, c, b @ b.T, measured)
+        expected = solve_continuous_are(a.T, c.T, b @ b.T, measured)
+        assert np.linalg.norm(found - expected) <= 1e-8 * np.linalg.norm(expected)
+
+
+def test_doubling_in_continuous_time_gives_nothing_that_is_stable_for_what_is_not_seen():
+    # x grows and nothing is measured of it: no stabilising solution.
+    found = continuous_riccati_solution(np.diag([1.0, -1.0]), np.array([[0.0, 1.0]]), np.eye(2), np.eye(1))
+    assert found is None
 
 
 def test_doubling_says_so_when_there_is_no_solution():

@@ -88,7 +88,7 @@ def search_least_gain(problem: GainProblem, *, solver: str, polish: bool = True)
     if problem.measured == 0 or gain == 0.0:
         return LeastGain(gain, first, best, starting, (gain, gain))
     for number in range(MOST_PASSES):
-        before = gain
+        before = last = gain
         for improve in (_central_filter, _polished) if polish else (_central_filter,):
             if gain <= least_level(problem) * (1.0 + PASS_IMPROVEMENT):
                 break  # nothing is below

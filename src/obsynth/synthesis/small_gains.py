@@ -119,8 +119,8 @@ class _Goal:
 
     @property
     def noisy(self) -> bool:
-        """Whether there is a noise model; without one the size of the gains is the cost."""
-        return bool(np.any(self.problem.Bn) or np.any(self.problem.Zn))
+        """Whether noise is the cost, or the size of the gains."""
+        return self.problem.states_noise
 
     def met(self, injection: Injection) -> bool:
         # A filter is asked for more than once, and for many states each answer takes a Riccati equation.

@@ -15,6 +15,8 @@ from obsynth.errors import PreconditionError
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.norms import highest_gain_found, hinf_norm, output_covariance, spectral_radius
+from obsynth.numerics.pencils import pencil_structure
+from obsynth.numerics.scaling import Scaling, balance_by_least_squares
 from obsynth.observers.linear import LinearObserver
 from obsynth.results.design import ObserverDesign
 from obsynth.results.report import Check, information, upper_bound_check
@@ -49,8 +51,9 @@ _IDENTITIES = {
 def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
     """Yield every check of ``design``; see `obsynth.verification.verify`."""
     (plant, observer), claims = design.linear, design.certificate.claims
-    yield from plant_information(plant)
-    yield from condition_rows(fault_filter_conditions(plant))
+    structure = pencil_structure(plant.E, plant.A)
+    yield from plant_information(plant, structure)
+    yield from condition_rows(fault_filter_conditions(plant, structure=structure))
     yield from claim_rows(plant, claims)
     yield from recovery_rows(plant, design.recovery)
     tracking, factor = design.certificate.matrices.get("tracking"), design.certificate.matrices.get("P_factor")
@@ -65,12 +68,14 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     )
     if not fitting or tracking is None or factor is None:
         return
-    allowances = yield from _gain_set_rows(design, tracking, printed_digits)
+    work = _with_sensor_faults(plant)
+    scaling = balance_by_least_squares(work.E, work.A, inputs=[work.Bf], outputs=[work.C]) if work is not None else None
+    allowances = yield from _gain_set_rows(design, work, scaling, tracking, printed_digits)
     for key, identity in tracking_identities(plant, observer, tracking, lag).items():
         name, claim, source = _IDENTITIES[key]
         yield equality(name, claim, identity.residual(allowances.get(key)), source)
     errors = ErrorSystem.of(plant, observer, tracking, lag)
-    yield from fault_rows(plant, observer, tracking, errors, allowances)
+    yield from fault_rows(plant, observer, tracking, errors, scaling, allowances)
     radius = spectral_radius(observer.Az)
     yield upper_bound_check(
         "spectral radius",
@@ -85,15 +90,17 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
 
 
 def _gain_set_rows(
-    design: ObserverDesign, tracking: FloatArray, printed_digits: int | None
+    design: ObserverDesign,
+    work: DescriptorSystem | None,
+    scaling: Scaling | None,
+    tracking: FloatArray,
+    printed_digits: int | None,
 ) -> Generator[Check, None, dict[str, FloatArray]]:
     """Yield the rows on the gain set, and return what its printed digits allow the identities to miss."""
     (plant, observer), gains = design.linear, design.gains
     if not gains:
         return {}  # nothing is said about gains: the realisation stands for itself
-    try:
-        work = with_sensor_faults_as_states(plant)
-    except PreconditionError:
+    if work is None or scaling is None:
         return {}  # a failed existence condition says so already
     fitting = gains_fit(work, gains, observer)
     yield fitting
@@ -101,10 +108,18 @@ def _gain_set_rows(
         return {}
     allowances: dict[str, FloatArray] = {}
     if printed_digits is not None:
-        allowances = printed_allowances(plant, work, observer, gains, printed_digits)
+        allowances = printed_allowances(plant, work, observer, gains, scaling, printed_digits)
     equations = Equations.of(plant, work, observer.fault_delays)
-    yield from gain_rows(work, gains, observer, tracking, equations, allowances)
+    yield from gain_rows(work, gains, observer, tracking, equations, scaling, allowances)
     return allowances
+
+
+def _with_sensor_faults(plant: DescriptorSystem) -> DescriptorSystem | None:
+    """Return the plant with its sensor faults as states; ``None`` where these cannot be told from the others."""
+    try:
+        return with_sensor_faults_as_states(plant)
+    except PreconditionError:
+        return None
 
 
 def _whole(lag: float) -> int:

@@ -25,7 +25,7 @@ import numpy as np
 from obsynth.analysis.conditions import Condition, require_all
 from obsynth.analysis.fault_detectability import WARN_CONDITION, FaultDetectability
 from obsynth.analysis.fault_filter import PreparedPlant, prepare
-from obsynth.analysis.fault_filter_conditions import fault_filter_conditions
+from obsynth.analysis.fault_filter_conditions import examine_fault_filter, fault_filter_conditions
 from obsynth.analysis.transformations import sampling_zero_warnings
 from obsynth.errors import InfeasibleError
 from obsynth.models.descriptor import DescriptorSystem
@@ -68,10 +68,10 @@ def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **op
     """Design the filter; see `obsynth.fault_estimation_filter` for the options, results and errors."""
     asked = FilterOptions(**options)
     progress("checking the existence conditions")
-    held = conditions(plant)
+    held, prepared = examine_fault_filter(plant)
     require_all(held)
     s = None if asked.S is None else as_matrix(asked.S, "S")
-    prepared = prepare(plant, s)
+    prepared = prepare(plant, s) if prepared is None or s is not None else prepared
     limit = asked.residual_weight_limit
     free = asked.free_residual_weight if asked.free_residual_weight is not None else plant.nw > 0 or limit is not None
     problem, parts = gain_problem(prepared, free_weight=free)
