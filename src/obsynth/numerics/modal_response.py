@@ -12,7 +12,7 @@ from obsynth.numerics.arrays import ComplexArray, FloatArray
 #: Poles of at least this modulus may make a peak of their own.
 NEAR = 0.5
 #: How many peaks are refined, by how many points on either side, and how often.
-MOST_PEAKS = 2
+MOST_PEAKS = 3
 POINTS_BESIDE = 4
 REFINEMENTS = 3
 #: Rows or columns up to which the largest singular value has a formula.
