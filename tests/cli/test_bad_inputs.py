@@ -135,7 +135,8 @@ SYNTAX = [
     Case("two documents", whole("a: 1\n---\nb: 2\n"), "is no valid YAML"),
     Case("another YAML", whole("%YAML 1.1\n---\nschema_version: 1\n"), "%YAML"),
     Case("duplicate key at the top", text('"name": "case"', '"name": "case", "name": "other"'), 'duplicate key "name"'),
-    Case("duplicate key in the plant", text('"dt": 1.0', '"dt": 1.0, "dt": 2.0'), 'duplicate key "dt"'),
+    Case("duplicate key in the plant", text('"dt": 1.0', '"dt": 1.0, "dt": 2.0'), 'duplicate key "dt" (line'),
+    Case("duplicate key of mappings", text('"options": {}', '"options": {}, "options": {"S": 1}'), '"options" (line'),
     Case("code in a tag", text('"case"', "!!python/object/apply:os.getcwd []"), "could not determine a constructor"),
     Case("value YAML cannot read", text('"case"', "2020-13-45"), "a value that YAML cannot read"),
     Case("undefined alias", text('"case"', "*nowhere"), "undefined alias"),
@@ -324,6 +325,7 @@ FILES = [
     Case("csv empty", put("plant", "A", {"file": "A.csv"}), "plant.A", files=written("A.csv", "")),
     Case("csv not text", put("plant", "A", {"file": "A.csv"}), "plant.A", files=written("A.csv", b"\xff\xfe\x00")),
     Case("npz damaged", put("plant", "A", {"file": "A.npz"}), "plant.A", files=written("A.npz", b"PK\x03\x04 cut off")),
+    Case("npz that is none", put("plant", "A", {"file": "A.npz"}), "no .npz archive", files=written("A.npz", b"text")),
     Case("npz with two arrays", put("plant", "A", {"file": "two.npz"}), "which array is meant", files=saved_npz),
     Case(
         "npz without the array",

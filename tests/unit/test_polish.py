@@ -57,6 +57,15 @@ def test_where_a_bound_is_reached_the_record_says_that_there_is_nothing_to_polis
     assert "lower bound" not in str(obsynth.fault_estimation_filter(plant(nd=1)).solver["runs"])
 
 
+@pytest.mark.parametrize(("factor", "engine"), [(1.01, "riccati"), (1.0 + 5e-5, "lmi")])
+def test_a_gamma_next_to_the_least_calls_the_inequality(factor: float, engine: str) -> None:
+    least = obsynth.fault_estimation_filter(plant(nd=9)).certificate.claims["gamma_min"]
+    design = obsynth.fault_estimation_filter(plant(nd=9), gamma=factor * least)
+    assert design.report.passed
+    assert design.solver["engine"] == engine
+    assert ("SCHUR" in {run["solver"] for run in design.solver["runs"]}) == (engine == "lmi")
+
+
 def test_solvers_are_named_where_asked_for() -> None:
     design = obsynth.fault_estimation_filter(plant(nd=9), engine="lmi", solver="CLARABEL")
     assert {run["solver"] for run in design.solver["runs"]} == {"central filter", "CLARABEL"}

@@ -54,6 +54,8 @@ class FilterOptions:
             problems.append(f"residual_weight_limit is {limit}: give a positive number.")
         if limit is not None and self.free_residual_weight is False:
             problems.append("residual_weight_limit needs free_residual_weight: the weight is fixed otherwise.")
+        if limit is not None and self.engine == "riccati":
+            problems.append("residual_weight_limit is not covered by engine 'riccati': use 'auto' or 'lmi'.")
         if problems:
             raise SpecError("Options of fault-estimation-filter:", path="method.options", problems=problems)
 

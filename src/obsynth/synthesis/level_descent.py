@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from itertools import pairwise
 
 from obsynth.synthesis.central_equation import CentralEquation
 from obsynth.synthesis.gain_problem import Injection
@@ -115,11 +114,11 @@ class Descent:
         points = [(item.level**2, item.margin * item.level**2) for item in self.reached[-3:]][::-1]
         if not points or (caution > 1.0 and len(points) < len(SAFETY)):
             return middle
-        (u, m), falling = points[0], all(a[1] < b[1] for a, b in pairwise(points))
+        u, m = points[0]
         zeros = [max(u - m, self.low**2)]
-        if falling and len(points) > 1:
+        if len(points) > 1:
             zeros.append(max(zeros[0], _vanishing(points[:2])))
-        if falling and len(points) > 2 and zeros[0] <= (parabola := _vanishing(points)) <= 0.5 * (zeros[1] + u):
+        if len(points) > 2 and zeros[0] <= (parabola := _vanishing(points)) <= 0.5 * (zeros[1] + u):
             zeros.append(parabola)
         zero = zeros[-1]
         distance = abs(zero - zeros[1]) if len(zeros) > 2 else u - zero

@@ -46,13 +46,17 @@ def stabilising_gain(a: FloatArray, c: FloatArray, noise_a: FloatArray, noise_c:
         q = process + epsilon * process_size * np.eye(n)
         size = float(np.linalg.norm(c @ q @ c.T, 2)) + float(np.linalg.norm(measured, 2))
         r = measured + epsilon * size * np.eye(m)
-        x = riccati_solution(a, c, q, r, cross)
-        if x is None:
-            continue
-        gain = np.linalg.solve(c @ x @ c.T + r, c @ x @ a.T + cross.T).T
-        radius = spectral_radius(a - gain @ c) if np.all(np.isfinite(gain)) else np.inf
-        if radius < least:
-            best, least = np.asarray(gain), radius
+        # Far outside the circle doubling may settle on what is no solution: its poles tell.
+        for solve in (riccati_solution, _riccati_solution_by_qz):
+            x = solve(a, c, q, r, cross)
+            if x is None:
+                continue
+            gain = np.linalg.solve(c @ x @ c.T + r, c @ x @ a.T + cross.T).T
+            radius = spectral_radius(a - gain @ c) if np.all(np.isfinite(gain)) else np.inf
+            if radius < least:
+                best, least = np.asarray(gain), radius
+            if radius < 1.0:
+                break
         if least <= FAST_ENOUGH:
             break
     return best
@@ -81,7 +85,7 @@ def bounded_real_matrix(
     weight = c.T @ c + slack * np.eye(n)
     cross, gap = c.T @ d, d.T @ d - level**2 * np.eye(b.shape[1])
     if b.shape[1]:
-        p = riccati_solution(a.T, b.T, weight, gap, cross, impossible=lambda found: _exceeds(found, b, gap))
+        p = riccati_solution(a.T, b.T, weight, gap, cross, impossible=_Exceeded(b, gap))
     else:
         p = _lyapunov_solution(a, weight)
     if p is None:
@@ -90,13 +94,30 @@ def bounded_real_matrix(
     return p if np.all(np.isfinite(p)) and is_positive(p) else None
 
 
-def _exceeds(p: FloatArray, b: FloatArray, gap: FloatArray) -> bool:
-    """Return whether the gain is above the level over as many steps as ``p`` stands for already, beyond rounding."""
-    left = -(gap + b.T @ p @ b)
-    if not np.all(np.isfinite(left)) or is_positive(left):
-        return False
-    margin = REFUTED * float(np.linalg.norm(b)) ** 2 * float(np.linalg.norm(p))
-    return bool(np.linalg.eigvalsh(left)[0] < -margin)
+class _Exceeded:
+    """Says whether the gain is above the level over as many steps as a solution stands for, beyond rounding.
+
+    Parameters
+    ----------
+    b, gap : FloatArray
+        ``(n, m)``, and ``D'D - level^2 I (m, m)``.
+    """
+
+    def __init__(self, b: FloatArray, gap: FloatArray) -> None:
+        self.b, self.gap = b, gap
+        self.last: FloatArray | None = None
+
+    def __call__(self, p: FloatArray) -> bool:
+        left, sizes = -(self.gap + self.b.T @ p @ self.b), np.diag(p)
+        if not np.all(np.isfinite(left)):
+            return False
+        # Over more steps the solution grows: one that does not is behind a level that was exceeded in between.
+        shrunk = self.last is not None and np.any(sizes < self.last - REFUTED * np.max(self.last))
+        self.last = sizes.copy()
+        if shrunk or is_positive(left):
+            return bool(shrunk)
+        margin = REFUTED * float(np.linalg.norm(self.b)) ** 2 * float(np.linalg.norm(p))
+        return bool(np.linalg.eigvalsh(left)[0] < -margin)
 
 
 def _lyapunov_solution(a: FloatArray, weight: FloatArray) -> FloatArray | None:
@@ -128,8 +149,6 @@ def riccati_solution(
     impossible : callable, optional
         Called with the solutions over 2, 4, 8, ... steps; true says that there is no solution to look for.
     """
-    from scipy.linalg import solve_discrete_are
-
     ended = False
 
     def possible(found: FloatArray) -> bool:
@@ -142,8 +161,21 @@ def riccati_solution(
             # An ill-conditioned equation only makes a worse filter or certificate, which is then not taken.
             warnings.simplefilter("ignore")
             doubled = doubled_riccati_solution(a, h, process, weight, cross, possible=possible)
-            if ended or doubled is not None:
-                return None if ended else doubled
+    except np.linalg.LinAlgError:
+        doubled = None
+    if ended or doubled is not None:
+        return None if ended else doubled
+    return _riccati_solution_by_qz(a, h, process, weight, cross)
+
+
+def _riccati_solution_by_qz(
+    a: FloatArray, h: FloatArray, process: FloatArray, weight: FloatArray, cross: FloatArray
+) -> FloatArray | None:
+    from scipy.linalg import solve_discrete_are
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
             return np.asarray(solve_discrete_are(a.T, h.T, process, weight, s=cross))
     except (np.linalg.LinAlgError, ValueError):
         return None

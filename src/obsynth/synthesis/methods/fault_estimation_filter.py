@@ -23,11 +23,11 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.conditions import Condition, require_all
-from obsynth.analysis.fault_detectability import WARN_CONDITION, FaultDetectability, fault_detectability
-from obsynth.analysis.fault_filter import PreparedPlant, prepare, with_sensor_faults_as_states
+from obsynth.analysis.fault_detectability import WARN_CONDITION, FaultDetectability
+from obsynth.analysis.fault_filter import PreparedPlant, prepare
 from obsynth.analysis.fault_filter_conditions import examine_fault_filter, fault_filter_conditions
 from obsynth.analysis.transformations import sampling_zero_warnings
-from obsynth.errors import InfeasibleError, SpecError
+from obsynth.errors import InfeasibleError
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.norms import spectral_radius
@@ -57,6 +57,11 @@ CERTIFICATE_SHARE = 0.2
 ROUNDING_GAIN = 1e-11
 #: Level of the certificate, relative to the same, when no disturbance reaches the fault estimate at all.
 NOMINAL_GAIN = 1e-3
+
+#: A gamma between these multiples of the least gain found by the equations calls the inequality by default, up to so
+#: many states: far below the least no polish helps, and far above none is needed.
+BELOW_LEAST, ABOVE_LEAST = 0.95, 1.0 + 1e-4
+MOST_STATES_TO_POLISH = 64
 
 
 def conditions(plant: DescriptorSystem) -> tuple[Condition, ...]:
@@ -90,6 +95,11 @@ def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **op
         # What is left of the disturbance in the estimates is rounding: nothing to minimise.
         problem = problem.without_disturbance()
         least = replace(_least_gain(problem, asked, engine), gain=least.starting_gain)
+    elif asked.engine == "auto" and asked.gamma is not None and _leaves_little(asked.gamma, least.gain, problem):
+        progress("polishing the least gain")
+        polished = _least_gain(problem, asked, "lmi")
+        records = [*least.records, *polished.records]
+        least = replace(min(least, polished, key=lambda found: found.gain), records=records)
     gamma = _gain_to_ship(asked, problem, least, noisy=plant.nw > 0)
     progress("choosing small gains")
     inner = gamma - min(CERTIFICATE_SHARE * (gamma - least.gain), CERTIFICATE_MARGIN * gamma)
@@ -121,34 +131,10 @@ def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **op
         observer,
         Certificate({"P_factor": factor, "tracking": tracking}, claims),
         {"engine": _engine_of([*least.records, *records]), "runs": [*least.records, *records]},
-        notes(plant, prepared.detectability, observer, largest_zero=held[-1].value),
-    )
-
-
-def synthesis_from_gains(plant: DescriptorSystem, *, T: Any, N: Any, L: Any, W: Any, gamma: float | None) -> Synthesis:
-    """Return the realisation and certificate of given gains; see `obsynth.fault_estimation_filter_from_gains`."""
-    require_all(conditions(plant))
-    work = with_sensor_faults_as_states(plant)
-    gains = {name: as_matrix(value, name) for name, value in (("T", T), ("N", N), ("L", L), ("W", W))}
-    shapes = {"T": (work.nx, work.nx), "N": (work.nx, work.ny), "L": (work.nx, work.ny), "W": (work.nf, work.ny)}
-    for name, shape in shapes.items():
-        if gains[name].shape != shape:
-            raise SpecError(f"{name} is {gains[name].shape}, but {shape} is needed.", path=name)
-    detectability = fault_detectability(gains["T"] @ work.A, work.C, gains["T"] @ work.Bf)
-    if not detectability.finite:
-        raise SpecError("With this T some fault never reaches the outputs.", path="T")
-    gains |= {"Psi": detectability.Psi, "Upsilon": detectability.Upsilon}
-    observer, tracking, lag = realise_filter(plant, work, gains, detectability)
-    level = 1.0 if gamma is None else gamma
-    factor = bounded_real_certificate(plant, observer, tracking, level, core=work.nx, lag=lag)
-    claims = {"state_lag": float(lag)} | ({"gamma": level} if plant.nd else {})
-    return Synthesis(
-        {"from_gains": True, "gamma": gamma},
-        gains,
-        observer,
-        Certificate({"P_factor": factor, "tracking": tracking}, claims),
-        {"runs": []},
-        notes(plant, detectability, observer),
+        (
+            *_gamma_notes(asked.gamma, level if plant.nd else np.inf),
+            *notes(plant, prepared.detectability, observer, largest_zero=held[-1].value),
+        ),
     )
 
 
@@ -208,6 +194,12 @@ def _least_gain(problem: GainProblem, asked: FilterOptions, engine: str) -> gain
     return search_by_bisection(problem, tolerance=asked.tolerance, solver=asked.solver, polish=polish)
 
 
+def _leaves_little(gamma: float, least: float, problem: GainProblem) -> bool:
+    """Whether a gamma leaves less room above the least gain found than the inequality may still find."""
+    near = BELOW_LEAST * least <= gamma <= ABOVE_LEAST * least
+    return near and problem.disturbances > 0 and problem.order <= MOST_STATES_TO_POLISH
+
+
 def _gain_to_ship(asked: FilterOptions, problem: GainProblem, least: gain_search.LeastGain, *, noisy: bool) -> float:
     floor = gain_search.SMALLEST_USEFUL_GAIN * least.starting_gain
     if problem.disturbances == 0:
@@ -218,9 +210,18 @@ def _gain_to_ship(asked: FilterOptions, problem: GainProblem, least: gain_search
         return max((1.0 + asked.gamma_margin) * least.gain, least.starting_gain)
     if asked.gamma is None:
         return max((1.0 + asked.gamma_margin) * least.gain, floor)
-    require_reachable(problem, least.gain, asked.gamma, solver=asked.solver)
+    require_reachable(problem, least, asked.gamma, solver=asked.solver)
     ceiling = LARGEST_USEFUL_GAIN * least.starting_gain
     return min(asked.gamma, ceiling) if ceiling > 0.0 else asked.gamma
+
+
+def _gamma_notes(asked: float | None, shipped: float) -> tuple[str, ...]:
+    """Return a note where less is shipped than was asked for."""
+    if asked is None or shipped >= asked:
+        return ()
+    return (
+        f"gamma = {asked:.6g} was asked for, and {shipped:.6g} is proved: gains for more would only be scaled worse.",
+    )
 
 
 def _gains(prepared: PreparedPlant, parts: _Parts, chosen: Injection) -> dict[str, FloatArray]:
