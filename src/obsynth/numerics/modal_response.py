@@ -12,7 +12,7 @@ from obsynth.numerics.arrays import ComplexArray, FloatArray
 #: Poles of at least this modulus may make a peak of their own.
 NEAR = 0.5
 #: How many peaks are refined, by how many points on either side, and how often.
-MOST_PEAKS = 2
+MOST_PEAKS = 3
 POINTS_BESIDE = 4
 REFINEMENTS = 3
 #: Rows or columns up to which the largest singular value has a formula.
@@ -83,7 +83,7 @@ class ModalResponse:
     def gains(self, angles: FloatArray, *, roughly: bool = False) -> FloatArray:
         """Return the largest singular value at each angle, zero where it is no number; an estimate for many states.
 
-        Roughly it may be the fourth root of the sum of the fourth powers of all singular values.
+        Roughly it may be the eighth root of the sum of the eighth powers of all singular values.
         """
         factors = 1.0 / (np.exp(1j * angles)[:, None] - self.poles)
         order = min(self.direct.shape)
@@ -102,7 +102,10 @@ class ModalResponse:
         if len(direct) > TWO:
             gram = response @ response.conj().transpose(0, 2, 1)
             if roughly:
-                return np.asarray(np.sqrt(np.sqrt(np.sum(np.abs(gram) ** 2, axis=(1, 2)))))
+                # In units of the largest, since eighth powers outgrow double precision.
+                unit = np.max(np.abs(gram), initial=np.finfo(np.float64).tiny)
+                gram = gram / unit
+                return np.asarray(np.sqrt(unit) * np.sum(np.abs(gram @ gram) ** 2, axis=(1, 2)) ** 0.125)
             return np.asarray(np.sqrt(np.linalg.eigvalsh(np.where(np.isfinite(gram), gram, 0.0))[:, -1]))
         squares = np.sum(np.abs(response) ** 2, axis=2)
         if len(direct) == 1:

@@ -34,8 +34,9 @@ from obsynth.numerics.spectra import abscissa, decay_rates, eigenvalues, noise_c
 from obsynth.observers.linear import LinearObserver
 from obsynth.results.design import Certificate
 from obsynth.synthesis.lyapunov import lyapunov_factor
+from obsynth.synthesis.placement.compromise import NOISE_PRICE, compromise
 from obsynth.synthesis.placement.eigenstructure import place
-from obsynth.synthesis.placement.kalman import NOISE_PRICE, KalmanProblem, compromise
+from obsynth.synthesis.placement.kalman import KalmanProblem
 from obsynth.synthesis.placement.region import Region, region_gain
 from obsynth.synthesis.result import Synthesis
 from obsynth.synthesis.ui_pi_noise import NoiseWeights, kalman_problem

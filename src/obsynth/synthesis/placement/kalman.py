@@ -1,34 +1,27 @@
-"""Kalman gains with a prescribed rate of decay, and the price of that rate in noise.
+"""Kalman gains with a prescribed rate of decay.
 
 Source: Share Pasand, Aliyari, Taghirad mention "the optimal estimation scheme of Kalman"; the prescribed rate is
-Anderson and Moore's, and the default that needs no numbers is ours.
+Anderson and Moore's.
 """
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.spectra import abscissa, decay_rates, eigenvalues, noise_covariance
-from obsynth.synthesis.placement.kalman_equation import kalman_filter
+from obsynth.numerics.doubling import continuous_riccati_solution, doubled_riccati_solution
+from obsynth.numerics.spectra import abscissa, noise_covariance
 
-#: The default pays at most this factor in noise, against the quietest Kalman filter, for being fast.
-NOISE_PRICE = 10.0
-#: The default rate is found to about this factor.
-RATE_STEP = 1.05
 #: Times the Riccati equation is solved, each time in the coordinates of the last solution, which improve it.
 ROUNDS = 2
-#: Estimates with less than this share of the outputs' noise have none but rounding.
-SILENT = 1e-8
-#: Deviations that differ by more than this share from one choice of states to another are rounding.
-SAME_DEVIATION = 0.1
+#: From so many states on the Riccati equation is solved by doubling first.
+MANY_STATES = 40
 #: A rate that cannot be had at once is gone to in steps of this factor, from one that is at most so many below.
 RATE_FACTOR = 4.0
 MOST_STEPS = 12
-#: Halvings of the default rate before the quietest filter is taken as it is.
-MOST_HALVINGS = 40
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +103,7 @@ class KalmanProblem:
         bound = float(np.exp(-decay * self.dt)) if self.dt > 0.0 else -decay
         best: FloatArray | None = None
         for _ in range(ROUNDS):
-            found = kalman_filter(free, self.C, rest, measured, (bound, self.dt), change)
+            found = _filtered(free, self.C, rest, measured, (bound, self.dt), change)
             if found is None:
                 break
             total = found[0] + direct
@@ -141,77 +134,71 @@ class KalmanProblem:
         return np.asarray(np.sqrt(np.maximum(np.diag(covariance), 0.0)))
 
 
-@dataclass(frozen=True, eq=False)
-class Compromise:
-    """What the default found.
+def _filtered(
+    f: FloatArray,
+    c: FloatArray,
+    driven: FloatArray,
+    measured: FloatArray,
+    asked: tuple[float, float],
+    change: FloatArray,
+) -> tuple[FloatArray, FloatArray] | None:
+    """Return the gain of a Kalman filter, and states in which its error covariance is the identity.
 
     Parameters
     ----------
-    K : FloatArray
-        ``(n, ny)``.
-    decay : float
-        1/s.
-    price : float
-        Largest ratio of the standard deviation of an estimate to that with the Kalman gain without a rate.
+    f, c, driven, measured : FloatArray
+        The pair and its noise covariances, uncorrelated.
+    asked : tuple of float
+        Bound of the poles, and seconds between samples.
+    change : FloatArray
+        ``(n, n)``: the equation is solved in states ``change^-1 e``.
     """
-
-    K: FloatArray
-    decay: float
-    price: float
-
-
-def compromise(problem: KalmanProblem, rate: float) -> Compromise | None:
-    """Return the fastest gain, up to ``rate`` (1/s), that costs at most `NOISE_PRICE` in noise.
-
-    The plain Kalman filter leaves modes slow that cost much to see (-0.0085 on the Kundur network); a fixed rate may
-    cost any amount of noise.
-
-    Parameters
-    ----------
-    problem : KalmanProblem
-        The pair and its noise.
-    rate : float, 1/s
-        As fast as makes sense for the plant.
-    """
-    start = np.eye(problem.F.shape[0])
-    plain, change = problem.solved(0.0, start)
-    if plain is None:
-        return None
-    # Each estimate by itself: they have units of their own.
-    quietest = problem.deviations(plain, change)
-    silent = SILENT * np.linalg.norm(problem.estimates, axis=1) * float(np.linalg.norm(problem.D))
-    # A deviation that depends on the coordinates it is computed in is rounding, too.
-    again = problem.deviations(plain, start)
-    counted = (quietest > silent) & np.isclose(quietest, again, rtol=SAME_DEVIATION, atol=0.0) & np.isfinite(quietest)
-    best = Compromise(plain, 0.0, 1.0)
-
-    def attempt(decay: float) -> Compromise | None:
-        gain, change = problem.solved(decay, start)
-        if gain is None:
+    bound, dt = asked
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        # What a badly conditioned equation gives is judged by its poles.
+        warnings.simplefilter("ignore")
+        try:
+            inverse = np.linalg.inv(change)
+            moved, noise = inverse @ f @ change, inverse @ driven @ inverse.T
+            moved = moved / bound if dt > 0.0 else moved - bound * np.eye(len(f))
+            noise = 0.5 * (noise + noise.T)
+            for equation in (_by_doubling, _by_the_library) if len(f) >= MANY_STATES else (_by_the_library,):
+                found, covariance = equation(moved, c @ change, noise, measured, dt)
+                gain = change @ (bound * found if dt > 0.0 else found)
+                values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
+                if np.all(np.isfinite(gain)) and abscissa(f - gain @ c, dt) < bound:
+                    break
+        except (np.linalg.LinAlgError, ValueError, ArithmeticError):
             return None
-        ratios = problem.deviations(gain, change)[counted] / quietest[counted]
-        price = float(np.max(ratios)) if ratios.size else 1.0
-        return Compromise(gain, decay, price) if price <= NOISE_PRICE else None
+    if not np.all(np.isfinite(gain)) or not np.all(np.isfinite(values)) or values[-1] <= 0.0:
+        return None
+    floor = float(np.finfo(np.float64).eps) * values[-1]
+    return np.asarray(gain), np.asarray(change @ (vectors * np.sqrt(np.maximum(values, floor))))
 
-    high = rate
-    slowest = float(np.min(decay_rates(eigenvalues(problem.F - plain @ problem.C), problem.dt), initial=np.inf))
-    for _ in range(MOST_HALVINGS):
-        found = attempt(high)
-        if found is not None:
-            best = found
-            break
-        high /= 2.0
-        if high <= slowest:
-            # The quietest filter is as fast as that by itself.
-            break
-    if best.decay in (0.0, rate):
-        return best
-    low, high = best.decay, 2.0 * best.decay
-    while high > RATE_STEP * low:
-        middle = float(np.sqrt(low * high))
-        found = attempt(middle)
-        if found is None:
-            high = middle
-        else:
-            best, low = found, middle
-    return best
+
+def _by_doubling(
+    f: FloatArray, c: FloatArray, noise: FloatArray, measured: FloatArray, dt: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return gain and error covariance of a Kalman filter; NaN where the doubling breaks down."""
+    nothing = np.full((len(f), len(c)), np.nan)
+    if dt > 0.0:
+        y = doubled_riccati_solution(f, c, noise, measured, np.zeros_like(nothing))
+        if y is None:
+            return nothing, np.eye(len(f))
+        return np.asarray(np.linalg.solve(c @ y @ c.T + measured, c @ y @ f.T).T), y
+    y = continuous_riccati_solution(f, c, noise, measured)
+    if y is None:
+        return nothing, np.eye(len(f))
+    return np.asarray(np.linalg.solve(measured, c @ y).T), y
+
+
+def _by_the_library(
+    f: FloatArray, c: FloatArray, noise: FloatArray, measured: FloatArray, dt: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return the same by the QZ algorithm, which takes several times as long and hardly ever breaks down."""
+    import control
+
+    # By scipy, so that no gain depends on whether slycot is there.
+    solve = control.dlqe if dt > 0.0 else control.lqe
+    found, covariance, _ = solve(f, np.eye(len(f)), c, noise, measured, method="scipy")
+    return np.asarray(found), np.asarray(covariance)
