@@ -72,6 +72,7 @@ def test_the_good_one_is_designed_saved_and_verified(tmp_path, capsys) -> None:
         ("plant/units/c", None, 2, ["units", "'c'"]),
         ("plant/units/x", "m", 2, ["units names 'x'"]),
         ("plant/parameters/d", 1.0, 2, ["parameter 'd' enters no equation"]),
+        ("plant/inputs/spare", 1.0, 2, ["input 'spare' enters no equation"]),
         ("plant/states/level", "one", 2, ["must be a number"]),
         ("plant/statse", {}, 2, ["unknown key", "'states'"]),
         ("method/options/dt", 0.0, 2, ["method.options.dt", "greater than 0"]),
@@ -82,8 +83,9 @@ def test_the_good_one_is_designed_saved_and_verified(tmp_path, capsys) -> None:
         ("method/options/integration", "euler", 2, ["'backward-euler'"]),
         ("method/id", "adaptive-observer", 2, ["method.options"]),
         ("plant/equations/valve", "level = c", 3, ["index 2", "valve"]),
-        ("plant/equations/balance", "2 * outflow = 2 * c * sqrt(level)", 3, ["not independent", "'balance'"]),
-        ("plant/equations/balance", "outflow = 2 * c * sqrt(level)", 5, ["No solution at k = 0", "equation"]),
+        ("plant/equations/balance", "2 * outflow - inflow = 2 * c * sqrt(level) - inflow", 3,
+         ["not independent", "'balance'"]),
+        ("plant/equations/balance", "outflow = 2 * c * sqrt(level) + inflow", 5, ["No solution at k = 0", "equation"]),
     ],
 )  # fmt: skip
 def test_what_is_wrong_is_named(path, value, code, words, tmp_path, capsys) -> None:

@@ -59,7 +59,7 @@ def wang_gains(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def run(*arguments: str, **settings: Any) -> subprocess.CompletedProcess[str]:
     """Run the command line as a process of its own."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT / "src"), **settings.pop("env", {})}
-    command = [sys.executable, "-m", "obsynth.cli.main", *arguments]
+    command = [sys.executable, "-m", "obsynth", *arguments]
     return subprocess.run(command, capture_output=True, text=True, check=False, env=environment, **settings)
 
 
@@ -307,7 +307,7 @@ class TestRealProcesses:
         assert "tor\\u03c4ue" in done.stdout
 
     def test_a_reader_that_leaves(self, wang_gains: Path) -> None:
-        command = [sys.executable, "-m", "obsynth.cli.main", "verify", str(wang_gains)]
+        command = [sys.executable, "-m", "obsynth", "verify", str(wang_gains)]
         environment = {**os.environ, "PYTHONPATH": str(ROOT / "src")}
         with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment) as process:
             assert process.stdout is not None
@@ -320,7 +320,7 @@ class TestRealProcesses:
     def test_progress_on_a_terminal_disappears(self, tmp_path: Path) -> None:
         here, there = os.openpty()
         environment = {**os.environ, "PYTHONPATH": str(ROOT / "src"), "TERM": "xterm"}
-        command = [sys.executable, "-m", "obsynth.cli.main", "design", "--system", str(WANG), "--json"]
+        command = [sys.executable, "-m", "obsynth", "design", "--system", str(WANG), "--json"]
         done = subprocess.run(command, stdout=subprocess.PIPE, stderr=there, check=False, env=environment)
         os.close(there)
         shown = os.read(here, 1_000_000).decode()

@@ -87,7 +87,7 @@ def test_decisions_on_parameters_are_counted(capsys):
 
 
 def test_a_spec_without_a_scenario_has_nothing_to_evaluate(capsys):
-    spec = str(ROOT / "designs" / "kundur" / "spec_fault_filter.yaml")
+    spec = str(ROOT / "designs" / "moussaali2013_ltv" / "as_printed.yaml")
     assert main(["evaluate", "--system", spec, "--quiet"]) == 2
     assert "has no scenario" in capsys.readouterr().err
 

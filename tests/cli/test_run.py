@@ -65,7 +65,7 @@ def test_a_stream_gives_what_a_file_gives_a_row_in_a_row_out(gains):
     log(*ROWS)
     assert run(gains, "--quiet") == 0
     environment = {**os.environ, "PYTHONPATH": str(ROOT / "src")}
-    command = [sys.executable, "-W", "error", "-m", "obsynth.cli.main", "run", "--gains", str(gains), "--data", "-"]
+    command = [sys.executable, "-W", "error", "-m", "obsynth", "run", "--gains", str(gains), "--data", "-"]
     with subprocess.Popen(
         [*command, "--quiet"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
     ) as process:

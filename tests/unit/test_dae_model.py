@@ -33,6 +33,7 @@ def small(**changes) -> DAEModel:
         ({"equations": {"moves": "der(a) = -c * a + b", "holds": "go = 1"}}, ["'holds'", "neither a state"]),
         ({"equations": {"moves": "der(a) = -c * a", "holds": "a = go"}}, ["state 'b' enters no equation"]),
         ({"equations": {"moves": "der(a) = -a + b", "holds": "b = go"}}, ["parameter 'c' enters no equation"]),
+        ({"equations": {"moves": "der(a) = -c * a + b", "holds": "b = a"}}, ["input 'go' enters no equation"]),
         ({"equations": {"moves": "der(a) = -c * a + der(go)", "holds": "b = a"}}, ["der(...)", "'go'"]),
         ({"equations": {"moves": "der(der(a)) = -c * a", "holds": "b = a"}}, ["no function 'der'"]),
         ({"equations": {"moves": "der(a) = __import__", "holds": "b = c"}}, ["'__import__'"]),

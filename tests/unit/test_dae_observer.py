@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from dae_plants import exchanger, linear
 
-from obsynth import DAEObserver, SolverError, SpecError, run_batch, simulate_dae
+from obsynth import DAEModel, DAEObserver, SolverError, SpecError, dae_adaptive_observer, run_batch, simulate_dae
 from obsynth.models.dae_functions import DAEFunctions
 from obsynth.models.dae_step import ImplicitStep
 
@@ -203,6 +203,20 @@ def test_bounds_hold() -> None:
     assert found.parameters[:, 0].min() == 0.95
     assert found.parameters[:, 0].max() <= 1.0
     assert found.parameters[:, 1].max() == 1e3
+
+
+@pytest.mark.parametrize("bounds", [{"rate": [-np.inf, 0.9]}, [[-np.inf, 0.9]]])
+def test_bounds_are_those_of_the_parameter_where_there_are_as_many_states(bounds) -> None:
+    model = DAEModel(
+        {"decay": "der(level) = 1 - rate * level"}, {"seen": "level"}, states={"level": 10.0},
+        parameters={"rate": 0.5}, units={"level": "m", "rate": "1/s", "seen": "m"},
+    )  # fmt: skip
+    design = dae_adaptive_observer(model, dt=0.1, Q=1e-6, R=1e-4, bounds=bounds, initial_parameter_covariance=0.04)
+    # The data ask for a rate of 2 1/s, and the level begins far above the bound.
+    found = design.observer.run(0.5 + 9.5 * np.exp(-0.2 * np.arange(20))[:, None])
+    assert (design.observer.lower.item(), design.observer.upper.item()) == (-np.inf, 0.9)
+    assert found.parameters.max() == 0.9
+    assert found.states[:5].min() > 3.0
 
 
 def test_a_start_off_the_constraint_is_projected_and_said() -> None:

@@ -54,6 +54,29 @@ def test_the_recursion_becomes_its_steady_state(name):
     np.testing.assert_allclose(np.linalg.norm(steady.residuals, axis=1)[-200:], lengths, rtol=1e-10)
 
 
+def test_expressions_without_k_are_constants(tmp_path):
+    given = {**PLANT.as_dict(), "constants": {"rate": 0.9}}
+    named = TimeVaryingDescriptorSystem(
+        **{
+            **given,
+            "A": [["rate", 0.1, 0], ["-0.2", 0.7, 0.1], [1, "rate / 1.8", -1]],
+            "E": [["1", 0, 0], [0, 1, 0], [0, 0, 0]],
+        }
+    )
+    moving = TimeVaryingDescriptorSystem(**{**given, "A": [["rate + 0 * k", 0.1, 0], [-0.2, 0.7, 0.1], [1, 0.5, -1]]})
+    assert (named.is_time_invariant, moving.is_time_invariant) == (True, False)
+    design = obsynth.descriptor_kalman(named, Q=Q, R=1e-2, **START)
+    found, wanted = (steady_observer(each.observer).observer for each in (design, DESIGNS["filter"]))
+    for letter in ("Az", "By", "Bu", "Cz", "Dy"):
+        np.testing.assert_array_equal(getattr(found, letter), getattr(wanted, letter))
+    design.save(tmp_path / "named.gains.json")
+    again = obsynth.load(tmp_path / "named.gains.json")
+    assert again.plant.is_time_invariant
+    assert obsynth.verify(again).passed
+    with pytest.raises(SpecError, match="A may change with k"):
+        steady_observer(obsynth.descriptor_kalman(moving, Q=Q, R=1e-2, **START).observer)
+
+
 def test_its_gains_are_those_of_the_riccati_equation():
     design = DESIGNS["filter"]
     state = obsynth.steady_state_filter(PLANT, Q=Q, R=1e-2 * np.eye(2))

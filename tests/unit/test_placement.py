@@ -7,8 +7,9 @@ import pytest
 
 from obsynth import DescriptorSystem, PreconditionError, SolverError, SpecError, ui_pi_observer
 from obsynth.numerics.spectra import decay_rates, spectrum_error
+from obsynth.synthesis.placement.compromise import NOISE_PRICE, compromise
 from obsynth.synthesis.placement.eigenstructure import jordan_form, place
-from obsynth.synthesis.placement.kalman import NOISE_PRICE, KalmanProblem, compromise
+from obsynth.synthesis.placement.kalman import KalmanProblem
 from obsynth.synthesis.placement.observable import observable_split
 from obsynth.synthesis.placement.region import Region, region_gain
 

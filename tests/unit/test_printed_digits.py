@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import sys
 from functools import cache
 from pathlib import Path
@@ -11,17 +10,14 @@ import numpy as np
 import pytest
 
 from obsynth import (
-    Certificate,
     DescriptorSystem,
     ObserverDesign,
+    SpecError,
     fault_estimation_filter,
     fault_estimation_filter_from_gains,
     verify,
 )
-from obsynth.analysis.fault_detectability import fault_detectability
-from obsynth.analysis.fault_filter import with_sensor_faults_as_states
 from obsynth.results.report import Check
-from obsynth.synthesis.filter_realisation import realise_filter
 
 sys.path.append(str(Path(__file__).parents[1] / "property"))
 from plants import build, random_recipe
@@ -45,23 +41,10 @@ def rounded(seed: int, digits: int) -> dict[str, np.ndarray]:
 
 
 def of_gains(seed: int, gains: dict[str, np.ndarray]) -> ObserverDesign:
-    """The filter of these gains, with the detectability indexes of the plant.
-
-    From a rounded T alone an index above one cannot be found: what should vanish in the outputs no longer does.
-    """
+    """The filter of these gains, with the detectability indexes of the plant."""
     design = designed(seed)
-    plant, delays = design.plant, design.observer.fault_delays
-    if max(delays) == 1:
-        gamma = design.certificate.claims.get("gamma")
-        return fault_estimation_filter_from_gains(plant, **gains, gamma=gamma)
-    work = with_sensor_faults_as_states(plant)
-    ta, tf = gains["T"] @ work.A, gains["T"] @ work.Bf
-    found = dataclasses.replace(fault_detectability(ta, work.C, tf), indexes=delays)
-    observer, tracking, _ = realise_filter(plant, work, gains, found)
-    psi = np.column_stack([np.linalg.matrix_power(ta, rho - 1) @ tf[:, i] for i, rho in enumerate(delays)])
-    certificate = Certificate({**design.certificate.matrices, "tracking": tracking}, design.certificate.claims)
-    letters = {**gains, "Psi": psi, "Upsilon": work.C @ psi}
-    return design.replace(gains=letters, observer=observer, certificate=certificate)
+    gamma = design.certificate.claims.get("gamma")
+    return fault_estimation_filter_from_gains(design.plant, **gains, gamma=gamma, indexes=design.observer.fault_delays)
 
 
 def equalities(design: ObserverDesign, digits: int | None) -> list[Check]:
@@ -79,6 +62,34 @@ def test_every_equality_holds_to_the_printed_digits(seed: int, digits: int) -> N
     design = of_gains(seed, rounded(seed, digits))
     assert [check for check in equalities(design, digits) if not check.passed] == []
     assert [check for check in equalities(design, None) if not check.passed] != []
+
+
+@pytest.mark.parametrize("seed", [seed for seed, longest in LONGEST.items() if longest > 1])
+def test_without_the_indexes_a_rounded_t_hides_them_and_the_design_says_so(seed: int) -> None:
+    design = designed(seed)
+    gamma, own = design.certificate.claims.get("gamma"), design.observer.fault_delays
+    found = fault_estimation_filter_from_gains(design.plant, **rounded(seed, 4), gamma=gamma)
+    lost = found.observer.fault_delays != own
+    assert any(f"give indexes={list(own)}" in note for note in found.notes) is lost
+    exact = {letter: design.gains[letter] for letter in "TNLW"}
+    kept = fault_estimation_filter_from_gains(design.plant, **exact, gamma=gamma)
+    assert kept.observer.fault_delays == own
+    assert not any("give indexes=" in note for note in kept.notes)
+
+
+@pytest.mark.parametrize("indexes", [[], [1, 2, 3, 4, 5, 6, 7], [0], "1", [1.0], 1, [99], [True]])
+def test_indexes_are_one_whole_number_for_each_fault(indexes: object) -> None:
+    plant = DescriptorSystem(None, [[0.5, 1.0], [0.0, 0.4]], C=[[1, 0]], Bf=[[0], [1]], dt=1.0)
+    gains = {letter: fault_estimation_filter(plant).gains[letter] for letter in "TNLW"}
+    with pytest.raises(SpecError, match="give one whole number from 1 to 2 for each of 'f1'"):
+        fault_estimation_filter_from_gains(plant, **gains, indexes=indexes)
+
+
+def test_an_index_at_which_nothing_shows_is_refused() -> None:
+    plant = DescriptorSystem(None, [[0.5, 1.0], [0.0, 0.4]], C=[[1, 0]], Bf=[[0], [1]], dt=1.0)
+    gains = {letter: fault_estimation_filter(plant).gains[letter] for letter in "TNLW"}
+    with pytest.raises(SpecError, match="the fault 'f1' does not reach the outputs"):
+        fault_estimation_filter_from_gains(plant, **gains, indexes=[1])
 
 
 def test_an_allowance_relative_to_the_terms_would_refuse_some_of_them() -> None:

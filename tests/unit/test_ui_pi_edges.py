@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from obsynth import DescriptorSystem, ui_pi_observer
-from obsynth.errors import PreconditionError, SpecError
+from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.pipeline.designing import check
 
 TWO = [[-1.0, 1.0], [0.0, -2.0]]
@@ -53,6 +53,43 @@ def test_faults_that_only_hide_together_are_named_together() -> None:
 @pytest.mark.parametrize("model", [{"polynomial": 10}, {"sum": ["step", {"sinusoid": 1e-6}]}])
 def test_stability_is_proved_where_no_lyapunov_equation_can_be_solved(model: object) -> None:
     assert ui_pi_observer(PAPER, fault_model=model).report["stability"].passed
+
+
+@pytest.mark.parametrize("dt", [0.0, 0.1])
+@pytest.mark.parametrize("frequency", [1e-6, 1e-7])
+def test_parts_of_a_fault_that_can_hardly_be_told_apart_are_said_to_make_it_slow(frequency: float, dt: float) -> None:
+    a = [[0.9, 0.03], [0.0, 0.8]] if dt else [[-1.0, 0.3], [0.0, -2.0]]
+    plant = DescriptorSystem(None, a, C=np.eye(2), Bf=[[1], [0.5]], Bd=[[0], [1]], dt=dt)
+    design = ui_pi_observer(plant, fault_model={"sum": ["step", {"sinusoid": frequency}]})
+    # Faster than the plain Kalman filter, whose slowest pole is half a frequency from the boundary.
+    assert design.certificate.claims["decay"] > 10.0 * frequency
+    assert design.certificate.claims["noise_price"] > 1.0
+    assert any("step plus sinusoid" in note and "give decay or poles" in note for note in design.notes)
+    usual = ui_pi_observer(plant, fault_model={"sum": ["step", {"sinusoid": 1.0}]})
+    assert not any("give decay or poles" in note for note in usual.notes)
+
+
+@pytest.mark.parametrize(("dt", "frequency"), [(0.1, 1e-4), (0.1, 1e-3), (0.0, 1e-5)])
+def test_the_price_in_noise_is_that_of_the_gain_that_is_shipped(dt: float, frequency: float) -> None:
+    # In the states of the fault model the covariance is lost in rounding, and a price of zero was once claimed.
+    a = [[0.9, 0.03], [0.0, 0.8]] if dt else [[-1.0, 0.3], [0.0, -2.0]]
+    plant = DescriptorSystem(None, a, C=np.eye(2), Bf=[[1], [0.5]], Bd=[[0], [1]], dt=dt)
+    design = ui_pi_observer(plant, fault_model={"sum": ["step", {"sinusoid": frequency}]})
+    assert 9.5 < design.certificate.claims["noise_price"] <= 10.0
+
+
+@pytest.mark.parametrize("decay", [3e3, 1e5, 1e6])
+@pytest.mark.parametrize("joint", [False, True])
+def test_a_rate_far_above_the_plants_own_is_reached(decay: float, joint: bool) -> None:
+    design = ui_pi_observer(PAPER, decay=decay, joint=joint)
+    assert design.report.passed
+    assert design.certificate.claims["decay"] >= decay
+
+
+def test_a_rate_that_cannot_be_had_says_what_is_left() -> None:
+    plant = DescriptorSystem(None, 0.9 * np.eye(3) + 0.1 * np.eye(3, k=1), C=[[1, 0, 0]], Bf=[[0], [0], [1]], dt=0.01)
+    with pytest.raises(SolverError, match=r"decay 10000 1/s has no solution.*or give poles"):
+        ui_pi_observer(plant, decay=1e4)
 
 
 def test_a_fault_model_that_is_lost_in_rounding_is_no_fixed_mode() -> None:

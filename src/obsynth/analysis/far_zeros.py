@@ -29,7 +29,9 @@ def system_zeros(E: FloatArray, A: FloatArray, *, nx: int) -> FiniteZeros:
     nx : int
         Number of states: the leading columns.
     """
-    found = finite_zeros(E, A)
+    found = finite_zeros(E, A, to_the_end=False)
+    if not found.values.size:
+        return found
     # Both of a pair are judged by the upper one.
     upper = [complex(z.real, abs(z.imag)) for z in found.values]
     kept = np.array([abs(z) <= 1.0 or _is_singular(E, A, z, found.normal_rank, nx=nx) for z in upper], dtype=bool)

@@ -66,7 +66,8 @@ def fault_detectability(ta: FloatArray, c: FloatArray, tf: FloatArray) -> FaultD
     ta, c, tf : FloatArray
         ``(nx, nx)``, ``(ny, nx)`` and ``(nx, nf)``.
     """
-    results = [_first_visible(ta, c, tf[:, i]) for i in range(tf.shape[1])]
+    size = float(np.linalg.norm(c, 2))
+    results = [_first_visible(ta, c, tf[:, i], size) for i in range(tf.shape[1])]
     psi = np.column_stack([vector for _, vector in results]) if results else np.zeros((ta.shape[0], 0))
     upsilon = c @ psi
     lengths = np.linalg.norm(upsilon, axis=0)
@@ -78,9 +79,12 @@ def fault_detectability(ta: FloatArray, c: FloatArray, tf: FloatArray) -> FaultD
     return FaultDetectability(tuple(index for index, _ in results), psi, upsilon, rank, condition)
 
 
-def _first_visible(ta: FloatArray, c: FloatArray, direction: FloatArray) -> tuple[int | None, FloatArray]:
-    """Return the index of one fault and the vector that becomes visible; by Cayley-Hamilton nx steps suffice."""
-    size, growth = float(np.linalg.norm(c, 2)), float(np.linalg.norm(ta, 2))
+def _first_visible(ta: FloatArray, c: FloatArray, direction: FloatArray, size: float) -> tuple[int | None, FloatArray]:
+    """Return the index of one fault and the vector that becomes visible; by Cayley-Hamilton nx steps suffice.
+
+    ``size`` is the norm of ``c``.
+    """
+    growth: float | None = None
     vector, bound = direction, float(np.linalg.norm(direction))
     for step in range(1, ta.shape[0] + 1):
         length = float(np.linalg.norm(vector))
@@ -88,7 +92,8 @@ def _first_visible(ta: FloatArray, c: FloatArray, direction: FloatArray) -> tupl
             break
         if float(np.linalg.norm(c @ vector)) > MARKOV_TOLERANCE * size * length:
             return step, vector
-        vector, bound = ta @ vector, bound * max(growth, 1.0)
+        growth = max(float(np.linalg.norm(ta, 2)), 1.0) if growth is None else growth
+        vector, bound = ta @ vector, bound * growth
     return None, np.zeros_like(direction)
 
 

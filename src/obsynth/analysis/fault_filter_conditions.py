@@ -7,40 +7,80 @@ inside the unit circle.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from obsynth.analysis.conditions import Condition, rank_condition
 from obsynth.analysis.fault_detectability import detectability_conditions
-from obsynth.analysis.fault_filter import prepare, with_sensor_faults_as_states
+from obsynth.analysis.fault_filter import PreparedPlant, prepare, with_sensor_faults_as_states
 from obsynth.analysis.zeros import Zero, fault_zeros, leading_names
 from obsynth.errors import PreconditionError
 from obsynth.models.descriptor import DescriptorSystem
-from obsynth.numerics.pencils import regularity
+from obsynth.numerics.pencils import PencilStructure, regularity
 from obsynth.numerics.ranks import decide_rank
 
 #: At most this many signals are named in a failed condition.
 MOST_NAMES = 4
 
 
-def fault_filter_conditions(plant: DescriptorSystem) -> tuple[Condition, ...]:
+def fault_filter_conditions(
+    plant: DescriptorSystem, *, structure: PencilStructure | None = None
+) -> tuple[Condition, ...]:
     """Return the existence conditions of the fault-estimation filter, in order; the list ends at the first failure.
 
     Parameters
     ----------
     plant : DescriptorSystem
         Any plant.
+    structure : PencilStructure, optional
+        Of the plant's E and A, where it is known.
     """
+    return examine_fault_filter(plant, structure=structure)[0]
+
+
+def examine_fault_filter(
+    plant: DescriptorSystem, *, structure: PencilStructure | None = None
+) -> tuple[tuple[Condition, ...], PreparedPlant | None]:
+    """Return the existence conditions, and the prepared plant on which the last of them were decided.
+
+    Parameters
+    ----------
+    plant, structure
+        As for `fault_filter_conditions`.
+
+    Returns
+    -------
+    tuple
+        The list of conditions, which ends at the first failure, and ``prepare(plant)`` where the ranks allow it.
+    """
+    prepared: PreparedPlant | None = None
+
+    def visibility_conditions() -> list[Condition]:
+        nonlocal prepared
+        prepared = prepare(plant)
+        return list(detectability_conditions(prepared.detectability, plant.fault_names, prepared.scaling.outputs))
+
+    groups: tuple[Callable[[], list[Condition]], ...] = (
+        lambda: _form_conditions(plant, structure),
+        lambda: _rank_conditions(plant),
+        visibility_conditions,
+        lambda: _zero_conditions(plant),
+    )
     found: list[Condition] = []
-    for group in (_form_conditions, _rank_conditions, _visibility_conditions, _zero_conditions):
-        found += group(plant)
-        if not all(condition.holds for condition in found):
-            first = next(i for i, condition in enumerate(found) if not condition.holds)
-            return tuple(found[: first + 1])
-    return tuple(found)
+    for group in groups:
+        for condition in group():
+            found.append(condition)
+            if not condition.holds:
+                return tuple(found), prepared
+    return tuple(found), prepared
 
 
-def _form_conditions(plant: DescriptorSystem) -> list[Condition]:
-    regular, normal_rank = regularity(plant.E, plant.A)
+def _form_conditions(plant: DescriptorSystem, structure: PencilStructure | None) -> list[Condition]:
+    if structure is None:
+        regular, normal_rank = regularity(plant.E, plant.A)
+    else:
+        regular, normal_rank = structure.regular, structure.normal_rank
     return [
         Condition(
             "discrete time",
@@ -143,11 +183,6 @@ def _rank_conditions(plant: DescriptorSystem) -> list[Condition]:
         ),
     ]
     return ranks
-
-
-def _visibility_conditions(plant: DescriptorSystem) -> list[Condition]:
-    prepared = prepare(plant)
-    return list(detectability_conditions(prepared.detectability, plant.fault_names, prepared.scaling.outputs))
 
 
 def _zero_conditions(plant: DescriptorSystem) -> list[Condition]:

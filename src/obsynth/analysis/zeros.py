@@ -112,11 +112,18 @@ def are_outside(E: FloatArray, A: FloatArray, zeros: FiniteZeros, dt: float) -> 
     dt : float
         Seconds between samples, 0 for continuous time.
     """
-    pencil = equilibrate_pencil(E, A)
-    return tuple(
-        is_outside(value, dt) or _reaches_boundary(pencil, value, dt, zeros.normal_rank)
-        for value in map(complex, zeros.values)
-    )
+    pencil: EquilibratedPencil | None = None
+    found: dict[complex, bool] = {}
+    for value in map(complex, zeros.values):
+        # Of a pair both are where the one before was found to be: the pencil is real.
+        if (other := value.conjugate()) in found:
+            found[value] = found[other]
+        elif is_outside(value, dt) or not _is_near_boundary(value, dt):
+            found[value] = is_outside(value, dt)
+        else:
+            pencil = equilibrate_pencil(E, A) if pencil is None else pencil
+            found[value] = _reaches_boundary(pencil, value, dt, zeros.normal_rank)
+    return tuple(found[value] for value in map(complex, zeros.values))
 
 
 def invariant_zeros(
@@ -175,15 +182,21 @@ def _system_pencil(
     return padded, np.block([[A, B], [C, feedthrough]])
 
 
-def _reaches_boundary(pencil: EquilibratedPencil, value: complex, dt: float, normal_rank: int) -> bool:
+def _is_near_boundary(value: complex, dt: float) -> bool:
     distance = abs(abs(value) - 1.0) if dt > 0.0 else abs(value.real)
-    if distance > BOUNDARY_NEIGHBOURHOOD * max(1.0, abs(value)):
-        return False
+    return distance <= BOUNDARY_NEIGHBOURHOOD * max(1.0, abs(value))
+
+
+def _reaches_boundary(pencil: EquilibratedPencil, value: complex, dt: float, normal_rank: int) -> bool:
     point = value / abs(value) if dt > 0.0 else complex(0.0, value.imag)
     # All the way to the boundary: another zero that lies there is no evidence about this one.
-    path = [value + fraction * (point - value) for fraction in _PATH_TO_BOUNDARY]
-    singular_values = np.array([np.linalg.svd(pencil.A - z * pencil.E, compute_uv=False) for z in path])
-    return bool(np.all(singular_values[:, normal_rank - 1] <= BOUNDARY_RANK_TOLERANCE * singular_values[:, 0]))
+    for fraction in _PATH_TO_BOUNDARY:
+        place = value + fraction * (point - value)
+        matrix = pencil.A - (place if place.imag else place.real) * pencil.E
+        singular_values = np.linalg.svd(matrix, compute_uv=False)
+        if singular_values[normal_rank - 1] > BOUNDARY_RANK_TOLERANCE * singular_values[0]:
+            return False
+    return True
 
 
 def _with_directions(E: FloatArray, A: FloatArray, found: FiniteZeros, *, nx: int) -> tuple[Zero, ...]:

@@ -216,6 +216,9 @@ def _summary(found: DataRun, watched: OnlineMonitor | None) -> str:
     if watched is not None:
         if watched.kind not in found.alarms:
             lines.append(f"No alarm by {watched.kind}.")
+            if 2 * sum(found.statuses.get(status, 0) for status in ("warm-up", "recovering")) > found.rows:
+                lines.append("More than half of the rows raise none, as they are warm-up: it lasts until the slowest "
+                             "mode of the observer is forgotten, or as long as --warm-up says.")  # fmt: skip
         lines.append(f"The {watched.kind} threshold: {watched.statement}.")
     return "\n".join(lines)
 

@@ -175,7 +175,3 @@ def _run(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> in
         # Whoever read our output has left; the interpreter's own flush at exit must not complain.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
-
-
-if __name__ == "__main__":
-    sys.exit(main())

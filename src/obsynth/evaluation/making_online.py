@@ -188,15 +188,24 @@ def _whitened(
     )  # fmt: skip
 
 
+def _whole_record(observer: RecursiveObserver | DAEObserver) -> str:
+    """Return why a likelihood ratio is not among the monitors, and what to use instead."""
+    why = " glr compares every time at which a change may have begun, which takes a whole record"
+    if isinstance(observer, DAEObserver) or observer.adaptation is None or observer.adaptation.form == "random-walk":
+        return f"{why}, and regressors, which this design does not have: chi-square or nis serve here."
+    return f"{why}: obsynth.decide(..., statistic='glr') has it for recorded estimates; row by row, use cusum."
+
+
 def _of_parameters(
     observer: RecursiveObserver | DAEObserver, kind: str, nominal: Mapping[str, float], change: float,
     false_alarms: float,
 ) -> OnlineMonitor:  # fmt: skip
     if kind not in PARAMETER_KINDS:
+        hint = _whole_record(observer) if kind == "glr" else ""
         raise SpecError(
-            f"kind is {kind!r}: for a recursive design use one of {', '.join(PARAMETER_KINDS)} (glr needs a whole "
-            "record: obsynth.decide).", path="kind",
-        )  # fmt: skip
+            f"kind is {kind!r}: for a recursive or nonlinear design use one of {', '.join(PARAMETER_KINDS)}.{hint}",
+            path="kind",
+        )
     names = observer.fault_names
     if isinstance(observer, DAEObserver):
         start, residuals, form = observer.initial_parameters, observer.model.ny, "nonlinear"

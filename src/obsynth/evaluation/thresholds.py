@@ -57,13 +57,13 @@ def scaled_inputs(
     reached = np.any(model.Bd != 0.0, axis=0) | np.any(model.Dd != 0.0, axis=0)
     if np.any(reached & ~np.isfinite(bounds)):
         raise SpecError(
-            "A disturbance has no bound (a Gaussian one has none): give disturbance_bounds, or use a statistical "
-            "threshold.", path="disturbance_bounds",
+            "A disturbance has no bound (a Gaussian one has none): give disturbance_bounds (--disturbance), or use "
+            "a statistical threshold.", path="disturbance_bounds",
         )  # fmt: skip
     if model.noisy and noise_bound is None:
         raise SpecError(
-            "Gaussian noise has no pointwise bound: say with noise_bound how many standard deviations yours never "
-            "exceeds, or use a statistical threshold.", path="noise_bound",
+            "Gaussian noise has no pointwise bound: say by noise_bound (--noise-bound) how many standard deviations "
+            "yours never exceeds, or use a statistical threshold (chi-square or cusum).", path="noise_bound",
         )  # fmt: skip
     sizes = np.where(reached, bounds, 0.0)
     factor = 0.0 if noise_bound is None else noise_bound
@@ -105,7 +105,7 @@ def paper_threshold(model: ResidualModel, bounds: FloatArray, initial_error: flo
         A disturbance has no bound.
     """
     if model.flow is not None:
-        raise SpecError("Eq. (66) is for discrete designs: use kind='pointwise', or sample the plant first.",
+        raise SpecError("Eq. (66) is for discrete designs: use pointwise, or sample the plant first.",
                         path="kind")  # fmt: skip
     if not np.isfinite(bounds).all():
         raise SpecError("The paper's threshold needs a bound of each disturbance.", path="disturbance_bounds")

@@ -37,7 +37,7 @@ def window_covariance(model: ResidualModel, window: int) -> FloatArray:
     if any(bool(hit) and not calm for hit, calm in zip(reached, model.steady, strict=True)):
         raise SpecError(
             "A disturbance that reaches the residual has a part that is not random or does not last: its covariance "
-            "is not known. Use kind='pointwise' or 'window'.", path="disturbances",
+            "is not known. Use pointwise or window.", path="disturbances",
         )  # fmt: skip
     b = np.hstack([model.Bd * model.deviations, model.Bw])
     d = np.hstack([model.Dd * model.deviations, model.Dw])
@@ -136,7 +136,7 @@ def correlation_left(model: ResidualModel, window: int, whitener: FloatArray) ->
         driven = model.A @ driven
         if float(np.linalg.norm(driven)) <= left:
             return total
-    raise SpecError("The residual remembers for too long to be whitened: use kind='chi-square'.", path="kind")
+    raise SpecError("The residual remembers for too long to be whitened: use chi-square.", path="kind")
 
 
 def cusum_whitener(model: ResidualModel, window: int) -> tuple[FloatArray, bool]:

@@ -65,8 +65,8 @@ class DAEModel:
     ------
     SpecError
         A text does not belong to the language or uses an unknown name; there are more or fewer equations than states;
-        an equation contains neither states nor their derivatives; a parameter enters no equation and no output; a unit
-        is missing; a derivative is taken of an input; a function decides with ``if`` on a state.
+        an equation contains neither states nor their derivatives; an input enters no equation, a parameter no equation
+        and no output; a unit is missing; a derivative is taken of an input; a function decides with ``if`` on a state.
 
     Examples
     --------

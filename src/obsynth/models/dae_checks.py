@@ -79,10 +79,12 @@ def check_distinct(model: DAEModel) -> None:
 
 
 def check_structure(model: DAEModel, problems: Problems) -> None:
-    """Note what is wrong with the equations as a whole: their number, empty ones, parameters that enter nothing."""
+    """Note what is wrong with the equations as a whole: their number, empty ones, signals that enter nothing."""
     symbols = problems.collect(lambda: symbols_of(model))
     problems.raise_if_any()
-    for check in (_square, _only_states_stored, _no_empty_equation, _every_parameter_used, _every_output_sees):
+    for check in (
+        _square, _only_states_stored, _no_empty_equation, _every_input_used, _every_parameter_used, _every_output_sees,
+    ):  # fmt: skip
         problems.collect(partial(check, model, symbols))
 
 
@@ -133,6 +135,16 @@ def _no_empty_equation(model: DAEModel, symbols: DAESymbols) -> None:
     if free.any():
         name = model.state_names[int(np.argmax(free))]
         raise SpecError(f"The state {name!r} enters no equation: nothing determines it.", path=f"states.{name}")
+
+
+def _every_input_used(model: DAEModel, symbols: DAESymbols) -> None:
+    import casadi as ca
+
+    # What an output must not contain is said elsewhere.
+    used = _depends(ca.vertcat(symbols.equations, symbols.stored, symbols.outputs), symbols.u).any(axis=0)
+    for name, enters in zip(model.input_names, used, strict=True):
+        if not enters:
+            raise SpecError(f"The input {name!r} enters no equation: remove it, or use it.", path=f"inputs.{name}")
 
 
 def _every_parameter_used(model: DAEModel, symbols: DAESymbols) -> None:

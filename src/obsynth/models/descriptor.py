@@ -22,6 +22,7 @@ from obsynth.models.validation import (
     picked_names,
     signal_counts,
     square,
+    uncounted_signals,
 )
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 
@@ -141,8 +142,12 @@ class DescriptorSystem:
             if value is not None:
                 given[name] = problems.collect(partial(matrix_or_picks, value, name, states))
         sizes = signal_counts(given)
+        # What depends on a matrix that could not be read is not judged: its own message is enough.
+        broken = {name for name, value in asked.items() if value is not None and given[name] is None}
+        unknown = uncounted_signals(given, broken)
         values: dict[str, Any] = {
-            name: problems.shaped(given.get(name), name, shape) for name, shape in expected_shapes(nx, sizes).items()
+            name: problems.shaped(given.get(name), name, shape)
+            for name, shape in expected_shapes(nx, sizes, unknown).items()
         }
         values |= {"dt": problems.collect(lambda: checked_dt(dt)), "state_names": states}
         named = {
@@ -153,6 +158,8 @@ class DescriptorSystem:
             "noise_names": (noise_names, "w"),
         }
         for field, (names, signal) in named.items():
+            if signal in unknown:
+                continue
             values[field] = problems.collect(partial(checked_names, names, sizes[signal], prefix=signal, what=field))
         problems.raise_if_any()
         known = {name for field in ("state_names", *named) for name in values[field]}

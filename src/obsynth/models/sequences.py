@@ -104,7 +104,9 @@ class MatrixSequence:
 
     @property
     def is_constant(self) -> bool:
-        """Whether it is the same matrix for every k."""
+        """Whether it is the same matrix for every k: numbers, or expressions none of which contains k."""
+        if self.entries is not None:
+            return not self.moving
         return self.values is not None and self.values.ndim == 2
 
     @property

@@ -216,7 +216,7 @@ class TimeVaryingDescriptorSystem:
 
     @property
     def is_time_invariant(self) -> bool:
-        """Whether every matrix is given as a constant."""
+        """Whether every matrix is the same for every k, as far as what is given tells: no stack, no function, no k."""
         return all(matrix.is_constant for matrix in self.matrices.values())
 
     def as_dict(self) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -99,10 +99,24 @@ def signal_counts(given: Mapping[str, FloatArray | None]) -> dict[str, int]:
     }
 
 
-def expected_shapes(nx: int, counts: Mapping[str, int]) -> dict[str, tuple[int, int]]:
-    """Return the shape every matrix must have."""
+def uncounted_signals(given: Mapping[str, FloatArray | None], broken: Container[str]) -> set[str]:
+    """Return the kinds of signals whose number nothing tells, since a matrix that might is ``broken``."""
+    telling = {"y": ("C",), "u": ("B", "D"), "f": ("Bf", "Df"), "d": ("Bd", "Dd"), "w": ("Bw", "Dw")}
+    return {
+        signal
+        for signal, names in telling.items()
+        if any(name in broken for name in names) and not any(given.get(name) is not None for name in names)
+    }
+
+
+def expected_shapes(nx: int, counts: Mapping[str, int], unknown: Container[str] = ()) -> dict[str, tuple[int, int]]:
+    """Return the shape every matrix must have, of those whose signals have a known number."""
     sizes = {"x": nx, **counts}
-    return {name: (sizes[rows], sizes[columns]) for name, rows, columns in MATRIX_LAYOUT}
+    return {
+        name: (sizes[rows], sizes[columns])
+        for name, rows, columns in MATRIX_LAYOUT
+        if rows not in unknown and columns not in unknown
+    }
 
 
 def _by(shape: tuple[int, ...]) -> str:

@@ -126,9 +126,17 @@ class Ball(Enclosure):
     @classmethod
     def blocks(cls, rows: Sequence[Sequence[Self]]) -> Self:
         """Return the ball of the block matrix with the given rows of blocks."""
-        return cls(
-            np.block([[b.midpoint for b in row] for row in rows]), np.block([[b.radius for b in row] for row in rows])
-        )
+        heights, widths = [row[0].shape[0] for row in rows], [ball.shape[1] for ball in rows[0]]
+        midpoint, radius = (np.zeros((sum(heights), sum(widths))) for _ in range(2))
+        bottom = 0
+        for row, height in zip(rows, heights, strict=True):
+            right = 0
+            for ball, width in zip(row, widths, strict=True):
+                place = slice(bottom, bottom + height), slice(right, right + width)
+                midpoint[place], radius[place] = ball.midpoint, ball.radius
+                right += width
+            bottom += height
+        return cls(midpoint, radius)
 
     @property
     def shape(self) -> tuple[int, ...]:

@@ -186,14 +186,14 @@ def _by_cholesky(ball: Ball, means: Means = "Cholesky") -> DefinitenessProof:
 
 def _smallest_eigenvalue(factor: FloatArray) -> float:
     """Return an estimate of the smallest eigenvalue of ``factor factor'``, from above, by inverse iteration."""
-    from scipy.linalg import cho_solve
+    from scipy.linalg.lapack import dpotrs
 
     vector = np.ones(len(factor)) / np.sqrt(len(factor))
     # Signs that alternate where those of the factor do keep the start away from a right angle.
     vector = np.where(factor[-1] > 0.0, -vector, vector)
     size = 0.0
     for _ in range(INVERSE_ITERATIONS):
-        vector = cho_solve((factor, True), vector, check_finite=False)
+        vector = dpotrs(factor, vector, lower=1)[0]
         size = float(np.linalg.norm(vector))
         if not np.isfinite(size) or size == 0.0:
             return 0.0

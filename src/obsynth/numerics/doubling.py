@@ -12,9 +12,16 @@ from obsynth.numerics.arrays import FloatArray
 #: Doubling stops when a step changes the solution by less than this, relative to it; each step squares the error.
 DOUBLING_TOLERANCE = 1e-14
 STAGNATION = 1e-9
+#: Below this change, that of the next step is told from the last two; and when it is far below rounding.
+SETTLED = 1e-8
+NOTHING = 1e-18
 #: Residual of a Riccati equation that counts as solved, relative to its terms.
 EQUATION_TOLERANCE = 1e-8
 MOST_DOUBLINGS = 60
+#: Eigenvalues that are smaller than the largest by more than this share do not set the rate of a Cayley transform.
+WIDEST_SPECTRUM = 1e-3
+#: Keeps that rate off an eigenvalue, which a single one would be.
+RATE_OFFSET = 1.3
 #: Share of the size of its terms by which a sign must be wrong.
 REFUTED = 1e-6
 #: Keeps a division by the size of a zero solution from failing.
@@ -53,21 +60,81 @@ def doubled_riccati_solution(
     Structure-preserving doubling of Chu, Fan, Lin and Wang (2004); it needs no definite weight, but may break down.
     """
     n = a.shape[0]
+    if n == 0:
+        return np.zeros((0, 0))
     solved = np.linalg.solve(weight, np.hstack([h, cross.T]))
-    power = (a - cross @ solved[:, :n]).T
-    back, solution = h.T @ solved[:, :n], process - cross @ solved[:, n:]
+    start = a - cross @ solved[:, :n], h.T @ solved[:, :n], process - cross @ solved[:, n:]
+    return _doubled(*start, possible=possible)
+
+
+def continuous_riccati_solution(
+    a: FloatArray, c: FloatArray, process: FloatArray, measured: FloatArray
+) -> FloatArray | None:
+    """Return the stabilising solution of the Kalman filter's Riccati equation in continuous time, by doubling.
+
+    ``A Y + Y A' - Y C' R^-1 C Y + Q = 0``.
+
+    Parameters
+    ----------
+    a, c : FloatArray
+        ``(n, n)`` and ``(p, n)``.
+    process, measured : FloatArray
+        Q ``(n, n)`` semidefinite, R ``(p, p)`` definite.
+
+    Returns
+    -------
+    FloatArray or None
+        Symmetric ``(n, n)``; ``None`` when the doubling breaks down or does not settle.
+
+    Notes
+    -----
+    A Cayley transform makes it an equation in discrete time with the same solution (Chu, Fan and Lin 2005).
+    """
+    n, one = a.shape[0], np.eye(a.shape[0])
+    if n == 0:
+        return np.zeros((0, 0))
+    sizes = np.abs(np.linalg.eigvals(a))
+    # In the middle of the eigenvalues, on a logarithmic scale: both ends are as slow.
+    largest = max(float(sizes.max()), SMALLEST)
+    rate = RATE_OFFSET * math.sqrt(largest * max(float(sizes.min()), WIDEST_SPECTRUM * largest))
+    shown = c.T @ np.linalg.solve(measured, c)
+    try:
+        inverse = np.linalg.inv(a.T - rate * one)
+        outer = np.linalg.inv((a - rate * one) + process @ inverse @ shown)
+    except np.linalg.LinAlgError:
+        return None
+    power = np.ascontiguousarray(one + 2.0 * rate * outer)
+    back, solution = inverse @ shown @ outer, outer @ process @ inverse
+    return _doubled(power, np.asarray(2.0 * rate * back), np.asarray(2.0 * rate * solution))
+
+
+def _doubled(
+    power: FloatArray,
+    back: FloatArray,
+    solution: FloatArray,
+    *,
+    possible: Callable[[FloatArray], bool] | None = None,
+) -> FloatArray | None:
+    """Double an equation without cross term and ``back = H' W^-1 H`` from its first step; see the callers.
+
+    ``power`` (transposed in the papers) is in C order, so that its transpose is what LAPACK works on in place.
+    """
+    n = len(power)
     back, solution = 0.5 * (back + back.T), 0.5 * (solution + solution.T)
-    error, identity = np.inf, np.eye(n)
+    error = np.inf
     with np.errstate(over="ignore", invalid="ignore"):
         for _ in range(MOST_DOUBLINGS):
             if possible is not None and not possible(solution):
                 return None
-            parts = np.linalg.solve(identity + back @ solution, np.hstack([power, back]))
-            change = power.T @ (solution @ parts[:, :n])
-            back = back + power @ parts[:, n:] @ power.T
-            power = power @ parts[:, :n]
-            solution = solution + 0.5 * (change + change.T)
-            back = 0.5 * (back + back.T)
+            # `dot` is `@` with half the overhead, which for few states is most of the time.
+            matrix, parts = solution.dot(back), np.concatenate([power, back])
+            matrix.reshape(-1)[:: n + 1] += 1.0
+            if not _solved_in_place(matrix, parts):
+                return None
+            change = power.dot(solution.dot(parts[:n].T))
+            added: FloatArray = power.T.dot(parts[n:]).dot(power)
+            back, solution = back + 0.5 * (added + added.T), solution + 0.5 * (change + change.T)
+            power = parts[:n].dot(power)
             size = math.sqrt(np.vdot(solution, solution))
             if not math.isfinite(size):
                 return None
@@ -75,7 +142,23 @@ def doubled_riccati_solution(
             # Rounding leaves changes that shrink no more; small ones are as good as none.
             if error <= DOUBLING_TOLERANCE or last <= error <= STAGNATION:
                 return solution
+            # Each step squares the change, up to a factor that the last two show: the next adds nothing.
+            if error <= SETTLED and error * max(error, (error / last) ** 2) <= NOTHING:
+                return solution
     return None
+
+
+def _solved_in_place(matrix: FloatArray, rows: FloatArray) -> bool:
+    """Replace ``rows`` (k, n) by ``rows @ inv(matrix)``, both in C order; false where the matrix is singular.
+
+    NumPy's solve would copy both, which for small matrices takes longer than the factorisation.
+    """
+    from scipy.linalg.lapack import dgesv
+
+    _, _, found, failed = dgesv(matrix.T, rows.T, overwrite_a=1, overwrite_b=1)
+    if not np.may_share_memory(found, rows):
+        rows[...] = found.T
+    return not failed
 
 
 def gain_is_below(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, level: float) -> bool:
@@ -131,8 +214,7 @@ def compared_gain(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, le
 
 def is_positive(matrix: FloatArray) -> bool:
     """Return whether a Cholesky factorisation of a symmetric matrix runs to its end (computed, not proved)."""
-    try:
-        factor = np.linalg.cholesky(matrix)
-    except np.linalg.LinAlgError:
-        return False
-    return bool(np.all(np.isfinite(factor)))
+    from scipy.linalg.lapack import dpotrf
+
+    factor, failed = dpotrf(matrix, lower=1, clean=0)
+    return not failed and math.isfinite(factor.trace())

@@ -8,21 +8,19 @@ import numpy as np
 
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.doubling import compared_gain, gain_is_below
+from obsynth.numerics.level_crossings import level_crossings
+from obsynth.numerics.modal_response import MANY_STATES, ModalResponse, Modes
 
 #: Relative gap between the attained value and the certified level of an H-infinity norm.
 NORM_TOLERANCE = 1e-9
-#: Eigenvalues of the symplectic pencil this close to the unit circle are looked at as crossings: a false one costs
-#: one more look, a missed one would cost the bound.
-CIRCLE_TOLERANCE = 1e-3
 #: Points of the starting frequency grid.
 GRID_POINTS = 33
-#: From so many states on, peaks are searched in modal coordinates and a Riccati equation takes the pencil's place.
-MANY_STATES = 60
-#: Relative gaps at which it is asked, in turn; angles looked at, steps of power iteration, and rounds of refinement.
+#: Relative difference of modal and true response from which modal coordinates are not believed.
+MODAL_ERROR = 1e-3
+#: From `MANY_STATES` on a Riccati equation takes the pencil's place: relative gaps at which it is asked, in turn, and
+#: points of the grid.
 WIDER_TOLERANCES = (1e-4, 1e-3)
 MANY_GRID_POINTS = 257
-POWER_STEPS = 8
-REFINEMENTS = 6
 #: Each round at least squares the relative error near the peak; more than this means trouble.
 MAXIMUM_ROUNDS = 40
 #: Variance of a state in the rest of an infinite sum, relative to what is summed, below which the sum is complete.
@@ -69,7 +67,7 @@ def frequency_response(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArra
     return np.asarray(c @ np.linalg.solve(resolvents, right_sides) + d)
 
 
-def hinf_norm(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> HinfNorm:
+def hinf_norm(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, *, modes: Modes | None = None) -> HinfNorm:
     """Return the H-infinity norm of a discrete-time system.
 
     Bruinsma and Steinbuch's iteration: raise the level to the largest gain found, ask the symplectic pencil
@@ -79,6 +77,8 @@ def hinf_norm(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> Hin
     ----------
     a, b, c, d : FloatArray
         ``(n, n)``, ``(n, m)``, ``(p, n)``, ``(p, m)``.
+    modes : Modes, optional
+        Of ``a``, where they are known.
 
     Returns
     -------
@@ -89,22 +89,21 @@ def hinf_norm(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> Hin
         return HinfNorm(0.0, 0.0, 0.0, np.inf)
     if not all(np.all(np.isfinite(part)) for part in (a, b, c, d)):
         return HinfNorm(np.inf, np.inf, np.nan, 0.0)
-    poles = np.linalg.eigvals(a) if a.size else np.zeros(0, dtype=complex)
-    if np.any(np.abs(poles) >= 1.0):
+    modes = Modes.of(a) if modes is None else modes
+    if modes.radius >= 1.0:
         return HinfNorm(np.inf, np.inf, np.nan, 0.0)
-    a, b, c = balanced_realisation(a, b, c)
+    a, b, c, modes = _balanced(a, b, c, modes)
     if a.shape[0] >= MANY_STATES:
-        found = _norm_of_many_states(a, b, c, d)
+        found = _norm_of_many_states(a, b, c, d, modes)
         if found is not None:
             return found
-    angles = np.concatenate([np.linspace(0.0, np.pi, GRID_POINTS), np.abs(np.angle(poles))])
-    best, angle = _peak(a, b, c, d, angles)
+    best, angle = _highest_peak(a, b, c, d, modes)
     if best == 0.0 or not np.isfinite(best) or a.shape[0] == 0:
         return HinfNorm(best, best, angle, np.inf)
     distance = 0.0
     for _ in range(MAXIMUM_ROUNDS):
         level = best * (1.0 + NORM_TOLERANCE)
-        crossings, distance = _crossings(a, b, c, d, level)
+        crossings, distance = level_crossings(a, b, c, d, level)
         if not crossings.size:
             return HinfNorm(best, level, angle, distance)
         ordered = np.sort(np.concatenate([[0.0], crossings, [np.pi]]))
@@ -140,28 +139,34 @@ def norm_is_at_most(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, 
     return hinf_norm(a, b, c, d).upper <= level
 
 
-def highest_gain_found(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> float:
+def highest_gain_found(
+    a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, *, modes: Modes | None = None
+) -> float:
     """Return the H-infinity norm or, for many states, the largest gain that a modal response shows: it is attained.
 
     Parameters
     ----------
     a, b, c, d : FloatArray
         ``(n, n)``, ``(n, m)``, ``(p, n)``, ``(p, m)``; infinite when ``a`` is not Schur stable.
+    modes : Modes, optional
+        Of ``a``, where they are known.
     """
     if a.shape[0] < MANY_STATES or b.shape[1] == 0 or c.shape[0] == 0 or not np.all(np.isfinite(a)):
-        return hinf_norm(a, b, c, d).upper
-    if spectral_radius(a) >= 1.0:
+        return hinf_norm(a, b, c, d, modes=modes).upper
+    modes = Modes.of(a) if modes is None else modes
+    if modes.radius >= 1.0:
         return float("inf")
-    best, _ = _modal_peak(*balanced_realisation(a, b, c), d)
-    return best if np.isfinite(best) else hinf_norm(a, b, c, d).upper
+    balanced = _balanced(a, b, c, modes)
+    best, _ = _modal_peak(*balanced[:3], d, balanced[3], points=MANY_GRID_POINTS)
+    return best if np.isfinite(best) else hinf_norm(a, b, c, d, modes=modes).upper
 
 
-def _norm_of_many_states(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> HinfNorm | None:
+def _norm_of_many_states(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, modes: Modes) -> HinfNorm | None:
     """Return the norm from the highest peak of a modal response and a Riccati equation just above it.
 
     ``None`` where the equation has no solution there: the peak was missed, or the data are too hard for doubling.
     """
-    best, angle = _modal_peak(a, b, c, d)
+    best, angle = _modal_peak(a, b, c, d, modes, points=MANY_GRID_POINTS)
     if not np.isfinite(best) or best == 0.0:
         return None
     for tolerance in WIDER_TOLERANCES:
@@ -170,51 +175,56 @@ def _norm_of_many_states(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatAr
     return None
 
 
-def _modal_peak(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> tuple[float, float]:
-    """Return the largest gain found, and where; infinite where there is no basis of eigenvectors."""
-    try:
-        angle = _modal_peak_angle(a, b, c, d)
-    except np.linalg.LinAlgError:
-        return np.inf, np.nan
-    return _peak(a, b, c, d, np.array([angle]))
+def _modal_peak(
+    a: FloatArray,
+    b: FloatArray,
+    c: FloatArray,
+    d: FloatArray,
+    modes: Modes,
+    *,
+    points: int,
+) -> tuple[float, float]:
+    """Return the largest gain found in modal coordinates, and where; infinite where they are not to be believed."""
+    with np.errstate(all="ignore"):
+        response = ModalResponse.of(modes, b, c, d)
+        if response is None:
+            return np.inf, np.nan
+        angles = response.peaks(points)
+        believed = float(np.max(response.gains(angles)))
+    best, angle = _peak(a, b, c, d, angles)
+    return (best, angle) if abs(best - believed) <= MODAL_ERROR * best else (np.inf, np.nan)
 
 
-def _modal_peak_angle(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> float:
-    """Return where the largest singular value peaks, as far as power iteration in modal coordinates tells."""
-    poles, vectors = np.linalg.eig(a)
-    shown, driven = c @ vectors, np.linalg.solve(vectors, b.astype(complex))
-    near = poles[(poles.imag >= 0.0) & (np.abs(poles) > 0.5)]
-    angles = np.unique(np.concatenate([np.linspace(0.0, np.pi, MANY_GRID_POINTS), np.angle(near)]))
-    start = np.random.default_rng(0).normal(size=(b.shape[1], 1)) + 0j
-    width = np.pi / (MANY_GRID_POINTS - 1)
-
-    def gains(where: FloatArray) -> FloatArray:
-        factors = 1.0 / (np.exp(1j * where) - poles[:, None])
-        u = np.repeat(start, len(where), axis=1)
-        size = np.zeros(len(where))
-        for _ in range(POWER_STEPS):
-            u = u / np.maximum(np.linalg.norm(u, axis=0), np.finfo(np.float64).tiny)
-            y = shown @ (factors * (driven @ u)) + d @ u
-            size = np.linalg.norm(y, axis=0)
-            u = driven.conj().T @ (factors.conj() * (shown.conj().T @ y)) + d.T @ y
-        return np.asarray(np.where(np.isfinite(size), size, 0.0))
-
-    sizes = gains(angles)
-    centres = angles[np.argsort(sizes)[-3:]]
-    for _ in range(REFINEMENTS):
-        tried = np.clip(np.concatenate([centre + width * np.linspace(-1.0, 1.0, 9) for centre in centres]), 0.0, np.pi)
-        centres = tried[np.argsort(gains(tried))[-3:]]
-        width /= 4.0
-    return float(centres[-1])
+def _highest_peak(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, modes: Modes) -> tuple[float, float]:
+    """Return the largest gain found, and where, of modal peaks or of a plain grid with the angles of the poles."""
+    if a.shape[0]:
+        best, angle = _modal_peak(a, b, c, d, modes, points=GRID_POINTS)
+        if np.isfinite(best):
+            return best, angle
+    grid = np.linspace(0.0, np.pi, GRID_POINTS)
+    return _peak(a, b, c, d, np.concatenate([grid, np.abs(np.angle(modes.values))]))
 
 
 def balanced_realisation(a: FloatArray, b: FloatArray, c: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the realisation with its states scaled by powers of two, which is exact: units must not cost digits."""
+    scale = _state_units(a, b, c)
+    return a * scale / scale[:, None], b / scale[:, None], c * scale
+
+
+def _balanced(
+    a: FloatArray, b: FloatArray, c: FloatArray, modes: Modes
+) -> tuple[FloatArray, FloatArray, FloatArray, Modes]:
+    """Return the realisation of `balanced_realisation` and its modes."""
+    scale = _state_units(a, b, c)
+    moved = Modes(modes.values, modes.vectors / scale[:, None])
+    return a * scale / scale[:, None], b / scale[:, None], c * scale, moved
+
+
+def _state_units(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
     n, inputs, outputs = a.shape[0], b.shape[1], c.shape[0]
     system = np.zeros((n + inputs + outputs, n + inputs + outputs))
     system[:n, :n], system[:n, n : n + inputs], system[n + inputs :, :n] = a, b, c
-    scale = balancing_factors(system)[:n]
-    return a * scale / scale[:, None], b / scale[:, None], c * scale
+    return balancing_factors(system)[:n]
 
 
 def balancing_factors(matrix: FloatArray) -> FloatArray:
@@ -233,32 +243,6 @@ def _peak(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, angles: Fl
     gains = np.linalg.svd(response, compute_uv=False)[:, 0]
     top = int(np.argmax(gains))
     return float(gains[top]), float(angles[top])
-
-
-def _crossings(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, level: float) -> tuple[FloatArray, float]:
-    """Angles in [0, pi] at which a singular value equals ``level``, and the distance of the closest miss.
-
-    The transfer function has the singular value g at e^{jw} exactly when the pencil
-    ``z [I 0; C'C + C'D R^-1 D'C, A' + C'D R^-1 B'] - [A + B R^-1 D'C, B R^-1 B'; 0 I]``, with
-    ``R = g^2 I - D'D``, is singular at z = e^{jw}.
-    """
-    from scipy.linalg import eigvals
-
-    root = np.sqrt(level)
-    b, c, d = b / root, c / root, d / level
-    n = a.shape[0]
-    weight = np.eye(d.shape[1]) - d.T @ d
-    solved = np.linalg.solve(weight, np.hstack([d.T @ c, b.T]))
-    through, back = solved[:, :n], solved[:, n:]
-    left = np.block([[np.eye(n), np.zeros((n, n))], [c.T @ c + c.T @ d @ through, a.T + c.T @ d @ back]])
-    right = np.block([[a + b @ through, b @ back], [np.zeros((n, n)), np.eye(n)]])
-    alpha, beta = eigvals(right, left, homogeneous_eigvals=True)
-    size = np.abs(alpha) + np.abs(beta)
-    # |alpha| and |beta| are compared, not divided: infinite eigenvalues need no special case.
-    miss = np.abs(np.abs(alpha) - np.abs(beta)) / np.where(size == 0.0, 1.0, 0.5 * size)
-    miss[size == 0.0] = 0.0
-    near = miss < CIRCLE_TOLERANCE
-    return np.abs(np.angle(alpha[near] * np.conj(beta[near]))), float(np.min(miss))
 
 
 def output_covariance(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> FloatArray:

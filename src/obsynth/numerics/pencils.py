@@ -14,12 +14,24 @@ References
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from obsynth.numerics.arrays import ComplexArray, FloatArray
-from obsynth.numerics.ranks import CLUSTER_TOLERANCE, RANK_TOLERANCE, RankDecision, decide_rank
-from obsynth.numerics.scaling import EquilibratedPencil, equilibrate_pencil
+from obsynth.numerics.ranks import CLUSTER_TOLERANCE, RANK_TOLERANCE, RankDecision
+from obsynth.numerics.scaling import equilibrate_pencil
+from obsynth.numerics.staircase import (
+    Deflation,
+    normal_rank_of,
+    reduce_pencil,
+    without_infinite_part,
+    without_left_singular_part,
+)
+
+#: From so many states on, a well-conditioned E is inverted: ordinary eigenvalues take a fraction of the time.
+MANY_STATES = 100
+SAFE_CONDITION = 1e5
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,17 +85,6 @@ class FiniteZeros:
     decisions: tuple[RankDecision, ...]
 
 
-@dataclass(frozen=True, eq=False)
-class _Deflation:
-    """A pencil without its infinite and right singular part, and the sizes of the steps taken."""
-
-    E: FloatArray
-    A: FloatArray
-    nullities: tuple[int, ...]
-    ranks: tuple[int, ...]
-    decisions: tuple[RankDecision, ...]
-
-
 def pencil_structure(E: FloatArray, A: FloatArray) -> PencilStructure:
     """Return the structure of ``A - z E`` for matrices ``(m, n)`` of any size, including zero.
 
@@ -101,7 +102,7 @@ def pencil_structure(E: FloatArray, A: FloatArray) -> PencilStructure:
     ----------
     .. [VanDooren1979] Algorithms 3.1 and 4.1.
     """
-    right, left = _reduce(equilibrate_pencil(E, A))
+    right, left = reduce_pencil(equilibrate_pencil(E, A))
     rows, columns = E.shape
     regular = _is_regular(E, right)
     next_nullities = (*right.nullities[1:], 0)
@@ -111,7 +112,7 @@ def pencil_structure(E: FloatArray, A: FloatArray) -> PencilStructure:
         rows=rows,
         columns=columns,
         regular=regular,
-        normal_rank=_normal_rank(right, left),
+        normal_rank=normal_rank_of(right, left),
         index=len(right.ranks) if regular else None,
         finite_eigenvalues=_eigenvalues(left.E, left.A),
         infinite_block_sizes=sizes,
@@ -119,13 +120,15 @@ def pencil_structure(E: FloatArray, A: FloatArray) -> PencilStructure:
     )
 
 
-def finite_zeros(E: FloatArray, A: FloatArray) -> FiniteZeros:
+def finite_zeros(E: FloatArray, A: FloatArray, *, to_the_end: bool = True) -> FiniteZeros:
     """Return the points where ``rank (A - z E)`` drops below the normal rank, with multiplicity.
 
     Parameters
     ----------
     E, A : FloatArray
         ``(m, n)`` real matrices of any size, including zero; they are not modified.
+    to_the_end : bool, optional
+        Whether every rank of the staircase is decided; otherwise it ends where there clearly are no zeros.
 
     Returns
     -------
@@ -138,28 +141,48 @@ def finite_zeros(E: FloatArray, A: FloatArray) -> FiniteZeros:
     """
     # A tall pencil leaves the long chains to the second pass, whose findings can be checked below.
     tall = equilibrate_pencil(E, A) if E.shape[0] >= E.shape[1] else equilibrate_pencil(E.T, A.T)
-    right, left = _reduce(tall)
+    scales, right = without_infinite_part(tall)
+    rows, columns = right.E.shape
+    parts = _SquarePart.of(right.E, right.A) if rows > columns > 0 else None
+    clear = parts is not None and _clearly_without_zeros(parts, scales)
+    if clear and not to_the_end:
+        # Full rank of the columns everywhere.
+        return FiniteZeros(_in_pairs(np.zeros(0, dtype=np.complex128)), sum(right.ranks) + columns, right.decisions)
+    left = without_left_singular_part(right, scales)
     values = _eigenvalues(left.E, left.A)
-    values = _with_missed_zeros(values, right.E, right.A, (_norm(tall.E), _norm(tall.A)))
-    return FiniteZeros(values, _normal_rank(right, left), right.decisions + left.decisions)
+    if parts is not None and not clear:
+        values = _with_missed_zeros(values, right.E, right.A, parts, scales)
+    return FiniteZeros(values, normal_rank_of(right, left), right.decisions + left.decisions)
 
 
-def _with_missed_zeros(found: ComplexArray, E: FloatArray, A: FloatArray, scales: tuple[float, float]) -> ComplexArray:
+class _SquarePart(NamedTuple):
+    """A tall pencil, ``E`` of full column rank, in an orthonormal basis of the range of ``E`` and of what is beside it.
+
+    ``E`` and ``A`` are square; ``rest`` holds the rows of A beside, where E has none.
+    """
+
+    E: FloatArray
+    A: FloatArray
+    rest: FloatArray
+
+    @classmethod
+    def of(cls, E: FloatArray, A: FloatArray) -> _SquarePart:
+        basis, square = np.linalg.qr(E, mode="complete")
+        turned, columns = basis.T @ A, E.shape[1]
+        return cls(square[:columns], turned[:columns], turned[columns:])
+
+
+def _with_missed_zeros(
+    found: ComplexArray, E: FloatArray, A: FloatArray, parts: _SquarePart, scales: tuple[float, float]
+) -> ComplexArray:
     """Add zeros of a tall pencil, ``E`` of full column rank, that a long staircase lost.
 
     A chain of many steps, each with a modest singular value, may hide that the pencil is singular at
     some point.  All zeros are among the eigenvalues of the part on the range of ``E``, and each of
     these candidates can be tested by itself.
     """
-    rows, columns = E.shape
-    if rows == columns:
-        return found
-    basis = np.linalg.svd(E)[0]
-    square_e, square_a = basis[:, :columns].T @ E, basis[:, :columns].T @ A
-    if _clearly_without_zeros(square_e, square_a, basis[:, columns:].T @ A, scales):
-        return found
     zeros = list(found)
-    for candidate in _eigenvalues(square_e, square_a):
+    for candidate in _eigenvalues(parts.E, parts.A):
         values = np.linalg.svd(A - candidate * E, compute_uv=False)
         nullity = np.sum(values <= RANK_TOLERANCE * (scales[1] + abs(candidate) * scales[0]))
         if nullity > sum(abs(zero - candidate) <= CLUSTER_TOLERANCE * max(1.0, abs(candidate)) for zero in zeros):
@@ -167,9 +190,7 @@ def _with_missed_zeros(found: ComplexArray, E: FloatArray, A: FloatArray, scales
     return _in_pairs(np.array(zeros, dtype=np.complex128))
 
 
-def _clearly_without_zeros(
-    square_e: FloatArray, square_a: FloatArray, rest: FloatArray, scales: tuple[float, float]
-) -> bool:
+def _clearly_without_zeros(parts: _SquarePart, scales: tuple[float, float]) -> bool:
     """Return whether ``[square_a - z square_e; rest]`` clearly has full rank at every z; false says nothing.
 
     Suppose it maps ``x`` of unit norm to no more than t.  Let V hold eigenvectors of the square part, F their residual,
@@ -178,6 +199,7 @@ def _clearly_without_zeros(
     and ``rest`` cannot map it to less than ``|rest v| (1 - r) - |rest| r``.  Where that is more than t for every v,
     there is no z left to look at.  Ill-conditioned eigenvectors and close eigenvalues leave the question open.
     """
+    square_e, square_a, rest = parts
     # What overflows is not clear.
     with np.errstate(all="ignore"):
         try:
@@ -204,59 +226,13 @@ def regularity(E: FloatArray, A: FloatArray) -> tuple[bool, int]:
     E, A : FloatArray
         ``(m, n)`` real matrices; they are not modified.
     """
-    right, left = _reduce(equilibrate_pencil(E, A))
-    return _is_regular(E, right), _normal_rank(right, left)
+    right, left = reduce_pencil(equilibrate_pencil(E, A))
+    return _is_regular(E, right), normal_rank_of(right, left)
 
 
-def _is_regular(E: FloatArray, right: _Deflation) -> bool:
+def _is_regular(E: FloatArray, right: Deflation) -> bool:
     # Without right singular blocks a square pencil has no left ones either.
     return E.shape[0] == E.shape[1] and right.nullities == right.ranks
-
-
-def _reduce(pencil: EquilibratedPencil) -> tuple[_Deflation, _Deflation]:
-    """Deflate the infinite and right singular part, then the left singular part (transposed)."""
-    scales = (_norm(pencil.E), _norm(pencil.A))
-    right = _deflate(pencil.E, pencil.A, scales, most_nullity=pencil.E.shape[1])
-    # E now has full column rank, so the ranks of E in the second pass follow from its shape.
-    surplus = right.E.shape[0] - right.E.shape[1]
-    left = _deflate(right.E.T, right.A.T, scales, most_nullity=surplus)
-    return right, left
-
-
-def _deflate(E: FloatArray, A: FloatArray, scales: tuple[float, float], *, most_nullity: int) -> _Deflation:
-    nullities: list[int] = []
-    ranks: list[int] = []
-    decisions: list[RankDecision] = []
-    while True:
-        rows, columns = E.shape
-        _, decision, right = _decided_svd(E, scale=scales[0], expected=columns)
-        # Rows were removed from a matrix of full column rank: this bounds the loss, whatever the tolerance says.
-        rank = max(decision.rank, columns - most_nullity)
-        if max(columns - rows, 0) < most_nullity:
-            decisions.append(decision)
-        if rank == columns:
-            return _Deflation(E, A, tuple(nullities), tuple(ranks), tuple(decisions))
-        kernel, complement = right[rank:].T, right[:rank].T
-        left, decision, _ = _decided_svd(A @ kernel, scale=scales[1], expected=columns - rank)
-        decisions.append(decision)
-        rest = left[:, decision.rank :].T
-        E, A = rest @ E @ complement, rest @ A @ complement
-        nullities.append(columns - rank)
-        ranks.append(decision.rank)
-        most_nullity = decision.rank
-
-
-def _decided_svd(matrix: FloatArray, *, scale: float, expected: int) -> tuple[FloatArray, RankDecision, FloatArray]:
-    """Return the full left and right singular bases and the rank decided relative to ``scale``."""
-    if matrix.size == 0:
-        left, values, right = np.eye(matrix.shape[0]), np.zeros(0), np.eye(matrix.shape[1])
-    else:
-        left, values, right = np.linalg.svd(matrix)
-    return left, decide_rank(np.diag(values), expected=expected, scale=scale, equilibrated=False), right
-
-
-def _normal_rank(right: _Deflation, left: _Deflation) -> int:
-    return sum(right.ranks) + sum(left.ranks) + int(left.E.shape[0])
 
 
 def _eigenvalues(E: FloatArray, A: FloatArray) -> ComplexArray:
@@ -265,6 +241,8 @@ def _eigenvalues(E: FloatArray, A: FloatArray) -> ComplexArray:
 
     if not E.size:
         return _in_pairs(np.zeros(0, dtype=np.complex128))
+    if len(E) >= MANY_STATES and (inverse := _safe_inverse(E)) is not None:
+        return _in_pairs(np.asarray(np.linalg.eigvals(inverse @ A), dtype=np.complex128))
     try:
         values = eigvals(A, E)
     except np.linalg.LinAlgError:
@@ -272,6 +250,15 @@ def _eigenvalues(E: FloatArray, A: FloatArray) -> ComplexArray:
         left, right = (np.linalg.qr(np.random.default_rng(seed).normal(size=E.shape))[0] for seed in (0, 1))
         values = eigvals(left @ A @ right, left @ E @ right)
     return _in_pairs(np.asarray(values, dtype=np.complex128))
+
+
+def _safe_inverse(E: FloatArray) -> FloatArray | None:
+    """Return the inverse of a well-conditioned matrix; ``None`` for any other."""
+    try:
+        inverse = np.linalg.inv(E)
+    except np.linalg.LinAlgError:
+        return None
+    return np.asarray(inverse) if float(np.linalg.norm(E) * np.linalg.norm(inverse)) <= SAFE_CONDITION else None
 
 
 def _in_pairs(values: ComplexArray) -> ComplexArray:
@@ -282,7 +269,3 @@ def _in_pairs(values: ComplexArray) -> ComplexArray:
     result = np.array(paired, dtype=np.complex128)
     result.setflags(write=False)
     return result
-
-
-def _norm(matrix: FloatArray) -> float:
-    return float(np.linalg.norm(matrix, 2)) if matrix.size else 0.0

@@ -122,9 +122,30 @@ def decide_rank(
         Scale rows and columns by powers of two first, so that units do not decide the rank.
     """
     work = equilibrate(matrix) if equilibrated and not np.iscomplexobj(matrix) else np.asarray(matrix)
-    values = np.linalg.svd(work, compute_uv=False) if work.size else np.zeros(0)
+    values = np.asarray(np.linalg.svd(work, compute_uv=False)) if work.size else np.zeros(0)
+    return rank_from(
+        values, expected=min(work.shape) if expected is None else expected, tolerance=tolerance, scale=scale
+    )
+
+
+def rank_from(
+    values: FloatArray, *, expected: int, tolerance: float = RANK_TOLERANCE, scale: float | None = None
+) -> RankDecision:
+    """Decide a rank by the singular values of a matrix.
+
+    Parameters
+    ----------
+    values : FloatArray
+        All of them, largest first.
+    expected : int
+        What full rank means.
+    tolerance : float, optional
+        Relative to ``scale``.
+    scale : float, optional
+        Reference size; the largest singular value by default.
+    """
     reference = scale if scale is not None else (float(values[0]) if values.size else 0.0)
-    rank = int(np.sum(values > tolerance * reference)) if reference > 0.0 else 0
+    rank = int(np.count_nonzero(values > tolerance * reference)) if reference > 0.0 else 0
     relative = values / reference if reference > 0.0 else values
     kept = float(relative[rank - 1]) if rank else 0.0
     dropped = float(relative[rank]) if rank < values.size else 0.0
@@ -134,5 +155,4 @@ def decide_rank(
         gap = float("inf")
     else:
         gap = (kept if rank else tolerance) / dropped
-    wanted = min(work.shape) if expected is None else expected
-    return RankDecision(rank, wanted, read_only(np.asarray(values, dtype=np.float64)), kept, dropped, gap)
+    return RankDecision(rank, expected, read_only(np.asarray(values, dtype=np.float64)), kept, dropped, gap)

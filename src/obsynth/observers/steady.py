@@ -94,7 +94,7 @@ def _require_constant(observer: RecursiveObserver) -> None:
     moving = [name for name, sequence in sequences.items() if not sequence.is_constant]
     if moving:
         raise SpecError(
-            f"{', '.join(moving)} may change with k (not given as plain numbers), so the gains do as well and there is "
+            f"{', '.join(moving)} may change with k (given as more than constants), so the gains do too and there is "
             "no constant realisation to hand on: use the recursion itself, obsynth run or observer.step.", path="plant",
         )  # fmt: skip
     if observer.adaptation is not None and observer.adaptation.reset:

@@ -162,7 +162,8 @@ def plot_gains(design: ObserverDesign, *, to: str = "faults", axes: Axes | None 
         panel.axhline(1.0, color="0.7", linewidth=0.8, zorder=0)
     for name, gain in found.gains.items():
         if np.any(gain > 0.0):
-            panel.plot(found.frequencies, _positive(gain), label=f"{name} to {target}", **_STYLES[name])
+            ending = "" if np.all(gain > 0.0) else " (elsewhere only rounding)"
+            panel.plot(found.frequencies, _positive(gain), label=f"{name} to {target}{ending}", **_STYLES[name])
         else:
             panel.plot([], [], label=f"{name}: nothing gets through", **_STYLES[name])
     largest = found.gains.get("faults", found.least)

@@ -160,6 +160,8 @@ def _text(value: Any) -> str:
         if len(value) > 1 and value.shape[0] == value.shape[1] and not np.any(value[~np.eye(len(value), dtype=bool)]):
             return f"diag({', '.join(map(_text, np.diag(value).tolist()))})"
         return f"[{'; '.join(', '.join(map(_text, row)) for row in value.tolist())}]"
+    if isinstance(value, (list, tuple)) and value and all(isinstance(item, Mapping) for item in value):
+        return "; ".join(map(_text, value))
     if isinstance(value, (list, tuple, np.ndarray)):
         return f"[{', '.join(_text(item) for item in value)}]" if len(value) else "none"
     return str(value)

@@ -178,6 +178,8 @@ def described(value: Any) -> str:
 def _one_line(error: Exception) -> str:
     """Return what the YAML reader says about the place and the problem, without the quoted source."""
     problem = getattr(error, "problem", None) or str(error).strip().splitlines()[0]
+    # The reader adds what it has of the values, which is empty where they are mappings.
+    problem = re.sub(r"^(found duplicate key .*?) with value .*", r"\1", str(problem), flags=re.DOTALL)
     mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
     place = f" (line {mark.line + 1}, column {mark.column + 1})" if mark is not None else ""
     return f"{str(problem).strip()}{place}."

@@ -73,7 +73,7 @@ def _profile(section: ProfileSection, where: str, problems: DocumentProblems) ->
     kind = KINDS[section.kind]
     given = {name: getattr(section, name) for name in section.model_fields_set - {"kind"}}
     known = {field.name: field.default is MISSING for field in fields(kind)}
-    for name in given.keys() - known.keys():
+    for name in sorted(given.keys() - known.keys()):
         problems.add(f"{where}.{name}", f"a {section.kind} has no {name}: it takes {', '.join(known)}.")
     missing = [name for name, needed in known.items() if needed and name not in given]
     for name in missing:

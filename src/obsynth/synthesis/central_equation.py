@@ -44,6 +44,10 @@ class CentralEquation:
         Of the equation in all states.
     lift : FloatArray or None
         F ``(n, k)`` where the measurements are exact.
+    outputs : FloatArray
+        ``[C; Z] (m + q, n)``.
+    last : FloatArray
+        ``diag(0, I) (m + q, m + q)``.
     """
 
     problem: GainProblem
@@ -56,6 +60,8 @@ class CentralEquation:
     full_weight: FloatArray
     full_cross: FloatArray
     lift: FloatArray | None
+    outputs: FloatArray
+    last: FloatArray
 
     @classmethod
     def of(cls, problem: GainProblem, *, noise: float) -> CentralEquation:
@@ -63,12 +69,13 @@ class CentralEquation:
         n, m, q = problem.order, problem.measured, problem.Z.shape[0]
         size = float(np.linalg.norm(problem.B, 2)) if problem.B.size else 0.0
         h, k = np.vstack([problem.C, problem.Z]), np.vstack([problem.D, problem.Zd])
+        last = np.diag([0.0] * m + [1.0] * q)
         process = problem.B @ problem.B.T + (noise * size) ** 2 * np.eye(n)
         if np.any(k) or not 0 < m < n or size == 0.0:
             seen = max(float(np.linalg.norm(part, 2)) if part.size else 0.0 for part in (problem.D, problem.C * size))
             weight = k @ k.T + np.diag([(noise * seen) ** 2] * m + [0.0] * q)
             cross = problem.B @ k.T
-            return cls(problem, problem.A, h, process, weight, cross, process, weight, cross, None)
+            return cls(problem, problem.A, h, process, weight, cross, process, weight, cross, None, h, last)
         basis = np.linalg.qr(problem.C.T, mode="complete")[0]
         hidden, known = basis[:, m:], basis[:, :m]
         lift = problem.A @ hidden
@@ -78,7 +85,7 @@ class CentralEquation:
         return cls(
             problem, hidden.T @ lift, np.vstack([known.T @ lift, problem.Z @ hidden]), hidden.T @ moved[:, m:], weight,
             np.hstack([hidden.T @ moved[:, :m], np.zeros((n - m, q))]), process, np.zeros((m + q, m + q)),
-            np.zeros((n, m + q)), lift,
+            np.zeros((n, m + q)), lift, h, last,
         )  # fmt: skip
 
     def filter_at(self, level: float) -> Injection | None:
@@ -104,9 +111,7 @@ class CentralEquation:
 
     def solution(self, level: float) -> FloatArray | None:
         """Return Y ``(n, n)`` at ``level``, or ``None``; its signs are not looked at."""
-        q = self.problem.Z.shape[0]
-        lowered = self.weight.copy()
-        lowered[-q:, -q:] -= level**2 * np.eye(q)
+        lowered = self.weight - level**2 * self.last
         s = doubled_riccati_solution(
             self.a, self.h, self.process, lowered, self.cross, possible=lambda y: self._is_possible(y, level)
         )
@@ -114,10 +119,8 @@ class CentralEquation:
 
     def _sums(self, y: FloatArray, level: float) -> tuple[FloatArray, FloatArray]:
         """Return ``k k' - diag(0, g^2 I) + h Y h'`` and ``A Y h' + B k'`` in all states."""
-        q = self.problem.Z.shape[0]
-        seen = y @ np.vstack([self.problem.C, self.problem.Z]).T
-        total = self.full_weight + np.vstack([self.problem.C, self.problem.Z]) @ seen
-        total[-q:, -q:] -= level**2 * np.eye(q)
+        seen = y @ self.outputs.T
+        total = self.full_weight + self.outputs @ seen - level**2 * self.last
         return total, self.problem.A @ seen + self.full_cross
 
     def _in_all_states(self, s: FloatArray, level: float) -> FloatArray:
@@ -131,10 +134,13 @@ class CentralEquation:
     def _is_possible(self, y: FloatArray, level: float) -> bool:
         """Whether what xi shows over finitely many steps is still below the level, with the current measurement."""
         m = self.problem.measured
-        total = self.weight + self.h @ y @ self.h.T
-        left = level**2 * np.eye(len(total) - m) - total[m:, m:]
         if self.problem.weight_is_free and self.lift is None:
-            left = left + total[m:, :m] @ np.linalg.solve(total[:m, :m], total[:m, m:])
+            total = self.weight + self.h @ y @ self.h.T
+            left = total[m:, :m] @ np.linalg.solve(total[:m, :m], total[:m, m:]) - total[m:, m:]
+        else:
+            shown = self.h[m:]
+            left = -self.weight[m:, m:] - shown.dot(y).dot(shown.T)
+        left.reshape(-1)[:: len(left) + 1] += level**2
         return is_positive(0.5 * (left + left.T))
 
     def _gains(self, total: FloatArray, through: FloatArray) -> tuple[Injection | None, FloatArray]:

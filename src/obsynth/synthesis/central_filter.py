@@ -12,6 +12,7 @@ import numpy as np
 
 from obsynth.synthesis.central_equation import CentralEquation, central_injection
 from obsynth.synthesis.gain_problem import GainProblem, Injection
+from obsynth.synthesis.level_descent import NEXT_TO, Descent
 
 #: Artificial noise relative to the disturbance, in turn: the first is bisected, and each of the others only where it
 #: reaches a level below.
@@ -19,26 +20,19 @@ NOISES = (1e-6, 1e-8, 1e-7, 1e-5, 1e-4, 1e-2)
 #: Relative width of the bracket at which the search ends, for few and for many states.
 FEW_STATES = 80
 LEVEL_TOLERANCE = 1e-7
-COARSE_LEVEL_TOLERANCE = 1e-4
+COARSE_LEVEL_TOLERANCE = 1e-5
 COARSE_NOISES = (1e-6, 1e-4)
-MOST_LEVELS = 60
-#: Distance below the best gain, in tolerances, at which another noise is tried, and from which a failure ends that.
+#: Distance below the best gain, in tolerances, at which another noise is tried.
 PROBE = 10.0
-NEXT_TO = 1e-3
-#: A filter whose true gain is above its level by this relative amount shows that the equation was not solved.
-BROKEN_PROMISE = 2e-3
-#: Share of the distance between a level that was reached and where the next should fail, by which it stays above that.
-SAFETY = 0.01
 #: The first level tried, relative to the start.
 START_SHARE = 0.5
 #: Weights of the noise beside the disturbance, relative to their sizes, and levels of both together, relative to the
-#: gain of the disturbance alone.
+#: gain of the disturbance alone: a higher one where noise is stated, since gains hardly get smaller by it.
 NOISE_WEIGHTS = np.logspace(-6.0, 3.0, 31)
 LEVEL_FACTORS = (1.0, 1.5)
 WEIGHT_STEPS = 4
 #: The same for many states, where each filter counts.
 COARSE_NOISE_WEIGHTS = np.logspace(-6.0, 3.0, 15)
-COARSE_LEVEL_FACTORS = (1.0,)
 #: A level this far above anything a disturbance could do is no limit.
 WITHOUT_LIMIT = 1e4
 
@@ -70,8 +64,8 @@ def search_central_filter(
 ) -> tuple[Injection, float]:
     """Return the best central filter found, and (a bound on) its true gain.
 
-    The least level of the equation with little noise is bisected.  Less of it may cost less, and with more of it the
-    equation is less sensitive to rounding: a level just below is tried, and if that is reached, bisected in turn.
+    The least level of the equation with little noise is found.  Less of it may cost less, and with more of it the
+    equation is less sensitive to rounding: a level just below is tried, and if that is reached, the least from there.
 
     Parameters
     ----------
@@ -89,21 +83,27 @@ def search_central_filter(
     if tolerance is None:
         tolerance = LEVEL_TOLERANCE if problem.order <= FEW_STATES else COARSE_LEVEL_TOLERANCE
     best, gain = start, problem.achieved_gain(start) if gain is None else gain
-    low = least_level(problem)
+    low, most_noise = least_level(problem), np.inf
     for noise in NOISES if problem.order <= FEW_STATES else COARSE_NOISES:
         if gain <= low * (1.0 + 2.0 * tolerance):
             break
-        equation = CentralEquation.of(problem, noise=noise)
+        if noise > most_noise:
+            continue
         close = start_is_good or best is not start
-        first = max(low, gain * (1.0 - PROBE * tolerance if close else START_SHARE))
-        found, level = _descended(equation, low, gain, first=first, tolerance=tolerance)
-        reached = np.inf if found is None else problem.achieved_gain(found)
-        if found is not None and reached > level * (1.0 + BROKEN_PROMISE):
-            # The equation promises more than its filter keeps: each filter is judged by itself.
-            found, level = _descended(equation, low, gain, first=first, tolerance=tolerance, judged=True)
-            reached = np.inf if found is None else problem.achieved_gain(found)
-        if found is not None and reached < gain:
-            best, gain = found, reached
+        equation = CentralEquation.of(problem, noise=noise)
+        descent = Descent(equation, low, gain, tolerance, wary=close)
+        descent.run(max(low, gain * (1.0 - PROBE * tolerance if close else START_SHARE)))
+        found = descent.best()
+        if found is None and descent.reached and descent.reached[0].level < gain * (1.0 - NEXT_TO):
+            descent = descent.judged_again(gain)
+            found = descent.best()
+        if found is None:
+            continue
+        injection, reached = found
+        if descent.settled and reached <= descent.high * (1.0 + PROBE * tolerance):
+            most_noise = noise  # more of it cannot cost less
+        if reached < gain:
+            best, gain = injection, reached
     return best, gain
 
 
@@ -113,54 +113,6 @@ def least_level(problem: GainProblem) -> float:
         return 0.0
     direct = problem.Zd if np.any(problem.D) else np.hstack([problem.Zd, problem.Z @ problem.B])
     return float(np.linalg.norm(direct, 2)) if direct.size else 0.0
-
-
-def _descended(
-    equation: CentralEquation, low: float, high: float, *, first: float, tolerance: float, judged: bool = False
-) -> tuple[Injection | None, float]:
-    """Return the central filter of the least level found between ``low`` and ``high``, and that level.
-
-    Parameters
-    ----------
-    equation : CentralEquation
-        For all levels.
-    low, high : float
-        No gain is below ``low``; nothing at or above ``high`` is of use.
-    first : float
-        Level to begin with: where it is not reached and close to ``high``, there is nothing below.
-    tolerance : float
-        Relative width of the bracket at which to stop.
-    judged : bool, optional
-        Whether a filter counts only when its true gain is as low as its level.
-    """
-    best, level = None, first * (1.0 + tolerance)
-    known: list[tuple[float, float]] = []
-    for _ in range(MOST_LEVELS):
-        if level >= high * (1.0 - 0.5 * tolerance):
-            break
-        found, margin = equation.filter_and_margin(level)
-        if found is not None and (not judged or equation.problem.achieved_gain(found) <= level * (1.0 + tolerance)):
-            best, high = found, level
-            known = [*known[-1:], (level, margin)]
-            level = _next_level(known, low, tolerance)
-        else:
-            if best is None and level >= high * (1.0 - NEXT_TO):
-                break
-            low = level
-            level = 0.5 * (low + high)
-    return best, high
-
-
-def _next_level(known: list[tuple[float, float]], low: float, tolerance: float) -> float:
-    """Return the level to try after those that were reached, with their margins: close to where the margin vanishes."""
-    high, margin = known[-1]
-    zero = high * (1.0 - 0.5 * margin)
-    if len(known) == 2 and known[0][1] > margin:
-        zero = max(zero, high - margin * (known[0][0] - high) / (known[0][1] - margin))
-    if high - zero <= tolerance * high:
-        return high * (1.0 - tolerance)  # there should be none
-    level = zero + SAFETY * (high - zero)
-    return level if level > low else 0.5 * (low + high)
 
 
 def least_noise_filter(problem: GainProblem) -> Injection | None:
@@ -193,7 +145,7 @@ def noise_weighted_filters(problem: GainProblem, gain: float) -> Iterator[Inject
         return
     few = work.order <= FEW_STATES
     weights, last = (NOISE_WEIGHTS if few else COARSE_NOISE_WEIGHTS) * sizes[0] / sizes[1], 0
-    for factor in LEVEL_FACTORS if few else COARSE_LEVEL_FACTORS:
+    for factor in LEVEL_FACTORS if few and problem.states_noise else LEVEL_FACTORS[:1]:
         # More weight than at a lower level, and not more than can be hoped for.
         low, high = last, len(weights) if factor == 1.0 else min(last + WEIGHT_STEPS, len(weights))
         best = None

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from itertools import product
 
 import numpy as np
 
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.norms import balancing_factors, output_covariance
 from obsynth.observers.linear import LinearObserver
 from obsynth.synthesis.riccati import bounded_real_matrix, normalising_change
 from obsynth.verification.bounded_real import prove_bounded_real
@@ -19,6 +21,10 @@ APPROACHES = ((1.05,), (1.5, 1.05, 1.001))
 TAILS = (1e-2, 1e-4, 1e-6, 1e-9, 1e-12, 1e-16, 1e-20)
 #: Slack of the Riccati equation relative to the output weight, largest first: the first that proves is taken.
 SLACKS = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)
+#: Steps towards coordinates in which the norm of the error dynamics is near one: how many, and down to which power.
+MOST_STEPS = 60
+STEP_POWER = 0.75
+NEAR_ONE = 1.05
 
 
 def bounded_real_certificate(
@@ -41,10 +47,7 @@ def bounded_real_certificate(
     a, b = observer.Az[:core, :core], errors.disturbance[:core] / gain
     c, d = -errors.fault_output[0][:, :core], errors.fault_output[2] / gain
     best, spare = np.eye(core), None
-    for path, tail in product(APPROACHES, TAILS):
-        change = _coordinates(a, b, c, d, path=path, tail=tail)
-        if change is None:
-            continue
+    for change in _changes(a, b, c, d):
         inverse = np.asarray(np.linalg.inv(change))
         moved_a, moved_b, moved_c = inverse @ a @ change, inverse @ b, c @ change
         weight = max(1.0, float(np.linalg.norm(moved_c, 2)) ** 2)
@@ -58,6 +61,46 @@ def bounded_real_certificate(
                 return best
             spare = best if proof.proved and spare is None else spare
     return best if spare is None else spare
+
+
+def _changes(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> Iterator[FloatArray]:
+    """Yield state changes in which a Riccati solution may prove something, the cheapest first."""
+    for begin in (_balanced, _contracted):
+        start = begin(a, b, c)
+        inverse = np.asarray(np.linalg.inv(start))
+        moved = (inverse @ a @ start, inverse @ b, c @ start)
+        for path, tail in product(APPROACHES, TAILS):
+            change = _coordinates(*moved, d, path=path, tail=tail)
+            if change is not None:
+                yield start @ change
+
+
+def _balanced(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
+    """Return a diagonal state change, powers of two, in which units cost no digits."""
+    n, inputs, outputs = a.shape[0], b.shape[1], c.shape[0]
+    system = np.zeros((n + inputs + outputs,) * 2)
+    system[:n, :n], system[:n, n : n + inputs], system[n + inputs :, :n] = a, b, c
+    return np.diag(balancing_factors(system)[:n])
+
+
+def _contracted(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
+    """Return a state change in which the norm of ``a``, far above its spectral radius, is at most about one.
+
+    In coordinates where the Lyapunov matrix of ``a / s`` is the identity the norm of ``a`` is below s.  From the norm
+    down to one s shrinks in steps, smaller ones close to one, so that each Lyapunov equation is well conditioned.
+    """
+    change, identity = _balanced(a, b, c), np.eye(a.shape[0])
+    moved = np.linalg.solve(change, a @ change)
+    norm = float(np.linalg.norm(moved, 2))
+    for _ in range(MOST_STEPS):
+        level = max(min(0.5 * norm, norm**STEP_POWER), 1.0)
+        p = output_covariance(moved.T / level, identity, identity, np.zeros_like(a))  # the sum of A'^k A^k
+        if norm <= NEAR_ONE or not np.all(np.isfinite(p)):
+            break
+        change = change @ normalising_change(p)
+        moved = np.linalg.solve(change, a @ change)
+        norm = float(np.linalg.norm(moved, 2))
+    return change
 
 
 def _coordinates(

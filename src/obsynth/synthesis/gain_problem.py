@@ -101,6 +101,11 @@ class GainProblem:
         return self.free_weight and self.measured > 0
 
     @property
+    def states_noise(self) -> bool:
+        """Whether there is a noise model; without one the noise is a unit one on the free measurements alone."""
+        return bool(np.any(self.Bn) or np.any(self.Zn))
+
+    @property
     def disturbance_size(self) -> float:
         """What the disturbance could do to xi at most in one step, whatever cancels: the scale of a gain."""
         state, direct = np.vstack([self.B, self.D]), float(np.linalg.norm(self.Zd))

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.doubling import doubled_riccati_solution
+from obsynth.numerics.doubling import REFUTED, doubled_riccati_solution, is_positive
 from obsynth.numerics.norms import spectral_radius
 
 #: Relative sizes of the fictitious process and measurement noise, tried in turn, that make the equation regular.
@@ -40,18 +41,22 @@ def stabilising_gain(a: FloatArray, c: FloatArray, noise_a: FloatArray, noise_c:
         return np.zeros((n, 0)) if spectral_radius(a) < 1.0 else None
     process, cross, measured = noise_a @ noise_a.T, noise_a @ noise_c.T, noise_c @ noise_c.T
     best, least = None, 1.0
-    process_size = max(float(np.linalg.norm(process, 2)), 1e-8 * float(np.linalg.norm(a, 2)) ** 2, 1e-8)
+    process_size = max(float(np.linalg.norm(noise_a, 2)) ** 2, 1e-8 * float(np.linalg.norm(a, 2)) ** 2, 1e-8)
     for epsilon in REGULARISATIONS:
         q = process + epsilon * process_size * np.eye(n)
         size = float(np.linalg.norm(c @ q @ c.T, 2)) + float(np.linalg.norm(measured, 2))
         r = measured + epsilon * size * np.eye(m)
-        x = riccati_solution(a, c, q, r, cross)
-        if x is None:
-            continue
-        gain = np.linalg.solve(c @ x @ c.T + r, c @ x @ a.T + cross.T).T
-        radius = spectral_radius(a - gain @ c) if np.all(np.isfinite(gain)) else np.inf
-        if radius < least:
-            best, least = np.asarray(gain), radius
+        # Far outside the circle doubling may settle on what is no solution: its poles tell.
+        for solve in (riccati_solution, _riccati_solution_by_qz):
+            x = solve(a, c, q, r, cross)
+            if x is None:
+                continue
+            gain = np.linalg.solve(c @ x @ c.T + r, c @ x @ a.T + cross.T).T
+            radius = spectral_radius(a - gain @ c) if np.all(np.isfinite(gain)) else np.inf
+            if radius < least:
+                best, least = np.asarray(gain), radius
+            if radius < 1.0:
+                break
         if least <= FAST_ENOUGH:
             break
     return best
@@ -79,11 +84,40 @@ def bounded_real_matrix(
         return np.zeros((0, 0))
     weight = c.T @ c + slack * np.eye(n)
     cross, gap = c.T @ d, d.T @ d - level**2 * np.eye(b.shape[1])
-    p = riccati_solution(a.T, b.T, weight, gap, cross) if b.shape[1] else _lyapunov_solution(a, weight)
+    if b.shape[1]:
+        p = riccati_solution(a.T, b.T, weight, gap, cross, impossible=_Exceeded(b, gap))
+    else:
+        p = _lyapunov_solution(a, weight)
     if p is None:
         return None
     p = 0.5 * (p + p.T)
-    return p if np.all(np.isfinite(p)) and float(np.linalg.eigvalsh(p)[0]) > 0.0 else None
+    return p if np.all(np.isfinite(p)) and is_positive(p) else None
+
+
+class _Exceeded:
+    """Says whether the gain is above the level over as many steps as a solution stands for, beyond rounding.
+
+    Parameters
+    ----------
+    b, gap : FloatArray
+        ``(n, m)``, and ``D'D - level^2 I (m, m)``.
+    """
+
+    def __init__(self, b: FloatArray, gap: FloatArray) -> None:
+        self.b, self.gap = b, gap
+        self.last: FloatArray | None = None
+
+    def __call__(self, p: FloatArray) -> bool:
+        left, sizes = -(self.gap + self.b.T @ p @ self.b), np.diag(p)
+        if not np.all(np.isfinite(left)):
+            return False
+        # Over more steps the solution grows: one that does not is behind a level that was exceeded in between.
+        shrunk = self.last is not None and np.any(sizes < self.last - REFUTED * np.max(self.last))
+        self.last = sizes.copy()
+        if shrunk or is_positive(left):
+            return bool(shrunk)
+        margin = REFUTED * float(np.linalg.norm(self.b)) ** 2 * float(np.linalg.norm(p))
+        return bool(np.linalg.eigvalsh(left)[0] < -margin)
 
 
 def _lyapunov_solution(a: FloatArray, weight: FloatArray) -> FloatArray | None:
@@ -98,7 +132,13 @@ def _lyapunov_solution(a: FloatArray, weight: FloatArray) -> FloatArray | None:
 
 
 def riccati_solution(
-    a: FloatArray, h: FloatArray, process: FloatArray, weight: FloatArray, cross: FloatArray
+    a: FloatArray,
+    h: FloatArray,
+    process: FloatArray,
+    weight: FloatArray,
+    cross: FloatArray,
+    *,
+    impossible: Callable[[FloatArray], bool] | None = None,
 ) -> FloatArray | None:
     """Return the stabilising solution by doubling, or where that breaks down by SciPy; ``None`` without one.
 
@@ -106,15 +146,37 @@ def riccati_solution(
     ----------
     a, h, process, weight, cross : FloatArray
         As for `obsynth.numerics.doubling.doubled_riccati_solution`.
+    impossible : callable, optional
+        Called with the solutions over 2, 4, 8, ... steps; true says that there is no solution to look for.
     """
-    from scipy.linalg import solve_discrete_are
+    ended = False
+
+    def possible(found: FloatArray) -> bool:
+        nonlocal ended
+        ended = impossible is not None and impossible(found)
+        return not ended
 
     try:
         with warnings.catch_warnings():
             # An ill-conditioned equation only makes a worse filter or certificate, which is then not taken.
             warnings.simplefilter("ignore")
-            doubled = doubled_riccati_solution(a, h, process, weight, cross)
-            return np.asarray(solve_discrete_are(a.T, h.T, process, weight, s=cross)) if doubled is None else doubled
+            doubled = doubled_riccati_solution(a, h, process, weight, cross, possible=possible)
+    except np.linalg.LinAlgError:
+        doubled = None
+    if ended or doubled is not None:
+        return None if ended else doubled
+    return _riccati_solution_by_qz(a, h, process, weight, cross)
+
+
+def _riccati_solution_by_qz(
+    a: FloatArray, h: FloatArray, process: FloatArray, weight: FloatArray, cross: FloatArray
+) -> FloatArray | None:
+    from scipy.linalg import solve_discrete_are
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return np.asarray(solve_discrete_are(a.T, h.T, process, weight, s=cross))
     except (np.linalg.LinAlgError, ValueError):
         return None
 

@@ -14,7 +14,10 @@ from obsynth.analysis.fault_filter_conditions import fault_filter_conditions
 from obsynth.errors import PreconditionError
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.norms import highest_gain_found, hinf_norm, output_covariance, spectral_radius
+from obsynth.numerics.modal_response import Modes
+from obsynth.numerics.norms import highest_gain_found, hinf_norm, output_covariance
+from obsynth.numerics.pencils import pencil_structure
+from obsynth.numerics.scaling import Scaling, balance_by_least_squares
 from obsynth.observers.linear import LinearObserver
 from obsynth.results.design import ObserverDesign
 from obsynth.results.report import Check, information, upper_bound_check
@@ -49,8 +52,9 @@ _IDENTITIES = {
 def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
     """Yield every check of ``design``; see `obsynth.verification.verify`."""
     (plant, observer), claims = design.linear, design.certificate.claims
-    yield from plant_information(plant)
-    yield from condition_rows(fault_filter_conditions(plant))
+    structure = pencil_structure(plant.E, plant.A)
+    yield from plant_information(plant, structure)
+    yield from condition_rows(fault_filter_conditions(plant, structure=structure))
     yield from claim_rows(plant, claims)
     yield from recovery_rows(plant, design.recovery)
     tracking, factor = design.certificate.matrices.get("tracking"), design.certificate.matrices.get("P_factor")
@@ -65,13 +69,16 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     )
     if not fitting or tracking is None or factor is None:
         return
-    allowances = yield from _gain_set_rows(design, tracking, printed_digits)
+    work = _with_sensor_faults(plant)
+    scaling = balance_by_least_squares(work.E, work.A, inputs=[work.Bf], outputs=[work.C]) if work is not None else None
+    allowances = yield from _gain_set_rows(design, work, scaling, tracking, printed_digits)
     for key, identity in tracking_identities(plant, observer, tracking, lag).items():
         name, claim, source = _IDENTITIES[key]
         yield equality(name, claim, identity.residual(allowances.get(key)), source)
     errors = ErrorSystem.of(plant, observer, tracking, lag)
-    yield from fault_rows(plant, observer, tracking, errors, allowances)
-    radius = spectral_radius(observer.Az)
+    yield from fault_rows(plant, observer, tracking, errors, scaling, allowances)
+    modes = Modes.of(observer.Az)
+    radius = modes.radius
     yield upper_bound_check(
         "spectral radius",
         "the observer is stable",
@@ -80,20 +87,22 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
         source="Wang 2015, Theorem 2",
         detail=f"eigenvalues computed; proved by the row 'LMI'; {_time_constant(radius, plant.dt)}",
     )
-    yield from _norm_rows(design, errors, tracking, factor, lag)
+    yield from _norm_rows(design, errors, modes, tracking, factor, lag)
     yield from _noise_rows(plant, errors)
 
 
 def _gain_set_rows(
-    design: ObserverDesign, tracking: FloatArray, printed_digits: int | None
+    design: ObserverDesign,
+    work: DescriptorSystem | None,
+    scaling: Scaling | None,
+    tracking: FloatArray,
+    printed_digits: int | None,
 ) -> Generator[Check, None, dict[str, FloatArray]]:
     """Yield the rows on the gain set, and return what its printed digits allow the identities to miss."""
     (plant, observer), gains = design.linear, design.gains
     if not gains:
         return {}  # nothing is said about gains: the realisation stands for itself
-    try:
-        work = with_sensor_faults_as_states(plant)
-    except PreconditionError:
+    if work is None or scaling is None:
         return {}  # a failed existence condition says so already
     fitting = gains_fit(work, gains, observer)
     yield fitting
@@ -101,10 +110,18 @@ def _gain_set_rows(
         return {}
     allowances: dict[str, FloatArray] = {}
     if printed_digits is not None:
-        allowances = printed_allowances(plant, work, observer, gains, printed_digits)
+        allowances = printed_allowances(plant, work, observer, gains, scaling, printed_digits)
     equations = Equations.of(plant, work, observer.fault_delays)
-    yield from gain_rows(work, gains, observer, tracking, equations, allowances)
+    yield from gain_rows(work, gains, observer, tracking, equations, scaling, allowances)
     return allowances
+
+
+def _with_sensor_faults(plant: DescriptorSystem) -> DescriptorSystem | None:
+    """Return the plant with its sensor faults as states; ``None`` where these cannot be told from the others."""
+    try:
+        return with_sensor_faults_as_states(plant)
+    except PreconditionError:
+        return None
 
 
 def _whole(lag: float) -> int:
@@ -134,7 +151,7 @@ def _fits(
 
 
 def _norm_rows(
-    design: ObserverDesign, errors: ErrorSystem, tracking: FloatArray, factor: FloatArray, lag: int
+    design: ObserverDesign, errors: ErrorSystem, modes: Modes, tracking: FloatArray, factor: FloatArray, lag: int
 ) -> Iterator[Check]:
     (plant, observer), claims = design.linear, design.certificate.claims
     gamma = claimed(claims, "gamma")
@@ -153,7 +170,8 @@ def _norm_rows(
     )
     if not plant.nd:
         return
-    norm = hinf_norm(errors.Az, errors.disturbance, errors.fault_output[0], -errors.fault_output[2])
+    fault, states = errors.fault_output, errors.state_output
+    norm = hinf_norm(errors.Az, errors.disturbance, fault[0], -fault[2], modes=modes)
     reported = max(gamma, norm.upper)
     yield upper_bound_check(
         "H-infinity norm",
@@ -163,7 +181,7 @@ def _norm_rows(
         source="Wang 2015, eq. (49)",
         detail=f"peak at {norm.angle:.4g} rad/sample; the gain to quote is {reported:.6g}",
     )
-    state = highest_gain_found(errors.Az, errors.disturbance, errors.state_output[0], -errors.state_output[2])
+    state = highest_gain_found(errors.Az, errors.disturbance, states[0], -states[2], modes=modes)
     yield information(
         "disturbance in the state estimate", "H-infinity norm d -> state error", state, source="recomputed"
     )

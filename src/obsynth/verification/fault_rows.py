@@ -11,11 +11,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from obsynth.analysis.fault_filter import with_sensor_faults_as_states
-from obsynth.errors import PreconditionError
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.scaling import balance_by_least_squares
+from obsynth.numerics.scaling import Scaling
 from obsynth.observers.linear import LinearObserver
 from obsynth.results.report import Check
 from obsynth.verification.error_system import ErrorSystem, LaggedPlant
@@ -70,6 +68,7 @@ def fault_rows(
     observer: LinearObserver,
     tracking: FloatArray,
     errors: ErrorSystem,
+    scaling: Scaling | None,
     allowances: Mapping[str, FloatArray],
 ) -> Iterator[Check]:
     """Yield the rows on the transfer from the faults.
@@ -78,10 +77,12 @@ def fault_rows(
     ----------
     plant, observer, tracking, errors
         What is shipped, and its error system.
+    scaling : Scaling or None
+        Units in which the plant, with its sensor faults as states, is balanced; ``None`` where there is no such plant.
     allowances : mapping
         What printed gains may add, by row and step; see `obsynth.verification.printed.printed_allowances`.
     """
-    sizes = _trace_sizes(plant, observer, tracking, fault_traces(errors, observer.fault_delays))
+    sizes = _trace_sizes(plant, observer, tracking, fault_traces(errors, observer.fault_delays), scaling)
     delays = ", ".join(map(str, observer.fault_delays))
     claims = {
         "fault decoupled after its delay": "(TA - LC) Psi = 0: no trace of a fault in the error after its delay",
@@ -110,7 +111,11 @@ def step_key(name: str, step: int) -> str:
 
 
 def _trace_sizes(
-    plant: DescriptorSystem, observer: LinearObserver, tracking: FloatArray, traces: list[FloatArray]
+    plant: DescriptorSystem,
+    observer: LinearObserver,
+    tracking: FloatArray,
+    traces: list[FloatArray],
+    scaling: Scaling | None,
 ) -> FloatArray:
     """Return, per error state and fault, the size of the terms from which its traces were formed ``(nz, nf)``.
 
@@ -125,12 +130,10 @@ def _trace_sizes(
     sizes = np.maximum(sizes, formed @ np.tile(largest, (lagged.lag + 1, 1)))
     # A state that no fault reaches holds only rounding errors of the gains: it is not judged against itself but
     # against a small share of the fault's largest trace, in the units in which the plant is balanced.
-    try:
-        work = with_sensor_faults_as_states(plant)
-    except PreconditionError:
+    if scaling is None:
         return np.asarray(sizes)  # a failed existence condition says so already
-    units = balance_by_least_squares(work.E, work.A, inputs=[work.Bf], outputs=[work.C]).states
-    units = np.resize(np.append(units, np.tile(units[: plant.nx], lagged.lag)), len(sizes))[:, None]
+    units = np.append(scaling.states, np.tile(scaling.states[: plant.nx], lagged.lag))
+    units = np.resize(units, len(sizes))[:, None]
     return np.asarray(np.maximum(sizes, UNREACHED * units * np.max(sizes / units, axis=0)))
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.scaling import balance_by_least_squares
+from obsynth.numerics.scaling import Scaling
 from obsynth.observers.linear import LinearObserver
 from obsynth.results.report import Check, upper_bound_check
 from obsynth.verification.identities import Identity, equality, worst
@@ -58,7 +58,7 @@ def gains_fit(work: DescriptorSystem, gains: Mapping[str, FloatArray], observer:
 
 
 def gain_identities(
-    work: DescriptorSystem, gains: Mapping[str, FloatArray], equations: Equations
+    work: DescriptorSystem, gains: Mapping[str, FloatArray], equations: Equations, scaling: Scaling
 ) -> dict[str, Identity]:
     """Return the identities that T, N and W satisfy, and that the rounding of printed gains disturbs.
 
@@ -70,14 +70,15 @@ def gain_identities(
         At least T, N and W.
     equations : Equations
         Of the plant.
+    scaling : Scaling
+        Units in which the plant is balanced.
     """
     t, n, w = gains["T"], gains["N"], gains["W"]
-    units = balance_by_least_squares(work.E, work.A, inputs=[work.Bf], outputs=[work.C]).states
     upsilon = work.C @ equations.detectability_matrix(gains)
     # The columns are in the units of the faults, which differ: each is compared with its own largest products.
     peaks = np.max(np.abs(w) @ np.abs(upsilon), axis=0, initial=0.0)
     return {
-        RESTRICTED: Identity((t @ work.E, n @ work.C, -np.eye(work.nx)), ((t, work.E), (n, work.C)), units),
+        RESTRICTED: Identity((t @ work.E, n @ work.C, -np.eye(work.nx)), ((t, work.E), (n, work.C)), scaling.states),
         WEIGHT: Identity(
             (w @ upsilon, -np.eye(work.nf)), ((w, upsilon),), 1.0 / np.where(peaks > 0.0, peaks, 1.0)
         ),
@@ -90,6 +91,7 @@ def gain_rows(
     observer: LinearObserver,
     tracking: FloatArray,
     equations: Equations,
+    scaling: Scaling,
     allowances: Mapping[str, FloatArray],
 ) -> Iterator[Check]:
     """Yield the rows on the gain set, which must fit.
@@ -100,10 +102,12 @@ def gain_rows(
         What is claimed and shipped.
     equations : Equations
         Of the plant.
+    scaling : Scaling
+        Units in which the plant is balanced.
     allowances : mapping
         What printed gains may add; see `obsynth.verification.printed.printed_allowances`.
     """
-    identities = gain_identities(work, gains, equations)
+    identities = gain_identities(work, gains, equations, scaling)
     claims = {
         RESTRICTED: ("T E + N C = I", "Wang 2015, eq. (8)"),
         WEIGHT: ("W Upsilon = I", "Wang 2015, eq. (44)"),
@@ -120,7 +124,7 @@ def gain_rows(
         yield equality(
             "gains: R",
             "R is the free part of L: R Upsilon = 0, and L - R = T A Psi G with G Upsilon = I",
-            worst([identity.residual() for identity in _free_part_identities(work, gains)]),
+            worst([identity.residual() for identity in _free_part_identities(work, gains, scaling)]),
             "Wang 2015, eq. (60)",
         )
     yield equality(
@@ -142,9 +146,8 @@ def _detectability_identities(
     ]
 
 
-def _free_part_identities(work: DescriptorSystem, gains: Mapping[str, FloatArray]) -> list[Identity]:
+def _free_part_identities(work: DescriptorSystem, gains: Mapping[str, FloatArray], scaling: Scaling) -> list[Identity]:
     # Which left inverse G of Upsilon is taken depends on the units of the outputs: any one is right.
-    scaling = balance_by_least_squares(work.E, work.A, inputs=[work.Bf], outputs=[work.C])
     outputs, fixed, free = 1.0 / scaling.outputs, gains["L"] - gains["R"], gains["R"]
     moved = gains["T"] @ work.A @ gains["Psi"]
     # The columns of L - R are combinations of those of T A Psi: nothing is left beside their span.

@@ -95,18 +95,21 @@ class Identity:
         total = self.total
         if total.size == 0:
             return Residual(0.0, 1.0)
-        size = sum((np.abs(term) for term in self.terms), start=np.zeros_like(total))
+        size = np.abs(self.terms[0])
+        for term in self.terms[1:]:
+            size += np.abs(term)
         for product in self.factors:
             bound = np.abs(product[0])
             for factor in product[1:]:
                 bound = bound @ np.abs(factor)
             size = size + bound
         more = np.zeros_like(total) if allowance is None else allowance
-        if not all(np.all(np.isfinite(part)) for part in (total, size, more)):
+        # Where the sizes are finite, the sum is.
+        if not (np.isfinite(size).all() and np.isfinite(more).all()):
             return Residual(float("nan"), 1.0)
-        scale = self._scale(size)
-        worst = np.unravel_index(int(np.argmax(np.abs(total) / (EQUALITY_TOLERANCE * scale + more))), total.shape)
-        return Residual(float(np.abs(total[worst])), float(scale[worst]), float(more[worst]))
+        scale, missed = self._scale(size), np.abs(total)
+        worst = np.unravel_index(int(np.argmax(missed / (EQUALITY_TOLERANCE * scale + more))), total.shape)
+        return Residual(float(missed[worst]), float(scale[worst]), float(more[worst]))
 
     def _scale(self, size: FloatArray) -> FloatArray:
         if self.entrywise:

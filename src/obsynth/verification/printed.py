@@ -14,6 +14,7 @@ import numpy as np
 
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.scaling import Scaling
 from obsynth.observers.linear import LinearObserver
 from obsynth.verification.error_system import ErrorSystem
 from obsynth.verification.fault_rows import fault_identities, step_key
@@ -30,6 +31,7 @@ def printed_allowances(
     work: DescriptorSystem,
     observer: LinearObserver,
     gains: Mapping[str, FloatArray],
+    scaling: Scaling,
     digits: int,
 ) -> dict[str, FloatArray]:
     """Return, by identity, what the rounding of the gains can add to each of its entries, to first order.
@@ -42,6 +44,8 @@ def printed_allowances(
         What is shipped: its signals and delays count here, its matrices are formed again.
     gains : mapping
         ``T (na, na)``, ``N (na, ny)``, ``L (na, ny)``, ``W (nf, ny)`` as printed.
+    scaling : Scaling
+        Units in which ``work`` is balanced.
     digits : int
         Decimals to which they were printed.
     """
@@ -50,7 +54,7 @@ def printed_allowances(
 
     def totals(letter: str = "", move: FloatArray | None = None) -> dict[str, FloatArray]:
         moved = dict(gains) if move is None else {**gains, letter: gains[letter] + move}
-        return _totals(plant, work, filter_of(observer, equations.realised(moved)), moved, equations)
+        return _totals(plant, work, filter_of(observer, equations.realised(moved)), moved, equations, scaling)
 
     centre = totals()
     found = {name: np.zeros_like(total) for name, total in centre.items()}
@@ -70,11 +74,12 @@ def _totals(
     observer: LinearObserver,
     gains: Mapping[str, FloatArray],
     equations: Equations,
+    scaling: Scaling,
 ) -> dict[str, FloatArray]:
     tracking = equations.tracking(gains["T"])
     lag = tracking.shape[1] // plant.nx - 1
     errors = ErrorSystem.of(plant, observer, tracking, lag)
-    found = {**tracking_identities(plant, observer, tracking, lag), **gain_identities(work, gains, equations)}
+    found = {**tracking_identities(plant, observer, tracking, lag), **gain_identities(work, gains, equations, scaling)}
     for name, steps in fault_identities(errors, observer.fault_delays).items():
         found |= {step_key(name, step): identity for step, identity in enumerate(steps)}
     return {name: identity.total for name, identity in found.items()}

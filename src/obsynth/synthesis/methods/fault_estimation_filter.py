@@ -23,11 +23,11 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.conditions import Condition, require_all
-from obsynth.analysis.fault_detectability import WARN_CONDITION, FaultDetectability, fault_detectability
-from obsynth.analysis.fault_filter import PreparedPlant, prepare, with_sensor_faults_as_states
-from obsynth.analysis.fault_filter_conditions import fault_filter_conditions
+from obsynth.analysis.fault_detectability import WARN_CONDITION, FaultDetectability
+from obsynth.analysis.fault_filter import PreparedPlant, prepare
+from obsynth.analysis.fault_filter_conditions import examine_fault_filter, fault_filter_conditions
 from obsynth.analysis.transformations import sampling_zero_warnings
-from obsynth.errors import InfeasibleError, SpecError
+from obsynth.errors import InfeasibleError
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.norms import spectral_radius
@@ -42,7 +42,7 @@ from obsynth.synthesis.gain_bisection import search_by_bisection
 from obsynth.synthesis.gain_bound import require_reachable
 from obsynth.synthesis.gain_design import null_basis
 from obsynth.synthesis.gain_problem import GainProblem, Injection, WeightLimit
-from obsynth.synthesis.lmi import SOLVER_SETTINGS
+from obsynth.synthesis.lmi import FILTER_SOLVERS
 from obsynth.synthesis.result import Synthesis
 from obsynth.synthesis.small_gains import small_gain_design
 
@@ -58,6 +58,11 @@ ROUNDING_GAIN = 1e-11
 #: Level of the certificate, relative to the same, when no disturbance reaches the fault estimate at all.
 NOMINAL_GAIN = 1e-3
 
+#: A gamma between these multiples of the least gain found by the equations calls the inequality by default, up to so
+#: many states: far below the least no polish helps, and far above none is needed.
+BELOW_LEAST, ABOVE_LEAST = 0.95, 1.0 + 1e-4
+MOST_STATES_TO_POLISH = 64
+
 
 def conditions(plant: DescriptorSystem) -> tuple[Condition, ...]:
     """Return the existence conditions; the list ends at the first failure."""
@@ -68,10 +73,10 @@ def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **op
     """Design the filter; see `obsynth.fault_estimation_filter` for the options, results and errors."""
     asked = FilterOptions(**options)
     progress("checking the existence conditions")
-    held = conditions(plant)
+    held, prepared = examine_fault_filter(plant)
     require_all(held)
     s = None if asked.S is None else as_matrix(asked.S, "S")
-    prepared = prepare(plant, s)
+    prepared = prepare(plant, s) if prepared is None or s is not None else prepared
     limit = asked.residual_weight_limit
     free = asked.free_residual_weight if asked.free_residual_weight is not None else plant.nw > 0 or limit is not None
     problem, parts = gain_problem(prepared, free_weight=free)
@@ -90,6 +95,11 @@ def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **op
         # What is left of the disturbance in the estimates is rounding: nothing to minimise.
         problem = problem.without_disturbance()
         least = replace(_least_gain(problem, asked, engine), gain=least.starting_gain)
+    elif asked.engine == "auto" and asked.gamma is not None and _leaves_little(asked.gamma, least.gain, problem):
+        progress("polishing the least gain")
+        polished = _least_gain(problem, asked, "lmi")
+        records = [*least.records, *polished.records]
+        least = replace(min(least, polished, key=lambda found: found.gain), records=records)
     gamma = _gain_to_ship(asked, problem, least, noisy=plant.nw > 0)
     progress("choosing small gains")
     inner = gamma - min(CERTIFICATE_SHARE * (gamma - least.gain), CERTIFICATE_MARGIN * gamma)
@@ -120,35 +130,11 @@ def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **op
         gains,
         observer,
         Certificate({"P_factor": factor, "tracking": tracking}, claims),
-        {"engine": _engine_of(engine, records), "runs": [*least.records, *records]},
-        notes(plant, prepared.detectability, observer, largest_zero=held[-1].value),
-    )
-
-
-def synthesis_from_gains(plant: DescriptorSystem, *, T: Any, N: Any, L: Any, W: Any, gamma: float | None) -> Synthesis:
-    """Return the realisation and certificate of given gains; see `obsynth.fault_estimation_filter_from_gains`."""
-    require_all(conditions(plant))
-    work = with_sensor_faults_as_states(plant)
-    gains = {name: as_matrix(value, name) for name, value in (("T", T), ("N", N), ("L", L), ("W", W))}
-    shapes = {"T": (work.nx, work.nx), "N": (work.nx, work.ny), "L": (work.nx, work.ny), "W": (work.nf, work.ny)}
-    for name, shape in shapes.items():
-        if gains[name].shape != shape:
-            raise SpecError(f"{name} is {gains[name].shape}, but {shape} is needed.", path=name)
-    detectability = fault_detectability(gains["T"] @ work.A, work.C, gains["T"] @ work.Bf)
-    if not detectability.finite:
-        raise SpecError("With this T some fault never reaches the outputs.", path="T")
-    gains |= {"Psi": detectability.Psi, "Upsilon": detectability.Upsilon}
-    observer, tracking, lag = realise_filter(plant, work, gains, detectability)
-    level = 1.0 if gamma is None else gamma
-    factor = bounded_real_certificate(plant, observer, tracking, level, core=work.nx, lag=lag)
-    claims = {"state_lag": float(lag)} | ({"gamma": level} if plant.nd else {})
-    return Synthesis(
-        {"from_gains": True, "gamma": gamma},
-        gains,
-        observer,
-        Certificate({"P_factor": factor, "tracking": tracking}, claims),
-        {"runs": []},
-        notes(plant, detectability, observer),
+        {"engine": _engine_of([*least.records, *records]), "runs": [*least.records, *records]},
+        (
+            *_gamma_notes(asked.gamma, level if plant.nd else np.inf),
+            *notes(plant, prepared.detectability, observer, largest_zero=held[-1].value),
+        ),
     )
 
 
@@ -202,11 +188,9 @@ def _left_inverse(upsilon: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.pinv(upsilon / units) / units[:, None])
 
 
-def _engine_of(asked: str, records: list[dict[str, Any]]) -> str:
-    """Return which engine ran: by default the inequality comes in only where nothing else was found."""
-    if asked != "auto":
-        return asked
-    return "lmi" if any(record.get("solver") in SOLVER_SETTINGS for record in records) else "riccati"
+def _engine_of(records: list[dict[str, Any]]) -> str:
+    """Return which engine ran: the inequality comes in only where it may and where there is something to find."""
+    return "lmi" if any(record.get("solver") in FILTER_SOLVERS for record in records) else "riccati"
 
 
 def _least_gain(problem: GainProblem, asked: FilterOptions, engine: str) -> gain_search.LeastGain:
@@ -214,6 +198,12 @@ def _least_gain(problem: GainProblem, asked: FilterOptions, engine: str) -> gain
     if asked.gamma_search == "direct":
         return gain_search.search_least_gain(problem, solver=asked.solver, polish=polish)
     return search_by_bisection(problem, tolerance=asked.tolerance, solver=asked.solver, polish=polish)
+
+
+def _leaves_little(gamma: float, least: float, problem: GainProblem) -> bool:
+    """Whether a gamma leaves less room above the least gain found than the inequality may still find."""
+    near = BELOW_LEAST * least <= gamma <= ABOVE_LEAST * least
+    return near and problem.disturbances > 0 and problem.order <= MOST_STATES_TO_POLISH
 
 
 def _gain_to_ship(asked: FilterOptions, problem: GainProblem, least: gain_search.LeastGain, *, noisy: bool) -> float:
@@ -229,6 +219,15 @@ def _gain_to_ship(asked: FilterOptions, problem: GainProblem, least: gain_search
     require_reachable(problem, least, asked.gamma, solver=asked.solver)
     ceiling = LARGEST_USEFUL_GAIN * least.starting_gain
     return min(asked.gamma, ceiling) if ceiling > 0.0 else asked.gamma
+
+
+def _gamma_notes(asked: float | None, shipped: float) -> tuple[str, ...]:
+    """Return a note where less is shipped than was asked for."""
+    if asked is None or shipped >= asked:
+        return ()
+    return (
+        f"gamma = {asked:.6g} was asked for, and {shipped:.6g} is proved: gains for more would only be scaled worse.",
+    )
 
 
 def _gains(prepared: PreparedPlant, parts: _Parts, chosen: Injection) -> dict[str, FloatArray]:

@@ -34,8 +34,9 @@ from obsynth.numerics.spectra import abscissa, decay_rates, eigenvalues, noise_c
 from obsynth.observers.linear import LinearObserver
 from obsynth.results.design import Certificate
 from obsynth.synthesis.lyapunov import lyapunov_factor
+from obsynth.synthesis.placement.compromise import NOISE_PRICE, compromise
 from obsynth.synthesis.placement.eigenstructure import place
-from obsynth.synthesis.placement.kalman import KalmanProblem, compromise
+from obsynth.synthesis.placement.kalman import KalmanProblem
 from obsynth.synthesis.placement.region import Region, region_gain
 from obsynth.synthesis.result import Synthesis
 from obsynth.synthesis.ui_pi_noise import NoiseWeights, kalman_problem
@@ -45,6 +46,8 @@ from obsynth.synthesis.ui_pi_realisation import ObserverGains, combinations_seen
 
 #: A region with a radius and no decay asks for at most this share of its radius.
 RADIUS_SHARE = 0.5
+#: A default this many times slower than the plant itself is worth a note.
+SLOW_DEFAULT = 1000.0
 
 
 def conditions(plant: DescriptorSystem, *, fault_model: Any = "step") -> tuple[Condition, ...]:
@@ -78,7 +81,11 @@ def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **op
         synthesis.observer,
         synthesis.certificate,
         {"runs": list(chosen.runs)},
-        (*_elimination_note(found.conditions, found.transformation is not None), *_notes(problem, asked, plant.dt)),
+        (
+            *_elimination_note(found.conditions, found.transformation is not None),
+            *_notes(problem, asked, plant.dt),
+            *_slow_note(problem, asked, synthesis.certificate.claims.get("decay")),
+        ),
         found.transformation,
     )
 
@@ -120,11 +127,12 @@ def _chosen(
         gain, record = _in_region(kalman, region.in_time(time), problem.rate, asked)
         runs = (record,)
     elif asked.decay is not None:
-        found = kalman.gain(time * asked.decay)
+        found = kalman.gain(time * asked.decay, persistent=True)
         if found is None:
             raise SolverError(
-                f"The Riccati equation for decay {asked.decay:g} 1/s has no usable solution: some mode shows too "
-                "little to be made that fast. Ask for less, or leave decay out."
+                f"The Riccati equation for decay {asked.decay:g} 1/s has no solution that double precision could tell "
+                "from rounding, not even by way of slower rates: some mode shows too little for so much speed. Ask for "
+                "less, leave decay out, or give poles, which are placed without this equation."
             )
         gain = found
     else:
@@ -269,3 +277,17 @@ def _notes(problem: PlacementProblem, asked: UiPiOptions, dt: float) -> tuple[st
             )
         )
     return tuple(found)
+
+
+def _slow_note(problem: PlacementProblem, asked: UiPiOptions, decay: float | None) -> tuple[str, ...]:
+    """Return a note where the default, for lack of noise to pay with, is far slower than the plant."""
+    own = problem.rate / problem.units.time
+    default = asked.poles is None and asked.decay is None and asked.region is None
+    if not default or decay is None or problem.fixed_modes.size or decay * SLOW_DEFAULT >= own:
+        return ()
+    return (
+        f"The slowest pole decays at {decay:.3g} 1/s, against {own:.3g} 1/s of the plant itself: what is faster costs "
+        f"more than {NOISE_PRICE:g} times the noise of a Kalman filter, or was not found. Parts of the fault models "
+        f"that can hardly be told apart ({', '.join(dict.fromkeys(problem.model.descriptions))}) do that: leave one "
+        "out, or give decay or poles.",
+    )

@@ -34,6 +34,8 @@ STARTS, FEW_STARTS, LARGE = 8, 2, 20
 #: Longest run of the search, and how often it is taken up again from where it ended, with eigenvectors of unit length,
 #: as long as the logarithm of the objective falls by more than this.
 MOST_STEPS, RESTARTS, LEAST_PROGRESS = 400, 8, 1e-3
+#: First steps of a search for good conditioning, and how many of the starts that are ahead after these go on.
+FIRST_STEPS, FINALISTS = 40, 3
 #: Seed of the starts: the same question gives the same gains.
 SEED = 20240
 #: Spectra of F and L closer than this, relative to the size of F, make the Sylvester equation nearly singular: F is
@@ -139,6 +141,11 @@ def place(
         # Well-conditioned eigenvectors are a good place to start from.
         other = replace(problem, objective="conditioning").minimised(starts[0])
         starts = starts if other is None else [other[1], *starts]
+    if objective == "conditioning":
+        # All go a short way, and the best of them to the end.  Small gains are not foreseen as early.
+        tried = [problem.minimised(start, steps=FIRST_STEPS, restarts=1) for start in starts]
+        ahead = sorted((found for found in tried if found is not None), key=lambda found: found[0])
+        starts = [start for _, start in ahead[:FINALISTS]]
     for start in starts:
         found = problem.minimised(start)
         if found is not None and (best is None or found[0] < best[0]):
@@ -222,7 +229,9 @@ class _Sylvester:
         gradient = direct + self.B.T @ self.adjoint(weight)
         return float(np.log(value)), np.asarray(gradient / value).ravel()
 
-    def minimised(self, start: FloatArray) -> tuple[float, FloatArray] | None:
+    def minimised(
+        self, start: FloatArray, *, steps: int = MOST_STEPS, restarts: int = RESTARTS
+    ) -> tuple[float, FloatArray] | None:
         """Return the least value found and its G; ``None`` when the equation is singular from the start."""
         from scipy.optimize import minimize
 
@@ -230,10 +239,10 @@ class _Sylvester:
         best: tuple[float, FloatArray] | None = None
         g = start
         try:
-            for _ in range(RESTARTS):
+            for _ in range(restarts):
                 g = self.normalised(g)
                 with np.errstate(all="ignore"):
-                    done = minimize(evaluate, g.ravel(), jac=True, method="L-BFGS-B", options={"maxiter": MOST_STEPS})
+                    done = minimize(evaluate, g.ravel(), jac=True, method="L-BFGS-B", options={"maxiter": steps})
                 if not np.isfinite(done.fun):
                     break
                 gained = np.inf if best is None else best[0] - float(done.fun)

@@ -1,7 +1,7 @@
-"""Kalman gains with a prescribed rate of decay, and the price of that rate in noise.
+"""Kalman gains with a prescribed rate of decay.
 
 Source: Share Pasand, Aliyari, Taghirad mention "the optimal estimation scheme of Kalman"; the prescribed rate is
-Anderson and Moore's, and the default that needs no numbers is ours.
+Anderson and Moore's.
 """
 
 from __future__ import annotations
@@ -12,18 +12,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.doubling import continuous_riccati_solution, doubled_riccati_solution
 from obsynth.numerics.spectra import abscissa, noise_covariance
 
-#: The default pays at most this factor in noise, against the quietest Kalman filter, for being fast.
-NOISE_PRICE = 10.0
-#: The default rate is found to about this factor.
-RATE_STEP = 1.05
 #: Times the Riccati equation is solved, each time in the coordinates of the last solution, which improve it.
 ROUNDS = 2
-#: Estimates with less than this share of the outputs' noise have none but rounding.
-SILENT = 1e-8
-#: Halvings of the default rate before the quietest filter is taken as it is.
-MOST_HALVINGS = 12
+#: From so many states on the Riccati equation is solved by doubling first.
+MANY_STATES = 40
+#: A rate that cannot be had at once is gone to in steps of this factor, from one that is at most so many below.
+RATE_FACTOR = 4.0
+MOST_STEPS = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,16 +53,47 @@ class KalmanProblem:
     estimates: FloatArray
     dt: float
 
-    def gain(self, decay: float) -> FloatArray | None:
+    def gain(self, decay: float, *, persistent: bool = False) -> FloatArray | None:
         """Return the gain whose poles all decay at ``decay`` (1/s) or faster; ``None`` when the equation has none.
+
+        Parameters
+        ----------
+        decay : float, 1/s
+            Not negative.
+        persistent : bool, optional
+            Where the equation cannot be solved as it stands, since the wanted rate is far above those of the pair, go
+            there from slower rates, each solved in the coordinates of the one before.
 
         References
         ----------
         .. [AndersonMoore1971] B. D. O. Anderson, J. B. Moore, "Linear optimal control", 1971, section 4.
         """
-        n = self.F.shape[0]
-        if n == 0:
-            return np.zeros((0, self.C.shape[0]))
+        plain = np.eye(self.F.shape[0])
+        best, change = self.solved(decay, plain)
+        if best is not None or not persistent:
+            return best
+        slower = [decay]
+        while best is None and len(slower) <= MOST_STEPS:
+            slower.append(slower[-1] / RATE_FACTOR)
+            best, change = self.solved(slower[-1], plain)
+        for rate in reversed(slower[:-1]):
+            if best is None:
+                break
+            best, change = self.solved(rate, change)
+        return best
+
+    def solved(self, decay: float, change: FloatArray) -> tuple[FloatArray | None, FloatArray]:
+        """Return the gain of a rate, and coordinates in which its error covariance is the identity.
+
+        Parameters
+        ----------
+        decay : float, 1/s
+            Not negative.
+        change : FloatArray
+            ``(n, n)``: the equation is first solved in states ``change^-1 e``.
+        """
+        if not self.F.size:
+            return np.zeros((0, self.C.shape[0])), change
         # The part of the process noise that the measurements carry is taken out first.
         measured = self.D @ self.D.T + self.background @ self.background.T
         direct = np.linalg.solve(measured, self.D @ self.B.T).T
@@ -73,7 +102,6 @@ class KalmanProblem:
         rest = 0.5 * (rest + rest.T)
         bound = float(np.exp(-decay * self.dt)) if self.dt > 0.0 else -decay
         best: FloatArray | None = None
-        change = np.eye(n)
         for _ in range(ROUNDS):
             found = _filtered(free, self.C, rest, measured, (bound, self.dt), change)
             if found is None:
@@ -83,13 +111,26 @@ class KalmanProblem:
             if abscissa(self.F - total @ self.C, self.dt) < bound:
                 best = total
             change = found[1]
-        return best
+        return best, change
 
-    def deviations(self, gain: FloatArray) -> FloatArray:
-        """Return the standard deviation of each estimate under the noise that counts (for unit intensity, dt = 0)."""
-        entering = self.B - gain @ self.D
+    def deviations(self, gain: FloatArray, change: FloatArray) -> FloatArray:
+        """Return the standard deviation of each estimate under the noise that counts (for unit intensity, dt = 0).
+
+        Parameters
+        ----------
+        gain : FloatArray
+            ``(n, ny)``.
+        change : FloatArray
+            ``(n, n)``: states ``change^-1 e`` in which the computation is well conditioned.
+        """
+        entering = np.asarray(np.linalg.solve(change, self.B - gain @ self.D), dtype=np.float64)
+        moved = np.asarray(np.linalg.solve(change, (self.F - gain @ self.C) @ change), dtype=np.float64)
         direct = np.zeros((self.estimates.shape[0], entering.shape[1]))
-        covariance = noise_covariance(self.F - gain @ self.C, entering, self.estimates, direct, self.dt)
+        bound = 1.0 if self.dt > 0.0 else 0.0
+        if not abscissa(moved, self.dt) < bound:
+            # Stable in some coordinates and not in others: only rounding tells.
+            return np.full(len(direct), np.inf)
+        covariance = noise_covariance(moved, entering, self.estimates @ change, direct, self.dt)
         return np.asarray(np.sqrt(np.maximum(np.diag(covariance), 0.0)))
 
 
@@ -112,100 +153,52 @@ def _filtered(
     change : FloatArray
         ``(n, n)``: the equation is solved in states ``change^-1 e``.
     """
-    import control
-
-    (bound, dt), n = asked, len(f)
+    bound, dt = asked
     with warnings.catch_warnings(), np.errstate(all="ignore"):
-        # What a badly conditioned equation gives is judged by its poles; by scipy, so that no gain depends on whether
-        # slycot is there.
+        # What a badly conditioned equation gives is judged by its poles.
         warnings.simplefilter("ignore")
         try:
             inverse = np.linalg.inv(change)
             moved, noise = inverse @ f @ change, inverse @ driven @ inverse.T
+            moved = moved / bound if dt > 0.0 else moved - bound * np.eye(len(f))
             noise = 0.5 * (noise + noise.T)
-            if dt > 0.0:
-                found, covariance, _ = control.dlqe(
-                    moved / bound, np.eye(n), c @ change, noise, measured, method="scipy"
-                )
-                found = bound * np.asarray(found)
-            else:
-                found, covariance, _ = control.lqe(
-                    moved - bound * np.eye(n), np.eye(n), c @ change, noise, measured, method="scipy"
-                )
-            values, vectors = np.linalg.eigh(0.5 * (covariance + np.asarray(covariance).T))
+            for equation in (_by_doubling, _by_the_library) if len(f) >= MANY_STATES else (_by_the_library,):
+                found, covariance = equation(moved, c @ change, noise, measured, dt)
+                gain = change @ (bound * found if dt > 0.0 else found)
+                values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
+                if np.all(np.isfinite(gain)) and abscissa(f - gain @ c, dt) < bound:
+                    break
         except (np.linalg.LinAlgError, ValueError, ArithmeticError):
             return None
-    gain = change @ found
     if not np.all(np.isfinite(gain)) or not np.all(np.isfinite(values)) or values[-1] <= 0.0:
         return None
     floor = float(np.finfo(np.float64).eps) * values[-1]
     return np.asarray(gain), np.asarray(change @ (vectors * np.sqrt(np.maximum(values, floor))))
 
 
-@dataclass(frozen=True, eq=False)
-class Compromise:
-    """What the default found.
-
-    Parameters
-    ----------
-    K : FloatArray
-        ``(n, ny)``.
-    decay : float
-        1/s.
-    price : float
-        Largest ratio of the standard deviation of an estimate to that with the Kalman gain without a rate.
-    """
-
-    K: FloatArray
-    decay: float
-    price: float
+def _by_doubling(
+    f: FloatArray, c: FloatArray, noise: FloatArray, measured: FloatArray, dt: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return gain and error covariance of a Kalman filter; NaN where the doubling breaks down."""
+    nothing = np.full((len(f), len(c)), np.nan)
+    if dt > 0.0:
+        y = doubled_riccati_solution(f, c, noise, measured, np.zeros_like(nothing))
+        if y is None:
+            return nothing, np.eye(len(f))
+        return np.asarray(np.linalg.solve(c @ y @ c.T + measured, c @ y @ f.T).T), y
+    y = continuous_riccati_solution(f, c, noise, measured)
+    if y is None:
+        return nothing, np.eye(len(f))
+    return np.asarray(np.linalg.solve(measured, c @ y).T), y
 
 
-def compromise(problem: KalmanProblem, rate: float) -> Compromise | None:
-    """Return the fastest gain, up to ``rate`` (1/s), that costs at most `NOISE_PRICE` in noise.
+def _by_the_library(
+    f: FloatArray, c: FloatArray, noise: FloatArray, measured: FloatArray, dt: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return the same by the QZ algorithm, which takes several times as long and hardly ever breaks down."""
+    import control
 
-    The plain Kalman filter leaves modes slow that cost much to see (-0.0085 on the Kundur network); a fixed rate may
-    cost any amount of noise.
-
-    Parameters
-    ----------
-    problem : KalmanProblem
-        The pair and its noise.
-    rate : float, 1/s
-        As fast as makes sense for the plant.
-    """
-    plain = problem.gain(0.0)
-    if plain is None:
-        return None
-    # Each estimate by itself: they have units of their own.
-    quietest = problem.deviations(plain)
-    silent = SILENT * np.linalg.norm(problem.estimates, axis=1) * float(np.linalg.norm(problem.D))
-    counted = (quietest > silent) & np.isfinite(quietest)
-    best = Compromise(plain, 0.0, 1.0)
-
-    def attempt(decay: float) -> Compromise | None:
-        gain = problem.gain(decay)
-        if gain is None:
-            return None
-        ratios = problem.deviations(gain)[counted] / quietest[counted]
-        price = float(np.max(ratios)) if ratios.size else 1.0
-        return Compromise(gain, decay, price) if price <= NOISE_PRICE else None
-
-    high = rate
-    for _ in range(MOST_HALVINGS):
-        found = attempt(high)
-        if found is not None:
-            best = found
-            break
-        high /= 2.0
-    if best.decay in (0.0, rate):
-        return best
-    low, high = best.decay, 2.0 * best.decay
-    while high > RATE_STEP * low:
-        middle = float(np.sqrt(low * high))
-        found = attempt(middle)
-        if found is None:
-            high = middle
-        else:
-            best, low = found, middle
-    return best
+    # By scipy, so that no gain depends on whether slycot is there.
+    solve = control.dlqe if dt > 0.0 else control.lqe
+    found, covariance, _ = solve(f, np.eye(len(f)), c, noise, measured, method="scipy")
+    return np.asarray(found), np.asarray(covariance)

@@ -1,0 +1,78 @@
+"""What is said besides the numbers: one message for one mistake, and no silence where less is done than was asked."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+import obsynth
+from obsynth.cli.main import main
+from obsynth.errors import SpecError
+from obsynth.report.page_tables import value_text
+
+PLANT = {
+    "E": [[1.0, 0.0], [0.0, 1.0]],
+    "A": [[0.9, 0.1], [0.0, 0.5]],
+    "C": [[1.0, 0.0], [0.0, 1.0]],
+    "Bf": [[1.0], [0.0]],
+    "Bd": [[0.0], [1.0]],
+    "dt": 0.1,
+}
+
+
+@pytest.mark.parametrize("letter", ["B", "C", "Bf", "Bd", "Bw"])
+def test_a_matrix_that_cannot_be_read_is_the_only_thing_said_of_its_signals(letter):
+    # D, Df, Dd, Dw and the names of the signals depend on a number that is not known then.
+    others = {"C": {"D": [[1.0], [1.0]], "output_names": ["y", "z"]}, "B": {"input_names": ["u"]}}
+    with pytest.raises(SpecError) as found:
+        obsynth.DescriptorSystem(**{**PLANT, **others.get(letter, {}), letter: ["x7"]})
+    assert str(found.value) == f"{letter} has no signal named 'x7'."
+
+
+def test_mistakes_that_have_nothing_to_do_with_one_another_are_told_together():
+    with pytest.raises(SpecError) as found:
+        obsynth.DescriptorSystem(**{**PLANT, "C": ["x7"], "Bd": [[1.0]], "fault_names": ["a", "b"]})
+    assert len(found.value.problems) == 3
+
+
+def test_a_gain_far_above_what_is_useful_is_not_shipped_and_the_report_says_so():
+    design = obsynth.fault_estimation_filter(obsynth.DescriptorSystem(**{**PLANT, "Bd": [[1.0], [1.0]]}), gamma=1e6)
+    gamma = design.certificate.claims["gamma"]
+    assert gamma < 1e6
+    assert any(note.startswith("gamma = 1e+06 was asked for, and") for note in design.notes)
+    usual = obsynth.fault_estimation_filter(design.plant, gamma=gamma / 2)
+    assert usual.certificate.claims["gamma"] == gamma / 2
+    assert not any("was asked for" in note for note in usual.notes)
+
+
+def test_a_run_that_is_mostly_warm_up_says_why_nothing_was_raised(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    design = obsynth.fault_estimation_filter(obsynth.DescriptorSystem(**PLANT))
+    design.save(tmp_path / "gains.json")
+    for rows, told in ((4, True), (400, False)):
+        log = "time,y1,y2\n" + "".join(f"{0.1 * row:.1f},0,0\n" for row in range(rows))
+        (tmp_path / "log.csv").write_text(log, encoding="utf-8")
+        files = ["--gains", str(tmp_path / "gains.json"), "--data", str(tmp_path / "log.csv")]
+        watch = ["--monitor", "pointwise", "--disturbance", "d1=1", "--out", str(tmp_path / "out.csv")]
+        assert main(["run", *files, *watch]) == 0
+        printed = capsys.readouterr().out
+        assert "No alarm by pointwise." in printed
+        assert ("or as long as --warm-up says" in printed) is told
+
+
+def test_the_order_of_messages_does_not_change_from_run_to_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    content = """
+schema_version: 1
+name: case
+plant: {dt: 1, A: [[0.5]], C: [[1]], Bf: [[1]]}
+method: {id: fault-estimation-filter}
+scenario: {horizon: 9, faults: {f1: {kind: sine, size: 1, rate: 2, period: 3, amplitude: 1, frequency: 0.1}}}
+"""
+    (tmp_path / "spec.yaml").write_text(content, encoding="utf-8")
+    assert main(["check", "--system", str(tmp_path / "spec.yaml")]) == 2
+    assert re.findall(r"a sine has no (\w+):", capsys.readouterr().err) == ["period", "rate", "size"]
+
+
+def test_what_a_solver_did_is_separated_run_by_run():
+    assert value_text([{"what": "a", "gain": 1}, {"what": "b"}]) == "what: a, gain: 1; what: b"
