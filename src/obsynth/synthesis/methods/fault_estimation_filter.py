@@ -151,7 +151,7 @@ def gain_problem(prepared: PreparedPlant, *, free_weight: bool) -> tuple[GainPro
     """Return the convex problem behind Theorem 2, with (32) solved exactly, and the fixed parts of the gains."""
     detectability = prepared.detectability
     upsilon = detectability.Upsilon
-    w0, v = np.asarray(np.linalg.pinv(upsilon)), null_basis(upsilon.T)
+    w0, v = _left_inverse(upsilon), null_basis(upsilon.T)
     l0 = prepared.TA @ detectability.Psi @ w0
     measure, na = v.T, prepared.TA.shape[0]
     if prepared.Bw.shape[1]:
@@ -180,6 +180,12 @@ def gain_problem(prepared: PreparedPlant, *, free_weight: bool) -> tuple[GainPro
         free_weight=free_weight,
     )
     return problem, _Parts(l0, w0, v)
+
+
+def _left_inverse(upsilon: FloatArray) -> FloatArray:
+    """Return the left inverse of least norm of a matrix of full column rank, whatever the units of the faults."""
+    units = np.exp2(np.round(np.log2(np.linalg.norm(upsilon, axis=0))))
+    return np.asarray(np.linalg.pinv(upsilon / units) / units[:, None])
 
 
 def _engine_of(records: list[dict[str, Any]]) -> str:
