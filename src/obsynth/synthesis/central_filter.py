@@ -5,7 +5,7 @@ See `obsynth.synthesis.central_equation` for the equation behind them.  The true
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -27,12 +27,10 @@ PROBE = 10.0
 #: The first level tried, relative to the start.
 START_SHARE = 0.5
 #: Weights of the noise beside the disturbance, relative to their sizes, and levels of both together, relative to the
-#: gain of the disturbance alone: a higher one where noise is stated, since gains hardly get smaller by it.
+#: gain of the disturbance alone.
 NOISE_WEIGHTS = np.logspace(-6.0, 3.0, 31)
 LEVEL_FACTORS = (1.0, 1.5)
 WEIGHT_STEPS = 4
-#: The same for many states, where each filter counts.
-COARSE_NOISE_WEIGHTS = np.logspace(-6.0, 3.0, 15)
 #: A level this far above anything a disturbance could do is no limit.
 WITHOUT_LIMIT = 1e4
 
@@ -124,7 +122,9 @@ def least_noise_filter(problem: GainProblem) -> Injection | None:
     return found if found is not None and np.isfinite(problem.noise_variance(found)) else None
 
 
-def noise_weighted_filters(problem: GainProblem, gain: float) -> Iterator[Injection]:
+def noise_weighted_filters(
+    problem: GainProblem, gain: float, *, reaches: Callable[[Injection], bool]
+) -> Iterator[Injection]:
     """Yield central filters that promise a gain of at most ``gain``, for which the noise counts as much as it can.
 
     The noise of the problem, times a weight, is one more disturbance.  At the level ``gain`` for both together the gain
@@ -138,14 +138,15 @@ def noise_weighted_filters(problem: GainProblem, gain: float) -> Iterator[Inject
         noise means small gains.
     gain : float
         Bound on the true gain of the disturbance.
+    reaches : callable
+        Whether the true gain of a filter is within that bound.
     """
     work = with_least_weight(problem)
     sizes = [float(np.linalg.norm(np.vstack(pair))) for pair in ((work.B, work.D), (work.Bn, work.Dn))]
     if work.order == 0 or work.measured == 0 or not min(sizes) > 0.0:
         return
-    few = work.order <= FEW_STATES
-    weights, last = (NOISE_WEIGHTS if few else COARSE_NOISE_WEIGHTS) * sizes[0] / sizes[1], 0
-    for factor in LEVEL_FACTORS if few and problem.states_noise else LEVEL_FACTORS[:1]:
+    weights, last = NOISE_WEIGHTS * sizes[0] / sizes[1], 0
+    for factor in LEVEL_FACTORS:
         # More weight than at a lower level, and not more than can be hoped for.
         low, high = last, len(weights) if factor == 1.0 else min(last + WEIGHT_STEPS, len(weights))
         best = None
@@ -153,7 +154,7 @@ def noise_weighted_filters(problem: GainProblem, gain: float) -> Iterator[Inject
             middle = (low + high) // 2
             equation = CentralEquation.of(_with_noise(work, weights[middle]), noise=NOISES[0])
             found = equation.filter_at(factor * gain)
-            if found is not None and (factor == 1.0 or problem.reaches(found, gain)):
+            if found is not None and (factor == 1.0 or reaches(found)):
                 best, low = found, middle + 1
             else:
                 high = middle
