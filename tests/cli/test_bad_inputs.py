@@ -325,6 +325,7 @@ FILES = [
     Case("csv empty", put("plant", "A", {"file": "A.csv"}), "plant.A", files=written("A.csv", "")),
     Case("csv not text", put("plant", "A", {"file": "A.csv"}), "plant.A", files=written("A.csv", b"\xff\xfe\x00")),
     Case("npz damaged", put("plant", "A", {"file": "A.npz"}), "plant.A", files=written("A.npz", b"PK\x03\x04 cut off")),
+    Case("npz that is none", put("plant", "A", {"file": "A.npz"}), "no .npz archive", files=written("A.npz", b"text")),
     Case("npz with two arrays", put("plant", "A", {"file": "two.npz"}), "which array is meant", files=saved_npz),
     Case(
         "npz without the array",

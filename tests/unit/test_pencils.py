@@ -219,3 +219,32 @@ def test_a_pencil_on_which_lapack_does_not_converge():
     expected = -1.0 + np.exp(2j * np.pi * np.arange(3) / 3)
     assert len(found) == 3
     assert max(np.min(np.abs(found - value)) for value in expected) < 1e-12
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("spread", [10.0, 1e6])
+def test_planted_eigenvalues_of_many_states(seed, spread):
+    """From a hundred states on, a well-conditioned E is inverted and an ill-conditioned one is not."""
+    rng = np.random.default_rng([11, seed])
+    planted = rng.uniform(-2.0, 2.0, 116)
+    E, A = canonical(planted, infinite=(2, 1, 1))
+    Q = nonsingular(120, rng, 10.0)
+    P = Q.T @ np.diag(spread ** rng.uniform(-0.5, 0.5, 120))
+    structure = pencil_structure(P @ E @ Q, P @ A @ Q)
+    assert structure.regular
+    assert structure.infinite_block_sizes == (2, 1, 1)
+    assert mismatch(planted, structure.finite_eigenvalues) < 1e-6
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_where_there_are_no_zeros_the_staircase_may_end_early(seed):
+    """What it says must not depend on that: with a planted zero, and with none."""
+    rng = np.random.default_rng([12, seed])
+    for eigenvalues in ((), (0.7,), (0.3, -0.5 + 0.2j)):
+        E, A = disguised(*canonical(eigenvalues, infinite=(1, 2), left=(3, 2, 2)), rng)
+        for e, a in ((E, A), (E.T, A.T)):
+            whole, early = finite_zeros(e, a), finite_zeros(e, a, to_the_end=False)
+            assert mismatch(with_conjugates(eigenvalues), early.values) < 1e-7
+            assert whole.normal_rank == early.normal_rank == min(E.shape)
+            if eigenvalues:
+                assert len(whole.decisions) == len(early.decisions)

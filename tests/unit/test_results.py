@@ -293,6 +293,19 @@ class TestTampering:
                 with pytest.raises(SpecError):
                     load(file)
 
+    @pytest.mark.parametrize("part", ["name", "method"])
+    def test_a_name_that_is_no_text_with_a_digest_that_fits(self, part, design, tmp_path):
+        for value in (None, 3, [], {}):
+            file = design.save(tmp_path / "a.json")
+
+            def change(document, value=value):
+                document["design"][part] = value
+                document["sha256"] = digest_of(document["design"])
+
+            damage(file, change)
+            with pytest.raises(SpecError, match=f"{part} is .*, not a text"):
+                load(file)
+
     def test_missing_file_and_folder(self, tmp_path):
         for path in (tmp_path / "missing.json", tmp_path):
             with pytest.raises(SpecError, match="cannot be read") as caught:
@@ -453,6 +466,7 @@ class TestReport:
     [
         {"gamma": "a"}, {"gamma": [1.0]}, {"gamma": True}, {"tolerance": "x"}, {"gamma_margin": None},
         {"residual_weight_limit": "2"}, {"free_residual_weight": "no"}, {"engine": "fast"},
+        {"residual_weight_limit": 2.0, "engine": "riccati"},
     ],
     ids=str,
 )  # fmt: skip

@@ -16,6 +16,7 @@ from obsynth.numerics.norms import hinf_norm, spectral_radius
 from obsynth.synthesis.central_equation import CentralEquation, central_injection
 from obsynth.synthesis.central_filter import central_filter_at, search_central_filter
 from obsynth.synthesis.gain_problem import GainProblem, Injection
+from obsynth.synthesis.riccati import bounded_real_matrix
 
 
 def random_problem(rng, n=5, m=2, q=1, nd=3, free_weight=False):
@@ -164,3 +165,23 @@ def test_a_level_far_below_the_norm_is_refuted_and_not_left_open():
         norm = hinf_norm(a, b, c, d).value
         assert compared_gain(a, b, c, d, 1.01 * norm) is True
         assert compared_gain(a, b, c, d, 0.5 * norm) is False
+
+
+def test_a_level_that_is_exceeded_in_finitely_many_steps_has_no_certificate_and_asks_no_second_solver(monkeypatch):
+    asked = []
+    monkeypatch.setattr("scipy.linalg.solve_discrete_are", lambda *args, **options: asked.append(1))
+    rng = np.random.default_rng(9)
+    for n in (3, 12):
+        for _ in range(10):
+            a = rng.normal(size=(n, n))
+            a *= 0.9 / spectral_radius(a)
+            b, c, d = rng.normal(size=(n, 2)), rng.normal(size=(2, n)), 0.1 * rng.normal(size=(2, 2))
+            norm = hinf_norm(a, b, c, d).value
+            assert bounded_real_matrix(a, b, c, d, 0.9 * norm, slack=1e-6 * norm**2) is None
+            p = bounded_real_matrix(a, b, c, d, 1.1 * norm, slack=1e-8)
+            left = (1.1 * norm) ** 2 * np.eye(2) - d.T @ d - b.T @ p @ b
+            through = a.T @ p @ b + c.T @ d
+            rest = p - a.T @ p @ a - c.T @ c - through @ np.linalg.solve(left, through.T)
+            assert np.linalg.eigvalsh(left)[0] > 0.0
+            assert np.linalg.eigvalsh(0.5 * (rest + rest.T))[0] > 0.0
+    assert asked == []

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 import scipy.linalg  # noqa: F401 - its BLAS must be loaded to be seen
+import threadpoolctl
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import obsynth
@@ -145,3 +146,24 @@ def test_the_method_itself_leaves_the_threads_alone() -> None:
     """The setting is at the door, once for every method."""
     method.synthesise(PLANT, progress=lambda _: None)
     assert blas_threads() == {2}
+
+
+def test_a_library_that_was_loaded_later_is_limited_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Libraries are looked for once for as long as no module is imported."""
+    looked: list[int] = []
+    right = threadpoolctl.ThreadpoolController
+
+    def watched() -> threadpoolctl.ThreadpoolController:
+        looked.append(1)
+        return right()
+
+    monkeypatch.setattr(threadpoolctl, "ThreadpoolController", watched)
+    for _ in range(3):
+        with one_thread_if_small(3):
+            pass
+    before = len(looked)
+    assert before <= 1
+    monkeypatch.setitem(sys.modules, "a_module_that_is_new", sys)
+    with one_thread_if_small(3):
+        assert len(looked) == before + 1
+        assert blas_threads() == {1}

@@ -289,3 +289,19 @@ def test_planted_zeros_far_out_of_a_tall_pencil_are_kept(modulus, seed):
     zeros = invariant_zeros(left @ right, left @ A @ right, left @ B, C @ right)
     assert [zero.value for zero in zeros] == [pytest.approx(-modulus, rel=1e-6)]
     assert zeros[0].is_unobservable_mode
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_both_zeros_of_a_pair_are_on_the_same_side(seed):
+    rng = np.random.default_rng([21, seed])
+    for modulus in (1.0, 1.0 - 1e-6, 1.0 - 1e-4, 0.5):
+        zero = modulus * np.exp(0.7j)
+        E, A, B, C = planted([zero, 0.3], rng)
+        system_e = np.zeros((len(A) + len(C), len(A) + B.shape[1]))
+        system_e[: len(E), : len(E)] = E
+        system_a = np.block([[A, B], [C, np.zeros((len(C), B.shape[1]))]])
+        found = finite_zeros(system_e, system_a)
+        sides = dict(zip(found.values, are_outside(system_e, system_a, found, 0.1), strict=True))
+        assert len(sides) == 3
+        assert all(outside == sides[value.conjugate()] for value, outside in sides.items())
+        assert sum(sides.values()) == (2 if modulus == 1.0 else 0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from obsynth.numerics.arrays import ComplexArray, FloatArray
 #: Poles of at least this modulus may make a peak of their own.
 NEAR = 0.5
 #: How many peaks are refined, by how many points on either side, and how often.
-MOST_PEAKS = 2
+MOST_PEAKS = 3
 POINTS_BESIDE = 4
 REFINEMENTS = 3
 #: Rows or columns up to which the largest singular value has a formula.
@@ -19,6 +20,32 @@ TWO = 2
 #: From so many states on, steps of power iteration take the place of eigenvalues.
 MANY_STATES = 60
 POWER_STEPS = 8
+
+
+class Modes(NamedTuple):
+    """Eigenvalues and eigenvectors of a matrix.
+
+    Parameters
+    ----------
+    values : ComplexArray
+        ``(n,)``.
+    vectors : ComplexArray
+        ``(n, n)``, as columns.
+    """
+
+    values: ComplexArray
+    vectors: ComplexArray
+
+    @classmethod
+    def of(cls, a: FloatArray) -> Modes:
+        """Return those of ``a (n, n)``."""
+        values, vectors = np.linalg.eig(a)
+        return cls(np.asarray(values, dtype=np.complex128), np.asarray(vectors, dtype=np.complex128))
+
+    @property
+    def radius(self) -> float:
+        """Largest modulus of an eigenvalue; 0 for no states."""
+        return float(np.max(np.abs(self.values), initial=0.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,27 +68,32 @@ class ModalResponse:
     direct: FloatArray
 
     @classmethod
-    def of(
-        cls, poles: ComplexArray, vectors: ComplexArray, b: FloatArray, c: FloatArray, d: FloatArray
-    ) -> ModalResponse | None:
+    def of(cls, modes: Modes, b: FloatArray, c: FloatArray, d: FloatArray) -> ModalResponse | None:
         """Return the response; ``None`` where the eigenvectors are no basis."""
         try:
-            driven = np.asarray(np.linalg.solve(vectors, b.astype(np.complex128)), dtype=np.complex128)
+            driven = np.asarray(np.linalg.solve(modes.vectors, b.astype(np.complex128)), dtype=np.complex128)
         except np.linalg.LinAlgError:
             return None
         return (
-            cls(poles, np.asarray(c @ vectors, dtype=np.complex128), driven, d) if np.all(np.isfinite(driven)) else None
+            cls(modes.values, np.asarray(c @ modes.vectors, dtype=np.complex128), driven, d)
+            if np.all(np.isfinite(driven))
+            else None
         )
 
-    def gains(self, angles: FloatArray) -> FloatArray:
-        """Return the largest singular value at each angle, zero where it is no number; an estimate for many states."""
+    def gains(self, angles: FloatArray, *, roughly: bool = False) -> FloatArray:
+        """Return the largest singular value at each angle, zero where it is no number; an estimate for many states.
+
+        Roughly it may be the eighth root of the sum of the eighth powers of all singular values.
+        """
         factors = 1.0 / (np.exp(1j * angles)[:, None] - self.poles)
         order = min(self.direct.shape)
-        sizes = self._by_gram_matrices(factors) if order <= TWO or len(self.poles) < MANY_STATES else None
-        sizes = self._by_power_iteration(factors) if sizes is None else sizes
+        if order <= TWO or len(self.poles) < MANY_STATES:
+            sizes = self._by_gram_matrices(factors, roughly=roughly)
+        else:
+            sizes = self._by_power_iteration(factors)
         return np.asarray(np.where(np.isfinite(sizes), sizes, 0.0))
 
-    def _by_gram_matrices(self, factors: ComplexArray) -> FloatArray:
+    def _by_gram_matrices(self, factors: ComplexArray, *, roughly: bool) -> FloatArray:
         inner, outer, direct = self.shown, self.driven, self.direct
         if direct.shape[0] > direct.shape[1]:
             inner, outer, direct = outer.T, inner.T, direct.T
@@ -69,6 +101,11 @@ class ModalResponse:
         response = response.reshape(len(factors), *direct.shape) + direct
         if len(direct) > TWO:
             gram = response @ response.conj().transpose(0, 2, 1)
+            if roughly:
+                # In units of the largest, since eighth powers outgrow double precision.
+                unit = np.max(np.abs(gram), initial=np.finfo(np.float64).tiny)
+                gram = gram / unit
+                return np.asarray(np.sqrt(unit) * np.sum(np.abs(gram @ gram) ** 2, axis=(1, 2)) ** 0.125)
             return np.asarray(np.sqrt(np.linalg.eigvalsh(np.where(np.isfinite(gram), gram, 0.0))[:, -1]))
         squares = np.sum(np.abs(response) ** 2, axis=2)
         if len(direct) == 1:
@@ -93,7 +130,7 @@ class ModalResponse:
         angles = np.concatenate([np.linspace(0.0, np.pi, points), np.angle(near)])
         order = np.argsort(angles, kind="stable")
         angles = angles[order]
-        sizes = self.gains(angles)
+        sizes = self.gains(angles, roughly=True)
         beside = np.concatenate([[-1.0], sizes, [-1.0]])
         tops = np.flatnonzero((sizes >= beside[:-2]) & (sizes >= beside[2:]))
         tops = tops[np.argsort(-sizes[tops], kind="stable")[:MOST_PEAKS]]
@@ -104,14 +141,15 @@ class ModalResponse:
         widths = np.minimum(widths, reaches[tops])
         steps, everyone = np.arange(-POINTS_BESIDE, POINTS_BESIDE + 1) / POINTS_BESIDE, np.arange(len(centres))
         for _ in range(REFINEMENTS):
-            tried = np.clip(centres[:, None] + widths[:, None] * steps, 0.0, np.pi)
+            tried = np.minimum(np.maximum(centres[:, None] + widths[:, None] * steps, 0.0), np.pi)
             found = self.gains(tried.ravel()).reshape(tried.shape)
             best = np.argmax(found, axis=1)
             centres, widths = tried[everyone, best], widths / POINTS_BESIDE
             # A parabola through three points is close to the response once they are.
-            inner = np.clip(best, 1, len(steps) - 2)
+            inner = np.minimum(np.maximum(best, 1), len(steps) - 2)
             low, middle, high = (found[everyone, inner + i] for i in (-1, 0, 1))
             bend = 2.0 * middle - low - high
             shift = np.where(bend > 0.0, 0.5 * (high - low) / np.where(bend > 0.0, bend, 1.0), 0.0)
-            centres = np.where(best == inner, tried[everyone, inner] + np.clip(shift, -1.0, 1.0) * widths, centres)
-        return np.asarray(np.clip(centres, 0.0, np.pi))
+            # The highest of three is less than one step from the top of its parabola.
+            centres = np.where(best == inner, tried[everyone, inner] + shift * widths, centres)
+        return np.asarray(np.minimum(np.maximum(centres, 0.0), np.pi))

@@ -9,7 +9,7 @@ import numpy as np
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.doubling import compared_gain, gain_is_below
 from obsynth.numerics.level_crossings import level_crossings
-from obsynth.numerics.modal_response import MANY_STATES, ModalResponse
+from obsynth.numerics.modal_response import MANY_STATES, ModalResponse, Modes
 
 #: Relative gap between the attained value and the certified level of an H-infinity norm.
 NORM_TOLERANCE = 1e-9
@@ -67,7 +67,7 @@ def frequency_response(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArra
     return np.asarray(c @ np.linalg.solve(resolvents, right_sides) + d)
 
 
-def hinf_norm(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> HinfNorm:
+def hinf_norm(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, *, modes: Modes | None = None) -> HinfNorm:
     """Return the H-infinity norm of a discrete-time system.
 
     Bruinsma and Steinbuch's iteration: raise the level to the largest gain found, ask the symplectic pencil
@@ -77,6 +77,8 @@ def hinf_norm(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> Hin
     ----------
     a, b, c, d : FloatArray
         ``(n, n)``, ``(n, m)``, ``(p, n)``, ``(p, m)``.
+    modes : Modes, optional
+        Of ``a``, where they are known.
 
     Returns
     -------
@@ -87,10 +89,10 @@ def hinf_norm(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> Hin
         return HinfNorm(0.0, 0.0, 0.0, np.inf)
     if not all(np.all(np.isfinite(part)) for part in (a, b, c, d)):
         return HinfNorm(np.inf, np.inf, np.nan, 0.0)
-    a, b, c = balanced_realisation(a, b, c)
-    modes = _modes(a)
-    if np.any(np.abs(modes[0]) >= 1.0):
+    modes = Modes.of(a) if modes is None else modes
+    if modes.radius >= 1.0:
         return HinfNorm(np.inf, np.inf, np.nan, 0.0)
+    a, b, c, modes = _balanced(a, b, c, modes)
     if a.shape[0] >= MANY_STATES:
         found = _norm_of_many_states(a, b, c, d, modes)
         if found is not None:
@@ -137,33 +139,29 @@ def norm_is_at_most(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, 
     return hinf_norm(a, b, c, d).upper <= level
 
 
-def highest_gain_found(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> float:
+def highest_gain_found(
+    a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, *, modes: Modes | None = None
+) -> float:
     """Return the H-infinity norm or, for many states, the largest gain that a modal response shows: it is attained.
 
     Parameters
     ----------
     a, b, c, d : FloatArray
         ``(n, n)``, ``(n, m)``, ``(p, n)``, ``(p, m)``; infinite when ``a`` is not Schur stable.
+    modes : Modes, optional
+        Of ``a``, where they are known.
     """
     if a.shape[0] < MANY_STATES or b.shape[1] == 0 or c.shape[0] == 0 or not np.all(np.isfinite(a)):
-        return hinf_norm(a, b, c, d).upper
-    a, b, c = balanced_realisation(a, b, c)
-    modes = _modes(a)
-    if np.any(np.abs(modes[0]) >= 1.0):
+        return hinf_norm(a, b, c, d, modes=modes).upper
+    modes = Modes.of(a) if modes is None else modes
+    if modes.radius >= 1.0:
         return float("inf")
-    best, _ = _modal_peak(a, b, c, d, modes, points=MANY_GRID_POINTS)
-    return best if np.isfinite(best) else hinf_norm(a, b, c, d).upper
+    balanced = _balanced(a, b, c, modes)
+    best, _ = _modal_peak(*balanced[:3], d, balanced[3], points=MANY_GRID_POINTS)
+    return best if np.isfinite(best) else hinf_norm(a, b, c, d, modes=modes).upper
 
 
-def _modes(a: FloatArray) -> tuple[ComplexArray, ComplexArray]:
-    """Return the eigenvalues ``(n,)`` of ``a`` and its eigenvectors ``(n, n)``."""
-    values, vectors = np.linalg.eig(a)
-    return np.asarray(values, dtype=np.complex128), np.asarray(vectors, dtype=np.complex128)
-
-
-def _norm_of_many_states(
-    a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, modes: tuple[ComplexArray, ComplexArray]
-) -> HinfNorm | None:
+def _norm_of_many_states(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, modes: Modes) -> HinfNorm | None:
     """Return the norm from the highest peak of a modal response and a Riccati equation just above it.
 
     ``None`` where the equation has no solution there: the peak was missed, or the data are too hard for doubling.
@@ -182,13 +180,13 @@ def _modal_peak(
     b: FloatArray,
     c: FloatArray,
     d: FloatArray,
-    modes: tuple[ComplexArray, ComplexArray],
+    modes: Modes,
     *,
     points: int,
 ) -> tuple[float, float]:
     """Return the largest gain found in modal coordinates, and where; infinite where they are not to be believed."""
     with np.errstate(all="ignore"):
-        response = ModalResponse.of(*modes, b, c, d)
+        response = ModalResponse.of(modes, b, c, d)
         if response is None:
             return np.inf, np.nan
         angles = response.peaks(points)
@@ -197,25 +195,36 @@ def _modal_peak(
     return (best, angle) if abs(best - believed) <= MODAL_ERROR * best else (np.inf, np.nan)
 
 
-def _highest_peak(
-    a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, modes: tuple[ComplexArray, ComplexArray]
-) -> tuple[float, float]:
+def _highest_peak(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, modes: Modes) -> tuple[float, float]:
     """Return the largest gain found, and where, of modal peaks or of a plain grid with the angles of the poles."""
     if a.shape[0]:
         best, angle = _modal_peak(a, b, c, d, modes, points=GRID_POINTS)
         if np.isfinite(best):
             return best, angle
     grid = np.linspace(0.0, np.pi, GRID_POINTS)
-    return _peak(a, b, c, d, np.concatenate([grid, np.abs(np.angle(modes[0]))]))
+    return _peak(a, b, c, d, np.concatenate([grid, np.abs(np.angle(modes.values))]))
 
 
 def balanced_realisation(a: FloatArray, b: FloatArray, c: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the realisation with its states scaled by powers of two, which is exact: units must not cost digits."""
+    scale = _state_units(a, b, c)
+    return a * scale / scale[:, None], b / scale[:, None], c * scale
+
+
+def _balanced(
+    a: FloatArray, b: FloatArray, c: FloatArray, modes: Modes
+) -> tuple[FloatArray, FloatArray, FloatArray, Modes]:
+    """Return the realisation of `balanced_realisation` and its modes."""
+    scale = _state_units(a, b, c)
+    moved = Modes(modes.values, modes.vectors / scale[:, None])
+    return a * scale / scale[:, None], b / scale[:, None], c * scale, moved
+
+
+def _state_units(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
     n, inputs, outputs = a.shape[0], b.shape[1], c.shape[0]
     system = np.zeros((n + inputs + outputs, n + inputs + outputs))
     system[:n, :n], system[:n, n : n + inputs], system[n + inputs :, :n] = a, b, c
-    scale = balancing_factors(system)[:n]
-    return a * scale / scale[:, None], b / scale[:, None], c * scale
+    return balancing_factors(system)[:n]
 
 
 def balancing_factors(matrix: FloatArray) -> FloatArray:

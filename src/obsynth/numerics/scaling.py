@@ -182,18 +182,18 @@ def balance_by_least_squares(
     """
     nx = E.shape[0]
     b, c = np.hstack([np.zeros((nx, 0)), *inputs]), np.vstack([np.zeros((0, nx)), *outputs])
-    parts = np.split(np.arange(2 * nx + len(c) + b.shape[1]), [nx, 2 * nx, 2 * nx + len(c)])
-    equations, states, shown, entering = parts
-    normal = SMALL_RIDGE * np.eye(sum(map(len, parts)))
-    right = np.zeros(len(normal))
+    ends = [0, nx, 2 * nx, 2 * nx + len(c), 2 * nx + len(c) + b.shape[1]]
+    equations, states, shown, entering = map(slice, ends[:-1], ends[1:])
+    normal = SMALL_RIDGE * np.eye(ends[-1])
+    diagonal, right = np.einsum("ii->i", normal), np.zeros(ends[-1])
     blocks = ((E, equations, states), (A, equations, states), (c, shown, states), (b, equations, entering))
     for matrix, rows, columns in blocks:
         there = matrix != 0.0
         sizes = np.log2(np.abs(np.where(there, matrix, 1.0)))
-        normal[np.ix_(rows, columns)] += there
-        normal[np.ix_(columns, rows)] += there.T
-        normal[rows, rows] += np.sum(there, axis=1)
-        normal[columns, columns] += np.sum(there, axis=0)
+        normal[rows, columns] += there
+        normal[columns, rows] += there.T
+        diagonal[rows] += np.sum(there, axis=1)
+        diagonal[columns] += np.sum(there, axis=0)
         right[rows] -= np.sum(sizes, axis=1)
         right[columns] -= np.sum(sizes, axis=0)
     exponents = np.round(np.linalg.solve(normal, right)).astype(np.int64)

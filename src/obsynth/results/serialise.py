@@ -167,6 +167,9 @@ def _fields_of(record: StateRecovery) -> dict[str, Any]:
 def _design_from(data: dict[str, Any]) -> ObserverDesign:
     if data.get("kind") not in _KINDS:
         raise SpecError(f"A design of the kind {data['kind']!r} is unknown to this obsynth.", path="kind")
+    for name in ("name", "method"):
+        if not isinstance(data[name], str):
+            raise TypeError(f"{name} is {data[name]!r}, not a text")
     plant, observer = _KINDS[data.get("kind")]
     return ObserverDesign(
         name=data["name"],

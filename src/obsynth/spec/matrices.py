@@ -136,10 +136,10 @@ def _comma_separated(path: Path) -> Any:
 def _numpy_archive(path: Path) -> dict[str, Any]:
     # Opened here, because numpy leaves a damaged file open.
     with path.open("rb") as stream:
-        archive = np.load(stream, allow_pickle=False)
-        if not isinstance(archive, np.lib.npyio.NpzFile):
+        if not zipfile.is_zipfile(stream):
             raise ValueError("it is no .npz archive")
-        with archive:
+        stream.seek(0)
+        with np.load(stream, allow_pickle=False) as archive:
             return dict(archive)
 
 

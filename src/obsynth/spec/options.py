@@ -22,7 +22,7 @@ class FaultEstimationFilterOptions(Section):
     residual_weight_limit: Positive | None = None
     S: Matrix | None = None
     engine: Literal["auto", "riccati", "lmi"] = "auto"
-    solver: Literal["CLARABEL", "SCS"] = "CLARABEL"
+    solver: Literal["auto", "SCHUR", "CLARABEL", "SCS"] = "auto"
     tolerance: Annotated[float, Field(gt=0.0, lt=1.0)] = 1e-6
 
 

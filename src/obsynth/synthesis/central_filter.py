@@ -20,7 +20,7 @@ NOISES = (1e-6, 1e-8, 1e-7, 1e-5, 1e-4, 1e-2)
 #: Relative width of the bracket at which the search ends, for few and for many states.
 FEW_STATES = 80
 LEVEL_TOLERANCE = 1e-7
-COARSE_LEVEL_TOLERANCE = 1e-4
+COARSE_LEVEL_TOLERANCE = 1e-5
 COARSE_NOISES = (1e-6, 1e-4)
 #: Distance below the best gain, in tolerances, at which another noise is tried.
 PROBE = 10.0

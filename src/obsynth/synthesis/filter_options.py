@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.synthesis.lmi import SOLVER_SETTINGS
+from obsynth.synthesis.lmi import FILTER_SOLVERS
 
 #: Who finds the gains: Riccati equations, or the matrix inequality started from them.
 ENGINES = ("auto", "riccati", "lmi")
@@ -27,7 +27,7 @@ class FilterOptions:
     residual_weight_limit: float | None = None
     S: Any = None
     engine: str = "auto"
-    solver: str = "CLARABEL"
+    solver: str = "auto"
     tolerance: float = 1e-6
 
     def __post_init__(self) -> None:
@@ -45,8 +45,8 @@ class FilterOptions:
             )
         if self.engine not in ENGINES:
             problems.append(f"engine is {self.engine!r}: use one of {', '.join(ENGINES)}.")
-        if self.solver not in SOLVER_SETTINGS:
-            problems.append(f"solver is {self.solver!r}: use one of {', '.join(SOLVER_SETTINGS)}.")
+        if self.solver not in FILTER_SOLVERS:
+            problems.append(f"solver is {self.solver!r}: use one of {', '.join(FILTER_SOLVERS)}.")
         if not 0.0 < self.tolerance < 1.0:
             problems.append(f"tolerance is {self.tolerance}: give a number between 0 and 1.")
         limit = self.residual_weight_limit
@@ -54,6 +54,8 @@ class FilterOptions:
             problems.append(f"residual_weight_limit is {limit}: give a positive number.")
         if limit is not None and self.free_residual_weight is False:
             problems.append("residual_weight_limit needs free_residual_weight: the weight is fixed otherwise.")
+        if limit is not None and self.engine == "riccati":
+            problems.append("residual_weight_limit is not covered by engine 'riccati': use 'auto' or 'lmi'.")
         if problems:
             raise SpecError("Options of fault-estimation-filter:", path="method.options", problems=problems)
 

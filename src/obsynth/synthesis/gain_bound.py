@@ -2,31 +2,76 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
 from obsynth.errors import InfeasibleError, SolverError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.synthesis import lmi
-from obsynth.synthesis.gain_problem import GainProblem, normalise
+from obsynth.synthesis.gain_problem import GainProblem, Injection, NormalisedProblem, normalise
+from obsynth.synthesis.gain_search import LeastGain
 from obsynth.synthesis.invisible import invisible_pairs, invisible_part, null_space, strict_point
 
 #: A dual point must be positive definite by this margin, where the point of `strict_point` is the identity, and beat
 #: the level by this relative one.
 DUAL_MARGIN = 1e-8
 BOUND_MARGIN = 1e-6
+#: Disturbances smaller than these, relative to the largest, may be left out of the proof.
+NEGLIGIBLE_DISTURBANCES = (1e-3, 3e-2)
 
 
-def proved_lower_bound(problem: GainProblem, *, solver: str) -> float:
+def proved_lower_bound(
+    problem: GainProblem, *, solver: str, best: Injection | None = None, enough: float = np.inf
+) -> float:
     """Return a lower bound on the gain of every filter, from a dual point that passes our own check; 0 without one.
 
+    The dual is solved in the coordinates of the starting filter, then in those of the best one; and in turn without the
+    disturbances that are negligible beside the largest, which only make the bound lower.
+
+    Parameters
+    ----------
+    problem : GainProblem
+        In the original coordinates.
+    solver : str
+        Name of the solver.
+    best : Injection, optional
+        Gains of the best filter found.
+    enough : float, optional
+        A bound above this is not improved upon.
+
+    Notes
+    -----
     For ``Z1 >= 0`` in the null basis N of [C D] with ``Q = G N Z1 N'G' - Nx Z1 Nx' >= 0`` and, for a fixed weight,
     ``Z2 = [Q, *; *, *] >= 0``: multiplying the two eliminated inequalities by Z1 and Z2 cancels P, and leaves
     ``g^2 (tr Nd Z1 Nd' + tr Z2_22) > tr H N Z1 N'H' + tr H Z2 H'`` (for a free weight without Z2).  The check is in
     floating point with margins, on data in which a strictly feasible dual point is the identity.
     """
-    normalised = normalise(problem, rotate=solver not in lmi.FIRST_ORDER_SOLVERS)
+    bound = 0.0
+    for work, start in product(_with_fewer_disturbances(problem), (None,) if best is None else (None, best)):
+        bound = max(
+            bound, _bound_in(normalise(work, start=start, rotate=solver not in lmi.FIRST_ORDER_SOLVERS), solver)
+        )
+        if bound > enough:
+            break
+    return bound
+
+
+def _with_fewer_disturbances(problem: GainProblem) -> Iterator[GainProblem]:
+    """Yield the problem, and the problem without small disturbances: a gain for fewer of them is not larger."""
+    yield problem
+    sizes = np.linalg.norm(np.vstack([problem.B, problem.D, problem.Zd]), axis=0)
+    count = len(sizes)
+    for share in NEGLIGIBLE_DISTURBANCES:
+        kept = sizes > share * np.max(sizes, initial=0.0)
+        if 0 < np.sum(kept) < count:
+            count = int(np.sum(kept))
+            yield replace(problem, B=problem.B[:, kept], D=problem.D[:, kept], Zd=problem.Zd[:, kept])
+
+
+def _bound_in(normalised: NormalisedProblem, solver: str) -> float:
     work = invisible_part(normalised.problem)
     if work.disturbances == 0:
         return 0.0
@@ -118,15 +163,15 @@ def _checked_bound(dual: _DualProblem, z1: FloatArray, corner: FloatArray, last:
     return float(np.sqrt(max(shown, 0.0) / energy)) * (1.0 - BOUND_MARGIN) if energy > 0.0 else 0.0
 
 
-def require_reachable(problem: GainProblem, best: float, gain: float, *, solver: str) -> None:
+def require_reachable(problem: GainProblem, least: LeastGain, gain: float, *, solver: str) -> None:
     """Raise unless ``gain`` is within reach of the best filter found.
 
     Parameters
     ----------
     problem : GainProblem
         In the original coordinates.
-    best : float
-        True norm of the best filter found.
+    least : LeastGain
+        The best filter found, with its true norm.
     gain : float
         Level asked for.
     solver : str
@@ -139,10 +184,13 @@ def require_reachable(problem: GainProblem, best: float, gain: float, *, solver:
     SolverError
         Neither a filter nor a proof was found.
     """
+    best = least.gain
     if problem.disturbances == 0 or best <= gain:
         return
     # Without free measurements there is one filter, and its norm is attained at a frequency.
-    bound = best * (1.0 - BOUND_MARGIN) if problem.measured == 0 else proved_lower_bound(problem, solver=solver)
+    bound = best * (1.0 - BOUND_MARGIN)
+    if problem.measured:
+        bound = proved_lower_bound(problem, solver=solver, best=least.injection, enough=gain)
     choice = "for this T and N" if problem.free_weight else "for this T, N and W"
     if bound > gain:
         remedy = "" if problem.free_weight else ", or set free_residual_weight: true"

@@ -6,13 +6,15 @@ The bounded real inequality in P, Y = P R and V, with g the gain level,
     \begin{bmatrix} P & 0 & (PA - YC)^T & (Z + VC)^T \\ & g^2 I & (PB - YD)^T & (Z_d + VD)^T \\
     & & P & 0 \\ & & & I \end{bmatrix} > 0
 
-is used in two forms.  The *eliminated* form has no Y and V (elimination lemma; N a basis of null [C D],
+is used in two forms.  The *eliminated* form has no Y (elimination lemma; N a basis of null [C D], M = [C D],
 G = [A B], H = [Z Zd]):
 
 .. math:: N^T(\mathrm{diag}(P, g^2 I) - G^T P G - H^T H) N > 0, \quad
-          \mathrm{diag}(P, g^2 I) - H^T H > 0 \ (\text{V fixed}), \quad P > 0 \ (\text{V free}),
+          \mathrm{diag}(P, g^2 I) - (H + VM)^T (H + VM) > 0,
 
-and its gains come in closed form, so that nothing is lost: they minimise the residual in the Loewner order.
+where V is zero when the weight is fixed, a variable when it has a limit, and eliminated as well when it is free,
+which leaves P > 0 of the second condition.  The gains come in closed form, so that nothing is lost: they minimise the
+residual in the Loewner order.
 """
 
 from __future__ import annotations
@@ -25,13 +27,15 @@ import numpy as np
 from obsynth.errors import SolverError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.synthesis import lmi
-from obsynth.synthesis.gain_problem import GainProblem, Injection
+from obsynth.synthesis.gain_problem import GainProblem, Injection, WeightLimit
 
 #: Strictness of the inequalities, in normalised coordinates where every block is of size one.
 MARGIN = 1e-9
 #: Bounds on P in normalised coordinates: they keep P away from singular and the gains from running away.
 P_FLOOR = 1e-4
 P_CEILING = 1e4
+#: Relative room in P and in the squared level for the gains of the eliminated form.
+RECOVERY_ROOM = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +70,7 @@ def null_basis(matrix: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class _Inequality:
-    """The bounded real inequality with its variables; ``y`` and ``v`` are ``None`` in the eliminated form."""
+    """The bounded real inequality with its variables; ``y`` is ``None`` in the eliminated form."""
 
     p: Any
     y: Any
@@ -75,43 +79,51 @@ class _Inequality:
 
     def gains(self, problem: GainProblem, level: float) -> Injection:
         """Return the gains that the solved variables stand for."""
-        solution = lmi.value_of(self.p)
+        solution, limit = lmi.value_of(self.p), problem.weight_limit
+        v = np.zeros((problem.Z.shape[0], problem.measured)) if self.v is None else lmi.value_of(self.v)
+        v = v if limit is None else limit.kept(v)
         if self.y is None:
-            return injection_for(problem, solution, level)
+            # Both conditions stay true, strictly, when P and g^2 grow by the same factor: the gains stay of a natural
+            # size where a solution lies on the boundary.
+            room = 1.0 + RECOVERY_ROOM
+            given = None if self.v is None else v
+            return injection_for(problem, room * solution, float(np.sqrt(room)) * level, v=given)
         if problem.measured == 0:
-            return Injection(np.zeros((problem.order, 0)), lmi.value_of(self.v))
-        v, limit = lmi.value_of(self.v), problem.weight_limit
-        return Injection(
-            np.asarray(np.linalg.solve(solution, lmi.value_of(self.y))), v if limit is None else limit.kept(v)
-        )
+            return Injection(np.zeros((problem.order, 0)), v)
+        return Injection(np.asarray(np.linalg.solve(solution, lmi.value_of(self.y))), v)
 
 
-def _inequality(problem: GainProblem, squared: Any, *, ceiling: float) -> _Inequality:
-    """Return the eliminated form, or the full one where the weight has a limit."""
-    p = lmi.symmetric_variable(problem.order)
-    if problem.weight_limit is None:
-        return _Inequality(p, None, None, _eliminated_constraints(problem, p, squared, ceiling=ceiling))
-    return _full_inequality(problem, p, squared, ceiling=ceiling)
-
-
-def _eliminated_constraints(problem: GainProblem, p: Any, squared: Any, *, ceiling: float) -> list[Any]:
-    n, nd = problem.order, problem.disturbances
-    outputs = np.hstack([problem.Z, problem.Zd])
-    basis = null_basis(np.hstack([problem.C, problem.D]))
+def _eliminated_inequality(problem: GainProblem, squared: Any, *, ceiling: float) -> _Inequality:
+    n, m, q, nd = problem.order, problem.measured, problem.Z.shape[0], problem.disturbances
+    p = lmi.symmetric_variable(n)
+    measured, outputs = np.hstack([problem.C, problem.D]), np.hstack([problem.Z, problem.Zd])
+    basis = null_basis(measured)
     top, bottom, image = basis[:n], basis[n:], np.hstack([problem.A, problem.B]) @ basis
     # Each cone costs its size to the sixth: the trace bounds P from above, and P > Z'Z from below where it is asked.
     constraints = [lmi.at_most(lmi.scalar_block(lmi.trace(p)), ceiling * n)] if n else []
     if basis.shape[1]:
         reduced = top.T @ p @ top - image.T @ p @ image - (outputs @ basis).T @ (outputs @ basis)
         constraints.append(lmi.at_least(reduced + squared * (bottom.T @ bottom) if nd else reduced, MARGIN))
-    if problem.weight_is_free:
-        constraints.append(lmi.at_least(p, P_FLOOR))
-    elif not np.any(problem.Zd):
-        constraints.append(lmi.at_least(p - problem.Z.T @ problem.Z, MARGIN))
+    limit = problem.weight_limit
+    if problem.weight_is_free and limit is None:
+        return _Inequality(p, None, None, [*constraints, lmi.at_least(p, P_FLOOR)])
+    blocks = [[p]]
+    if np.any(problem.Zd) or (limit is not None and np.any(problem.D)):
+        blocks.append([np.zeros((nd, n)), squared * np.eye(nd)])
     else:
-        weight = lmi.symmetric_blocks([[p], [np.zeros((nd, n)), squared * np.eye(nd)]])
-        constraints.append(lmi.at_least(weight - outputs.T @ outputs, MARGIN))
-    return constraints
+        measured, outputs = problem.C, problem.Z
+    if limit is None:
+        weight = lmi.symmetric_blocks(blocks)
+        return _Inequality(p, None, None, [*constraints, lmi.at_least(weight - outputs.T @ outputs, MARGIN)])
+    v = lmi.matrix_variable(q, m)
+    shown = [outputs[:, part] + v @ measured[:, part] for part in (slice(n), slice(n, None))[: len(blocks)]]
+    whole = lmi.symmetric_blocks([*blocks, [*shown, np.eye(q)]])
+    return _Inequality(p, None, v, [*constraints, lmi.at_least(whole, MARGIN), _weight_constraint(limit, v)])
+
+
+def _weight_constraint(limit: WeightLimit, v: Any) -> Any:
+    weight = limit.fixed / limit.bound + v @ (limit.free / limit.bound)
+    return lmi.at_least(lmi.symmetric_blocks([[np.eye(weight.shape[1])], [weight, np.eye(weight.shape[0])]]))
 
 
 def _full_inequality(
@@ -129,19 +141,17 @@ def _full_inequality(
         ]
     )
     constraints = [lmi.at_least(p, P_FLOOR), lmi.at_most(p, ceiling), lmi.at_least(whole, MARGIN)]
-    limit = problem.weight_limit
-    if limit is not None:
-        weight = limit.fixed / limit.bound + v @ (limit.free / limit.bound)
-        constraints.append(lmi.at_least(lmi.symmetric_blocks([[np.eye(weight.shape[1])], [weight, np.eye(q)]])))
+    if problem.weight_limit is not None:
+        constraints.append(_weight_constraint(problem.weight_limit, v))
     return _Inequality(p, y, v, constraints)
 
 
-def injection_for(problem: GainProblem, p: FloatArray, gain: float) -> Injection:
-    """Return the gains that P allows at level ``gain``, in closed form.
+def injection_for(problem: GainProblem, p: FloatArray, gain: float, *, v: FloatArray | None = None) -> Injection:
+    """Return the gains that P allows at level ``gain``, in closed form, with the given V or the best there is.
 
     ``(G - R M) S^-1 (G - R M)' < P^-1`` with ``M = [C D]`` is least, in the Loewner order, at
-    ``R = G S^-1 M' (M S^-1 M')^-1``; S is diag(P, g^2 I), less ``H'H`` when V is fixed, and V comes out of
-    the same formula with H stacked under G when it is free.
+    ``R = G S^-1 M' (M S^-1 M')^-1``; S is diag(P, g^2 I), less ``(H + V M)'(H + V M)`` when V is given or fixed at
+    zero, and V comes out of the same formula with H stacked under G when it is free.
     """
     n, m, q = problem.order, problem.measured, problem.Z.shape[0]
     if m == 0:
@@ -151,15 +161,15 @@ def injection_for(problem: GainProblem, p: FloatArray, gain: float) -> Injection
     weight = np.zeros((n + problem.disturbances,) * 2)
     weight[:n, :n] = p
     weight[n:, n:] = gain**2 * np.eye(problem.disturbances)
-    stacked = through
-    if problem.weight_is_free:
-        stacked = np.vstack([through, outputs])
-    else:
+    free = problem.weight_is_free and v is None
+    stacked = np.vstack([through, outputs]) if free else through
+    if not free:
+        given = np.zeros((q, m)) if v is None else v
+        outputs = outputs + given @ measured
         weight = weight - outputs.T @ outputs
     lifted = np.linalg.solve(0.5 * (weight + weight.T), measured.T)
     gains = np.linalg.solve(measured @ lifted, (stacked @ lifted).T).T
-    v = -gains[n:] if problem.weight_is_free else np.zeros((q, m))
-    return Injection(gains[:n], v)
+    return Injection(gains[:n], -gains[n:] if free else given)
 
 
 def least_gain(problem: GainProblem, *, solver: str, ceiling: float = P_CEILING) -> GainSolution:
@@ -180,7 +190,7 @@ def least_gain(problem: GainProblem, *, solver: str, ceiling: float = P_CEILING)
         No usable answer.
     """
     squared = lmi.scalar_variable()
-    inequality = _inequality(problem, squared, ceiling=ceiling)
+    inequality = _eliminated_inequality(problem, squared, ceiling=ceiling)
     record = lmi.minimise(squared, inequality.constraints, what="least gain", solver=solver)
     gain = float(np.sqrt(max(float(lmi.value_of(squared)), 0.0)))
     return GainSolution(gain, lmi.value_of(inequality.p), inequality.gains(problem, gain), record)
@@ -194,7 +204,7 @@ def feasible_point(problem: GainProblem, gain: float, *, solver: str) -> GainSol
     """
     slack = lmi.scalar_variable()
     # A slack of t is the same as asking for the level g^2 - t in the disturbance block.
-    inequality = _inequality(problem, gain**2 - slack, ceiling=P_CEILING)
+    inequality = _eliminated_inequality(problem, gain**2 - slack, ceiling=P_CEILING)
     try:
         record = lmi.minimise(-slack, inequality.constraints, what=f"feasibility at {gain:.6g}", solver=solver)
         level = float(np.sqrt(max(gain**2 - float(lmi.value_of(slack)), 0.0)))

@@ -27,6 +27,8 @@ CEILINGS = (1e4, 1e2, 1e1)
 NEGLIGIBLE_GAIN = 1e-6
 #: A shipped gain is never asked to be smaller than this fraction of the starting filter's.
 SMALLEST_USEFUL_GAIN = 1e-3
+#: Why the inequality was not asked, or not again.
+NOTHING_TO_POLISH = "reached: the disturbance does as much before any measurement can help; nothing to polish"
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,6 +113,8 @@ def search_least_gain(problem: GainProblem, *, solver: str, polish: bool = True)
             break
         if not polish and gain >= GOOD_COORDINATES * before:
             break
+    if polish and gain <= least_level(problem) * (1.0 + PASS_IMPROVEMENT):
+        records.append({"what": "least gain", "solver": "lower bound", "status": NOTHING_TO_POLISH, "gain": gain})
     return LeastGain(gain, first, best, starting, (gain, gain), records)
 
 

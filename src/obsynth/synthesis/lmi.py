@@ -11,24 +11,33 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Sequence
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from obsynth.errors import SolverError
 from obsynth.numerics.arrays import FloatArray
+from obsynth.synthesis.interior_point import solve_cone_programme
 
 if TYPE_CHECKING:
     import cvxpy
 
 #: Statuses that come with numbers; whether they count is decided by verification, not here.
 USABLE_STATUSES = ("optimal", "optimal_inaccurate")
-#: Solvers that take semidefinite constraints, and the settings we use.
+#: Our own solver, see `obsynth.synthesis.interior_point`, and what "auto" tries in turn.
+SCHUR = "SCHUR"
+AUTO_SOLVERS = (SCHUR, "CLARABEL")
 FIRST_ORDER_SOLVERS = ("SCS",)
+#: Solvers of cvxpy that take semidefinite constraints, and the settings we use.
 SOLVER_SETTINGS: dict[str, dict[str, Any]] = {
     "CLARABEL": {},
     "SCS": {"eps_abs": 1e-9, "eps_rel": 1e-9, "max_iters": 20_000},
 }
+#: Problems with more unknowns are made into cones faster by SciPy than by the usual way of cvxpy.
+MANY_UNKNOWNS = 500
+#: Solvers of filters: their inequalities have dense blocks of orders like those of the plant.
+FILTER_SOLVERS = ("auto", SCHUR, *SOLVER_SETTINGS)
 
 
 def symmetric_variable(size: int) -> Any:
@@ -128,7 +137,7 @@ def minimise(objective: Any, constraints: Sequence[Any], *, what: str, solver: s
     what : str
         What is being solved, for messages.
     solver : str, optional
-        A key of `SOLVER_SETTINGS`.
+        One of `FILTER_SOLVERS`; "auto" tries `AUTO_SOLVERS` in turn.
 
     Returns
     -------
@@ -143,14 +152,34 @@ def minimise(objective: Any, constraints: Sequence[Any], *, what: str, solver: s
     import cvxpy
 
     problem: cvxpy.Problem = cvxpy.Problem(cvxpy.Minimize(0 if objective is None else objective), list(constraints))
-    settings = SOLVER_SETTINGS[solver]
+    if solver != "auto":
+        return _solved(problem, what, solver)
+    first, second = AUTO_SOLVERS
+    try:
+        return _solved(problem, what, first)
+    except SolverError as error:
+        if error.record["status"] == "infeasible":
+            raise
+        before = {key: error.record[key] for key in ("solver", "status")}
+    return _solved(problem, what, second) | {"tried_before": before}
+
+
+def _solved(problem: cvxpy.Problem, what: str, solver: str) -> dict[str, Any]:
+    """Solve a problem by one solver and return the record."""
+    settings = SOLVER_SETTINGS.get(solver, {})
     record: dict[str, Any] = {"what": what, "solver": solver, "version": _version(solver), "settings": dict(settings)}
     began = time.perf_counter()
     try:
         with warnings.catch_warnings():
             # "Solution may be inaccurate": every solution is verified, so the warning tells nobody anything.
             warnings.simplefilter("ignore")
-            problem.solve(solver=solver, **settings)
+            if solver == SCHUR:
+                record |= _solved_by_schur_complement(problem)
+            else:
+                problem.solve(solver=solver, **settings)
+                stats = problem.solver_stats
+                iterations = None if stats is None or stats.num_iters is None else int(stats.num_iters)
+                record |= {"status": str(problem.status), "iterations": iterations}
     except (KeyboardInterrupt, SystemExit):
         raise
     except BaseException as error:  # Rust panics, and memory that ran out inside the solver
@@ -159,22 +188,46 @@ def minimise(objective: Any, constraints: Sequence[Any], *, what: str, solver: s
         raise SolverError(
             f"{solver} failed while solving for {what} ({reason}): nothing is known.", record=record
         ) from error
-    stats = problem.solver_stats
-    record |= {
-        "status": str(problem.status),
-        "iterations": None if stats is None or stats.num_iters is None else int(stats.num_iters),
-        "seconds": time.perf_counter() - began,
-    }
-    if problem.status not in USABLE_STATUSES:
+    record["seconds"] = time.perf_counter() - began
+    if record["status"] not in USABLE_STATUSES:
         raise SolverError(
-            f"{solver} ended with status {problem.status!r} while solving for {what}: nothing is known.", record=record
+            f"{solver} ended with status {record['status']!r} while solving for {what}: nothing is known.",
+            record=record,
         )
     return record
+
+
+def _solved_by_schur_complement(problem: cvxpy.Problem) -> dict[str, Any]:
+    """Solve a problem by our own method, from the cones that cvxpy makes of it, and give its variables their values."""
+    # As for CLARABEL: lower triangles, row by row, times sqrt(2) off the diagonal.
+    size = sum(variable.size for variable in problem.variables())
+    backend = "SCIPY" if size > MANY_UNKNOWNS else None
+    data, chain, inverse = problem.get_problem_data("CLARABEL", canon_backend=backend, solver_opts={})
+    cones = data["dims"]
+    if cones.zero or cones.soc or cones.exp or cones.p3d or "P" in data:
+        raise ValueError("only semidefinite blocks, numbers that are not negative and linear objectives are taken")
+    orders = [1] * int(cones.nonneg) + [int(order) for order in cones.psd]
+    found = solve_cone_programme(data["c"], data["A"].toarray(), data["b"], orders)
+    if found.status in USABLE_STATUSES:
+        solution = SimpleNamespace(
+            status="Solved",
+            x=found.x,
+            z=found.z,
+            obj_val=float(data["c"] @ found.x),
+            solve_time=0.0,
+            iterations=found.iterations,
+        )
+        problem.unpack_results(solution, chain, inverse)
+    return {"status": found.status, "iterations": found.iterations}
 
 
 def _version(solver: str) -> str:
     from importlib.metadata import PackageNotFoundError, version
 
+    if solver == SCHUR:
+        from obsynth import __version__
+
+        return __version__
     try:
         return version(solver.lower())
     except PackageNotFoundError:

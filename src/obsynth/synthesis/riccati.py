@@ -85,7 +85,7 @@ def bounded_real_matrix(
     weight = c.T @ c + slack * np.eye(n)
     cross, gap = c.T @ d, d.T @ d - level**2 * np.eye(b.shape[1])
     if b.shape[1]:
-        p = riccati_solution(a.T, b.T, weight, gap, cross, impossible=lambda found: _exceeds(found, b, gap))
+        p = riccati_solution(a.T, b.T, weight, gap, cross, impossible=_Exceeded(b, gap))
     else:
         p = _lyapunov_solution(a, weight)
     if p is None:
@@ -94,13 +94,30 @@ def bounded_real_matrix(
     return p if np.all(np.isfinite(p)) and is_positive(p) else None
 
 
-def _exceeds(p: FloatArray, b: FloatArray, gap: FloatArray) -> bool:
-    """Return whether the gain is above the level over as many steps as ``p`` stands for already, beyond rounding."""
-    left = -(gap + b.T @ p @ b)
-    if not np.all(np.isfinite(left)) or is_positive(left):
-        return False
-    margin = REFUTED * float(np.linalg.norm(b)) ** 2 * float(np.linalg.norm(p))
-    return bool(np.linalg.eigvalsh(left)[0] < -margin)
+class _Exceeded:
+    """Says whether the gain is above the level over as many steps as a solution stands for, beyond rounding.
+
+    Parameters
+    ----------
+    b, gap : FloatArray
+        ``(n, m)``, and ``D'D - level^2 I (m, m)``.
+    """
+
+    def __init__(self, b: FloatArray, gap: FloatArray) -> None:
+        self.b, self.gap = b, gap
+        self.last: FloatArray | None = None
+
+    def __call__(self, p: FloatArray) -> bool:
+        left, sizes = -(self.gap + self.b.T @ p @ self.b), np.diag(p)
+        if not np.all(np.isfinite(left)):
+            return False
+        # Over more steps the solution grows: one that does not is behind a level that was exceeded in between.
+        shrunk = self.last is not None and np.any(sizes < self.last - REFUTED * np.max(self.last))
+        self.last = sizes.copy()
+        if shrunk or is_positive(left):
+            return bool(shrunk)
+        margin = REFUTED * float(np.linalg.norm(self.b)) ** 2 * float(np.linalg.norm(p))
+        return bool(np.linalg.eigvalsh(left)[0] < -margin)
 
 
 def _lyapunov_solution(a: FloatArray, weight: FloatArray) -> FloatArray | None:

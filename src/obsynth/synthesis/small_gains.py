@@ -12,14 +12,11 @@ import numpy as np
 
 from obsynth.errors import SolverError
 from obsynth.numerics.norms import spectral_radius
-from obsynth.synthesis import gain_design
 from obsynth.synthesis.central_filter import FEW_STATES, least_noise_filter, noise_weighted_filters
-from obsynth.synthesis.gain_problem import GainProblem, Injection, NormalisedProblem
-from obsynth.synthesis.gain_search import LeastGain, coordinates
+from obsynth.synthesis.gain_problem import GainProblem, Injection
+from obsynth.synthesis.gain_search import LeastGain
+from obsynth.synthesis.inequality_gains import gains_by_inequality
 
-#: Descent in steps: ratios of successive levels, tried in turn, and how many steps at most.
-STEP_RATIOS = (0.6, 0.9)
-MOST_STEPS = 24
 #: The error shall be forgotten at least this fast (spectral radius), or half as fast as the starting filter does: the
 #: smallest gains alone would leave an observable mode at the very edge of stability.
 SLOWEST_DECAY = 0.999
@@ -32,8 +29,6 @@ PRICE_OF_SPEED = 1.04
 #: Halvings of the step towards the filter of least noise, for few and for many states.
 LINE_STEPS = 7
 COARSE_LINE_STEPS = 3
-#: A step counts when its level is met to this relative accuracy.
-LEVEL_ACCURACY = 1e-6
 
 
 def small_gain_design(
@@ -67,7 +62,7 @@ def small_gain_design(
         return least.injection, records
     nothing = Injection(np.zeros_like(least.injection.R), np.zeros_like(least.injection.V))
     fresh = least.first
-    goal = _Goal(problem, gain, max(SLOWEST_DECAY, 0.5 + 0.5 * _radius(problem, fresh.start)))
+    goal = Goal(problem, gain, max(SLOWEST_DECAY, 0.5 + 0.5 * _radius(problem, fresh.start)))
     if not goal.noisy and goal.met_fast(nothing):
         # Without a noise model the objective is the size of the gains themselves, and zero is least.
         return nothing, records
@@ -95,7 +90,7 @@ def small_gain_design(
     }
     if wanted[engine]:
         # The eliminated inequality has no gains to make small: this takes the whole one.
-        candidates += _by_inequality(goal, least, fresh, records, solver=solver)
+        candidates += gains_by_inequality(goal, least, records, solver=solver)
     if (wanted[engine] or not candidates) and goal.met(least.injection):
         candidates.append(least.injection)
     if not candidates:
@@ -109,7 +104,7 @@ def small_gain_design(
 
 
 @dataclass(frozen=True, eq=False)
-class _Goal:
+class Goal:
     """What a filter must meet, and what it shall cost little of."""
 
     problem: GainProblem
@@ -122,25 +117,33 @@ class _Goal:
         """Whether noise is the cost, or the size of the gains."""
         return self.problem.states_noise
 
+    def at(self, gain: float) -> Goal:
+        """Return the goal at another level."""
+        return replace(self, gain=gain, judged={})
+
     def met(self, injection: Injection) -> bool:
+        """Return whether the true gain is within the level, and the weight within its limit."""
         # A filter is asked for more than once, and for many states each answer takes a Riccati equation.
         if id(injection) not in self.judged:
             self.judged[id(injection)] = (injection, _reaches(self.problem, injection, self.gain))
         return self.judged[id(injection)][1]
 
     def is_fast(self, injection: Injection) -> bool:
+        """Return whether the filter forgets fast enough."""
         return _radius(self.problem, injection) <= self.slowest
 
     def met_fast(self, injection: Injection) -> bool:
+        """Return both."""
         return self.is_fast(injection) and self.met(injection)
 
     def cost(self, injection: Injection) -> float:
+        """Return the variance under the noise, or the size of the gains."""
         if self.noisy:
             return self.problem.noise_variance(injection)
         return float(np.linalg.norm(np.vstack([injection.R, injection.V])))
 
 
-def _lively_filters(goal: _Goal) -> list[Injection]:
+def _lively_filters(goal: Goal) -> list[Injection]:
     """Return fast filters that meet the goal, the best first, where those that weigh the noise alone are slow.
 
     Noise on every state makes a filter trust its measurements more.  Of those that cost little more noise than the
@@ -158,30 +161,7 @@ def _lively_filters(goal: _Goal) -> list[Injection]:
     )
 
 
-def _by_inequality(
-    goal: _Goal, least: LeastGain, fresh: NormalisedProblem, records: list[dict[str, Any]], *, solver: str
-) -> list[Injection]:
-    """Return what the inequality gives, in different coordinates until one is good and fast enough."""
-    problem, gain = goal.problem, goal.gain
-    candidates: list[Injection] = []
-    close = coordinates(problem, solver=solver, start=least.injection, gain=least.gain)
-    attempts = ((close, 1.0), (fresh, 1.0), (None, 1.0), (close, goal.slowest), (fresh, goal.slowest))
-    for normalised, decay in attempts:
-        if normalised is None:
-            injection = _small_gains_step_by_step(problem, fresh, gain, records, solver=solver)
-        else:
-            injection = _small_gains_in(problem, normalised, gain, records, solver=solver, decay=decay)
-        if injection is not None and goal.met(injection):
-            candidates.append(injection)
-            if goal.met_fast(injection):
-                break
-    if not candidates and problem.disturbances:
-        centre = gain_design.feasible_point(close.problem, gain / close.gain, solver=solver)
-        candidates = [] if centre is None else [close.restore(centre.injection)]
-    return [item for item in candidates if goal.met(item)]
-
-
-def _towards(goal: _Goal, injection: Injection, target: Injection | None, *, slowest: float | None = None) -> Injection:
+def _towards(goal: Goal, injection: Injection, target: Injection | None, *, slowest: float | None = None) -> Injection:
     """Go towards a cheaper filter as far as the true gain allows: one P for gain and noise leaves room."""
     if target is None:
         return injection
@@ -204,49 +184,6 @@ def _radius(problem: GainProblem, injection: Injection) -> float:
     return spectral_radius(problem.closed_loop(injection)[0])
 
 
-def _small_gains_in(
-    problem: GainProblem,
-    normalised: NormalisedProblem,
-    gain: float,
-    records: list[dict[str, Any]],
-    *,
-    solver: str,
-    decay: float = 1.0,
-) -> Injection | None:
-    try:
-        work, level = _with_scaled_noise(normalised), gain / normalised.gain
-        found = gain_design.small_gains(work, level, solver=solver, decay=decay)
-    except (SolverError, np.linalg.LinAlgError) as error:
-        records.append(dict(getattr(error, "record", {})) | {"outcome": str(error)})
-        return None
-    records.append(found.record)
-    return normalised.restore(found.injection)
-
-
-def _small_gains_step_by_step(
-    problem: GainProblem, normalised: NormalisedProblem, gain: float, records: list[dict[str, Any]], *, solver: str
-) -> Injection | None:
-    """Walk from the filter of ``normalised`` down to ``gain``, each filter giving the coordinates for the next level.
-
-    Far below the starting filter's gain its coordinates are too bad for one jump, and those of the least gain can
-    be extreme (a decoupled disturbance).
-    """
-    reached = problem.achieved_gain(normalised.start)
-    for _ in range(MOST_STEPS):
-        for ratio in STEP_RATIOS:
-            level = max(gain, ratio * reached)
-            injection = _small_gains_in(problem, normalised, level, records, solver=solver)
-            if injection is not None and _reaches(problem, injection, level * (1.0 + LEVEL_ACCURACY)):
-                break
-        else:
-            return None
-        if _reaches(problem, injection, gain):
-            return injection
-        reached = problem.achieved_gain(injection)
-        normalised = coordinates(problem, solver=solver, start=injection)
-    return None
-
-
 def _reaches(problem: GainProblem, injection: Injection, gain: float) -> bool:
     limit = problem.weight_limit
     if limit is not None and float(np.linalg.norm(limit.fixed + injection.V @ limit.free, 2)) > limit.bound:
@@ -254,12 +191,3 @@ def _reaches(problem: GainProblem, injection: Injection, gain: float) -> bool:
     if problem.disturbances == 0:
         return _radius(problem, injection) < 1.0
     return problem.reaches(injection, gain)
-
-
-def _with_scaled_noise(normalised: NormalisedProblem) -> GainProblem:
-    """Return the problem with its noise scaled so that the objective is of size one."""
-    work = normalised.problem
-    r = normalised.contracted(normalised.start).R
-    size = float(np.linalg.norm(np.vstack([work.Bn - r @ work.Dn, work.Zn])))
-    size = size if size > 0.0 else max(float(np.linalg.norm(work.Dn)), 1.0)
-    return replace(work, Bn=work.Bn / size, Dn=work.Dn / size, Zn=work.Zn / size)

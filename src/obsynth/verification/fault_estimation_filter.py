@@ -14,7 +14,8 @@ from obsynth.analysis.fault_filter_conditions import fault_filter_conditions
 from obsynth.errors import PreconditionError
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.norms import highest_gain_found, hinf_norm, output_covariance, spectral_radius
+from obsynth.numerics.modal_response import Modes
+from obsynth.numerics.norms import highest_gain_found, hinf_norm, output_covariance
 from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.scaling import Scaling, balance_by_least_squares
 from obsynth.observers.linear import LinearObserver
@@ -76,7 +77,8 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
         yield equality(name, claim, identity.residual(allowances.get(key)), source)
     errors = ErrorSystem.of(plant, observer, tracking, lag)
     yield from fault_rows(plant, observer, tracking, errors, scaling, allowances)
-    radius = spectral_radius(observer.Az)
+    modes = Modes.of(observer.Az)
+    radius = modes.radius
     yield upper_bound_check(
         "spectral radius",
         "the observer is stable",
@@ -85,7 +87,7 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
         source="Wang 2015, Theorem 2",
         detail=f"eigenvalues computed; proved by the row 'LMI'; {_time_constant(radius, plant.dt)}",
     )
-    yield from _norm_rows(design, errors, tracking, factor, lag)
+    yield from _norm_rows(design, errors, modes, tracking, factor, lag)
     yield from _noise_rows(plant, errors)
 
 
@@ -149,7 +151,7 @@ def _fits(
 
 
 def _norm_rows(
-    design: ObserverDesign, errors: ErrorSystem, tracking: FloatArray, factor: FloatArray, lag: int
+    design: ObserverDesign, errors: ErrorSystem, modes: Modes, tracking: FloatArray, factor: FloatArray, lag: int
 ) -> Iterator[Check]:
     (plant, observer), claims = design.linear, design.certificate.claims
     gamma = claimed(claims, "gamma")
@@ -168,7 +170,8 @@ def _norm_rows(
     )
     if not plant.nd:
         return
-    norm = hinf_norm(errors.Az, errors.disturbance, errors.fault_output[0], -errors.fault_output[2])
+    fault, states = errors.fault_output, errors.state_output
+    norm = hinf_norm(errors.Az, errors.disturbance, fault[0], -fault[2], modes=modes)
     reported = max(gamma, norm.upper)
     yield upper_bound_check(
         "H-infinity norm",
@@ -178,7 +181,7 @@ def _norm_rows(
         source="Wang 2015, eq. (49)",
         detail=f"peak at {norm.angle:.4g} rad/sample; the gain to quote is {reported:.6g}",
     )
-    state = highest_gain_found(errors.Az, errors.disturbance, errors.state_output[0], -errors.state_output[2])
+    state = highest_gain_found(errors.Az, errors.disturbance, states[0], -states[2], modes=modes)
     yield information(
         "disturbance in the state estimate", "H-infinity norm d -> state error", state, source="recomputed"
     )

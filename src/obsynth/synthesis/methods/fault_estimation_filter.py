@@ -42,7 +42,7 @@ from obsynth.synthesis.gain_bisection import search_by_bisection
 from obsynth.synthesis.gain_bound import require_reachable
 from obsynth.synthesis.gain_design import null_basis
 from obsynth.synthesis.gain_problem import GainProblem, Injection, WeightLimit
-from obsynth.synthesis.lmi import SOLVER_SETTINGS
+from obsynth.synthesis.lmi import FILTER_SOLVERS
 from obsynth.synthesis.result import Synthesis
 from obsynth.synthesis.small_gains import small_gain_design
 
@@ -57,6 +57,11 @@ CERTIFICATE_SHARE = 0.2
 ROUNDING_GAIN = 1e-11
 #: Level of the certificate, relative to the same, when no disturbance reaches the fault estimate at all.
 NOMINAL_GAIN = 1e-3
+
+#: A gamma between these multiples of the least gain found by the equations calls the inequality by default, up to so
+#: many states: far below the least no polish helps, and far above none is needed.
+BELOW_LEAST, ABOVE_LEAST = 0.95, 1.0 + 1e-4
+MOST_STATES_TO_POLISH = 64
 
 
 def conditions(plant: DescriptorSystem) -> tuple[Condition, ...]:
@@ -90,6 +95,11 @@ def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **op
         # What is left of the disturbance in the estimates is rounding: nothing to minimise.
         problem = problem.without_disturbance()
         least = replace(_least_gain(problem, asked, engine), gain=least.starting_gain)
+    elif asked.engine == "auto" and asked.gamma is not None and _leaves_little(asked.gamma, least.gain, problem):
+        progress("polishing the least gain")
+        polished = _least_gain(problem, asked, "lmi")
+        records = [*least.records, *polished.records]
+        least = replace(min(least, polished, key=lambda found: found.gain), records=records)
     gamma = _gain_to_ship(asked, problem, least, noisy=plant.nw > 0)
     progress("choosing small gains")
     inner = gamma - min(CERTIFICATE_SHARE * (gamma - least.gain), CERTIFICATE_MARGIN * gamma)
@@ -120,7 +130,7 @@ def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **op
         gains,
         observer,
         Certificate({"P_factor": factor, "tracking": tracking}, claims),
-        {"engine": _engine_of(engine, records), "runs": [*least.records, *records]},
+        {"engine": _engine_of([*least.records, *records]), "runs": [*least.records, *records]},
         (
             *_gamma_notes(asked.gamma, level if plant.nd else np.inf),
             *notes(plant, prepared.detectability, observer, largest_zero=held[-1].value),
@@ -141,7 +151,7 @@ def gain_problem(prepared: PreparedPlant, *, free_weight: bool) -> tuple[GainPro
     """Return the convex problem behind Theorem 2, with (32) solved exactly, and the fixed parts of the gains."""
     detectability = prepared.detectability
     upsilon = detectability.Upsilon
-    w0, v = np.asarray(np.linalg.pinv(upsilon)), null_basis(upsilon.T)
+    w0, v = _left_inverse(upsilon), null_basis(upsilon.T)
     l0 = prepared.TA @ detectability.Psi @ w0
     measure, na = v.T, prepared.TA.shape[0]
     if prepared.Bw.shape[1]:
@@ -172,11 +182,15 @@ def gain_problem(prepared: PreparedPlant, *, free_weight: bool) -> tuple[GainPro
     return problem, _Parts(l0, w0, v)
 
 
-def _engine_of(asked: str, records: list[dict[str, Any]]) -> str:
-    """Return which engine ran: by default the inequality comes in only where nothing else was found."""
-    if asked != "auto":
-        return asked
-    return "lmi" if any(record.get("solver") in SOLVER_SETTINGS for record in records) else "riccati"
+def _left_inverse(upsilon: FloatArray) -> FloatArray:
+    """Return the left inverse of least norm of a matrix of full column rank, whatever the units of the faults."""
+    units = np.exp2(np.round(np.log2(np.linalg.norm(upsilon, axis=0))))
+    return np.asarray(np.linalg.pinv(upsilon / units) / units[:, None])
+
+
+def _engine_of(records: list[dict[str, Any]]) -> str:
+    """Return which engine ran: the inequality comes in only where it may and where there is something to find."""
+    return "lmi" if any(record.get("solver") in FILTER_SOLVERS for record in records) else "riccati"
 
 
 def _least_gain(problem: GainProblem, asked: FilterOptions, engine: str) -> gain_search.LeastGain:
@@ -184,6 +198,12 @@ def _least_gain(problem: GainProblem, asked: FilterOptions, engine: str) -> gain
     if asked.gamma_search == "direct":
         return gain_search.search_least_gain(problem, solver=asked.solver, polish=polish)
     return search_by_bisection(problem, tolerance=asked.tolerance, solver=asked.solver, polish=polish)
+
+
+def _leaves_little(gamma: float, least: float, problem: GainProblem) -> bool:
+    """Whether a gamma leaves less room above the least gain found than the inequality may still find."""
+    near = BELOW_LEAST * least <= gamma <= ABOVE_LEAST * least
+    return near and problem.disturbances > 0 and problem.order <= MOST_STATES_TO_POLISH
 
 
 def _gain_to_ship(asked: FilterOptions, problem: GainProblem, least: gain_search.LeastGain, *, noisy: bool) -> float:
@@ -196,7 +216,7 @@ def _gain_to_ship(asked: FilterOptions, problem: GainProblem, least: gain_search
         return max((1.0 + asked.gamma_margin) * least.gain, least.starting_gain)
     if asked.gamma is None:
         return max((1.0 + asked.gamma_margin) * least.gain, floor)
-    require_reachable(problem, least.gain, asked.gamma, solver=asked.solver)
+    require_reachable(problem, least, asked.gamma, solver=asked.solver)
     ceiling = LARGEST_USEFUL_GAIN * least.starting_gain
     return min(asked.gamma, ceiling) if ceiling > 0.0 else asked.gamma
 

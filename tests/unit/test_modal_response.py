@@ -1,0 +1,77 @@
+"""Peaks of a frequency response in modal coordinates, against the response itself."""
+
+import numpy as np
+import pytest
+
+from obsynth.numerics.level_crossings import SAFE_CONDITION, level_crossings
+from obsynth.numerics.modal_response import ModalResponse, Modes
+from obsynth.numerics.norms import frequency_response, highest_gain_found, hinf_norm
+
+
+def random_system(rng, n, m, p, *, damping):
+    a = rng.standard_normal((n, n))
+    a *= (1.0 - damping) / np.max(np.abs(np.linalg.eigvals(a)))
+    return a, rng.standard_normal((n, m)), rng.standard_normal((p, n)), rng.standard_normal((p, m))
+
+
+@pytest.mark.parametrize(("m", "p"), [(1, 1), (1, 4), (2, 2), (5, 2), (2, 7), (3, 3), (6, 4)])
+def test_gains_are_the_largest_singular_values(m, p):
+    rng = np.random.default_rng([1, m, p])
+    angles = np.linspace(0.0, np.pi, 40)
+    for n in (1, 5, 12):
+        a, b, c, d = random_system(rng, n, m, p, damping=0.1)
+        true = np.linalg.svd(frequency_response(a, b, c, d, angles), compute_uv=False)[:, 0]
+        found = ModalResponse.of(Modes.of(a), b, c, d).gains(angles)
+        assert np.allclose(found, true, rtol=1e-9)
+
+
+def test_an_estimate_for_many_states_and_signals_is_below_and_close():
+    rng = np.random.default_rng(2)
+    a, b, c, d = random_system(rng, 70, 4, 5, damping=1e-2)
+    response = ModalResponse.of(Modes.of(a), b, c, d)
+    angle = response.peaks(257)[:1]
+    true = np.linalg.svd(frequency_response(a, b, c, d, angle), compute_uv=False)[:, 0]
+    assert 0.9 * true[0] <= response.gains(angle)[0] <= true[0] * (1.0 + 1e-9)
+
+
+@pytest.mark.parametrize("damping", [0.5, 1e-1, 1e-2, 1e-4, 1e-6])
+@pytest.mark.parametrize("seed", range(5))
+def test_the_highest_peak_is_found_where_a_fine_grid_has_it(damping, seed):
+    rng = np.random.default_rng([3, seed])
+    a, b, c, d = random_system(rng, 8, 2, 2, damping=damping)
+    modes = Modes.of(a)
+    angles = ModalResponse.of(modes, b, c, d).peaks(33)
+    found = np.linalg.svd(frequency_response(a, b, c, d, angles), compute_uv=False)[:, 0].max()
+    poles = np.abs(np.angle(modes.values))[:, None] + damping * np.linspace(-3.0, 3.0, 601)
+    fine = np.concatenate([np.linspace(0.0, np.pi, 4001), poles.ravel()])
+    assert found >= np.linalg.svd(frequency_response(a, b, c, d, fine), compute_uv=False)[:, 0].max() * (1.0 - 1e-6)
+
+
+def test_eigenvectors_that_are_no_basis_give_no_response():
+    shift = np.eye(3, k=1)
+    assert ModalResponse.of(Modes.of(shift), np.ones((3, 1)), np.ones((1, 3)), np.zeros((1, 1))) is None
+
+
+def test_known_modes_change_nothing():
+    rng = np.random.default_rng(4)
+    for n in (6, 70):
+        a, b, c, d = random_system(rng, n, 2, 2, damping=0.05)
+        assert hinf_norm(a, b, c, d, modes=Modes.of(a)) == hinf_norm(a, b, c, d)
+        assert highest_gain_found(a, b, c, d, modes=Modes.of(a)) == highest_gain_found(a, b, c, d)
+    assert Modes.of(np.diag([0.5, -0.75])).radius == 0.75
+    assert Modes.of(np.zeros((0, 0))).radius == 0.0
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_crossings_next_to_zero_and_to_the_highest_frequency(side):
+    """|1 / (z - a)| = level at one angle; close to pi the pencil cannot be made an ordinary problem."""
+    a = 0.5 * side
+    for angle in (1e-3, 0.5, 2.0, np.pi - 1e-3):
+        level = 1.0 / abs(np.exp(1j * angle) - a)
+        matrices = (np.full((1, 1), value) for value in (a, 1.0, 1.0, 0.0))
+        crossings, _ = level_crossings(*matrices, level)
+        assert np.min(np.abs(crossings - angle)) < 1e-6
+    # At the peak itself the pencil is singular at z = 1 or -1.
+    crossings, distance = level_crossings(*(np.full((1, 1), v) for v in (a, 1.0, 1.0, 0.0)), 2.0)
+    assert distance < np.sqrt(SAFE_CONDITION)
+    assert np.all(np.minimum(crossings, np.pi - crossings) < 1e-3)
