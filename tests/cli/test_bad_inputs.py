@@ -241,7 +241,7 @@ SCHEMA = [
     Case(
         "unknown solver",
         put("method", "options", "solver", "MOSEK"),
-        "method.options.solver: must be one of 'CLARABEL' or 'SCS'",
+        "method.options.solver: must be one of 'auto', 'SCHUR', 'CLARABEL' or 'SCS'",
     ),
     Case(
         "unknown search",

@@ -375,6 +375,7 @@ def test_quiet_runs_have_no_alarm(kind):
     [
         (lambda wang, noisy: obsynth.online_monitor(None), "design is a NoneType"),
         (lambda wang, noisy: obsynth.online_monitor(wang, "nis"), "for this design use one of"),
+        (lambda wang, noisy: obsynth.online_monitor(wang, "glr"), "cusum is nearest to it"),
         (lambda wang, noisy: obsynth.online_monitor(wang), "has no bound"),
         (lambda wang, noisy: obsynth.online_monitor(wang, disturbance_bounds={"w": 0.0}), "its bound would be zero"),
         (lambda wang, noisy: obsynth.online_monitor(wang, disturbance_bounds={"v": 0.0}), "no signal named 'v'"),

@@ -92,5 +92,5 @@ def test_gains_on_the_boundary_of_the_inequality_are_of_a_natural_size(monkeypat
         found = gain_design.least_gain(problem, solver="SCHUR")
         sizes.append(float(np.linalg.norm(found.injection.R)))
         if room:
-            assert problem.achieved_gain(found.injection) <= found.gain * (1.0 + 1e-6)
+            assert problem.achieved_gain(found.injection) <= found.gain * (1.0 + 1e-5)
     assert sizes[0] < 0.5 * sizes[1]

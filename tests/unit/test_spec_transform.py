@@ -62,3 +62,17 @@ def test_its_problems_are_found_where_it_stands(tmp_path: Path) -> None:
         loaded(tmp_path, PLANT, "{file: plant.yaml, transform: {sampletime: 0.5}}")
     with pytest.raises(SpecError, match=r"plant\.transform\.sample_time"):
         loaded(tmp_path, PLANT, "{file: plant.yaml, transform: {sample_time: -1.0}}")
+
+
+@pytest.mark.parametrize("folder", ["moussaali2013_ltv", "diode_circuit"])
+def test_a_transform_of_a_plant_that_takes_none_is_refused(folder: str, tmp_path: Path) -> None:
+    plant = Path(__file__).parents[2] / "designs" / folder / "plant.yaml"
+    spec = tmp_path / "spec.yaml"
+    method = "{id: dae-adaptive-observer, options: {dt: 1}}" if folder == "diode_circuit" else "{id: adaptive-observer}"
+    spec.write_text(
+        f"schema_version: 1\nname: case\nplant: {{file: {plant}, transform: {{sample_time: 0.1}}}}\nmethod: {method}\n",
+        encoding="utf-8",
+    )
+    with pytest.raises(SpecError, match="transform is for linear plants with constant matrices") as caught:
+        load_spec(spec)
+    assert caught.value.path == "plant.transform"

@@ -103,7 +103,11 @@ def online_monitor(
     if isinstance(design.observer, (RecursiveObserver, DAEObserver)):
         return _of_parameters(design.observer, kind, nominal or {}, change, false_alarms)
     if kind not in KINDS:
-        raise SpecError(f"kind is {kind!r}: for this design use one of {', '.join(KINDS)}.", path="kind")
+        hint = " glr is a decision on parameters, which a linear design has none of: cusum is nearest to it."
+        raise SpecError(
+            f"kind is {kind!r}: for this design use one of {', '.join(KINDS)}.{hint if kind == 'glr' else ''}",
+            path="kind",
+        )
     if nominal:
         raise SpecError("nominal is for recursive designs, which estimate parameters.", path="nominal")
     model, dt = _endless_model(design, scenario, window, sample_time)

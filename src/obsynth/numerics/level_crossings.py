@@ -50,16 +50,18 @@ def level_crossings(
 def _pencil_eigenvalues(right: FloatArray, left: FloatArray) -> tuple[ComplexArray, ComplexArray]:
     """Return alpha and beta of the eigenvalues ``z = alpha / beta`` of ``right - z left``.
 
-    With ``z = (1 + s) / (1 - s)`` these are ordinary ones, of ``(left + right)^-1 (right - left)``, where that can be
-    inverted without harm; the circle becomes the imaginary axis.
+    With ``z = (1 + s) / (1 - s)`` these are ordinary ones, of ``(right + left)^-1 (right - left)``, where that can be
+    inverted without harm, which it cannot if there is one close to -1; or the same with ``-left`` and -z, and +1.  The
+    circle becomes the imaginary axis.
     """
     from scipy.linalg import eigvals
     from scipy.linalg.lapack import dgecon, dgetrf, dgetrs
 
-    both = np.asarray_chkfinite(left + right)
-    factors, pivots, failed = dgetrf(both)
-    if not failed and dgecon(factors, np.max(np.sum(np.abs(both), axis=0)))[0] > SAFE_CONDITION:
-        s = np.linalg.eigvals(dgetrs(factors, pivots, right - left)[0])
-        return np.asarray(1.0 + s, dtype=np.complex128), np.asarray(1.0 - s, dtype=np.complex128)
+    for sign in (1.0, -1.0):
+        both = np.asarray_chkfinite(right + sign * left)
+        factors, pivots, failed = dgetrf(both)
+        if not failed and dgecon(factors, np.max(np.sum(np.abs(both), axis=0)))[0] > SAFE_CONDITION:
+            s = np.linalg.eigvals(dgetrs(factors, pivots, right - sign * left)[0])
+            return np.asarray(sign * (1.0 + s), dtype=np.complex128), np.asarray(1.0 - s, dtype=np.complex128)
     alpha, beta = eigvals(right, left, homogeneous_eigvals=True)
     return np.asarray(alpha), np.asarray(beta)

@@ -9,7 +9,7 @@ import numpy as np
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.doubling import compared_gain, gain_is_below
 from obsynth.numerics.level_crossings import level_crossings
-from obsynth.numerics.modal_response import MANY_STATES, ModalResponse, Modes
+from obsynth.numerics.modal_response import ModalResponse, Modes
 
 #: Relative gap between the attained value and the certified level of an H-infinity norm.
 NORM_TOLERANCE = 1e-9
@@ -17,8 +17,9 @@ NORM_TOLERANCE = 1e-9
 GRID_POINTS = 33
 #: Relative difference of modal and true response from which modal coordinates are not believed.
 MODAL_ERROR = 1e-3
-#: From `MANY_STATES` on a Riccati equation takes the pencil's place: relative gaps at which it is asked, in turn, and
-#: points of the grid.
+#: Above so many states a Riccati equation takes the pencil's place, which takes no longer up to there and is exact:
+#: relative gaps at which it is asked, in turn, and points of the grid.
+STATES_OF_PENCIL = 80
 WIDER_TOLERANCES = (1e-4, 1e-3)
 MANY_GRID_POINTS = 257
 #: Each round at least squares the relative error near the peak; more than this means trouble.
@@ -93,7 +94,7 @@ def hinf_norm(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, *, mod
     if modes.radius >= 1.0:
         return HinfNorm(np.inf, np.inf, np.nan, 0.0)
     a, b, c, modes = _balanced(a, b, c, modes)
-    if a.shape[0] >= MANY_STATES:
+    if a.shape[0] > STATES_OF_PENCIL:
         found = _norm_of_many_states(a, b, c, d, modes)
         if found is not None:
             return found
@@ -151,7 +152,7 @@ def highest_gain_found(
     modes : Modes, optional
         Of ``a``, where they are known.
     """
-    if a.shape[0] < MANY_STATES or b.shape[1] == 0 or c.shape[0] == 0 or not np.all(np.isfinite(a)):
+    if a.shape[0] <= STATES_OF_PENCIL or b.shape[1] == 0 or c.shape[0] == 0 or not np.all(np.isfinite(a)):
         return hinf_norm(a, b, c, d, modes=modes).upper
     modes = Modes.of(a) if modes is None else modes
     if modes.radius >= 1.0:

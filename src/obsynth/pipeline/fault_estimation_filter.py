@@ -61,7 +61,7 @@ def fault_estimation_filter(
         verified in each case.
     solver : {"auto", "SCHUR", "CLARABEL", "SCS"}, optional
         Semidefinite solver, for the inequality and for proofs that a gamma cannot be reached.  "SCHUR" is our own
-        interior-point method for few unknowns in dense blocks, 8 to 40 times as fast there as Clarabel; "auto" takes
+        interior-point method for few unknowns in dense blocks, several times as fast there as Clarabel; "auto" takes
         it, and Clarabel where it fails.
     tolerance : float, optional
         Relative width of the bracket at which bisection ends.

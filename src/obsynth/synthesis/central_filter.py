@@ -27,12 +27,10 @@ PROBE = 10.0
 #: The first level tried, relative to the start.
 START_SHARE = 0.5
 #: Weights of the noise beside the disturbance, relative to their sizes, and levels of both together, relative to the
-#: gain of the disturbance alone: a higher one where noise is stated, since gains hardly get smaller by it.
+#: gain of the disturbance alone.
 NOISE_WEIGHTS = np.logspace(-6.0, 3.0, 31)
 LEVEL_FACTORS = (1.0, 1.5)
 WEIGHT_STEPS = 4
-#: The same for many states, where each filter counts.
-COARSE_NOISE_WEIGHTS = np.logspace(-6.0, 3.0, 15)
 #: A level this far above anything a disturbance could do is no limit.
 WITHOUT_LIMIT = 1e4
 
@@ -143,9 +141,8 @@ def noise_weighted_filters(problem: GainProblem, gain: float) -> Iterator[Inject
     sizes = [float(np.linalg.norm(np.vstack(pair))) for pair in ((work.B, work.D), (work.Bn, work.Dn))]
     if work.order == 0 or work.measured == 0 or not min(sizes) > 0.0:
         return
-    few = work.order <= FEW_STATES
-    weights, last = (NOISE_WEIGHTS if few else COARSE_NOISE_WEIGHTS) * sizes[0] / sizes[1], 0
-    for factor in LEVEL_FACTORS if few and problem.states_noise else LEVEL_FACTORS[:1]:
+    weights, last = NOISE_WEIGHTS * sizes[0] / sizes[1], 0
+    for factor in LEVEL_FACTORS:
         # More weight than at a lower level, and not more than can be hoped for.
         low, high = last, len(weights) if factor == 1.0 else min(last + WEIGHT_STEPS, len(weights))
         best = None

@@ -65,7 +65,7 @@ def bounded_real_certificate(
 
 def _changes(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> Iterator[FloatArray]:
     """Yield state changes in which a Riccati solution may prove something, the cheapest first."""
-    for begin in (_balanced, _contracted):
+    for begin in (_balanced, _contracted, _unchanged):
         start = begin(a, b, c)
         inverse = np.asarray(np.linalg.inv(start))
         moved = (inverse @ a @ start, inverse @ b, c @ start)
@@ -81,6 +81,11 @@ def _balanced(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
     system = np.zeros((n + inputs + outputs,) * 2)
     system[:n, :n], system[:n, n : n + inputs], system[n + inputs :, :n] = a, b, c
     return np.diag(balancing_factors(system)[:n])
+
+
+def _unchanged(a: FloatArray, _b: FloatArray, _c: FloatArray) -> FloatArray:
+    """Return no change: at the edge of what can be proved in double precision, other rounding errors may do."""
+    return np.eye(a.shape[0])
 
 
 def _contracted(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:

@@ -116,7 +116,7 @@ def _eliminated_inequality(problem: GainProblem, squared: Any, *, ceiling: float
         weight = lmi.symmetric_blocks(blocks)
         return _Inequality(p, None, None, [*constraints, lmi.at_least(weight - outputs.T @ outputs, MARGIN)])
     v = lmi.matrix_variable(q, m)
-    shown = [outputs[:, :n] + v @ measured[:, :n], outputs[:, n:] + v @ measured[:, n:]][: len(blocks)]
+    shown = [outputs[:, part] + v @ measured[:, part] for part in (slice(n), slice(n, None))[: len(blocks)]]
     whole = lmi.symmetric_blocks([*blocks, [*shown, np.eye(q)]])
     return _Inequality(p, None, v, [*constraints, lmi.at_least(whole, MARGIN), _weight_constraint(limit, v)])
 

@@ -204,8 +204,8 @@ def _solved_by_schur_complement(problem: cvxpy.Problem) -> dict[str, Any]:
     backend = "SCIPY" if size > MANY_UNKNOWNS else None
     data, chain, inverse = problem.get_problem_data("CLARABEL", canon_backend=backend, solver_opts={})
     cones = data["dims"]
-    if cones.zero or cones.soc or cones.exp or cones.p3d:
-        raise ValueError("only semidefinite blocks and numbers that are not negative are taken")
+    if cones.zero or cones.soc or cones.exp or cones.p3d or "P" in data:
+        raise ValueError("only semidefinite blocks, numbers that are not negative and linear objectives are taken")
     orders = [1] * int(cones.nonneg) + [int(order) for order in cones.psd]
     found = solve_cone_programme(data["c"], data["A"].toarray(), data["b"], orders)
     if found.status in USABLE_STATUSES:

@@ -35,6 +35,8 @@ class LaggedPlant:
     @classmethod
     def of(cls, plant: DescriptorSystem, lag: int) -> LaggedPlant:
         """Return ``plant`` with its last ``lag`` states appended."""
+        if lag == 0:
+            return cls(plant.E, plant.A, plant.B, plant.C, 0, plant.nx)
         nx, total = plant.nx, plant.nx * (lag + 1)
         e, a = np.eye(total), np.zeros((total, total))
         e[:nx, :nx], a[:nx, :nx] = plant.E, plant.A
@@ -45,7 +47,7 @@ class LaggedPlant:
 
     def input(self, matrix: FloatArray) -> FloatArray:
         """Return an input matrix ``(nx, *)`` padded for the appended states."""
-        return np.vstack([matrix, np.zeros((self.nx * self.lag, matrix.shape[1]))])
+        return np.vstack([matrix, np.zeros((self.nx * self.lag, matrix.shape[1]))]) if self.lag else matrix
 
     @property
     def oldest(self) -> FloatArray:

@@ -103,13 +103,14 @@ class Identity:
             for factor in product[1:]:
                 bound = bound @ np.abs(factor)
             size = size + bound
-        more = np.zeros_like(total) if allowance is None else allowance
         # Where the sizes are finite, the sum is.
-        if not (np.isfinite(size).all() and np.isfinite(more).all()):
+        if not np.isfinite(size).all() or (allowance is not None and not np.isfinite(allowance).all()):
             return Residual(float("nan"), 1.0)
         scale, missed = self._scale(size), np.abs(total)
-        worst = np.unravel_index(int(np.argmax(missed / (EQUALITY_TOLERANCE * scale + more))), total.shape)
-        return Residual(float(missed[worst]), float(scale[worst]), float(more[worst]))
+        allowed = EQUALITY_TOLERANCE * scale if allowance is None else EQUALITY_TOLERANCE * scale + allowance
+        worst = divmod(int((missed / allowed).argmax()), total.shape[1])
+        more = 0.0 if allowance is None else float(allowance[worst])
+        return Residual(float(missed[worst]), float(scale[worst]), more)
 
     def _scale(self, size: FloatArray) -> FloatArray:
         if self.entrywise:

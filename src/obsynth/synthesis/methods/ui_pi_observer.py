@@ -24,7 +24,7 @@ import numpy as np
 
 from obsynth.analysis.conditions import Condition, require_all
 from obsynth.analysis.unknown_input_conditions import existence
-from obsynth.analysis.unknown_input_pencils import number, numbers
+from obsynth.analysis.unknown_input_pencils import number
 from obsynth.analysis.zeros import is_outside
 from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.models.descriptor import DescriptorSystem
@@ -34,20 +34,19 @@ from obsynth.numerics.spectra import abscissa, decay_rates, eigenvalues, noise_c
 from obsynth.observers.linear import LinearObserver
 from obsynth.results.design import Certificate
 from obsynth.synthesis.lyapunov import lyapunov_factor
-from obsynth.synthesis.placement.compromise import NOISE_PRICE, compromise
+from obsynth.synthesis.placement.compromise import compromise
 from obsynth.synthesis.placement.eigenstructure import place
 from obsynth.synthesis.placement.kalman import KalmanProblem
 from obsynth.synthesis.placement.region import Region, region_gain
 from obsynth.synthesis.result import Synthesis
 from obsynth.synthesis.ui_pi_noise import NoiseWeights, kalman_problem
+from obsynth.synthesis.ui_pi_notes import elimination_note, fixed_mode_notes, slow_note
 from obsynth.synthesis.ui_pi_options import UiPiOptions, checked_poles, plain
 from obsynth.synthesis.ui_pi_problem import PlacementProblem, placement_problem, with_faults
 from obsynth.synthesis.ui_pi_realisation import ObserverGains, combinations_seen, realise
 
 #: A region with a radius and no decay asks for at most this share of its radius.
 RADIUS_SHARE = 0.5
-#: A default this many times slower than the plant itself is worth a note.
-SLOW_DEFAULT = 1000.0
 
 
 def conditions(plant: DescriptorSystem, *, fault_model: Any = "step") -> tuple[Condition, ...]:
@@ -82,9 +81,9 @@ def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **op
         synthesis.certificate,
         {"runs": list(chosen.runs)},
         (
-            *_elimination_note(found.conditions, found.transformation is not None),
-            *_notes(problem, asked, plant.dt),
-            *_slow_note(problem, asked, synthesis.certificate.claims.get("decay")),
+            *elimination_note(found.conditions, found.transformation is not None),
+            *fixed_mode_notes(problem, asked, plant.dt),
+            *slow_note(problem, asked, synthesis.certificate.claims.get("decay")),
         ),
         found.transformation,
     )
@@ -252,42 +251,3 @@ def noise_amplification(observer: LinearObserver) -> float:
         return 0.0 if not len(rows) else float("inf")
     covariance = noise_covariance(observer.Az, observer.By, rows, direct, observer.dt)
     return float(np.sqrt(np.max(np.maximum(np.diag(covariance), 0.0))))
-
-
-def _elimination_note(found: tuple[Condition, ...], eliminated: bool) -> tuple[str, ...]:
-    if not eliminated:
-        return ()
-    detail = next(condition.detail for condition in found if condition.name.startswith("(D1)"))
-    return (f"(D1) holds only without the algebraic states, which were eliminated: {detail}.",)
-
-
-def _notes(problem: PlacementProblem, asked: UiPiOptions, dt: float) -> tuple[str, ...]:
-    found = []
-    fixed = problem.fixed_modes
-    if fixed.size:
-        text = ", ".join(numbers(fixed))
-        rates = decay_rates(fixed, dt)
-        slow = asked.slowest_asked(dt)
-        found.append(
-            f"{fixed.size} of {len(problem.F)} poles are fixed, whatever the gains: {text}"
-            + (
-                f"; the slowest decays at {np.min(rates):.3g} 1/s, slower than asked."
-                if slow is not None and np.min(rates) < slow
-                else "."
-            )
-        )
-    return tuple(found)
-
-
-def _slow_note(problem: PlacementProblem, asked: UiPiOptions, decay: float | None) -> tuple[str, ...]:
-    """Return a note where the default, for lack of noise to pay with, is far slower than the plant."""
-    own = problem.rate / problem.units.time
-    default = asked.poles is None and asked.decay is None and asked.region is None
-    if not default or decay is None or problem.fixed_modes.size or decay * SLOW_DEFAULT >= own:
-        return ()
-    return (
-        f"The slowest pole decays at {decay:.3g} 1/s, against {own:.3g} 1/s of the plant itself: what is faster costs "
-        f"more than {NOISE_PRICE:g} times the noise of a Kalman filter, or was not found. Parts of the fault models "
-        f"that can hardly be told apart ({', '.join(dict.fromkeys(problem.model.descriptions))}) do that: leave one "
-        "out, or give decay or poles.",
-    )

@@ -1,0 +1,214 @@
+"""From the sections of a checked document to plants."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.models.dae import DAEModel
+from obsynth.models.descriptor import DescriptorSystem
+from obsynth.models.names import index_of
+from obsynth.models.time_varying import TimeVaryingDescriptorSystem
+from obsynth.spec.checking import DocumentProblems
+from obsynth.spec.documents import read_names
+from obsynth.spec.matrices import read_matrices, read_matrix
+
+if TYPE_CHECKING:
+    from obsynth.analysis.transformations import Transformation
+    from obsynth.spec.schema import DAESection, PlantSection, TimeVaryingSection, TransformSection
+
+_Plant = TypeVar("_Plant", DescriptorSystem, TimeVaryingDescriptorSystem, DAEModel)
+
+_MATRICES = ("E", "A", "B", "C", "D", "Bf", "Df", "Bd", "Dd", "Bw", "Dw")
+_NAME_LISTS = ("state_names", "input_names", "output_names", "fault_names", "disturbance_names", "noise_names")
+# Equations picked by name also name the signal that enters there.
+_SIGNAL_OF_PICK = {"B": "input_names", "Bw": "noise_names"}
+_LABELS = ("operating_point", "scales", "units")
+
+
+def built_plant(
+    section: PlantSection | TimeVaryingSection | DAESection, source: Path, prefix: str
+) -> DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel:
+    """Return the plant of a section, as written.
+
+    Parameters
+    ----------
+    section : PlantSection, TimeVaryingSection or DAESection
+        Checked.
+    source : Path
+        The document: files are looked up beside it.
+    prefix : str
+        Path of the section in it; empty for a document that is a plant.
+
+    Raises
+    ------
+    SpecError
+        A file cannot be read, or the plant is not well formed.
+    """
+    kind = getattr(section, "kind", None)
+    make: Any = _invariant_plant if kind is None else _nonlinear_plant if kind == "dae" else _varying_plant
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel = make(section, source, prefix)
+    return plant
+
+
+def _placed(make: Callable[[], _Plant], source: Path, prefix: str) -> _Plant:
+    """Return the plant that is made; an error gets its place in the document."""
+    try:
+        return make()
+    except SpecError as error:
+        raise SpecError(
+            f"{source}: {error.args[0].splitlines()[0]}",
+            path=_joined(prefix, error.path or ""),
+            problems=error.problems,
+        ) from error
+
+
+def _joined(prefix: str, name: str) -> str:
+    return f"{prefix}.{name}" if prefix and name else prefix or name
+
+
+def read_value(value: Any, folder: Path, where: str, problems: DocumentProblems) -> Any:
+    """Return rows as an array, files read, picks as lists of names, sections as mappings, all else as it is.
+
+    Parameters
+    ----------
+    value : object
+        An entry of a checked document.
+    folder : Path
+        In which files are looked up.
+    where : str
+        Path of the entry, for problems.
+    problems : DocumentProblems
+        To which what cannot be read is added; the value is ``None`` then.
+    """
+    if isinstance(value, list) and any(isinstance(entry, str) for row in value for entry in _listed(row)):
+        return value
+    if isinstance(value, list):
+        return np.array(value, dtype=np.float64) if all(isinstance(row, list) for row in value) else value
+    if hasattr(value, "file"):
+        path = folder / value.file
+        try:
+            if hasattr(value, "stack"):
+                return read_matrices(path, variable=value.variable, count=value.stack, where=where)
+            return read_matrix(path, variable=value.variable, where=where)
+        except SpecError as error:
+            problems.add(where, str(error))
+            return None
+    if hasattr(value, "outputs") or hasattr(value, "states"):
+        return getattr(value, "outputs", getattr(value, "states", None))
+    return value.model_dump(exclude_unset=True) if hasattr(value, "model_dump") else value
+
+
+def _names(value: Any, folder: Path, where: str, problems: DocumentProblems) -> list[str] | None:
+    if hasattr(value, "file"):
+        try:
+            return read_names(folder / value.file, where=where)
+        except SpecError as error:
+            problems.add(where, str(error))
+            return None
+    return None if value is None else list(value)
+
+
+def _listed(row: Any) -> list[Any]:
+    return row if isinstance(row, list) else [row]
+
+
+def _varying_plant(section: TimeVaryingSection, source: Path, prefix: str) -> TimeVaryingDescriptorSystem:
+    problems = DocumentProblems(source, what="plant" if not prefix else "spec")
+    kept = ("dt", "horizon", "constants", "operating_point", "scales", "units")
+    arguments: dict[str, Any] = {name: getattr(section, name) for name in kept}
+    for name in ("E", "A", "B", "C", "Phi", "Psi"):
+        arguments[name] = read_value(getattr(section, name), source.parent, _joined(prefix, name), problems)
+    for name in ("state_names", "input_names", "output_names", "parameter_names"):
+        arguments[name] = _names(getattr(section, name), source.parent, _joined(prefix, name), problems)
+    problems.raise_if_any()
+    return _placed(lambda: TimeVaryingDescriptorSystem(**arguments), source, prefix)
+
+
+def _nonlinear_plant(section: DAESection, source: Path, prefix: str) -> DAEModel:
+    arguments = section.model_dump(exclude={"kind", "schema_version"}, exclude_none=True)
+    return _placed(lambda: DAEModel(**arguments), source, prefix)
+
+
+def _invariant_plant(section: PlantSection, source: Path, prefix: str) -> DescriptorSystem:
+    problems = DocumentProblems(source, what="plant" if not prefix else "spec")
+    arguments: dict[str, Any] = {name: getattr(section, name) for name in ("dt", *_LABELS)}
+    for name in _MATRICES:
+        arguments[name] = read_value(getattr(section, name), source.parent, _joined(prefix, name), problems)
+    for name in _NAME_LISTS:
+        arguments[name] = _names(getattr(section, name), source.parent, _joined(prefix, name), problems)
+    problems.raise_if_any()
+    for matrix, names in _SIGNAL_OF_PICK.items():
+        if isinstance(arguments[matrix], list) and arguments[names] is None:
+            arguments[names] = arguments[matrix]
+
+    def whole() -> DescriptorSystem:
+        # The operating point may name noise that is appended below, so it is checked with the whole plant.
+        bare = DescriptorSystem(**{**arguments, **dict.fromkeys(_LABELS)})
+        noisy = _noise_arguments(bare, section.sensor_noise)
+        return DescriptorSystem(**{**bare.as_dict(), **noisy, **{name: arguments[name] for name in _LABELS}})
+
+    return _placed(whole, source, prefix)
+
+
+def _noise_arguments(plant: DescriptorSystem, sensor_noise: Mapping[str, float] | None) -> dict[str, Any]:
+    """Return the noise matrices with one column appended for each noisy sensor."""
+    if not sensor_noise:
+        return {}
+    columns = np.zeros((plant.ny, len(sensor_noise)))
+    for column, (name, deviation) in enumerate(sensor_noise.items()):
+        columns[index_of(name, plant.output_names, what="sensor_noise"), column] = deviation
+    return {
+        "Bw": np.hstack([plant.Bw, np.zeros((plant.nx, len(sensor_noise)))]),
+        "Dw": np.hstack([plant.Dw, columns]),
+        "noise_names": (*plant.noise_names, *(f"noise {name}" for name in sensor_noise)),
+    }
+
+
+def transformed(
+    wanted: TransformSection | None, plant: DescriptorSystem, source: Path, prefix: str
+) -> Transformation | None:
+    """Return a plant without its algebraic states, sampled, or both, as asked; ``None`` where nothing is.
+
+    Parameters
+    ----------
+    wanted : TransformSection or None
+        The section ``transform``.
+    plant : DescriptorSystem
+        As written.
+    source : Path
+        The document, for errors.
+    prefix : str
+        Path of what holds the section.
+
+    Raises
+    ------
+    SpecError
+        The plant is sampled already.
+    PreconditionError
+        The plant cannot be transformed, for example because its index is not one.
+    """
+    if wanted is None or not (wanted.eliminate_algebraic_states or wanted.sample_time is not None):
+        return None
+    where = _joined(prefix, "transform")
+    if wanted.sample_time is not None and plant.is_discrete:
+        raise SpecError(
+            f"{source}: {where}.sample_time is given, but the plant is discrete in time already "
+            f"(dt = {plant.dt:g} s): remove it, or set dt to 0.",
+            path=f"{where}.sample_time",
+        )
+    from obsynth.analysis.transformations import discretise, eliminate_algebraic_states
+
+    try:
+        if wanted.sample_time is None:
+            return eliminate_algebraic_states(plant)
+        if not wanted.eliminate_algebraic_states:
+            return discretise(plant, wanted.sample_time)
+        reduced = eliminate_algebraic_states(plant)
+        return reduced.then(discretise(reduced.plant, wanted.sample_time))
+    except SpecError as error:
+        raise SpecError(f"{source}: {where}: {error}", path=where) from error
