@@ -55,7 +55,7 @@ def test_the_design_passes_and_its_claims_are_recomputed(design: obsynth.Observe
 
 
 def test_noise_against_gamma() -> None:
-    """The trade-off of the notes: less gain costs little noise down to a knee, and explodes below it."""
+    """The trade-off of the notes: less gain costs little noise, and below a knee it costs hours to forget the start."""
     rows = EXPECTED["trade_off"]
     found = [obsynth.fault_estimation_filter(PLANT, gamma=row[0]) for row in rows]
     for design, (gamma, deviation, radius) in zip(found, rows, strict=True):
@@ -66,7 +66,8 @@ def test_noise_against_gamma() -> None:
     assert deviations[-1] == min(deviations)
     assert max(deviations) < 1.02 * min(deviations)
     below = obsynth.fault_estimation_filter(PLANT, gamma=0.1)
-    assert below.report["noise in fhat[tm GENCLS 1]"].value > 5.0 * deviations[0]
+    assert below.report["noise in fhat[tm GENCLS 1]"].value < 1.02 * min(deviations)
+    assert -PLANT.dt / np.log(spectral_radius(below.observer.Az)) > 3600.0
 
 
 def test_a_torque_step_is_followed_within_the_stated_noise(design: obsynth.ObserverDesign) -> None:
