@@ -213,7 +213,8 @@ def verified(
         failed = "; ".join(f"{row.name} ({row.value:.3g} against {row.bound:.3g})" for row in report.failures)
         raise VerificationError(
             f"Gains were found, but the shipped realisation fails: {failed}. Nothing was shipped; "
-            "the plant may be badly scaled, or what was asked may be at the edge of what can be had: ask for less.",
+            "the plant may be badly scaled, or what was asked may be at the edge of what can be had: ask for less."
+            + "".join(f" {note}" for note in draft.notes),
             report=report,
         )
     return draft.replace(report=report)
