@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pandas as pd
@@ -38,6 +39,7 @@ def test_json_is_what_python_gives(gains, capsys):
     assert (printed["runs"], printed["confidence"]) == (40, 0.95)
     assert printed["monitor"]["kind"] == "pointwise"
     assert "never passed without a fault" in printed["monitor"]["statement"]
+    assert printed["monitor"]["final_threshold"] == obsynth.monitor(design, scenario).threshold[-1]
 
 
 def test_the_table_has_intervals_and_says_what_the_threshold_means(gains, capsys):
@@ -46,6 +48,7 @@ def test_the_table_has_intervals_and_says_what_the_threshold_means(gains, capsys
     for text in ("wang2015: 40 runs", "90 % interval", "false alarms", "missed detections", "actuator 1", "x4"):
         assert text in printed
     assert "not a pointwise bound" in printed
+    assert re.search(r"Its threshold \(\d[.\de-]* at the end of a run\):", printed)
     assert evaluated(gains, "--runs", "3") == 0
     printed = capsys.readouterr().out
     assert "false alarms" not in printed

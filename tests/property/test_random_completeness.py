@@ -96,12 +96,12 @@ def test_every_plant_is_solved_with_options(options):
     assert failures == []
 
 
-def test_limit_on_the_residual_weight_is_kept():
-    plants = plants_of("random")[:30]
+@pytest.mark.parametrize(("engine", "factor", "count"), [("lmi", 2.0, 30), ("auto", 2.0, 30), ("auto", 1.2, 10)])
+def test_limit_on_the_residual_weight_is_kept(engine, factor, count):
     failures = []
-    for known in plants:
+    for known in plants_of("random")[:count]:
         least = 1.0 / np.linalg.svd(obsynth.fault_estimation_filter(known.plant).gains["Upsilon"])[1][-1]
-        design = obsynth.fault_estimation_filter(known.plant, residual_weight_limit=2.0 * least)
-        if not design.report.passed or np.linalg.norm(design.gains["W"], 2) > 2.0 * least:
+        design = obsynth.fault_estimation_filter(known.plant, residual_weight_limit=factor * least, engine=engine)
+        if not design.report.passed or np.linalg.norm(design.gains["W"], 2) > factor * least:
             failures.append(known.recipe)
     assert failures == []

@@ -62,6 +62,18 @@ class TestManyStates:
             assert norm_is_at_most(*realisation, 1.002 * true)
             assert not norm_is_at_most(*realisation, 0.999 * true)
 
+    @pytest.mark.parametrize("damping", [0.3, 1e-3])
+    def test_against_slicot_with_several_signals(self, damping):
+        """The largest singular value of more than two is estimated by power iteration."""
+        rng = np.random.default_rng(12)
+        for _ in range(3):
+            a, b, c = rng.standard_normal((70, 70)), rng.standard_normal((70, 4)), rng.standard_normal((5, 70))
+            a *= (1.0 - damping) / np.max(np.abs(np.linalg.eigvals(a)))
+            realisation = a, b, c, rng.standard_normal((5, 4))
+            true = by_slicot(*realisation)
+            check_encloses(hinf_norm(*realisation), true, width=1.1e-3, slack=1e-8)
+            assert highest_gain_found(*realisation) == pytest.approx(true, rel=1e-4)
+
     def test_defective_dynamics(self):
         """A chain of delays has one eigenvector: modal coordinates say nothing, and the norm is that of the taps."""
         taps = np.linspace(1.0, 2.0, 80)

@@ -95,10 +95,13 @@ def run_evaluate(options: argparse.Namespace) -> int:
                 design, scenario, runs=options.runs, monitor=watched, executor=executor,
                 progress=lambda done, total: report_stage(f"{done} of {total} runs"), confidence=options.confidence,
             )  # fmt: skip
-    from obsynth.report.evaluation import described, evaluation_report
+    from obsynth.report.evaluation import described, evaluation_report, final_threshold
 
     if options.json:
-        told = None if watched is None else dict(zip(("kind", "statement"), described(watched), strict=True))
+        told: dict[str, Any] | None = None
+        if watched is not None:
+            kind, statement = described(watched)
+            told = {"kind": kind, "statement": statement, "final_threshold": final_threshold(watched)}
         print_json({"command": "evaluate", "spec": str(spec.path), "monitor": told, **found.as_dict()})
         return 0
     evaluation_report(design.name, found, monitor=watched, console=stdout_console(), units=design.plant.units)

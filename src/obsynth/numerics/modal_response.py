@@ -19,7 +19,7 @@ REFINEMENTS = 3
 TWO = 2
 #: From so many states on, steps of power iteration take the place of eigenvalues.
 MANY_STATES = 60
-POWER_STEPS = 8
+POWER_STEPS, ROUGH_STEPS = 8, 4
 
 
 class Modes(NamedTuple):
@@ -83,14 +83,14 @@ class ModalResponse:
     def gains(self, angles: FloatArray, *, roughly: bool = False) -> FloatArray:
         """Return the largest singular value at each angle, zero where it is no number; an estimate for many states.
 
-        Roughly it may be the eighth root of the sum of the eighth powers of all singular values.
+        Roughly it may be the eighth root of the sum of the eighth powers of all singular values, or further below.
         """
         factors = 1.0 / (np.exp(1j * angles)[:, None] - self.poles)
         order = min(self.direct.shape)
         if order <= TWO or len(self.poles) < MANY_STATES:
             sizes = self._by_gram_matrices(factors, roughly=roughly)
         else:
-            sizes = self._by_power_iteration(factors)
+            sizes = self._by_power_iteration(factors, steps=ROUGH_STEPS if roughly else POWER_STEPS)
         return np.asarray(np.where(np.isfinite(sizes), sizes, 0.0))
 
     def _by_gram_matrices(self, factors: ComplexArray, *, roughly: bool) -> FloatArray:
@@ -114,10 +114,10 @@ class ModalResponse:
         middle, half = 0.5 * (squares[:, 0] + squares[:, 1]), 0.5 * (squares[:, 0] - squares[:, 1])
         return np.asarray(np.sqrt(middle + np.hypot(half, beside)))
 
-    def _by_power_iteration(self, factors: ComplexArray) -> FloatArray:
+    def _by_power_iteration(self, factors: ComplexArray, *, steps: int) -> FloatArray:
         factors, start = factors.T, np.random.default_rng(0).normal(size=(self.direct.shape[1], 1))
         u, size = np.repeat(start + 0j, factors.shape[1], axis=1), np.zeros(factors.shape[1])
-        for _ in range(POWER_STEPS):
+        for _ in range(steps):
             u = u / np.maximum(np.linalg.norm(u, axis=0), np.finfo(np.float64).tiny)
             y = self.shown @ (factors * (self.driven @ u)) + self.direct @ u
             size = np.linalg.norm(y, axis=0)

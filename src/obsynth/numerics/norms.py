@@ -191,9 +191,10 @@ def _modal_peak(
         if response is None:
             return np.inf, np.nan
         angles = response.peaks(points)
-        believed = float(np.max(response.gains(angles)))
-    best, angle = _peak(a, b, c, d, angles)
-    return (best, angle) if abs(best - believed) <= MODAL_ERROR * best else (np.inf, np.nan)
+        sizes = response.gains(angles)
+        top = int(np.argmax(sizes))
+    best, angle = _peak(a, b, c, d, angles[[top]])
+    return (best, angle) if abs(best - sizes[top]) <= MODAL_ERROR * best else (np.inf, np.nan)
 
 
 def _highest_peak(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, modes: Modes) -> tuple[float, float]:

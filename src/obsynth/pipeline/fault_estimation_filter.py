@@ -54,7 +54,7 @@ def fault_estimation_filter(
     engine : {"auto", "riccati", "lmi"}, optional
         Who finds the gains: Riccati equations alone, which serve hundreds of states; or the matrix inequality as well,
         started from them, for the last digits of gamma and, with up to 12 states, somewhat smaller gains.  By default
-        the equations; the inequality where ``residual_weight_limit`` is given, which they do not cover, where ``gamma``
+        the equations; the inequality where what they find does not keep ``residual_weight_limit``, where ``gamma``
         is below what they found or less than 1e-4 above (up to 64 states), and where up to 12 states have no filter of
         theirs.  The result's ``solver["engine"]`` says which ran: "riccati" also where
         "lmi" was asked for and the gain is at a lower bound already, see ``solver["runs"]``.  The inequality is what is

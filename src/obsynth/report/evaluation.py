@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
+import numpy as np
 from rich.console import Console
 from rich.text import Text
 
@@ -58,7 +59,9 @@ def evaluation_report(
                 table.add_row(Text(title), number(item.value), _interval(item), str(item.count), Text(unit))
         kind, statement = described(monitor)
         print_section(console, f"Monitor {kind}", table)
-        console.print(Text(f"Its threshold: {statement}."))
+        end = final_threshold(monitor)
+        size = "" if end is None else f" ({number(end)} at the end of a run)"
+        console.print(Text(f"Its threshold{size}: {statement}."))
         console.print()
     for title, errors in (("Fault estimates", found.fault_rmse), ("State estimates", found.state_rmse)):
         if not errors:
@@ -80,6 +83,13 @@ def described(monitor: Monitor | ParameterMonitor) -> tuple[str, str]:
         "of a decision on parameters, passed in a run without a change with about the stated probability "
         f"({monitor.false_alarms:g})"
     )
+
+
+def final_threshold(monitor: Monitor | ParameterMonitor) -> float | None:
+    """Return the threshold at the end of a run; ``None`` where it is not the same in each run, or decides nothing."""
+    if not isinstance(monitor, Monitor) or not monitor.threshold.size or not np.isfinite(monitor.threshold[-1]):
+        return None
+    return float(monitor.threshold[-1])
 
 
 def _interval(item: Interval) -> str:

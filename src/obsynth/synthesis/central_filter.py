@@ -5,7 +5,7 @@ See `obsynth.synthesis.central_equation` for the equation behind them.  The true
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -122,7 +122,9 @@ def least_noise_filter(problem: GainProblem) -> Injection | None:
     return found if found is not None and np.isfinite(problem.noise_variance(found)) else None
 
 
-def noise_weighted_filters(problem: GainProblem, gain: float) -> Iterator[Injection]:
+def noise_weighted_filters(
+    problem: GainProblem, gain: float, *, reaches: Callable[[Injection], bool]
+) -> Iterator[Injection]:
     """Yield central filters that promise a gain of at most ``gain``, for which the noise counts as much as it can.
 
     The noise of the problem, times a weight, is one more disturbance.  At the level ``gain`` for both together the gain
@@ -136,6 +138,8 @@ def noise_weighted_filters(problem: GainProblem, gain: float) -> Iterator[Inject
         noise means small gains.
     gain : float
         Bound on the true gain of the disturbance.
+    reaches : callable
+        Whether the true gain of a filter is within that bound.
     """
     work = with_least_weight(problem)
     sizes = [float(np.linalg.norm(np.vstack(pair))) for pair in ((work.B, work.D), (work.Bn, work.Dn))]
@@ -150,7 +154,7 @@ def noise_weighted_filters(problem: GainProblem, gain: float) -> Iterator[Inject
             middle = (low + high) // 2
             equation = CentralEquation.of(_with_noise(work, weights[middle]), noise=NOISES[0])
             found = equation.filter_at(factor * gain)
-            if found is not None and (factor == 1.0 or problem.reaches(found, gain)):
+            if found is not None and (factor == 1.0 or reaches(found)):
                 best, low = found, middle + 1
             else:
                 high = middle

@@ -68,7 +68,7 @@ def small_gain_design(
         return nothing, records
     candidates: list[Injection] = []
     target = least_noise_filter(problem) if goal.noisy else nothing
-    central = [item for item in noise_weighted_filters(problem, gain) if goal.met(item)]
+    central = [item for item in noise_weighted_filters(problem, gain, reaches=goal.met) if goal.met(item)]
     if fresh.start_gain <= gain and goal.met(fresh.start):
         central.append(fresh.start)
     lively = [] if not goal.noisy or any(map(goal.is_fast, central)) else _lively_filters(goal)
@@ -154,7 +154,7 @@ def _lively_filters(goal: Goal) -> list[Injection]:
     found: list[Injection] = []
     for share in STATE_NOISE:
         noisier = problem.with_state_noise(share * size)
-        found += [item for item in noise_weighted_filters(noisier, goal.gain) if goal.met_fast(item)]
+        found += [item for item in noise_weighted_filters(noisier, goal.gain, reaches=goal.met) if goal.met_fast(item)]
     least = min(map(goal.cost, found), default=0.0)
     return sorted(
         (item for item in found if goal.cost(item) <= PRICE_OF_SPEED * least), key=lambda item: _radius(problem, item)

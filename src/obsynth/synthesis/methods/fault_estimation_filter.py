@@ -34,34 +34,17 @@ from obsynth.numerics.norms import spectral_radius
 from obsynth.numerics.ranks import SLOW_ZERO_RADIUS
 from obsynth.observers.linear import LinearObserver
 from obsynth.results.design import Certificate
-from obsynth.synthesis import gain_search
 from obsynth.synthesis.certify import bounded_real_certificate
 from obsynth.synthesis.filter_options import FilterOptions
 from obsynth.synthesis.filter_realisation import realise_filter
-from obsynth.synthesis.gain_bisection import search_by_bisection
-from obsynth.synthesis.gain_bound import require_reachable
+from obsynth.synthesis.filter_search import NOMINAL_GAIN, found_gains, found_within
 from obsynth.synthesis.gain_design import null_basis
 from obsynth.synthesis.gain_problem import GainProblem, Injection, WeightLimit
 from obsynth.synthesis.lmi import FILTER_SOLVERS
 from obsynth.synthesis.result import Synthesis
-from obsynth.synthesis.small_gains import small_gain_design
 
 #: Fictitious noise on the measurements, relative to the given one, so that no direction of the gains is free of cost.
 BACKGROUND_NOISE = 1e-3
-#: Asking for a gain above this multiple of the starting filter's adds nothing but bad scaling.
-LARGEST_USEFUL_GAIN = 1e3
-#: The gains are designed for a slightly smaller gamma than claimed, so that the claim has a well-conditioned proof.
-CERTIFICATE_MARGIN = 5e-3
-CERTIFICATE_SHARE = 0.2
-#: Gains below this, relative to the disturbance and the output it could reach, are rounding errors.
-ROUNDING_GAIN = 1e-11
-#: Level of the certificate, relative to the same, when no disturbance reaches the fault estimate at all.
-NOMINAL_GAIN = 1e-3
-
-#: A gamma between these multiples of the least gain found by the equations calls the inequality by default, up to so
-#: many states: far below the least no polish helps, and far above none is needed.
-BELOW_LEAST, ABOVE_LEAST = 0.95, 1.0 + 1e-4
-MOST_STATES_TO_POLISH = 64
 
 
 def conditions(plant: DescriptorSystem) -> tuple[Condition, ...]:
@@ -80,31 +63,14 @@ def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **op
     limit = asked.residual_weight_limit
     free = asked.free_residual_weight if asked.free_residual_weight is not None else plant.nw > 0 or limit is not None
     problem, parts = gain_problem(prepared, free_weight=free)
-    if limit is not None:
-        problem = with_weight_limit(problem, prepared, parts, limit)
     size = max(problem.disturbance_size, NOMINAL_GAIN)
-    # Riccati equations do not cover a limit on the weight.
-    engine = "lmi" if asked.engine == "auto" and limit is not None else asked.engine
-    progress("searching the least gain")
-    least = _least_gain(problem, asked, engine)
-    unfelt = problem.disturbances and least.starting_gain <= ROUNDING_GAIN * problem.disturbance_size
-    if unfelt and plant.nw and limit is None:
-        # Against the noise, gains may take up measurements that feel the disturbance: it stays in the problem.
-        least = replace(least, starting_gain=NOMINAL_GAIN * size)
-    elif unfelt:
-        # What is left of the disturbance in the estimates is rounding: nothing to minimise.
-        problem = problem.without_disturbance()
-        least = replace(_least_gain(problem, asked, engine), gain=least.starting_gain)
-    elif asked.engine == "auto" and asked.gamma is not None and _leaves_little(asked.gamma, least.gain, problem):
-        progress("polishing the least gain")
-        polished = _least_gain(problem, asked, "lmi")
-        records = [*least.records, *polished.records]
-        least = replace(min(least, polished, key=lambda found: found.gain), records=records)
-    gamma = _gain_to_ship(asked, problem, least, noisy=plant.nw > 0)
-    progress("choosing small gains")
-    inner = gamma - min(CERTIFICATE_SHARE * (gamma - least.gain), CERTIFICATE_MARGIN * gamma)
-    chosen, records = small_gain_design(problem, least, inner, solver=asked.solver, engine=engine)
-    gains = _gains(prepared, parts, chosen)
+    if limit is None:
+        found = found_gains(problem, asked, asked.engine, noisy=plant.nw > 0, progress=progress)
+    else:
+        limited = with_weight_limit(problem, prepared, parts, limit)
+        found = found_within(problem, limited, asked, noisy=plant.nw > 0, progress=progress)
+    problem, least, gamma, records = found.problem, found.least, found.gamma, found.records
+    gains = _gains(prepared, parts, found.chosen)
     progress("building the realisation and its certificate")
     observer, tracking, lag = realise_filter(plant, prepared.plant, gains, prepared.detectability)
     level = gamma if problem.disturbances else NOMINAL_GAIN * size
@@ -191,34 +157,6 @@ def _left_inverse(upsilon: FloatArray) -> FloatArray:
 def _engine_of(records: list[dict[str, Any]]) -> str:
     """Return which engine ran: the inequality comes in only where it may and where there is something to find."""
     return "lmi" if any(record.get("solver") in FILTER_SOLVERS for record in records) else "riccati"
-
-
-def _least_gain(problem: GainProblem, asked: FilterOptions, engine: str) -> gain_search.LeastGain:
-    polish = engine == "lmi"
-    if asked.gamma_search == "direct":
-        return gain_search.search_least_gain(problem, solver=asked.solver, polish=polish)
-    return search_by_bisection(problem, tolerance=asked.tolerance, solver=asked.solver, polish=polish)
-
-
-def _leaves_little(gamma: float, least: float, problem: GainProblem) -> bool:
-    """Whether a gamma leaves less room above the least gain found than the inequality may still find."""
-    near = BELOW_LEAST * least <= gamma <= ABOVE_LEAST * least
-    return near and problem.disturbances > 0 and problem.order <= MOST_STATES_TO_POLISH
-
-
-def _gain_to_ship(asked: FilterOptions, problem: GainProblem, least: gain_search.LeastGain, *, noisy: bool) -> float:
-    floor = gain_search.SMALLEST_USEFUL_GAIN * least.starting_gain
-    if problem.disturbances == 0:
-        return NOMINAL_GAIN
-    if asked.gamma is None and noisy:
-        # Where noise is stated, the least gain may cost any amount of it (a decoupled disturbance).  The Kalman filter
-        # that takes the disturbance as unit white noise is a fair compromise, and its gain is known to be reachable.
-        return max((1.0 + asked.gamma_margin) * least.gain, least.starting_gain)
-    if asked.gamma is None:
-        return max((1.0 + asked.gamma_margin) * least.gain, floor)
-    require_reachable(problem, least, asked.gamma, solver=asked.solver)
-    ceiling = LARGEST_USEFUL_GAIN * least.starting_gain
-    return min(asked.gamma, ceiling) if ceiling > 0.0 else asked.gamma
 
 
 def _gamma_notes(asked: float | None, shipped: float) -> tuple[str, ...]:
