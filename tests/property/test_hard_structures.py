@@ -149,5 +149,5 @@ def test_a_start_that_is_best_already(engine):
 @pytest.mark.parametrize("seed", range(2))
 def test_a_fault_that_hardly_shows_is_blamed_for_what_cannot_be_done(seed):
     plant = hardly_visible_fault(np.random.default_rng([50, seed]), share=1e-8, nx=12)
-    with pytest.raises(obsynth.ObsynthError, match="outputs (very )?little within its delay"):
+    with pytest.raises(obsynth.ObsynthError, match=r"outputs (very )?little within its delay"):
         obsynth.fault_estimation_filter(obsynth.DescriptorSystem(**plant, dt=0.1))
