@@ -20,7 +20,13 @@ from obsynth.synthesis.methods import pd_observer as method
 
 PLANT = obsynth.DescriptorSystem(None, [[0.5, 1.0], [0.0, -1.0]], C=[[1.0, 0.0]], Bf=[[0.0], [1.0]])
 
-LOADED = {library["filepath"] for library in threadpool_info() if library["user_api"] == "blas"}
+#: A solver may have brought a BLAS that was built for one thread: its number cannot be set.
+with threadpool_limits(limits=2, user_api="blas"):
+    LOADED = {
+        library["filepath"]
+        for library in threadpool_info()
+        if library["user_api"] == "blas" and library["num_threads"] == 2
+    }
 
 
 def blas_threads() -> set[int]:

@@ -20,7 +20,7 @@ APPROACHES = ((1.05,), (1.5, 1.05, 1.001))
 #: Weights of what the output does not show, relative to the output's, tried in turn.
 TAILS = (1e-2, 1e-4, 1e-6, 1e-9, 1e-12, 1e-16, 1e-20)
 #: Slack of the Riccati equation relative to the output weight, largest first: the first that proves is taken.
-SLACKS = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)
+SLACKS = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10)
 #: Steps towards coordinates in which the norm of the error dynamics is near one: how many, and down to which power.
 MOST_STEPS = 60
 STEP_POWER = 0.75
