@@ -96,10 +96,10 @@ def hardly_different_faults(rng: np.random.Generator) -> dict:
     return plant
 
 
-def hardly_visible_fault(rng: np.random.Generator) -> dict:
-    plant = described(rng, spread(rng, 1.1, 12), ny=5)
+def hardly_visible_fault(rng: np.random.Generator, share: float = 1e-4, nx: int = 13) -> dict:
+    plant = described(rng, spread(rng, 1.1, nx), ny=5)
     c, f = plant["C"], plant["Bf"][:, 0]
-    plant["Bf"][:, 0] = f - np.linalg.pinv(c) @ (c @ f - 1e-4 * rng.normal(size=5))
+    plant["Bf"][:, 0] = f - np.linalg.pinv(c) @ (c @ f - share * rng.normal(size=5))
     return plant
 
 
@@ -118,7 +118,7 @@ STRUCTURES: dict[Callable[[np.random.Generator], dict], int] = {
     in_very_bad_units: 8,
     many_faults: 3,
     hardly_different_faults: 4,
-    hardly_visible_fault: 1,
+    hardly_visible_fault: 4,
     equal_disturbances_in_the_sensors_too: 2,
 }
 
@@ -144,3 +144,10 @@ def test_a_start_that_is_best_already(engine):
     )
     design = obsynth.fault_estimation_filter(plant, engine=engine)
     assert design.certificate.claims["gamma_min"] == pytest.approx(1.0, rel=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_fault_that_hardly_shows_is_blamed_for_what_cannot_be_done(seed):
+    plant = hardly_visible_fault(np.random.default_rng([50, seed]), share=1e-8, nx=12)
+    with pytest.raises(obsynth.ObsynthError, match=r"outputs (very )?little within its delay"):
+        obsynth.fault_estimation_filter(obsynth.DescriptorSystem(**plant, dt=0.1))

@@ -480,3 +480,13 @@ def test_options_of_a_wrong_type_are_named(options):
 def test_what_is_no_plant_is_refused(plant):
     with pytest.raises(obsynth.SpecError, match="DescriptorSystem"):
         obsynth.fault_estimation_filter(plant)
+
+
+def test_trouble_inside_lapack_is_a_solver_error(monkeypatch):
+    def gives_up(*_: object, **__: object) -> None:
+        raise np.linalg.LinAlgError("did not converge")
+
+    monkeypatch.setattr("obsynth.synthesis.methods.fault_estimation_filter.gain_problem", gives_up)
+    plant = obsynth.DescriptorSystem(None, [[0.5]], None, [[1.0]], Bf=[[1.0]], dt=0.1)
+    with pytest.raises(obsynth.SolverError, match=r"LAPACK gave up \(did not converge\)"):
+        obsynth.fault_estimation_filter(plant)

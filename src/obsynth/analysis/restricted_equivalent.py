@@ -11,7 +11,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.ranks import RANK_TOLERANCE
+from obsynth.numerics.ranks import RANK_TOLERANCE, decide_rank
 
 
 def restricted_equivalent(e: FloatArray, c: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -61,13 +61,15 @@ def restricted_equivalent_from(e: FloatArray, c: FloatArray, s: FloatArray) -> t
     if s.shape != (nx, nx + ny):
         raise SpecError(f"S is {s.shape[0]} by {s.shape[1]}, but {nx} by {nx + ny} is needed.", path="S")
     stacked = np.vstack([e, c])
-    pseudo = np.linalg.pinv(stacked)
+    # Of full column rank: its columns may be scaled, so that states in small units are not taken for zero.
+    units = np.exp2(np.round(np.log2(np.linalg.norm(stacked, axis=0))))
+    pseudo = np.linalg.pinv(stacked / units) / units[:, None]
     m = pseudo + s @ (np.eye(nx + ny) - stacked @ pseudo)
     t, n = m[:, :nx], m[:, nx:]
-    values = np.linalg.svd(t, compute_uv=False)
-    if values[-1] <= RANK_TOLERANCE * values[0]:
+    rank = decide_rank(t, expected=nx)
+    if not rank.full:
         raise SpecError(
-            f"This S makes T singular (smallest singular value {values[-1]:.1e}), which throws away algebraic "
+            f"This S makes T singular ({rank.describe()}), which throws away algebraic "
             "equations: choose another S, or leave it out for a T that is nonsingular by construction.",
             path="S",
         )

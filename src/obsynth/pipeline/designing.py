@@ -7,9 +7,11 @@ from collections.abc import Callable, Mapping
 from importlib import import_module
 from typing import Any, TypeAlias
 
+import numpy as np
+
 from obsynth.analysis.conditions import Condition
 from obsynth.analysis.transformations import StateRecovery
-from obsynth.errors import SpecError, VerificationError
+from obsynth.errors import SolverError, SpecError, VerificationError
 from obsynth.models.dae import DAEModel
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.models.time_varying import TimeVaryingDescriptorSystem
@@ -76,10 +78,16 @@ def design(
     options = _checked_options(method, options)
     for condition in _kind_conditions(plant, method):
         condition.require()
-    with one_thread_if_small(plant.nx):
-        found = method_module(method).synthesise(plant, progress=report_stage, **options)
-        report_stage("verifying the shipped realisation")
-        return verified(plant, method, found, name=name, recovery=recovery)
+    try:
+        with one_thread_if_small(plant.nx):
+            found = method_module(method).synthesise(plant, progress=report_stage, **options)
+            report_stage("verifying the shipped realisation")
+            return verified(plant, method, found, name=name, recovery=recovery)
+    except np.linalg.LinAlgError as error:
+        raise SolverError(
+            f"LAPACK gave up ({error}): the numbers are beyond double precision. Nothing is known; look at the units "
+            "of the plant and at the options."
+        ) from error
 
 
 def check(plant: Plant, options: Mapping[str, Mapping[str, Any]] | None = None) -> dict[str, VerificationReport]:
@@ -213,7 +221,8 @@ def verified(
         failed = "; ".join(f"{row.name} ({row.value:.3g} against {row.bound:.3g})" for row in report.failures)
         raise VerificationError(
             f"Gains were found, but the shipped realisation fails: {failed}. Nothing was shipped; "
-            "the plant may be badly scaled, or what was asked may be at the edge of what can be had: ask for less.",
+            "the plant may be badly scaled, or what was asked may be at the edge of what can be had: ask for less."
+            + "".join(f" {note}" for note in draft.notes),
             report=report,
         )
     return draft.replace(report=report)

@@ -17,7 +17,7 @@ import numpy as np
 
 from obsynth.errors import SolverError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.norms import highest_gain_found, hinf_norm, norm_is_at_most, output_covariance
+from obsynth.numerics.norms import highest_gain_found, hinf_norm, norm_is_at_most, output_covariance, spectral_radius
 from obsynth.synthesis.riccati import bounded_real_matrix, normalising_change, stabilising_gain
 
 #: The normalising Riccati solution is taken at this multiple of the starting filter's norm.
@@ -277,7 +277,9 @@ def _starting_filter(problem: GainProblem) -> Injection:
     gain = stabilising_gain(problem.A, problem.C, noise, through)
     if gain is None:
         raise SolverError(
-            "No stable starting filter was found, although the existence conditions hold: "
-            "the data are too badly scaled or too close to the boundary. Nothing is known."
+            "No stable starting filter was found, although the existence conditions hold. Without feedback the error "
+            f"grows by a factor of up to {spectral_radius(problem.A):.3g} per sample, with {problem.measured} free "
+            "measurement(s) against it: a fault that moves the outputs little within its delay makes it grow fast, "
+            "and many unstable modes need more outputs. Nothing is known."
         )
     return Injection(gain, np.zeros((problem.Z.shape[0], problem.measured)))
