@@ -253,7 +253,7 @@ TABLE: dict[str, tuple[str, Callable[[ObserverDesign], ObserverDesign], tuple[st
         (INPUTS, IN_ERROR, STABILITY, POLES, DECAY, DIGITS, DECOUPLING, NOISE)),
     "coordinates that cost digits": ("paper", lambda d: in_other_coordinates(d, 3e4), (POLES, DIGITS)),
     "coordinates that cost digits, discrete": ("direct", lambda d: in_other_coordinates(d, 5e5),
-        (POLES, DECAY, DIGITS)),
+        (POLES, DECAY, DIGITS, NOISE)),
     # The certificate.
     "tracking": ("paper", certificate("tracking", 1, 0, 0.4), (SYLVESTER, IN_ERROR, STATE, RESIDUAL)),
     "tracking of the fault model": ("fixed", certificate("tracking", 3, 3, 1.1), (SYLVESTER, FAULT)),

@@ -24,6 +24,8 @@ WIDEST_SPECTRUM = 1e-3
 RATE_OFFSET = 1.3
 #: Share of the size of its terms by which a sign must be wrong.
 REFUTED = 1e-6
+#: Norm of the dynamics above which a level is not refuted by doubling.
+LARGEST_TRUSTED_NORM = 10.0
 #: Keeps a division by the size of a zero solution from failing.
 SMALLEST = float(np.finfo(np.float64).tiny)
 
@@ -199,7 +201,8 @@ def compared_gain(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, le
         try:
             p = doubled_riccati_solution(a.T, b.T, process, gap, cross, possible=possible)
             if p is None:
-                return False if refuted else None
+                # Far from normal, rounding in the doubling outgrows any margin.
+                return False if refuted and float(np.linalg.norm(a, 2)) <= LARGEST_TRUSTED_NORM else None
             through = a.T @ p @ b + cross
             left = -(gap + b.T @ p @ b)
             if not is_positive(left):

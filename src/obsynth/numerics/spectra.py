@@ -15,6 +15,8 @@ from obsynth.numerics.norms import balanced_realisation, output_covariance
 SAME_POLE = 1e-3
 #: Modulus below which a discrete eigenvalue counts as zero: it forgets in a few samples, and has no useful rate.
 DEAD_BEAT = 1e-6
+#: Relative difference of two ways of computing a variance up to which it counts as known.
+AGREEMENT = 1e-2
 
 
 def eigenvalues(matrix: FloatArray) -> ComplexArray:
@@ -109,6 +111,20 @@ def noise_covariance(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray,
         except RuntimeWarning:
             return np.full((c.shape[0], c.shape[0]), np.inf)
     return np.asarray(c @ states @ c.T) / size
+
+
+def certain_noise_covariance(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, dt: float) -> FloatArray:
+    """Return `noise_covariance`, or NaN where another way of computing its trace disagrees: all digits are rounding.
+
+    The other way is by what the output shows of each state, where `noise_covariance` goes by what the noise moves.
+    For matrices far from normal neither may have a digit left.
+    """
+    found = noise_covariance(a, b, c, d, dt)
+    # A variance below zero is rounding as well.
+    variance, again = float(np.trace(found)), float(np.trace(noise_covariance(a.T, c.T, b.T, d.T, dt)))
+    if not np.isfinite(variance) or abs(variance - again) <= AGREEMENT * variance:
+        return found
+    return np.full_like(found, np.nan)
 
 
 def response(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, points: ComplexArray) -> ComplexArray:

@@ -15,14 +15,15 @@ from obsynth.errors import PreconditionError
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.modal_response import Modes
-from obsynth.numerics.norms import highest_gain_found, hinf_norm, output_covariance
+from obsynth.numerics.norms import highest_gain_found, hinf_norm
 from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.scaling import Scaling, balance_by_least_squares
+from obsynth.numerics.spectra import certain_noise_covariance
 from obsynth.observers.linear import LinearObserver
 from obsynth.results.design import ObserverDesign
 from obsynth.results.report import Check, information, upper_bound_check
 from obsynth.verification.bounded_real import prove_bounded_real
-from obsynth.verification.claim_rows import claim_rows, claimed, recovery_rows
+from obsynth.verification.claim_rows import UNCERTAIN, claim_rows, claimed, recovery_rows
 from obsynth.verification.error_system import ErrorSystem
 from obsynth.verification.fault_rows import fault_rows
 from obsynth.verification.gain_rows import gain_rows, gains_fit
@@ -190,14 +191,16 @@ def _norm_rows(
 def _noise_rows(plant: DescriptorSystem, errors: ErrorSystem) -> Iterator[Check]:
     if not plant.nw:
         return
-    covariance = output_covariance(errors.Az, errors.noise, -errors.fault_output[0], errors.fault_output[3])
+    covariance = certain_noise_covariance(
+        errors.Az, errors.noise, -errors.fault_output[0], errors.fault_output[3], plant.dt
+    )
     for name, variance in zip(plant.fault_names, np.diag(covariance), strict=True):
         yield information(
             f"noise in fhat[{name}]",
             "standard deviation of the fault estimate under the stated noise",
             float(np.sqrt(variance)),
             source="recomputed, Lyapunov equation",
-            detail=plant.units.get(name, ""),
+            detail=UNCERTAIN if np.isnan(variance) else plant.units.get(name, ""),
         )
 
 

@@ -8,9 +8,10 @@ import numpy as np
 
 from obsynth.analysis.unknown_input_pencils import numbers
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.spectra import abscissa, decay_rates, eigenvalues, noise_covariance, spectrum_error
+from obsynth.numerics.spectra import abscissa, certain_noise_covariance, decay_rates, eigenvalues, spectrum_error
 from obsynth.results.design import ObserverDesign
 from obsynth.results.report import Check, information, lower_bound_check, upper_bound_check
+from obsynth.verification.claim_rows import UNCERTAIN
 from obsynth.verification.lyapunov import prove_stable
 
 #: Recomputed poles may miss the claimed ones by this, relative to their size; claimed rates and norms likewise.
@@ -109,7 +110,7 @@ def noise_rows(design: ObserverDesign) -> Iterator[Check]:
     rows = observer.Cz[observer.fault_rows]
     direct = observer.Dy[observer.fault_rows]
     discrete = float(plant.dt > 0.0)
-    unit = noise_covariance(observer.Az, observer.By, rows, discrete * direct, plant.dt)
+    unit = certain_noise_covariance(observer.Az, observer.By, rows, discrete * direct, plant.dt)
     if "noise_amplification" in claims:
         largest = float(np.sqrt(np.max(np.maximum(np.diag(unit), 0.0), initial=0.0)))
         yield upper_bound_check(
@@ -121,17 +122,20 @@ def noise_rows(design: ObserverDesign) -> Iterator[Check]:
             detail="outputs in their own units" + ("" if plant.dt else "; times the root of the sample time in s")
             + (f"; besides, y enters fhat directly by {float(np.linalg.norm(direct, 2)):.3g}" if direct.any() else ""),
         )  # fmt: skip
+    elif np.any(np.isnan(unit)):
+        text = "H2 norm from white noise on every output to a fault estimate"
+        yield information("noise amplification", text, np.nan, source="recomputed, Lyapunov equation", detail=UNCERTAIN)
     if not plant.nw:
         return
     tracking = design.certificate.matrices["tracking"][:, : plant.nx]
     entering = tracking @ plant.Bw - observer.By @ plant.Dw
-    stated = noise_covariance(observer.Az, entering, rows, discrete * (direct @ plant.Dw), plant.dt)
+    stated = certain_noise_covariance(observer.Az, entering, rows, discrete * (direct @ plant.Dw), plant.dt)
     for name, variance in zip(plant.fault_names, np.diag(stated), strict=True):
         yield information(
             f"noise in fhat[{name}]",
             "standard deviation of the fault estimate under the stated noise"
             + ("" if plant.dt else ", for a sample time of 1 s (times its root for others)"),
-            float(np.sqrt(max(variance, 0.0))),
+            float(np.sqrt(variance)),
             source="recomputed, Lyapunov equation",
-            detail=plant.units.get(name, ""),
+            detail=UNCERTAIN if np.isnan(variance) else plant.units.get(name, ""),
         )

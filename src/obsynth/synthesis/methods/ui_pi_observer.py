@@ -30,7 +30,7 @@ from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.models.exosystems import Exosystem, exosystem
 from obsynth.numerics.arrays import ComplexArray, FloatArray, as_matrix
-from obsynth.numerics.spectra import abscissa, decay_rates, eigenvalues, noise_covariance
+from obsynth.numerics.spectra import abscissa, certain_noise_covariance, decay_rates, eigenvalues
 from obsynth.observers.linear import LinearObserver
 from obsynth.results.design import Certificate
 from obsynth.synthesis.lyapunov import lyapunov_factor
@@ -242,12 +242,13 @@ def _assembled(
 def noise_amplification(observer: LinearObserver) -> float:
     """Return the largest H2 norm from unit white noise on every output to a fault estimate, the direct part left out.
 
-    Times the square root of the sample time it is a standard deviation, for dt = 0 and noise held between samples.
+    Times the square root of the sample time it is a standard deviation, for dt = 0 and noise held between samples.  NaN
+    where rounding leaves no digit of it.
     """
     rows = observer.Cz[observer.fault_rows]
     direct = observer.Dy[observer.fault_rows] * (observer.dt > 0.0)
     stable = abscissa(observer.Az, observer.dt) < (1.0 if observer.dt > 0.0 else 0.0)
     if not len(rows) or not stable:
         return 0.0 if not len(rows) else float("inf")
-    covariance = noise_covariance(observer.Az, observer.By, rows, direct, observer.dt)
+    covariance = certain_noise_covariance(observer.Az, observer.By, rows, direct, observer.dt)
     return float(np.sqrt(np.max(np.maximum(np.diag(covariance), 0.0))))
