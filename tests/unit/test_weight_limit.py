@@ -58,3 +58,26 @@ def test_a_limit_below_what_the_equations_find_is_kept_all_the_same() -> None:
     assert np.linalg.norm(design.gains["W"], 2) <= limit
     assert design.report.passed
     assert design.certificate.claims["gamma"] > free.certificate.claims["gamma"]
+
+
+def plant(seed: int) -> obsynth.DescriptorSystem:
+    """Return a plant of six states whose outputs have units far apart."""
+    rng = np.random.default_rng([102, seed])
+    a = rng.normal(size=(6, 6))
+    a *= 1.1 / np.max(np.abs(np.linalg.eigvals(a)))
+    c = rng.normal(size=(4, 6)) * 10.0 ** rng.uniform(-2.0, 2.0, size=(4, 1))
+    return obsynth.DescriptorSystem(
+        None, a, None, c, Bf=rng.normal(size=(6, 2)), Bd=0.3 * rng.normal(size=(6, 2)), dt=0.1
+    )
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_limit_just_above_the_least_weight_is_kept(seed: int) -> None:
+    faulty = plant(seed)
+    upsilon = obsynth.fault_estimation_filter(faulty).gains["Upsilon"]
+    least = 1.0 / np.linalg.svd(upsilon, compute_uv=False)[-1]
+    design = obsynth.fault_estimation_filter(faulty, residual_weight_limit=1.001 * least)
+    assert design.report.passed
+    assert np.linalg.norm(design.gains["W"], 2) <= 1.001 * least
+    with pytest.raises(obsynth.InfeasibleError, match="the least is"):
+        obsynth.fault_estimation_filter(faulty, residual_weight_limit=0.999 * least)

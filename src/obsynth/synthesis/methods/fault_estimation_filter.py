@@ -67,6 +67,7 @@ def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **op
     if limit is None:
         found = found_gains(problem, asked, asked.engine, noisy=plant.nw > 0, progress=progress)
     else:
+        problem, parts = centred(problem, prepared, parts)
         limited = with_weight_limit(problem, prepared, parts, limit)
         found = found_within(problem, limited, asked, noisy=plant.nw > 0, progress=progress)
     problem, least, gamma, records = found.problem, found.least, found.gamma, found.records
@@ -185,6 +186,18 @@ def _gains(prepared: PreparedPlant, parts: _Parts, chosen: Injection) -> dict[st
         "Upsilon": prepared.detectability.Upsilon / outputs[:, None],
         "R": states * free * outputs,
     }
+
+
+def centred(problem: GainProblem, prepared: PreparedPlant, parts: _Parts) -> tuple[GainProblem, _Parts]:
+    """Return the problem with a free weight written so that V = 0 is the W of least norm in the user's output units.
+
+    In balanced outputs another W has the least norm, which may be outside a limit that this one keeps.
+    """
+    outputs = prepared.scaling.outputs
+    w0 = _left_inverse(prepared.detectability.Upsilon / outputs[:, None]) / outputs
+    v = (w0 - parts.W0) @ parts.V
+    moved = replace(problem, Z=problem.Z + v @ problem.C, Zd=problem.Zd + v @ problem.D, Zn=problem.Zn + v @ problem.Dn)
+    return moved, replace(parts, W0=w0)
 
 
 def with_weight_limit(problem: GainProblem, prepared: PreparedPlant, parts: _Parts, bound: float) -> GainProblem:
