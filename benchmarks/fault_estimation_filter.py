@@ -27,7 +27,7 @@ from obsynth.analysis.fault_filter import prepare
 from obsynth.numerics.definiteness import prove_positive_definite
 from obsynth.numerics.norms import hinf_norm
 from obsynth.spec import load_spec
-from obsynth.synthesis.gain_problem import GainProblem
+from obsynth.synthesis.fault_filter.gain_problem import GainProblem
 from obsynth.synthesis.methods.fault_estimation_filter import gain_problem, with_weight_limit
 
 ROOT = Path(__file__).parents[1]

@@ -33,7 +33,7 @@ from obsynth.plotting import plot_delta_scan, plot_faults
 from obsynth.simulation import simulate_plant
 from obsynth.spec import load_spec
 from obsynth.spec.documents import read_yaml
-from obsynth.synthesis import lmi
+from obsynth.synthesis.conic import lmi
 
 np.set_printoptions(precision=4, suppress=True)
 plant = load_spec("../designs/filasova/spec.yaml").plant

@@ -21,7 +21,7 @@ from obsynth.numerics.norms import hinf_norm, spectral_radius
 from obsynth.simulation import simulate_plant
 from obsynth.spec import load_spec
 from obsynth.spec.documents import read_yaml
-from obsynth.synthesis import gain_design, gain_search
+from obsynth.synthesis.fault_filter import gain_design, gain_search
 from obsynth.synthesis.methods.fault_estimation_filter import gain_problem
 
 DESIGNS = Path(__file__).parents[2] / "designs"

@@ -13,8 +13,8 @@ import cvxpy
 import numpy as np
 import pytest
 
-from obsynth.synthesis import gain_design
-from obsynth.synthesis.gain_problem import GainProblem, WeightLimit, normalise
+from obsynth.synthesis.fault_filter import gain_design
+from obsynth.synthesis.fault_filter.gain_problem import GainProblem, WeightLimit, normalise
 
 #: What solvers leave open of the squared level, relative; the whole inequality is solved worse.
 ACCURACY = 1e-5

@@ -5,8 +5,8 @@ import pytest
 
 import obsynth
 from obsynth.analysis.fault_filter import prepare
-from obsynth.synthesis.gain_bound import proved_lower_bound
-from obsynth.synthesis.gain_search import search_least_gain
+from obsynth.synthesis.fault_filter.gain_bound import proved_lower_bound
+from obsynth.synthesis.fault_filter.gain_search import search_least_gain
 from obsynth.synthesis.methods.fault_estimation_filter import gain_problem
 
 

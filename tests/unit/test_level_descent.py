@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from obsynth.synthesis.gain_problem import Injection
-from obsynth.synthesis.level_descent import Descent
+from obsynth.synthesis.fault_filter.gain_problem import Injection
+from obsynth.synthesis.fault_filter.level_descent import Descent
 
 TOLERANCE = 1e-7
 

@@ -8,7 +8,7 @@ import pytest
 
 import obsynth
 from obsynth.errors import SolverError
-from obsynth.synthesis import lmi
+from obsynth.synthesis.conic import lmi
 
 
 class PanicException(BaseException):

@@ -12,9 +12,10 @@ import scipy.linalg
 import obsynth
 from obsynth.analysis.pd_augmentation import with_faults_as_states
 from obsynth.spec import load_spec
-from obsynth.synthesis import pd_design, pd_reduced
-from obsynth.synthesis.pd_options import MOST_STATES_FOR_LMI, PdOptions
-from obsynth.synthesis.pd_problem import PdTask, solve
+from obsynth.synthesis.pd import design as pd_design
+from obsynth.synthesis.pd import reduced as pd_reduced
+from obsynth.synthesis.pd.options import MOST_STATES_FOR_LMI, PdOptions
+from obsynth.synthesis.pd.problem import PdTask, solve
 from obsynth.verification.pd_inequality import prove_gains, prove_symmetric_positive
 
 PLANT = load_spec(Path(__file__).parents[2] / "designs" / "filasova" / "spec.yaml").plant

@@ -14,14 +14,15 @@ from obsynth.analysis.pd_conditions import pd_observer_conditions
 from obsynth.numerics.continuous import continuous_hinf_norm
 from obsynth.simulation import simulate_plant
 from obsynth.spec import load_spec
-from obsynth.synthesis import lmi, pd_design
-from obsynth.synthesis.pd_certificate import (
+from obsynth.synthesis.conic import lmi
+from obsynth.synthesis.pd import design as pd_design
+from obsynth.synthesis.pd.certificate import (
     coupled_certificate,
     explicit_certificate,
     gain_certificate,
     symmetric_certificate,
 )
-from obsynth.synthesis.pd_limits import least_noise_gain
+from obsynth.synthesis.pd.limits import least_noise_gain
 from obsynth.verification.pd_inequality import (
     error_inputs,
     prove_gain,
@@ -536,7 +537,7 @@ class TestRefusals:
 
 
 def test_the_doors_options_are_those_of_the_method() -> None:
-    from obsynth.synthesis.pd_options import PdOptions
+    from obsynth.synthesis.pd.options import PdOptions
 
     door = {
         name: parameter.default

@@ -7,8 +7,9 @@ import pytest
 
 import obsynth
 from obsynth.errors import SolverError
-from obsynth.synthesis import gain_design, gain_search, lmi
-from obsynth.synthesis.gain_problem import GainProblem, WeightLimit, normalise
+from obsynth.synthesis.conic import lmi
+from obsynth.synthesis.fault_filter import gain_design, gain_search
+from obsynth.synthesis.fault_filter.gain_problem import GainProblem, WeightLimit, normalise
 
 
 def plant(nd: int) -> obsynth.DescriptorSystem:

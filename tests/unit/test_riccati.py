@@ -13,9 +13,9 @@ from obsynth.numerics.doubling import (
     gain_is_below,
 )
 from obsynth.numerics.norms import hinf_norm, spectral_radius
-from obsynth.synthesis.central_equation import CentralEquation, central_injection
-from obsynth.synthesis.central_filter import central_filter_at, search_central_filter
-from obsynth.synthesis.gain_problem import GainProblem, Injection
+from obsynth.synthesis.fault_filter.central_equation import CentralEquation, central_injection
+from obsynth.synthesis.fault_filter.central_filter import central_filter_at, search_central_filter
+from obsynth.synthesis.fault_filter.gain_problem import GainProblem, Injection
 from obsynth.synthesis.riccati import bounded_real_matrix
 
 

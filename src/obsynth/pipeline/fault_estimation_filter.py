@@ -161,7 +161,7 @@ def fault_estimation_filter_from_gains(
     ----------
     .. [Wang2015] Fault estimation filter design for discrete-time descriptor systems, eq. (23).
     """
-    from obsynth.synthesis.given_filter_gains import synthesis_from_gains
+    from obsynth.synthesis.fault_filter.given_filter_gains import synthesis_from_gains
 
     if plant.nd and gamma is None:
         raise SpecError(

@@ -257,8 +257,8 @@ def pd_delta_scan(
     """
     from obsynth.analysis.conditions import require_all
     from obsynth.analysis.pd_conditions import explicit_form, pd_observer_conditions
-    from obsynth.synthesis.pd_options import PdOptions
-    from obsynth.synthesis.pd_scan import scan_delta
+    from obsynth.synthesis.pd.options import PdOptions
+    from obsynth.synthesis.pd.scan import scan_delta
 
     asked = PdOptions(theorem=theorem, decay=decay, delta_scan=delta, solver=solver)
     require_all(pd_observer_conditions(plant))

@@ -34,13 +34,13 @@ from obsynth.numerics.norms import spectral_radius
 from obsynth.numerics.ranks import SLOW_ZERO_RADIUS
 from obsynth.observers.linear import LinearObserver
 from obsynth.results.design import Certificate
-from obsynth.synthesis.certify import bounded_real_certificate
-from obsynth.synthesis.filter_options import FilterOptions
-from obsynth.synthesis.filter_realisation import realise_filter
-from obsynth.synthesis.filter_search import NOMINAL_GAIN, found_gains, found_within
-from obsynth.synthesis.gain_design import null_basis
-from obsynth.synthesis.gain_problem import GainProblem, Injection, WeightLimit
-from obsynth.synthesis.lmi import FILTER_SOLVERS
+from obsynth.synthesis.conic.lmi import FILTER_SOLVERS
+from obsynth.synthesis.fault_filter.certify import bounded_real_certificate
+from obsynth.synthesis.fault_filter.filter_options import FilterOptions
+from obsynth.synthesis.fault_filter.filter_realisation import realise_filter
+from obsynth.synthesis.fault_filter.filter_search import NOMINAL_GAIN, found_gains, found_within
+from obsynth.synthesis.fault_filter.gain_design import null_basis
+from obsynth.synthesis.fault_filter.gain_problem import GainProblem, Injection, WeightLimit
 from obsynth.synthesis.result import Synthesis
 
 #: Fictitious noise on the measurements, relative to the given one, so that no direction of the gains is free of cost.

@@ -12,11 +12,11 @@ Our deviations
        place of F, or for a whole range.
     5. Decay rate, disk, bounds on the gains and on two l2 gains, all as inequalities with the same P3, Y, Z.
     6. Feedthrough of inputs, faults, disturbances and noise; singular E of index 1, by elimination.
-    7. What is shipped never differentiates the outputs (see `obsynth.synthesis.pd_realisation`).
+    7. What is shipped never differentiates the outputs (see `obsynth.synthesis.pd.realisation`).
     8. The inequality is proved for the shipped realisation; where the solver's certificate does not do, one is
        computed from the gains.
     9. For hundreds of states the gains come from a smaller inequality or in closed form (see
-       `obsynth.synthesis.pd_reduced`), with L = 0.
+       `obsynth.synthesis.pd.reduced`), with L = 0.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.observers.linear import LinearObserver
 from obsynth.results.design import Certificate
-from obsynth.synthesis.pd_certificate import explicit_certificate
-from obsynth.synthesis.pd_design import design_gains
-from obsynth.synthesis.pd_gains import PdGains
-from obsynth.synthesis.pd_options import PdOptions, checked_adaptation_gain
-from obsynth.synthesis.pd_realisation import realise_pd_observer
-from obsynth.synthesis.pd_scan import scan_delta
+from obsynth.synthesis.pd.certificate import explicit_certificate
+from obsynth.synthesis.pd.design import design_gains
+from obsynth.synthesis.pd.gains import PdGains
+from obsynth.synthesis.pd.options import PdOptions, checked_adaptation_gain
+from obsynth.synthesis.pd.realisation import realise_pd_observer
+from obsynth.synthesis.pd.scan import scan_delta
 from obsynth.synthesis.result import Synthesis
 
 #: Gains from sensor noise to a fault estimate above this are worth a note.

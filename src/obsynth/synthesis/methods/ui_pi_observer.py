@@ -39,11 +39,11 @@ from obsynth.synthesis.placement.eigenstructure import place
 from obsynth.synthesis.placement.kalman import KalmanProblem
 from obsynth.synthesis.placement.region import Region, region_gain
 from obsynth.synthesis.result import Synthesis
-from obsynth.synthesis.ui_pi_noise import NoiseWeights, kalman_problem
-from obsynth.synthesis.ui_pi_notes import elimination_note, fixed_mode_notes, slow_note
-from obsynth.synthesis.ui_pi_options import UiPiOptions, checked_poles, plain
-from obsynth.synthesis.ui_pi_problem import PlacementProblem, placement_problem, with_faults
-from obsynth.synthesis.ui_pi_realisation import ObserverGains, combinations_seen, realise
+from obsynth.synthesis.ui_pi.noise import NoiseWeights, kalman_problem
+from obsynth.synthesis.ui_pi.notes import elimination_note, fixed_mode_notes, slow_note
+from obsynth.synthesis.ui_pi.options import UiPiOptions, checked_poles, plain
+from obsynth.synthesis.ui_pi.problem import PlacementProblem, placement_problem, with_faults
+from obsynth.synthesis.ui_pi.realisation import ObserverGains, combinations_seen, realise
 
 #: A region with a radius and no decay asks for at most this share of its radius.
 RADIUS_SHARE = 0.5

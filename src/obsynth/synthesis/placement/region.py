@@ -18,7 +18,7 @@ import numpy as np
 from obsynth.errors import SolverError, SpecError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.spectra import eigenvalues, speeds
-from obsynth.synthesis import lmi
+from obsynth.synthesis.conic import lmi
 from obsynth.synthesis.placement.kalman import KalmanProblem
 
 #: The inequalities are asked for a region smaller by this share, so that a solution on its boundary still counts.
@@ -123,7 +123,7 @@ def region_gain(problem: KalmanProblem, region: Region, *, solver: str) -> tuple
     region : Region
         Where the poles must lie.
     solver : str
-        A key of `obsynth.synthesis.lmi.SOLVER_SETTINGS`.
+        A key of `obsynth.synthesis.conic.lmi.SOLVER_SETTINGS`.
 
     Raises
     ------

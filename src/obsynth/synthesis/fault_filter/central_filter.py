@@ -1,6 +1,7 @@
 """Central H-infinity filters: the least gain of a `GainProblem`, and filters that weigh noise at a given gain.
 
-See `obsynth.synthesis.central_equation` for the equation behind them.  The true gain of the true problem decides.
+See `obsynth.synthesis.fault_filter.central_equation` for the equation behind them.  The true gain of the true problem
+decides.
 """
 
 from __future__ import annotations
@@ -10,9 +11,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from obsynth.synthesis.central_equation import CentralEquation, central_injection
-from obsynth.synthesis.gain_problem import GainProblem, Injection
-from obsynth.synthesis.level_descent import NEXT_TO, Descent
+from obsynth.synthesis.fault_filter.central_equation import CentralEquation, central_injection
+from obsynth.synthesis.fault_filter.gain_problem import GainProblem, Injection
+from obsynth.synthesis.fault_filter.level_descent import NEXT_TO, Descent
 
 #: Artificial noise relative to the disturbance, in turn: the first is bisected, and each of the others only where it
 #: reaches a level below.

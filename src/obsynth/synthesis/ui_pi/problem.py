@@ -28,7 +28,7 @@ from obsynth.numerics.pencils import finite_zeros, pencil_structure
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
 from obsynth.numerics.spectra import DEAD_BEAT, eigenvalues, speeds
 from obsynth.synthesis.placement.observable import ObservableSplit, observable_split
-from obsynth.synthesis.ui_pi_realisation import ObserverGains
+from obsynth.synthesis.ui_pi.realisation import ObserverGains
 
 #: Modes slower than this share of the fastest do not count for the plant's time scale: integrators and rounding.
 SLOW_SHARE = 1e-6

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SolverError
-from obsynth.synthesis import gain_search
-from obsynth.synthesis.filter_options import FilterOptions
-from obsynth.synthesis.gain_bisection import search_by_bisection
-from obsynth.synthesis.gain_bound import require_reachable
-from obsynth.synthesis.gain_problem import GainProblem, Injection, WeightLimit
-from obsynth.synthesis.small_gains import small_gain_design
+from obsynth.synthesis.fault_filter import gain_search
+from obsynth.synthesis.fault_filter.filter_options import FilterOptions
+from obsynth.synthesis.fault_filter.gain_bisection import search_by_bisection
+from obsynth.synthesis.fault_filter.gain_bound import require_reachable
+from obsynth.synthesis.fault_filter.gain_problem import GainProblem, Injection, WeightLimit
+from obsynth.synthesis.fault_filter.small_gains import small_gain_design
 
 #: Asking for a gain above this multiple of the starting filter's adds nothing but bad scaling.
 LARGEST_USEFUL_GAIN = 1e3

@@ -26,8 +26,8 @@ import numpy as np
 
 from obsynth.errors import SolverError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.synthesis import lmi
-from obsynth.synthesis.gain_problem import GainProblem, Injection, WeightLimit
+from obsynth.synthesis.conic import lmi
+from obsynth.synthesis.fault_filter.gain_problem import GainProblem, Injection, WeightLimit
 
 #: Strictness of the inequalities, in normalised coordinates where every block is of size one.
 MARGIN = 1e-9

@@ -10,10 +10,10 @@ import numpy as np
 
 from obsynth.errors import InfeasibleError, SolverError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.synthesis import lmi
-from obsynth.synthesis.gain_problem import GainProblem, Injection, NormalisedProblem, normalise
-from obsynth.synthesis.gain_search import LeastGain
-from obsynth.synthesis.invisible import invisible_pairs, invisible_part, null_space, strict_point
+from obsynth.synthesis.conic import lmi
+from obsynth.synthesis.fault_filter.gain_problem import GainProblem, Injection, NormalisedProblem, normalise
+from obsynth.synthesis.fault_filter.gain_search import LeastGain
+from obsynth.synthesis.fault_filter.invisible import invisible_pairs, invisible_part, null_space, strict_point
 
 #: A dual point must be positive definite by this margin, where the point of `strict_point` is the identity, and beat
 #: the level by this relative one.

@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from obsynth.synthesis.central_equation import CentralEquation
-from obsynth.synthesis.gain_problem import Injection
+from obsynth.synthesis.fault_filter.central_equation import CentralEquation
+from obsynth.synthesis.fault_filter.gain_problem import Injection
 
 MOST_LEVELS = 60
 #: Relative distance to the best gain from which a first level that fails ends the descent.

@@ -15,7 +15,7 @@ import numpy as np
 from obsynth.analysis.unknown_inputs import AugmentedPlant
 from obsynth.numerics.arrays import FloatArray
 from obsynth.synthesis.placement.kalman import KalmanProblem
-from obsynth.synthesis.ui_pi_problem import PlacementProblem
+from obsynth.synthesis.ui_pi.problem import PlacementProblem
 
 #: How strongly states are driven by default, beside fault models: a plant is better known than the course of a fault.
 PROCESS_SHARE = 0.1

@@ -28,8 +28,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
-from obsynth.synthesis.normal_equations import NormalEquations
-from obsynth.synthesis.semidefinite_block import SemidefiniteBlock
+from obsynth.synthesis.conic.normal_equations import NormalEquations
+from obsynth.synthesis.conic.semidefinite_block import SemidefiniteBlock
 
 #: Relative gap, and relative residuals of both equations, at which the search ends.
 TOLERANCE = 1e-6

@@ -21,8 +21,8 @@ from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.ranks import decide_rank
 from obsynth.results.design import Certificate
-from obsynth.synthesis.certify import bounded_real_certificate
-from obsynth.synthesis.filter_realisation import realise_filter
+from obsynth.synthesis.fault_filter.certify import bounded_real_certificate
+from obsynth.synthesis.fault_filter.filter_realisation import realise_filter
 from obsynth.synthesis.methods.fault_estimation_filter import notes
 from obsynth.synthesis.result import Synthesis
 

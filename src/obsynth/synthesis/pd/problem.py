@@ -22,7 +22,7 @@ import numpy as np
 
 from obsynth.errors import SolverError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.synthesis import lmi
+from obsynth.synthesis.conic import lmi
 
 #: How far inside the cone the inequalities must hold, with ``P3 + P3' >= 2 I`` as the scale.
 MARGIN = 1e-3

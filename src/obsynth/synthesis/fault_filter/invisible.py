@@ -13,7 +13,7 @@ import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import RANK_TOLERANCE
-from obsynth.synthesis.gain_problem import GainProblem
+from obsynth.synthesis.fault_filter.gain_problem import GainProblem
 
 #: An invariant zero must have a modulus above one by this much to count as growing.
 GROWTH_MARGIN = 1e-6

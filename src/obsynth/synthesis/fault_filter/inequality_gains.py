@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from obsynth.errors import SolverError
-from obsynth.synthesis import gain_design
-from obsynth.synthesis.gain_problem import GainProblem, Injection, NormalisedProblem
-from obsynth.synthesis.gain_search import LeastGain, coordinates
+from obsynth.synthesis.fault_filter import gain_design
+from obsynth.synthesis.fault_filter.gain_problem import GainProblem, Injection, NormalisedProblem
+from obsynth.synthesis.fault_filter.gain_search import LeastGain, coordinates
 
 if TYPE_CHECKING:
-    from obsynth.synthesis.small_gains import Goal
+    from obsynth.synthesis.fault_filter.small_gains import Goal
 
 #: Descent in steps: ratios of successive levels, tried in turn, and how many steps at most.
 STEP_RATIOS = (0.6, 0.9)

@@ -27,7 +27,7 @@ import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.doubling import doubled_riccati_solution, is_positive
-from obsynth.synthesis.gain_problem import GainProblem, Injection
+from obsynth.synthesis.fault_filter.gain_problem import GainProblem, Injection
 
 
 @dataclass(frozen=True, eq=False)

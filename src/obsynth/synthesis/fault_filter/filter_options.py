@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.synthesis.lmi import FILTER_SOLVERS
+from obsynth.synthesis.conic.lmi import FILTER_SOLVERS
 
 #: Who finds the gains: Riccati equations, or the matrix inequality started from them.
 ENGINES = ("auto", "riccati", "lmi")

@@ -13,11 +13,11 @@ from obsynth.analysis.structure import analyse_structure
 from obsynth.errors import InfeasibleError, SolverError
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray
-from obsynth.synthesis.pd_gains import PdGains, certified
-from obsynth.synthesis.pd_limits import default_delta, fastest_mode, require_possible
-from obsynth.synthesis.pd_options import PdOptions
-from obsynth.synthesis.pd_problem import PdSolution, PdTask, solve
-from obsynth.synthesis.pd_reduced import closed_form, reduced_lmi
+from obsynth.synthesis.pd.gains import PdGains, certified
+from obsynth.synthesis.pd.limits import default_delta, fastest_mode, require_possible
+from obsynth.synthesis.pd.options import PdOptions
+from obsynth.synthesis.pd.problem import PdSolution, PdTask, solve
+from obsynth.synthesis.pd.reduced import closed_form, reduced_lmi
 
 #: The unit of time is the power of two nearest to this many times the inverse of the plant's fastest mode, where the
 #: objective weighs J and L as it does for a plant with modes of a few 1/s in seconds.

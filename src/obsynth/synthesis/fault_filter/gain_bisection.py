@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from obsynth.synthesis import gain_design
-from obsynth.synthesis.central_filter import central_filter_at
-from obsynth.synthesis.gain_problem import GainProblem, Injection
-from obsynth.synthesis.gain_search import LeastGain, coordinates
+from obsynth.synthesis.fault_filter import gain_design
+from obsynth.synthesis.fault_filter.central_filter import central_filter_at
+from obsynth.synthesis.fault_filter.gain_problem import GainProblem, Injection
+from obsynth.synthesis.fault_filter.gain_search import LeastGain, coordinates
 
 #: The bracket ends at this share of the width asked for: the filter in hand is at its upper end.
 BRACKET_SHARE = 0.1

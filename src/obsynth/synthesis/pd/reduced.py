@@ -32,8 +32,8 @@ from obsynth.errors import SolverError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import spectral_abscissa
 from obsynth.numerics.ranks import decide_rank
-from obsynth.synthesis.pd_certificate import coupled_certificate, symmetric_certificate
-from obsynth.synthesis.pd_problem import PdSolution, PdTask, solve
+from obsynth.synthesis.pd.certificate import coupled_certificate, symmetric_certificate
+from obsynth.synthesis.pd.problem import PdSolution, PdTask, solve
 
 #: Share of its limit at which p, and delta where it is free, is taken.
 SHARE = 0.5

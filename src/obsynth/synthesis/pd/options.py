@@ -10,7 +10,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.ranks import decide_rank
-from obsynth.synthesis.lmi import SOLVER_SETTINGS
+from obsynth.synthesis.conic.lmi import SOLVER_SETTINGS
 
 #: How gains are found: from the whole inequality, from the smaller one without the gains, or in closed form.
 ENGINES = ("auto", "lmi", "reduced-lmi", "riccati")

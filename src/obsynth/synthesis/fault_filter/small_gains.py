@@ -12,10 +12,10 @@ import numpy as np
 
 from obsynth.errors import SolverError
 from obsynth.numerics.norms import spectral_radius
-from obsynth.synthesis.central_filter import FEW_STATES, least_noise_filter, noise_weighted_filters
-from obsynth.synthesis.gain_problem import GainProblem, Injection
-from obsynth.synthesis.gain_search import LeastGain
-from obsynth.synthesis.inequality_gains import gains_by_inequality
+from obsynth.synthesis.fault_filter.central_filter import FEW_STATES, least_noise_filter, noise_weighted_filters
+from obsynth.synthesis.fault_filter.gain_problem import GainProblem, Injection
+from obsynth.synthesis.fault_filter.gain_search import LeastGain
+from obsynth.synthesis.fault_filter.inequality_gains import gains_by_inequality
 
 #: The error shall be forgotten at least this fast (spectral radius), or half as fast as the starting filter does: the
 #: smallest gains alone would leave an observable mode at the very edge of stability.

@@ -13,10 +13,10 @@ from obsynth.models.exosystems import Exosystem
 from obsynth.models.fault_models import FaultModel
 from obsynth.numerics.arrays import ComplexArray
 from obsynth.numerics.spectra import decay_rates
-from obsynth.synthesis.lmi import SOLVER_SETTINGS
+from obsynth.synthesis.conic.lmi import SOLVER_SETTINGS
 from obsynth.synthesis.placement.eigenstructure import OBJECTIVES
 from obsynth.synthesis.placement.region import Region
-from obsynth.synthesis.ui_pi_noise import NoiseWeights
+from obsynth.synthesis.ui_pi.noise import NoiseWeights
 
 #: Poles given as numbers count as a conjugate pair when they agree to this, relative to their size.
 PAIR_TOLERANCE = 1e-9

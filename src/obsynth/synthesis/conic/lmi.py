@@ -18,14 +18,14 @@ import numpy as np
 
 from obsynth.errors import SolverError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.synthesis.interior_point import solve_cone_programme
+from obsynth.synthesis.conic.interior_point import solve_cone_programme
 
 if TYPE_CHECKING:
     import cvxpy
 
 #: Statuses that come with numbers; whether they count is decided by verification, not here.
 USABLE_STATUSES = ("optimal", "optimal_inaccurate")
-#: Our own solver, see `obsynth.synthesis.interior_point`, and what "auto" tries in turn.
+#: Our own solver, see `obsynth.synthesis.conic.interior_point`, and what "auto" tries in turn.
 SCHUR = "SCHUR"
 AUTO_SOLVERS = (SCHUR, "CLARABEL")
 FIRST_ORDER_SOLVERS = ("SCS",)

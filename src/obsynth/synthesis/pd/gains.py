@@ -13,10 +13,10 @@ from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import spectral_abscissa
 from obsynth.observers.linear import LinearObserver
-from obsynth.synthesis.pd_certificate import explicit_certificate, gain_certificate
-from obsynth.synthesis.pd_options import PdOptions
-from obsynth.synthesis.pd_problem import PdSolution
-from obsynth.synthesis.pd_realisation import realise_pd_observer
+from obsynth.synthesis.pd.certificate import explicit_certificate, gain_certificate
+from obsynth.synthesis.pd.options import PdOptions
+from obsynth.synthesis.pd.problem import PdSolution
+from obsynth.synthesis.pd.realisation import realise_pd_observer
 from obsynth.verification.pd_inequality import (
     error_inputs,
     prove_gains,

@@ -12,9 +12,15 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SolverError
-from obsynth.synthesis import gain_design, lmi
-from obsynth.synthesis.central_filter import FEW_STATES, least_level, search_central_filter, with_least_weight
-from obsynth.synthesis.gain_problem import GainProblem, Injection, NormalisedProblem, normalise
+from obsynth.synthesis.conic import lmi
+from obsynth.synthesis.fault_filter import gain_design
+from obsynth.synthesis.fault_filter.central_filter import (
+    FEW_STATES,
+    least_level,
+    search_central_filter,
+    with_least_weight,
+)
+from obsynth.synthesis.fault_filter.gain_problem import GainProblem, Injection, NormalisedProblem, normalise
 
 #: The search stops when another pass in better coordinates improves the gain by less than this.
 PASS_IMPROVEMENT = 1e-6

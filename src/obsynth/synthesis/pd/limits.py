@@ -13,7 +13,7 @@ from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import NEGLIGIBLE_MODE, decide_rank
 from obsynth.numerics.scaling import equilibrate_pencil
-from obsynth.synthesis.pd_options import PdOptions
+from obsynth.synthesis.pd.options import PdOptions
 
 #: Damping ratio from which a mode dies out by itself.
 WELL_DAMPED = 0.5

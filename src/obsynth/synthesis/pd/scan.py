@@ -12,9 +12,9 @@ from obsynth.errors import InfeasibleError, SolverError
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.continuous import spectral_abscissa
 from obsynth.results.delta_scan import DeltaScan
-from obsynth.synthesis.pd_design import gains_for
-from obsynth.synthesis.pd_gains import PdGains
-from obsynth.synthesis.pd_options import PdOptions
+from obsynth.synthesis.pd.design import gains_for
+from obsynth.synthesis.pd.gains import PdGains
+from obsynth.synthesis.pd.options import PdOptions
 from obsynth.verification.pd_error_system import PdErrorSystem
 
 

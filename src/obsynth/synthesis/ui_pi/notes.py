@@ -8,8 +8,8 @@ from obsynth.analysis.conditions import Condition
 from obsynth.analysis.unknown_input_pencils import numbers
 from obsynth.numerics.spectra import decay_rates
 from obsynth.synthesis.placement.compromise import NOISE_PRICE
-from obsynth.synthesis.ui_pi_options import UiPiOptions
-from obsynth.synthesis.ui_pi_problem import PlacementProblem
+from obsynth.synthesis.ui_pi.options import UiPiOptions
+from obsynth.synthesis.ui_pi.problem import PlacementProblem
 
 #: A default this many times slower than the plant itself is worth a note.
 SLOW_DEFAULT = 1000.0

@@ -1,0 +1,1 @@
+"""Matrix inequalities as convex problems, and the solvers that take them."""

@@ -1,0 +1,1 @@
+"""The gains of PD observers."""

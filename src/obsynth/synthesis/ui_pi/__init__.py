@@ -1,0 +1,1 @@
+"""The gains of unknown-input PI observers."""
