@@ -31,6 +31,8 @@ START_SHARE = 0.5
 #: gain of the disturbance alone.
 NOISE_WEIGHTS = np.logspace(-6.0, 3.0, 31)
 LEVEL_FACTORS = (1.0, 1.5)
+#: Above so many states the higher level, which makes gains up to a quarter smaller, would cost up to half of the time.
+MOST_STATES_FOR_LEVELS = 200
 WEIGHT_STEPS = 4
 #: A level this far above anything a disturbance could do is no limit.
 WITHOUT_LIMIT = 1e4
@@ -147,7 +149,7 @@ def noise_weighted_filters(
     if work.order == 0 or work.measured == 0 or not min(sizes) > 0.0:
         return
     weights, last = NOISE_WEIGHTS * sizes[0] / sizes[1], 0
-    for factor in LEVEL_FACTORS:
+    for factor in LEVEL_FACTORS if work.order <= MOST_STATES_FOR_LEVELS else LEVEL_FACTORS[:1]:
         # More weight than at a lower level, and not more than can be hoped for.
         low, high = last, len(weights) if factor == 1.0 else min(last + WEIGHT_STEPS, len(weights))
         best = None
