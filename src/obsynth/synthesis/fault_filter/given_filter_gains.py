@@ -23,7 +23,7 @@ from obsynth.numerics.ranks import decide_rank
 from obsynth.results.design import Certificate
 from obsynth.synthesis.fault_filter.certify import bounded_real_certificate
 from obsynth.synthesis.fault_filter.filter_realisation import realise_filter
-from obsynth.synthesis.methods.fault_estimation_filter import notes
+from obsynth.synthesis.fault_filter.notes import notes
 from obsynth.synthesis.result import Synthesis
 
 

@@ -6,7 +6,7 @@ No number of a solver is believed: the true gain and the spectral radius of the 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -14,9 +14,7 @@ from obsynth.errors import SolverError
 from obsynth.synthesis.fault_filter import gain_design
 from obsynth.synthesis.fault_filter.gain_problem import GainProblem, Injection, NormalisedProblem
 from obsynth.synthesis.fault_filter.gain_search import LeastGain, coordinates
-
-if TYPE_CHECKING:
-    from obsynth.synthesis.fault_filter.small_gains import Goal
+from obsynth.synthesis.fault_filter.goal import Goal
 
 #: Descent in steps: ratios of successive levels, tried in turn, and how many steps at most.
 STEP_RATIOS = (0.6, 0.9)

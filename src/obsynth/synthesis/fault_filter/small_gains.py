@@ -5,16 +5,16 @@ No number of a solver is believed: the true gain, the true variance and the spec
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from obsynth.errors import SolverError
-from obsynth.numerics.norms import spectral_radius
 from obsynth.synthesis.fault_filter.central_filter import FEW_STATES, least_noise_filter, noise_weighted_filters
 from obsynth.synthesis.fault_filter.gain_problem import GainProblem, Injection
 from obsynth.synthesis.fault_filter.gain_search import LeastGain
+from obsynth.synthesis.fault_filter.goal import Goal, radius
 from obsynth.synthesis.fault_filter.inequality_gains import gains_by_inequality
 
 #: The error shall be forgotten at least this fast (spectral radius), or half as fast as the starting filter does: the
@@ -62,7 +62,7 @@ def small_gain_design(
         return least.injection, records
     nothing = Injection(np.zeros_like(least.injection.R), np.zeros_like(least.injection.V))
     fresh = least.first
-    goal = Goal(problem, gain, max(SLOWEST_DECAY, 0.5 + 0.5 * _radius(problem, fresh.start)))
+    goal = Goal(problem, gain, max(SLOWEST_DECAY, 0.5 + 0.5 * radius(problem, fresh.start)))
     if not goal.noisy and goal.met_fast(nothing):
         # Without a noise model the objective is the size of the gains themselves, and zero is least.
         return nothing, records
@@ -75,7 +75,7 @@ def small_gain_design(
     quick = None
     if lively:
         # The filter of least noise may forget slowly again: what was bought is not given back.
-        quick = _towards(goal, lively[0], target, slowest=_radius(problem, lively[0]))
+        quick = _towards(goal, lively[0], target, slowest=radius(problem, lively[0]))
         candidates.append(quick)
         central += lively
     else:
@@ -103,46 +103,6 @@ def small_gain_design(
     return (_towards(goal, found, target) if goal.noisy and quick is None else found), records
 
 
-@dataclass(frozen=True, eq=False)
-class Goal:
-    """What a filter must meet, and what it shall cost little of."""
-
-    problem: GainProblem
-    gain: float
-    slowest: float
-    judged: dict[int, tuple[Injection, bool]] = field(default_factory=dict, repr=False)
-
-    @property
-    def noisy(self) -> bool:
-        """Whether noise is the cost, or the size of the gains."""
-        return self.problem.states_noise
-
-    def at(self, gain: float) -> Goal:
-        """Return the goal at another level."""
-        return replace(self, gain=gain, judged={})
-
-    def met(self, injection: Injection) -> bool:
-        """Return whether the true gain is within the level, and the weight within its limit."""
-        # A filter is asked for more than once, and for many states each answer takes a Riccati equation.
-        if id(injection) not in self.judged:
-            self.judged[id(injection)] = (injection, _reaches(self.problem, injection, self.gain))
-        return self.judged[id(injection)][1]
-
-    def is_fast(self, injection: Injection) -> bool:
-        """Return whether the filter forgets fast enough."""
-        return _radius(self.problem, injection) <= self.slowest
-
-    def met_fast(self, injection: Injection) -> bool:
-        """Return both."""
-        return self.is_fast(injection) and self.met(injection)
-
-    def cost(self, injection: Injection) -> float:
-        """Return the variance under the noise, or the size of the gains."""
-        if self.noisy:
-            return self.problem.noise_variance(injection)
-        return float(np.linalg.norm(np.vstack([injection.R, injection.V])))
-
-
 def _lively_filters(goal: Goal) -> list[Injection]:
     """Return fast filters that meet the goal, the best first, where those that weigh the noise alone are slow.
 
@@ -157,7 +117,7 @@ def _lively_filters(goal: Goal) -> list[Injection]:
         found += [item for item in noise_weighted_filters(noisier, goal.gain, reaches=goal.met) if goal.met_fast(item)]
     least = min(map(goal.cost, found), default=0.0)
     return sorted(
-        (item for item in found if goal.cost(item) <= PRICE_OF_SPEED * least), key=lambda item: _radius(problem, item)
+        (item for item in found if goal.cost(item) <= PRICE_OF_SPEED * least), key=lambda item: radius(problem, item)
     )
 
 
@@ -178,16 +138,3 @@ def _towards(goal: Goal, injection: Injection, target: Injection | None, *, slow
             best, least, share = mixed, cost, tried
         step *= 0.5
     return best
-
-
-def _radius(problem: GainProblem, injection: Injection) -> float:
-    return spectral_radius(problem.closed_loop(injection)[0])
-
-
-def _reaches(problem: GainProblem, injection: Injection, gain: float) -> bool:
-    limit = problem.weight_limit
-    if limit is not None and float(np.linalg.norm(limit.fixed + injection.V @ limit.free, 2)) > limit.bound:
-        return False
-    if problem.disturbances == 0:
-        return _radius(problem, injection) < 1.0
-    return problem.reaches(injection, gain)

@@ -23,16 +23,11 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.conditions import Condition, require_all
-from obsynth.analysis.fault_detectability import WARN_CONDITION, FaultDetectability
 from obsynth.analysis.fault_filter import PreparedPlant, prepare
 from obsynth.analysis.fault_filter_conditions import examine_fault_filter, fault_filter_conditions
-from obsynth.analysis.transformations import sampling_zero_warnings
 from obsynth.errors import InfeasibleError
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray, as_matrix
-from obsynth.numerics.norms import spectral_radius
-from obsynth.numerics.ranks import SLOW_ZERO_RADIUS
-from obsynth.observers.linear import LinearObserver
 from obsynth.results.design import Certificate
 from obsynth.synthesis.conic.lmi import FILTER_SOLVERS
 from obsynth.synthesis.fault_filter.certify import bounded_real_certificate
@@ -41,6 +36,7 @@ from obsynth.synthesis.fault_filter.filter_realisation import realise_filter
 from obsynth.synthesis.fault_filter.filter_search import NOMINAL_GAIN, found_gains, found_within
 from obsynth.synthesis.fault_filter.gain_design import null_basis
 from obsynth.synthesis.fault_filter.gain_problem import GainProblem, Injection, WeightLimit
+from obsynth.synthesis.fault_filter.notes import notes
 from obsynth.synthesis.result import Synthesis
 
 #: Fictitious noise on the measurements, relative to the given one, so that no direction of the gains is free of cost.
@@ -218,42 +214,3 @@ def with_weight_limit(problem: GainProblem, prepared: PreparedPlant, parts: _Par
             lower_bound=smallest,
         )
     return replace(problem, weight_limit=WeightLimit(parts.W0 * outputs, parts.V.T * outputs, bound))
-
-
-def notes(
-    plant: DescriptorSystem,
-    detectability: FaultDetectability,
-    observer: LinearObserver,
-    *,
-    largest_zero: float = np.inf,
-) -> tuple[str, ...]:
-    """Return what a user should know: slow zeros, ill-conditioned faults, amplified noise, slow filters.
-
-    ``largest_zero`` is the largest modulus of a fault zero, where that is known already.
-    """
-    found = list(sampling_zero_warnings(plant)) if largest_zero > SLOW_ZERO_RADIUS else []
-    if detectability.condition_number > WARN_CONDITION:
-        found.append(
-            f"Upsilon has condition number {detectability.condition_number:.3g}: some combination of faults is "
-            "estimated with much more noise than others."
-        )
-    for name, row in zip(plant.fault_names, observer.Dy[observer.fault_rows], strict=True):
-        amplification = float(np.linalg.norm(row))
-        if amplification > WARN_AMPLIFICATION:
-            found.append(
-                f"The estimate of {name!r} multiplies errors of the newest measurement by up to {amplification:.3g}: "
-                "the fault moves the outputs little within its delay."
-            )
-    radius = spectral_radius(observer.Az)
-    if radius > SLOW_FILTER:
-        found.append(
-            f"The filter forgets its start slowly: spectral radius {radius:.6g}, time constant "
-            f"{-plant.dt / np.log(radius):.3g} s."
-        )
-    return tuple(found)
-
-
-#: Amplifications of measurement errors above this are worth a note.
-WARN_AMPLIFICATION = 50.0
-#: Spectral radii above this are worth a note.
-SLOW_FILTER = 0.98
