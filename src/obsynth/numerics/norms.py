@@ -137,12 +137,13 @@ def norm_is_at_most(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, 
     verdict = compared_gain(*scaled, d, level)
     if verdict is not None:
         return verdict
-    if a.shape[0] > STATES_OF_PENCIL:
-        # A gain above the level that is attained is cheaper to find than the norm.
-        best, _ = _modal_peak(*scaled, d, Modes.of(scaled[0]), points=MANY_GRID_POINTS)
-        if np.isfinite(best) and best > level:
-            return False
-    return hinf_norm(a, b, c, d).upper <= level
+    # A gain above the level that is attained is cheaper to find than the norm.
+    modes, points = Modes.of(a), GRID_POINTS if a.shape[0] <= STATES_OF_PENCIL else MANY_GRID_POINTS
+    balanced = _balanced(a, b, c, modes)
+    best, _ = _modal_peak(*balanced[:3], d, balanced[3], points=points)
+    if np.isfinite(best) and best > level:
+        return False
+    return hinf_norm(a, b, c, d, modes=modes).upper <= level
 
 
 def highest_gain_found(
