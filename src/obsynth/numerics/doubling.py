@@ -188,13 +188,7 @@ def compared_gain(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, le
 
     def possible(p: FloatArray) -> bool:
         nonlocal refuted
-        shown = b.T @ p @ b
-        left = -(gap + shown)
-        if not np.all(np.isfinite(left)) or is_positive(left):
-            return True
-        # Below zero by more than what rounding may have done to the solution.
-        margin = REFUTED * float(np.linalg.norm(b)) ** 2 * float(np.linalg.norm(p))
-        refuted = bool(np.linalg.eigvalsh(left)[0] < -margin)
+        refuted = is_clearly_negative(-(gap + b.T @ p @ b), b, p)
         return not refuted
 
     with np.errstate(all="ignore"):
@@ -213,6 +207,14 @@ def compared_gain(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, le
         moved = a.T @ p @ a
         sizes = float(np.linalg.norm(p)) + float(np.linalg.norm(moved)) + float(np.linalg.norm(added))
         return True if float(np.linalg.norm(p - moved - process - added)) <= EQUATION_TOLERANCE * sizes else None
+
+
+def is_clearly_negative(left: FloatArray, b: FloatArray, p: FloatArray) -> bool:
+    """Return whether ``left``, which holds ``-B'PB``, is below zero by more than what rounding may have done to P."""
+    if not np.all(np.isfinite(left)) or is_positive(left):
+        return False
+    margin = REFUTED * float(np.linalg.norm(b)) ** 2 * float(np.linalg.norm(p))
+    return bool(np.linalg.eigvalsh(left)[0] < -margin)
 
 
 def is_positive(matrix: FloatArray) -> bool:

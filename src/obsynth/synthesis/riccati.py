@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.doubling import REFUTED, doubled_riccati_solution, is_positive
+from obsynth.numerics.doubling import REFUTED, doubled_riccati_solution, is_clearly_negative, is_positive
 from obsynth.numerics.norms import spectral_radius
 
 #: Relative sizes of the fictitious process and measurement noise, tried in turn, that make the equation regular.
@@ -47,7 +47,7 @@ def stabilising_gain(a: FloatArray, c: FloatArray, noise_a: FloatArray, noise_c:
         size = float(np.linalg.norm(c @ q @ c.T, 2)) + float(np.linalg.norm(measured, 2))
         r = measured + epsilon * size * np.eye(m)
         # Far outside the circle doubling may settle on what is no solution: its poles tell.
-        for solve in (riccati_solution, _riccati_solution_by_qz):
+        for solve in (_by_doubling, _by_qz):
             x = solve(a, c, q, r, cross)
             if x is None:
                 continue
@@ -114,10 +114,7 @@ class _Exceeded:
         # Over more steps the solution grows: one that does not is behind a level that was exceeded in between.
         shrunk = self.last is not None and np.any(sizes < self.last - REFUTED * np.max(self.last))
         self.last = sizes.copy()
-        if shrunk or is_positive(left):
-            return bool(shrunk)
-        margin = REFUTED * float(np.linalg.norm(self.b)) ** 2 * float(np.linalg.norm(p))
-        return bool(np.linalg.eigvalsh(left)[0] < -margin)
+        return bool(shrunk) or is_clearly_negative(left, self.b, p)
 
 
 def _lyapunov_solution(a: FloatArray, weight: FloatArray) -> FloatArray | None:
@@ -156,19 +153,31 @@ def riccati_solution(
         ended = impossible is not None and impossible(found)
         return not ended
 
+    doubled = _by_doubling(a, h, process, weight, cross, possible=possible)
+    if ended or doubled is not None:
+        return None if ended else doubled
+    return _by_qz(a, h, process, weight, cross)
+
+
+def _by_doubling(
+    a: FloatArray,
+    h: FloatArray,
+    process: FloatArray,
+    weight: FloatArray,
+    cross: FloatArray,
+    *,
+    possible: Callable[[FloatArray], bool] | None = None,
+) -> FloatArray | None:
     try:
         with warnings.catch_warnings():
             # An ill-conditioned equation only makes a worse filter or certificate, which is then not taken.
             warnings.simplefilter("ignore")
-            doubled = doubled_riccati_solution(a, h, process, weight, cross, possible=possible)
+            return doubled_riccati_solution(a, h, process, weight, cross, possible=possible)
     except np.linalg.LinAlgError:
-        doubled = None
-    if ended or doubled is not None:
-        return None if ended else doubled
-    return _riccati_solution_by_qz(a, h, process, weight, cross)
+        return None
 
 
-def _riccati_solution_by_qz(
+def _by_qz(
     a: FloatArray, h: FloatArray, process: FloatArray, weight: FloatArray, cross: FloatArray
 ) -> FloatArray | None:
     from scipy.linalg import solve_discrete_are
