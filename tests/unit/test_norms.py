@@ -6,6 +6,7 @@ import pytest
 import slycot
 
 from obsynth.numerics.norms import (
+    STATES_OF_PENCIL,
     frequency_response,
     highest_gain_found,
     hinf_norm,
@@ -47,15 +48,22 @@ def by_slicot(a, b, c, d):
 
 
 class TestManyStates:
-    """From sixty states on a modal response and a Riccati equation take the place of the pencil."""
+    """Above eighty states a modal response and a Riccati equation take the place of the pencil."""
+
+    SIZE = STATES_OF_PENCIL + 10
+
+    def realisation(self, rng, inputs, outputs, damping):
+        """Return a stable system with its largest pole at a distance ``damping`` from the circle."""
+        a = rng.standard_normal((self.SIZE, self.SIZE))
+        b, c = rng.standard_normal((self.SIZE, inputs)), rng.standard_normal((outputs, self.SIZE))
+        a *= (1.0 - damping) / np.max(np.abs(np.linalg.eigvals(a)))
+        return a, b, c, rng.standard_normal((outputs, inputs))
 
     @pytest.mark.parametrize("damping", [0.3, 1e-2, 1e-4])
     def test_against_slicot(self, damping):
         rng = np.random.default_rng(11)
         for _ in range(4):
-            a, b, c = rng.standard_normal((70, 70)), rng.standard_normal((70, 3)), rng.standard_normal((2, 70))
-            a *= (1.0 - damping) / np.max(np.abs(np.linalg.eigvals(a)))
-            realisation = a, b, c, rng.standard_normal((2, 3))
+            realisation = self.realisation(rng, 3, 2, damping)
             true = by_slicot(*realisation)
             check_encloses(hinf_norm(*realisation), true, width=1.1e-3, slack=1e-8)
             assert highest_gain_found(*realisation) == pytest.approx(true, rel=1e-4)
@@ -67,17 +75,15 @@ class TestManyStates:
         """The largest singular value of more than two is estimated by power iteration."""
         rng = np.random.default_rng(12)
         for _ in range(3):
-            a, b, c = rng.standard_normal((70, 70)), rng.standard_normal((70, 4)), rng.standard_normal((5, 70))
-            a *= (1.0 - damping) / np.max(np.abs(np.linalg.eigvals(a)))
-            realisation = a, b, c, rng.standard_normal((5, 4))
+            realisation = self.realisation(rng, 4, 5, damping)
             true = by_slicot(*realisation)
             check_encloses(hinf_norm(*realisation), true, width=1.1e-3, slack=1e-8)
             assert highest_gain_found(*realisation) == pytest.approx(true, rel=1e-4)
 
     def test_defective_dynamics(self):
         """A chain of delays has one eigenvector: modal coordinates say nothing, and the norm is that of the taps."""
-        taps = np.linspace(1.0, 2.0, 80)
-        found = hinf_norm(np.eye(79, k=-1), np.eye(79)[:, :1], taps[None, 1:], taps[:1, None])
+        taps = np.linspace(1.0, 2.0, self.SIZE + 1)
+        found = hinf_norm(np.eye(self.SIZE, k=-1), np.eye(self.SIZE)[:, :1], taps[None, 1:], taps[:1, None])
         check_encloses(found, float(np.sum(taps)), width=1.1e-3, slack=1e-9)
 
 
