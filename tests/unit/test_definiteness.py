@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from obsynth.numerics import definiteness
-from obsynth.numerics.balls import Ball
-from obsynth.numerics.definiteness import prove_positive_definite
+from obsynth.proofs.balls import Ball
+from obsynth.proofs.definiteness import prove_positive_definite
 
 
 def whole(matrix):

@@ -7,8 +7,8 @@ import pytest
 from time_varying_plants import maximum_likelihood, observer_for, printed, record, textbook, varying
 
 from obsynth import PreconditionError, SpecError, TimeVaryingDescriptorSystem
-from obsynth.models.sequences import MatrixSequence
-from obsynth.observers.recursive import RecursiveObserver
+from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.plants.sequences import MatrixSequence
 
 SAMPLES = 9
 

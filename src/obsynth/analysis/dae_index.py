@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from obsynth.models.dae import DAEModel
-from obsynth.models.dae_functions import DAEFunctions
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.newton import ScaledMatrix
+from obsynth.plants.dae.functions import DAEFunctions
+from obsynth.plants.dae.model import DAEModel
 
 #: A matrix of (7) whose condition is above this is singular: three digits are left of sixteen.
 SINGULAR_CONDITION = 1e13

@@ -15,11 +15,11 @@ from itertools import pairwise
 
 import numpy as np
 
-from obsynth.models.descriptor import DescriptorSystem
-from obsynth.models.exosystems import Exosystem
 from obsynth.numerics.arrays import ComplexArray, FloatArray, read_only
 from obsynth.numerics.log_balance import LogBalance
 from obsynth.numerics.ranks import RANK_TOLERANCE
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.exosystems import Exosystem
 
 #: Weight of inputs and outputs beside equations and states, which they scale only where A and E leave that open.
 SIGNALS_WEIGHT = 1e-3

@@ -10,11 +10,11 @@ from types import MappingProxyType
 import numpy as np
 
 from obsynth.analysis.zeros import are_outside
-from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.pencils import FiniteZeros, finite_zeros, pencil_structure
 from obsynth.numerics.ranks import RankDecision, decide_rank
 from obsynth.numerics.scaling import equilibrate_pencil
+from obsynth.plants.descriptor import DescriptorSystem
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.errors import SpecError
-from obsynth.models.descriptor import DescriptorSystem
-from obsynth.models.time_varying import TimeVaryingDescriptorSystem
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import RankDecision, decide_rank
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 
 #: Steps that are looked at where the plant has no horizon.
 STEPS_WITHOUT_HORIZON = 1000

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.analysis.far_zeros import equilibrated_at, system_zeros
-from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.pencils import FiniteZeros
 from obsynth.numerics.ranks import (
@@ -24,6 +23,7 @@ from obsynth.numerics.ranks import (
     RankDecision,
 )
 from obsynth.numerics.scaling import EquilibratedPencil, equilibrate_pencil
+from obsynth.plants.descriptor import DescriptorSystem
 
 #: Points without meaning, tried as generic ones; the clearest of them is used.
 _GENERIC_POINTS = (0.7391, -1.3247, 1.9561, -0.4142)

@@ -36,7 +36,7 @@ def run_design(options: argparse.Namespace) -> int:
     ObsynthError
         As its exit code says; nothing is written then.
     """
-    from obsynth.results.serialise import design_as_dict
+    from obsynth.results.gain_sets import design_as_dict
 
     with progress(quiet=options.quiet) as report_stage:
         report_stage(f"reading {options.system}")
@@ -60,7 +60,7 @@ def run_design(options: argparse.Namespace) -> int:
 
 def designed(spec: Spec, report_stage: Any) -> ObserverDesign:
     """Return the design that a spec asks for, proved; stages go to ``report_stage``."""
-    from obsynth.pipeline.designing import design
+    from obsynth.methods.designing import design
 
     recovery = None if spec.transformation is None else spec.transformation.recovery
     return design(
@@ -78,7 +78,7 @@ def designed_or_loaded(spec: Spec, gains: Path | None, report_stage: Any) -> Obs
     """
     if gains is None:
         return designed(spec, report_stage)
-    from obsynth.results.serialise import load
+    from obsynth.results.gain_sets import load
 
     design = load(gains)
     require_same_signals(design, gains, spec)
@@ -132,8 +132,8 @@ def run_check(options: argparse.Namespace) -> int:
 
     spec = load_spec(options.system)
     from obsynth.analysis.structure import analyse_structure
-    from obsynth.models.descriptor import DescriptorSystem
-    from obsynth.pipeline.designing import check
+    from obsynth.methods.designing import check
+    from obsynth.plants.descriptor import DescriptorSystem
 
     # A pencil, its eigenvalues and its index are those of one matrix pair: a plant that changes with k has none.
     structures = {}
@@ -189,8 +189,8 @@ def run_verify(options: argparse.Namespace) -> int:
     SpecError
         The file is no gain set, or was changed.
     """
-    from obsynth.results.serialise import load
-    from obsynth.verification import verify
+    from obsynth.methods.verifying import verify
+    from obsynth.results.gain_sets import load
 
     design = load(options.gains)
     report = verify(design, printed_digits=options.printed_digits)

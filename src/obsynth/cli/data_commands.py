@@ -15,7 +15,7 @@ from obsynth.errors import SpecError, VerificationError
 
 if TYPE_CHECKING:
     from obsynth.data.run import DataRun
-    from obsynth.evaluation.online import OnlineMonitor
+    from obsynth.experiments.monitors.online import OnlineMonitor
     from obsynth.results.design import ObserverDesign
 
 STREAM = "-"
@@ -40,7 +40,7 @@ def run_run(options: argparse.Namespace) -> int:
     SpecError
         The gain set, the data or an option is malformed; no file is written then.
     """
-    from obsynth.results.serialise import load
+    from obsynth.results.gain_sets import load
 
     out = _target(options)
     if options.json and out is sys.stdout:
@@ -92,7 +92,7 @@ def run_export(options: argparse.Namespace) -> int:
         The gain set is malformed or recursive, or the file cannot be written.
     """
     from obsynth.exporting.files import export
-    from obsynth.results.serialise import load
+    from obsynth.results.gain_sets import load
 
     design = load(options.gains)
     files = export(design, options.to, sample_time=options.sample_time)
@@ -121,14 +121,14 @@ def run_report(options: argparse.Namespace) -> int:
     SpecError
         The gain set or the spec is malformed, the scenario does not fit the plant, or the page cannot be written.
     """
-    from obsynth.results.serialise import load
-    from obsynth.verification import verify
+    from obsynth.methods.verifying import verify
+    from obsynth.results.gain_sets import load
 
     if options.out.resolve() == options.gains.resolve():
         raise SpecError(f"--out and --gains are the same file {options.out}: give another one.", path=str(options.out))
     design = load(options.gains)
     report = verify(design)
-    from obsynth.cli.simulating import required_scenario
+    from obsynth.cli.simulate import required_scenario
     from obsynth.report.page import html_report
     from obsynth.spec import load_spec
 
@@ -184,12 +184,12 @@ def _monitor(design: ObserverDesign, options: argparse.Namespace) -> OnlineMonit
             flag = f"--{asked[0].replace('_', '-')}"
             raise SpecError(f"{flag} is for a monitor: say which one by --monitor.", path=flag)
         return None
-    from obsynth.evaluation.making_online import online_monitor
+    from obsynth.experiments.monitors.online_monitor import online_monitor
 
     scenario = None
     if options.system is not None:
         from obsynth.cli.commands import require_same_signals
-        from obsynth.cli.simulating import required_scenario
+        from obsynth.cli.simulate import required_scenario
         from obsynth.spec import load_spec
 
         spec = load_spec(options.system)

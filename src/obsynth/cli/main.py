@@ -13,7 +13,7 @@ from pathlib import Path
 
 from obsynth import __version__
 from obsynth.cli.data_arguments import add_data_verbs
-from obsynth.cli.evaluating import add_evaluate_verb
+from obsynth.cli.evaluate import add_evaluate_verb
 from obsynth.cli.output import print_error, print_json
 from obsynth.errors import ObsynthError
 
@@ -139,14 +139,14 @@ def _digits(text: str) -> int:
 
 
 def _verb(name: str) -> Callable[[argparse.Namespace], int]:
-    from obsynth.cli import commands, data_commands, evaluating, simulating
+    from obsynth.cli import commands, data_commands, evaluate, simulate
 
     return {
         "design": commands.run_design,
         "check": commands.run_check,
         "verify": commands.run_verify,
-        "simulate": simulating.run_simulate,
-        "evaluate": evaluating.run_evaluate,
+        "simulate": simulate.run_simulate,
+        "evaluate": evaluate.run_evaluate,
         "run": data_commands.run_run,
         "export": data_commands.run_export,
         "report": data_commands.run_report,

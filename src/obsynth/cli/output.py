@@ -28,7 +28,7 @@ _TITLES = {
 
 def print_json(data: Any, *, is_plain: bool = False) -> None:
     """Print ``data`` as one JSON document on stdout; arrays and special floats as in gain sets."""
-    from obsynth.results.serialise import plain
+    from obsynth.results.gain_sets import plain
 
     print(json.dumps(data if is_plain else plain(data), indent=1, allow_nan=False))
 

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.transformations import StateRecovery
-from obsynth.data.engine import DECIDING, Engine, Row, delayed
-from obsynth.data.operating import FirstSecond
+from obsynth.data.log_estimator import DECIDING, Engine, Row, delayed
+from obsynth.data.operating_point import OperatingPointCheck
 from obsynth.data.recovered import LATE, RecoveredStates
 from obsynth.data.signals import TIME, Signals
 from obsynth.errors import SpecError
-from obsynth.evaluation.online import OnlineMonitor
+from obsynth.experiments.monitors.online import OnlineMonitor
 from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray
 
@@ -74,7 +74,7 @@ class Job:
             *(("statistic", "threshold") if monitor is not None else ()),
             *(("alarm",) if thresholds or monitor is not None else ()),
         )  # fmt: skip
-        self.first, self.rows = FirstSecond(signals), 0
+        self.first, self.rows = OperatingPointCheck(signals), 0
         self.statuses, self.alarms, self.isolated = Counter[str](), dict[str, float](), ""
 
     def take(self, chunk: FloatArray) -> list[list[Any]]:

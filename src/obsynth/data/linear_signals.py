@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from obsynth.results.design import ObserverDesign
 
 
-class LinearSignals:
+class LinearSignalNames:
     """Names, delays, operating point and scales of a linear design.
 
     Parameters

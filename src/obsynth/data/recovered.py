@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.transformations import StateRecovery
-from obsynth.data.engine import Engine, Row
+from obsynth.data.log_estimator import Engine, Row
 from obsynth.numerics.arrays import FloatArray
 
 #: Its column says of which time the recovered states are.

@@ -8,16 +8,16 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.models.dae import DAEModel
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray
-from obsynth.observers.dae import DAEObserver
-from obsynth.observers.linear import LinearObserver
-from obsynth.observers.recursive import RecursiveObserver
-from obsynth.observers.sampling import sample_observer
-from obsynth.observers.steady import steady_observer
+from obsynth.observers.dae.observer import DAEObserver
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.linear.sampling import sample_observer
+from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.recursive.steady_state import steady_observer
+from obsynth.plants.dae.model import DAEModel
 from obsynth.results.design import ObserverDesign
-from obsynth.results.serialise import design_as_dict
+from obsynth.results.gain_sets import design_as_dict
 
 #: What a file says about the steady state of a recursion.
 STEADY = (

@@ -10,11 +10,11 @@ from rich.table import Table
 from rich.text import Text
 
 from obsynth.analysis.transformations import StateRecovery
-from obsynth.models.dae import DAEModel
-from obsynth.models.descriptor import DescriptorSystem
-from obsynth.models.time_varying import TimeVaryingDescriptorSystem
-from obsynth.observers.linear import LinearObserver
-from obsynth.observers.recursive import RecursiveObserver
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.plants.dae.model import DAEModel
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.report.claims import meaning_of
 from obsynth.report.layout import facts_table, headed_table, name_list, number, print_section
 from obsynth.report.verification import verification_report

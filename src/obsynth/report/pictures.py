@@ -8,16 +8,16 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 from obsynth.errors import ObsynthError, SpecError
-from obsynth.evaluation.demonstration import demonstration_scenario
-from obsynth.evaluation.monitors import Detection
-from obsynth.evaluation.recursive_simulating import RecursiveSimulation
-from obsynth.evaluation.simulating import Simulation, simulate
-from obsynth.evaluation.watching import monitor
+from obsynth.experiments.demonstration import demonstration_scenario
+from obsynth.experiments.monitors.monitor import Detection
+from obsynth.experiments.monitors.residual_monitor import monitor
+from obsynth.experiments.parameter_simulation import RecursiveSimulation
+from obsynth.experiments.simulation import Simulation, simulate
 from obsynth.observers.alarms import Decision
 from obsynth.observers.decisions import decide
-from obsynth.observers.linear import LinearObserver
-from obsynth.observers.recursive import RecursiveObserver
-from obsynth.observers.recursive_estimates import RecursiveEstimates
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.recursive.estimates import RecursiveEstimates
+from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.plotting.frequency import plot_gains
 from obsynth.plotting.simulation import plot_simulation
 from obsynth.plotting.spectra import plot_poles

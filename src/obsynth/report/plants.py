@@ -8,9 +8,9 @@ from rich.console import Console
 from rich.text import Text
 
 from obsynth.analysis.structure import Structure
-from obsynth.models.dae import DAEModel
-from obsynth.models.descriptor import DescriptorSystem
-from obsynth.models.time_varying import TimeVaryingDescriptorSystem
+from obsynth.plants.dae.model import DAEModel
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.report.designs import plant_facts
 from obsynth.report.layout import complex_numbers, facts_table, name_list, print_section
 from obsynth.report.verification import checks_table

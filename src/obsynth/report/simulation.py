@@ -7,8 +7,8 @@ from collections.abc import Iterator, Mapping
 from rich.console import Console
 from rich.text import Text
 
-from obsynth.evaluation.recursive_simulating import RecursiveSimulation
-from obsynth.evaluation.simulating import Simulation
+from obsynth.experiments.parameter_simulation import RecursiveSimulation
+from obsynth.experiments.simulation import Simulation
 from obsynth.report.layout import headed_table, number, print_section
 
 #: Rows of a table; of a large plant the worst estimates are shown.

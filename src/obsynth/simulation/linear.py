@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike
 
 from obsynth.analysis.transformations import StateRecovery, eliminate_algebraic_states
 from obsynth.errors import SpecError
-from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
+from obsynth.plants.descriptor import DescriptorSystem
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,10 +9,10 @@ from numpy.typing import ArrayLike
 
 from obsynth.analysis.time_varying import algebraic_rows
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.models.time_varying import TimeVaryingDescriptorSystem
 from obsynth.numerics.arguments import real_array, real_vector, whole_number
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.ranks import decide_rank
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 
 
 @dataclass(frozen=True, eq=False)

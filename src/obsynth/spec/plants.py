@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.models.dae import DAEModel
-from obsynth.models.descriptor import DescriptorSystem
-from obsynth.models.names import index_of
-from obsynth.models.time_varying import TimeVaryingDescriptorSystem
+from obsynth.plants.dae.model import DAEModel
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.names import index_of
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.spec.checking import DocumentProblems
 from obsynth.spec.documents import read_names
 from obsynth.spec.matrices import read_matrices, read_matrix

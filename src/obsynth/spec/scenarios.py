@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from obsynth.errors import SpecError
-from obsynth.models.dae import DAEModel
-from obsynth.models.descriptor import DescriptorSystem
-from obsynth.models.time_varying import TimeVaryingDescriptorSystem
+from obsynth.plants.dae.model import DAEModel
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.simulation.failures import KINDS
+from obsynth.simulation.parameter_scenario_signals import check_recursive
 from obsynth.simulation.profiles import Profile
-from obsynth.simulation.recursive_drive import check_recursive
 from obsynth.simulation.scenario import Scenario
 from obsynth.spec.checking import DocumentProblems
 

@@ -16,11 +16,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.balls import Enclosed, block
-from obsynth.numerics.definiteness import DefinitenessProof, prove_positive_definite, unproved
-from obsynth.observers.linear import LinearObserver
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.proofs.balls import Enclosed, block
+from obsynth.proofs.definiteness import DefinitenessProof, prove_positive_definite, unproved
 from obsynth.verification.error_system import LaggedPlant
 
 

@@ -13,10 +13,10 @@ from typing import NamedTuple
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
-from obsynth.observers.gain_schedule import GainStep, gain_steps
-from obsynth.observers.recursive import RecursiveObserver
-from obsynth.observers.recursive_running import RunningRecursiveObserver
-from obsynth.observers.step_model import EarlySteps, StepMatrices
+from obsynth.observers.recursive.gain_schedule import GainStep, gain_steps
+from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.recursive.running import RunningRecursiveObserver
+from obsynth.observers.recursive.step_model import EarlyConstraintSteps, StepMatrices
 from obsynth.results.report import Check, upper_bound_check
 
 #: Trials and steps: a wrong variance of 10 % is 20 standard deviations away.
@@ -49,14 +49,14 @@ def consistency(stated: RecursiveObserver, shipped: RecursiveObserver, steps: in
     nq = len(truth.parameters.theta)
     x = rng.standard_normal((TRIALS, truth.factor.shape[1])) @ truth.factor.T
     theta = rng.standard_normal((TRIALS, nq)) @ truth.parameters.spread.T
-    model, early = truth.model, isinstance(truth.model, EarlySteps)
+    model, early = truth.model, isinstance(truth.model, EarlyConstraintSteps)
     nis, pairs = [], []
     scores: dict[int, Scores] = {}
     before = np.zeros((TRIALS, 0))
     count, factor = min(steps, STEPS), truth.factor
     for position, gains in enumerate(gain_steps(shipped, count)):
         k = position - 1 if early else position
-        true = model.first() if isinstance(model, EarlySteps) and position == 0 else model.at(k)
+        true = model.first() if isinstance(model, EarlyConstraintSteps) and position == 0 else model.at(k)
         noise = rng.standard_normal((TRIALS, true.noise.shape[1])) @ true.noise.T
         known = np.zeros_like(noise)
         known[:, : len(true.A)] = x @ gains.step.A.T

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.scaling import balance_by_least_squares
-from obsynth.observers.linear import LinearObserver
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.report import Check, upper_bound_check
 from obsynth.verification.error_system import LaggedPlant
 

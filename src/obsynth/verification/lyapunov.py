@@ -13,8 +13,8 @@ from __future__ import annotations
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.balls import Enclosed, block
-from obsynth.numerics.definiteness import DefinitenessProof, prove_positive_definite, unproved
+from obsynth.proofs.balls import Enclosed, block
+from obsynth.proofs.definiteness import DefinitenessProof, prove_positive_definite, unproved
 
 
 def prove_stable(a: FloatArray, factor: FloatArray, dt: float) -> DefinitenessProof:

@@ -6,8 +6,8 @@ from collections.abc import Iterable, Iterator
 
 from obsynth.analysis.conditions import Condition
 from obsynth.analysis.zeros import are_outside
-from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.pencils import FiniteZeros, PencilStructure, pencil_structure
+from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.report import Check, information
 
 

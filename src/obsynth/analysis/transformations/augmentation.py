@@ -9,11 +9,11 @@ import numpy as np
 from obsynth.analysis.transformations.recovery import Transformation, unchanged_states, with_states
 from obsynth.analysis.zeros import leading_names
 from obsynth.errors import PreconditionError
-from obsynth.models.descriptor import DescriptorSystem
-from obsynth.models.names import index_of
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import NEGLIGIBLE_INPUT, decide_rank
 from obsynth.numerics.scaling import equilibrate_pencil
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.names import index_of
 
 
 def augment_faults(plant: DescriptorSystem, faults: Sequence[str]) -> Transformation:

@@ -8,8 +8,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.plants.descriptor import DescriptorSystem
 
 _Value = TypeVar("_Value")
 

@@ -1,0 +1,1 @@
+"""Proofs in outward rounding and exact arithmetic: balls, definiteness."""
