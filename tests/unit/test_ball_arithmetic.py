@@ -10,8 +10,8 @@ import pytest
 
 import obsynth
 from obsynth.methods.pd_observer.checks.inequality import prove_gain, prove_gains
-from obsynth.numerics import definiteness
 from obsynth.observers.linear.observer import LinearObserver
+from obsynth.proofs import definiteness
 from obsynth.proofs.balls import Ball, Enclosed, block
 from obsynth.proofs.definiteness import prove_positive_definite
 from obsynth.proofs.extended_balls import MOST_ROWS, ExtendedBall, prove_by_ball_arithmetic

@@ -5,7 +5,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from obsynth.numerics import definiteness
+from obsynth.proofs import definiteness
 from obsynth.proofs.balls import Ball
 from obsynth.proofs.definiteness import prove_positive_definite
 

@@ -1,4 +1,4 @@
-"""The doors of the recursive methods: from plant, options or spec to a verified design, to a file and back."""
+"""The public functions of the recursive methods: from plant, options or spec to a verified design and its file."""
 
 from __future__ import annotations
 

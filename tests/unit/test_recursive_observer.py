@@ -1,4 +1,4 @@
-"""The recursive observer in motion: against batch solutions, with missing samples, with early constraints."""
+"""The running recursive observer: against batch solutions, with missing samples, with early constraints."""
 
 from __future__ import annotations
 

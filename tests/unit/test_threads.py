@@ -149,7 +149,7 @@ def test_verification_alone_runs_on_one_thread(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_the_method_itself_leaves_the_threads_alone() -> None:
-    """The setting is at the door, once for every method."""
+    """The setting is in `design`, once for every method."""
     method.synthesise(PLANT, progress=lambda _: None)
     assert blas_threads() == {2}
 

@@ -29,15 +29,10 @@ SIGNALS_WEIGHT = 1e-3
 class PlantUnits:
     """Factors between a plant as given and the scaled one.
 
-    Parameters
-    ----------
-    time : float, seconds
-        The unit of time: tau, or the sample time.
-    equations, states, outputs, faults, disturbances, model : FloatArray
-        ``(nx,)``, ``(nx,)``, ``(ny,)``, ``(nf,)``, ``(nd,)``, ``(nw,)``: equations and outputs are multiplied by
-        theirs; a state, fault, disturbance or state of the fault model is its factor times the scaled one.
-    discrete : bool
-        Whether the plant is sampled: its matrices have no unit of time then.
+    Fields: time: The unit of time: tau, or the sample time; equations, states, outputs, faults, disturbances, model:
+    ``(nx,)``, ``(nx,)``, ``(ny,)``, ``(nf,)``, ``(nd,)``, ``(nw,)``: equations and outputs are multiplied by theirs; a
+    state, fault, disturbance or state of the fault model is its factor times the scaled one; discrete: Whether the
+    plant is sampled: its matrices have no unit of time then.
     """
 
     time: float

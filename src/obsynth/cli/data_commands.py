@@ -22,24 +22,7 @@ STREAM = "-"
 
 
 def run_run(options: argparse.Namespace) -> int:
-    """Run ``run``: gain set and data in, estimates out.
-
-    Parameters
-    ----------
-    options : argparse.Namespace
-        ``gains``, ``data``, ``out``, ``map``, ``scale``, ``threshold``, ``monitor`` and its options, ``system``,
-        ``gap``, ``warm_up``, ``state``, ``json``, ``quiet``.
-
-    Returns
-    -------
-    int
-        0; every failure is an error.
-
-    Raises
-    ------
-    SpecError
-        The gain set, the data or an option is malformed; no file is written then.
-    """
+    """Run ``run``: gain set and data in, estimates out."""
     from obsynth.results.gain_sets import load
 
     out = _target(options)
@@ -74,23 +57,7 @@ def run_run(options: argparse.Namespace) -> int:
 
 
 def run_export(options: argparse.Namespace) -> int:
-    """Run ``export``: gain set in, file for another program out.
-
-    Parameters
-    ----------
-    options : argparse.Namespace
-        ``gains``, ``to``, ``sample_time``, ``json``.
-
-    Returns
-    -------
-    int
-        0; every failure is an error.
-
-    Raises
-    ------
-    SpecError
-        The gain set is malformed or recursive, or the file cannot be written.
-    """
+    """Run ``export``: gain set in, file for another program out."""
     from obsynth.exporting.files import export
     from obsynth.results.gain_sets import load
 
@@ -104,23 +71,7 @@ def run_export(options: argparse.Namespace) -> int:
 
 
 def run_report(options: argparse.Namespace) -> int:
-    """Run ``report``: gain set in, verified again, one HTML page out.
-
-    Parameters
-    ----------
-    options : argparse.Namespace
-        ``gains``, ``out``, ``system``, ``json``.
-
-    Returns
-    -------
-    int
-        0 if every check holds, else 6; the page is written in either case, and says so.
-
-    Raises
-    ------
-    SpecError
-        The gain set or the spec is malformed, the scenario does not fit the plant, or the page cannot be written.
-    """
+    """Run ``report``: gain set in, verified again, one HTML page out."""
     from obsynth.methods.verifying import verify
     from obsynth.results.gain_sets import load
 
@@ -159,13 +110,7 @@ def _target(options: argparse.Namespace) -> Path | TextIO:
 
 
 def numbers_of(pairs: list[tuple[str, str]]) -> Mapping[str, float]:
-    """Return values by name, from arguments of the form NAME=VALUE.
-
-    Raises
-    ------
-    SpecError
-        A value is no number.
-    """
+    """Return values by name, from arguments of the form NAME=VALUE."""
     found = {}
     for name, text in pairs:
         try:
@@ -239,13 +184,7 @@ def _rows_done(data: str, *, quiet: bool) -> Iterator[Callable[[int], None] | No
 
 
 def rows_in(path: Path) -> int | None:
-    """Return how many rows a file of data has, about; `None` where that cannot be told without reading it whole.
-
-    Parameters
-    ----------
-    path : Path
-        CSV or Parquet.
-    """
+    """Return how many rows a file of data has, about; `None` where that cannot be told without reading it whole."""
     try:
         if path.suffix.lower() == ".parquet":
             import pyarrow.parquet

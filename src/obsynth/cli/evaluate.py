@@ -23,13 +23,7 @@ _EVALUATE = "Design an observer from a spec, run the spec's scenario many times,
 
 
 def add_evaluate_verb(verbs: Any) -> None:
-    """Add the parser.
-
-    Parameters
-    ----------
-    verbs : object
-        The subparsers of ``obsynth``.
-    """
+    """Add the parser."""
     evaluate = verbs.add_parser("evaluate", help=_EVALUATE, description=_EVALUATE)
     evaluate.add_argument("--system", type=Path, required=True, metavar="FILE", help="the spec (YAML), with a scenario")
     evaluate.add_argument(
@@ -49,23 +43,7 @@ def add_evaluate_verb(verbs: Any) -> None:
 
 
 def run_evaluate(options: argparse.Namespace) -> int:
-    """Run ``evaluate``: spec in, table of rates and errors out.
-
-    Parameters
-    ----------
-    options : argparse.Namespace
-        ``system``, ``gains``, ``runs``, ``confidence``, ``jobs``, ``monitor`` and its options, ``json``, ``quiet``.
-
-    Returns
-    -------
-    int
-        0; every failure is an error.
-
-    Raises
-    ------
-    ObsynthError
-        As its exit code says.
-    """
+    """Run ``evaluate``: spec in, table of rates and errors out."""
     from obsynth.cli.commands import designed_or_loaded
     from obsynth.cli.data_commands import numbers_of
     from obsynth.spec import load_spec

@@ -29,34 +29,12 @@ exit codes:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run ``obsynth``.
-
-    Parameters
-    ----------
-    arguments : sequence of str, optional
-        The command line without the program's name; that of the process by default.
-
-    Returns
-    -------
-    int
-        The exit code.
-    """
+    """Run ``obsynth``."""
     return _run(_parser(), arguments)
 
 
 def design_command(arguments: Sequence[str] | None = None) -> int:
-    """Run ``design``, which is ``obsynth design``.
-
-    Parameters
-    ----------
-    arguments : sequence of str, optional
-        The command line without the program's name; that of the process by default.
-
-    Returns
-    -------
-    int
-        The exit code.
-    """
+    """Run ``design``, which is ``obsynth design``."""
     parser = argparse.ArgumentParser(
         prog="design", description=_DESIGN, epilog=_EXIT_CODES, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -61,18 +61,7 @@ def stdout_console() -> Console:
 
 @contextmanager
 def progress(*, quiet: bool) -> Iterator[Callable[[str], None]]:
-    """Show the stages of a long run on stderr.
-
-    Parameters
-    ----------
-    quiet : bool
-        Show nothing.
-
-    Yields
-    ------
-    callable
-        Takes the text of a stage.  On a terminal a line that disappears at the end; else one line each.
-    """
+    """Show the stages of a long run on stderr."""
     if quiet:
         yield lambda text: None
         return

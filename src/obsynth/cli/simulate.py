@@ -14,13 +14,7 @@ if TYPE_CHECKING:
 
 
 def required_scenario(spec: Spec) -> Scenario:
-    """Return the scenario of a spec.
-
-    Raises
-    ------
-    SpecError
-        It has none.
-    """
+    """Return the scenario of a spec."""
     if spec.scenario is None:
         raise SpecError(
             f"{spec.path} has no scenario: add one, for example scenario: {{horizon: 100}}.", path="scenario"
@@ -29,23 +23,7 @@ def required_scenario(spec: Spec) -> Scenario:
 
 
 def run_simulate(options: argparse.Namespace) -> int:
-    """Run ``simulate``: spec in, table of errors out, and every signal in a file if asked.
-
-    Parameters
-    ----------
-    options : argparse.Namespace
-        ``system``, ``gains``, ``out``, ``json``, ``quiet``.
-
-    Returns
-    -------
-    int
-        0; every failure is an error.
-
-    Raises
-    ------
-    ObsynthError
-        As its exit code says; nothing is written then.
-    """
+    """Run ``simulate``: spec in, table of errors out, and every signal in a file if asked."""
     from obsynth.cli.commands import designed_or_loaded, output_file
     from obsynth.spec import load_spec
 

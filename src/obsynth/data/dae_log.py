@@ -17,20 +17,11 @@ from obsynth.results.design import ObserverDesign
 
 
 class DAEDataObserver(SteppingEngine[DAEEstimates]):
-    """An observer of a DAE in motion on measured data; signals are absolute values, as the model's.
+    """A running observer of a DAE on measured data; signals are absolute values, as the model's.
 
-    Parameters
-    ----------
-    design : ObserverDesign
-        Of a nonlinear plant.
-    warm_up : float or None
-        Seconds that are marked after a start, and after rows with unknown inputs; by default until forgetting has
-        shrunk the weight of the start to 2 %, and none for the forms that do not forget.
-
-    Raises
-    ------
-    SpecError
-        The design is linear, or the option is out of range.
+    Fields: design: Of a nonlinear plant; warm_up: Seconds that are marked after a start, and after rows with unknown
+    inputs; by default until forgetting has shrunk the weight of the start to 2 %, and none for the forms that do not
+    forget.
     """
 
     def __init__(self, design: ObserverDesign, *, warm_up: float | None = None) -> None:
@@ -44,23 +35,13 @@ class DAEDataObserver(SteppingEngine[DAEEstimates]):
         )  # fmt: skip
 
     def started(self) -> RunningDAEObserver:
-        """Return the observer in motion, at k = 0."""
+        """Return the running observer, at k = 0."""
         return self.observer.start()
 
     def first_inputs(self, values: FloatArray, row: int) -> FloatArray:
         """Return the inputs of the first row, in which they must be known.
 
-        Parameters
-        ----------
-        values : FloatArray
-            ``(nu,)``.
-        row : int
-            Of the data, for errors.
-
-        Raises
-        ------
-        SpecError
-            An input is missing.
+        Shapes: ``values (nu,)``.
         """
         if not np.isfinite(values).all():
             raise SpecError(
@@ -72,12 +53,7 @@ class DAEDataObserver(SteppingEngine[DAEEstimates]):
     def taken(self, y: FloatArray, u: FloatArray, row: int) -> DAEEstimates | Exception | None:
         """Take one sample, or return why it cannot be taken.
 
-        Parameters
-        ----------
-        y, u : FloatArray
-            ``(ny,)`` and ``(nu,)``.
-        row : int
-            Of the data, for errors.
+        Shapes: ``y (ny,)``, ``u (nu,)``.
         """
         try:
             found: DAEEstimates = self.running.step(y, u)
@@ -89,24 +65,12 @@ class DAEDataObserver(SteppingEngine[DAEEstimates]):
         return found if all(bool(np.isfinite(array).all()) for array in arrays) else None
 
     def values(self, found: DAEEstimates) -> FloatArray:
-        """Return a row: estimates, standard deviations, innovation.
-
-        Parameters
-        ----------
-        found : DAEEstimates
-            Of one sample.
-        """
+        """Return a row: estimates, standard deviations, innovation."""
         parts = (found.states, found.parameters, found.state_deviations, found.parameter_deviations, found.innovations)
         return np.concatenate([part[0] for part in parts])
 
     def evidence(self, found: DAEEstimates) -> Evidence:
-        """Return what the sample says, for decisions; to first order, as the covariances.
-
-        Parameters
-        ----------
-        found : DAEEstimates
-            Of one sample.
-        """
+        """Return what the sample says, for decisions; to first order, as the covariances."""
         # Only the length of the innovation counts, which is known in units of its own covariance.
         degrees = int(found.nis_degrees[0])
         white = np.zeros(degrees)

@@ -15,23 +15,18 @@ from obsynth.plants.descriptor import DescriptorSystem
 
 
 @dataclass(frozen=True, eq=False)
-class Bridge:
+class GapModel:
     """A plant with its algebraic states eliminated, ready to be propagated.
 
-    Parameters
-    ----------
-    plant : DescriptorSystem
-        ``E = I``.
-    into : FloatArray
-        ``(nx, nx_source)``: the dynamic states in an estimate of all states.
+    Fields: plant: ``E = I``; into: ``(nx, nx_source)``: the dynamic states in an estimate of all states.
     """
 
     plant: DescriptorSystem
     into: FloatArray
 
     @classmethod
-    def of(cls, plant: DescriptorSystem) -> Bridge | None:
-        """Return the bridge of a plant; ``None`` where the plant cannot be propagated (index 2 or more)."""
+    def of(cls, plant: DescriptorSystem) -> GapModel | None:
+        """Return the gap_model of a plant; ``None`` where the plant cannot be propagated (index 2 or more)."""
         try:
             done = eliminate_algebraic_states(plant)
         except PreconditionError:
@@ -42,14 +37,7 @@ class Bridge:
     def start(self, estimate: FloatArray, inputs: Sequence[FloatArray], fault: FloatArray) -> FloatArray:
         """Return the dynamic states now from an estimate of the past.
 
-        Parameters
-        ----------
-        estimate : FloatArray
-            ``(nx_source,)``, as old as there are ``inputs``.
-        inputs : sequence of FloatArray
-            Known inputs ``(nu,)`` of each sample since, oldest first; none for continuous time.
-        fault : FloatArray
-            ``(nf,)``.
+        Shapes: ``estimate (nx_source,)``, ``inputs (nu,)``, ``fault (nf,)``.
         """
         state = self.into @ estimate
         for u in inputs:
@@ -71,14 +59,7 @@ class Bridge:
     def miss(self, v: FloatArray, state: FloatArray | None = None, fault: FloatArray | None = None) -> float:
         """Return the distance between measured outputs and those of a state; of rest and no fault by default.
 
-        Parameters
-        ----------
-        v : FloatArray
-            ``[u, y]``.
-        state : FloatArray, optional
-            ``(nx,)``.
-        fault : FloatArray, optional
-            ``(nf,)``.
+        Shapes: ``state (nx,)``, ``fault (nf,)``.
         """
         plant = self.plant
         at = np.zeros(plant.nx) if state is None else state

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from obsynth.data.clock import Clock
-from obsynth.data.gap_model import Bridge
+from obsynth.data.gap_model import GapModel
 from obsynth.data.linear_signals import LinearSignalNames
 from obsynth.data.log_estimator import GAP, LONGEST_BRIDGE, OK, RECOVERING, WARM_UP, Row, estimate_columns
 from obsynth.data.observer_holds import KeptHolds, checked_warm_up, transient
@@ -24,35 +24,17 @@ _Part = TypeVar("_Part")
 
 
 def _running(part: _Part | None) -> _Part:
-    """Return a part that is there while the observer runs.
-
-    Raises
-    ------
-    ObsynthError
-        It is not: the run is in a state that no order of calls should lead to.
-    """
+    """Return a part that is there while the observer runs."""
     if part is None:
         raise ObsynthError("The run is in an impossible state: its observer or plant model is missing. Start it again.")
     return part
 
 
 class DataObserver(LinearSignalNames):
-    """A linear observer in motion on measured data.
+    """A running linear observer on measured data.
 
-    Parameters
-    ----------
-    design : ObserverDesign
-        A linear design.
-    gap : float or None
-        Continuous time: intervals longer than this are gaps, in seconds.
-    warm_up : float or None
-        Seconds that are marked after a start and after a gap; by default until the slowest mode has shrunk to
-        2 %.
-
-    Raises
-    ------
-    SpecError
-        The design is recursive, or an option is out of range.
+    Fields: design: A linear design; gap: Continuous time: intervals longer than this are gaps, in seconds; warm_up:
+    Seconds that are marked after a start and after a gap; by default until the slowest mode has shrunk to 2 %.
     """
 
     def __init__(self, design: ObserverDesign, *, gap: float | None = None, warm_up: float | None = None) -> None:
@@ -67,14 +49,14 @@ class DataObserver(LinearSignalNames):
         self.columns = estimate_columns(self.state_names, self.fault_names, self.observer.residual_names)
         self.notes: tuple[str, ...] = ()
         self.clock = Clock(self.observer.dt, gap)
-        self.bridge = Bridge.of(self.plant)
+        self.gap_model = GapModel.of(self.plant)
         lags = set(self.observer.state_delays) or {0}
         if len(lags) > 1:
-            self.bridge = None
+            self.gap_model = None
         self.nu = len(self.observer.input_names)
         self.b = np.hstack([self.observer.Bu, self.observer.By])
         self.observer_hold = KeptHolds(partial(first_order_hold, self.observer.Az, self.b))
-        self.plant_hold = None if self.bridge is None else KeptHolds(self.bridge.held)
+        self.plant_hold = None if self.gap_model is None else KeptHolds(self.gap_model.held)
         self.d = np.hstack([self.observer.Du, self.observer.Dy])
         self.z: FloatArray | None = None
         self.v = np.zeros(self.b.shape[1])
@@ -86,27 +68,7 @@ class DataObserver(LinearSignalNames):
         self.inputs: deque[FloatArray] = deque(maxlen=max(lags) + 1)
 
     def step(self, time: float, values: FloatArray, row: int) -> Row:
-        """Take one row of data.
-
-        Parameters
-        ----------
-        time : float
-            Seconds.
-        values : FloatArray
-            ``[u, y]``, deviations; not finite where a sample is missing.
-        row : int
-            Number of the row, for errors.
-
-        Returns
-        -------
-        Row
-            The estimates at this row.
-
-        Raises
-        ------
-        SpecError
-            The time stamp is refused; the state is left as it was.
-        """
+        """Take one row of data."""
         seconds, missing = self.clock.advance(time, row)
         good = bool(np.isfinite(values).all())
         u = values[: self.nu]
@@ -148,9 +110,9 @@ class DataObserver(LinearSignalNames):
     def _lost(self, seconds: float, v: FloatArray) -> bool:
         """Whether the model, after a gap, misses the outputs by more than their whole size before and after it."""
         self._propagate(seconds, v[: self.nu])
-        bridge = _running(self.bridge)
+        gap_model = _running(self.gap_model)
         # The outputs and the model may both be huge; a miss that is not finite is lost as well.
-        return not bridge.miss(v, self.model, self.fault) <= bridge.miss(self.measured) + bridge.miss(v)
+        return not gap_model.miss(v, self.model, self.fault) <= gap_model.miss(self.measured) + gap_model.miss(v)
 
     def _taken(self, v: FloatArray) -> None:
         if self.observer.dt > 0.0:
@@ -183,17 +145,17 @@ class DataObserver(LinearSignalNames):
         """Let the plant model stand in for the sensors at one sample; return the estimates, faults held."""
         if self.z is None:
             return self._held()
-        if self.bridge is None:
+        if self.gap_model is None:
             self._restart()
             return self._held()
         if self.model is None:
             known = list(self.inputs) if self.observer.dt > 0.0 else []
-            self.model = self.bridge.start(self.row[self.observer.state_rows], known, self.fault)
+            self.model = self.gap_model.start(self.row[self.observer.state_rows], known, self.fault)
             if self.observer.dt == 0.0:
                 self._propagate(seconds, u)
         else:
             self._propagate(seconds, u)
-        v = np.concatenate([u, self.bridge.outputs(self.model, u, self.fault)])
+        v = np.concatenate([u, self.gap_model.outputs(self.model, u, self.fault)])
         if self.observer.dt == 0.0:
             self._flow(seconds, v)
         row = np.asarray(self.observer.Cz @ self.z + self.d @ v)
@@ -208,7 +170,7 @@ class DataObserver(LinearSignalNames):
     def _propagate(self, seconds: float, u: FloatArray) -> None:
         before, model = self.v[: self.nu], _running(self.model)
         if self.observer.dt > 0.0:
-            self.model = _running(self.bridge).sampled(model, before, self.fault)
+            self.model = _running(self.gap_model).sampled(model, before, self.fault)
         elif seconds > 0.0:
             transition, constant, ramp = _running(self.plant_hold).at(seconds)
             rise = np.concatenate([u - before, np.zeros(len(self.fault))])
@@ -227,7 +189,7 @@ class DataObserver(LinearSignalNames):
         return row
 
     def as_dict(self) -> dict[str, Any]:
-        """Return what is carried from row to row, as data."""
+        """Return the state that goes from row to row, as data."""
         return {
             "last": self.clock.last, "longest": self.clock.longest, "z": self.z, "v": self.v, "row": self.row,
             "model": self.model, "fault": self.fault, "settled_at": self.settled_at, "phase": self.phase,
@@ -236,18 +198,7 @@ class DataObserver(LinearSignalNames):
         }  # fmt: skip
 
     def resume(self, data: dict[str, Any]) -> None:
-        """Go on from what `as_dict` returned.
-
-        Parameters
-        ----------
-        data : dict
-            From a run with the same gain set and options.
-
-        Raises
-        ------
-        SpecError
-            The options differ.
-        """
+        """Go on from what `as_dict` returned."""
         if (data["warm_up"], data["gap"]) != (self.warm_up, self.clock.gap):
             raise SpecError(
                 "The saved state is of a run with another gap or warm-up: use the same options.", path="state"

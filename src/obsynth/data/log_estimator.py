@@ -19,17 +19,10 @@ LONGEST_BRIDGE = 10_000
 class Row(NamedTuple):
     """Estimates at one row of data.
 
-    Parameters
-    ----------
-    status : str
-        ``ok``, ``warm-up``, ``partial``, ``gap`` or ``recovering``.
-    values : FloatArray
-        One for each column of the engine, state estimates first, then fault estimates; deviations; NaN where nothing
-        is known.
-    skipped : int
-        How many rows were missing before this one.
-    evidence : Evidence or None
-        What a recursive observer learnt from this row, for decisions; `None` for others.
+    Fields: status: ``ok``, ``warm-up``, ``partial``, ``gap`` or ``recovering``; values: One for each column of the
+    engine, state estimates first, then fault estimates; deviations; NaN where nothing is known; skipped: How many rows
+    were missing before this one; evidence: What a recursive observer learnt from this row, for decisions; `None` for
+    others.
     """
 
     status: str
@@ -39,26 +32,13 @@ class Row(NamedTuple):
 
 
 class Engine(Protocol):
-    """A design in motion on measured data.
+    """A running design on measured data.
 
-    Parameters
-    ----------
-    input_names, output_names : tuple of str
-        What is read from each row, in order.
-    state_names, fault_names : tuple of str
-        What is estimated: the first columns.
-    columns : tuple of str
-        Names of the columns of estimates.
-    state_delays, fault_delays : tuple of int
-        Samples by which each estimate lags.
-    dt : float
-        Seconds between samples; 0 for continuous time.
-    point : mapping
-        Operating point by name of the signal.
-    scales : mapping
-        Factor of inputs and outputs by name, where the plant states one.
-    notes : tuple of str
-        What a user should know before anything is run.
+    Fields: input_names, output_names: What is read from each row, in order; state_names, fault_names: What is
+    estimated: the first columns; columns: Names of the columns of estimates; state_delays, fault_delays: Samples by
+    which each estimate lags; dt: Seconds between samples; 0 for continuous time; point: Operating point by name of the
+    signal; scales: Factor of inputs and outputs by name, where the plant states one; notes: What a user should know
+    before anything is run.
     """
 
     @property
@@ -121,7 +101,7 @@ class Engine(Protocol):
         ...
 
     def as_dict(self) -> dict[str, Any]:
-        """Return what is carried from row to row, as data."""
+        """Return the state that goes from row to row, as data."""
         ...
 
     def resume(self, data: dict[str, Any]) -> None:
@@ -132,15 +112,7 @@ class Engine(Protocol):
 def estimate_columns(
     states: tuple[str, ...], faults: tuple[str, ...], residuals: tuple[str, ...], *, deviations: bool = False
 ) -> tuple[str, ...]:
-    """Return the names of columns.
-
-    Parameters
-    ----------
-    states, faults, residuals : tuple of str
-        Signals.
-    deviations : bool, optional
-        Whether standard deviations of states and faults stand before the residuals.
-    """
+    """Return the names of columns."""
     estimated = (*(f"xhat[{name}]" for name in states), *(f"fhat[{name}]" for name in faults))
     spread = tuple(f"sd {name}" for name in estimated) if deviations else ()
     return (*estimated, *spread, *(f"r[{name}]" for name in residuals))

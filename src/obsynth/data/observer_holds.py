@@ -24,10 +24,7 @@ Hold: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
 class KeptHolds:
     """First-order holds of one system by the length of the interval; those used last are kept.
 
-    Parameters
-    ----------
-    compute : callable
-        Takes seconds, returns ``Phi, Gamma_0, Gamma_1``.
+    Fields: compute: Takes seconds, returns ``Phi, Gamma_0, Gamma_1``.
     """
 
     def __init__(self, compute: Callable[[float], Hold]) -> None:
@@ -45,13 +42,7 @@ class KeptHolds:
 
 
 def transient(observer: LinearObserver) -> float:
-    """Return the seconds after which an observer has forgotten its start: the slowest mode at `FORGOTTEN`.
-
-    Parameters
-    ----------
-    observer : LinearObserver
-        Stable.
-    """
+    """Return the seconds after which an observer has forgotten its start: the slowest mode at `FORGOTTEN`."""
     if observer.order == 0:
         return 0.0
     slowest = abscissa(observer.Az, observer.dt)
@@ -66,20 +57,7 @@ def transient(observer: LinearObserver) -> float:
 
 
 def checked_warm_up(asked: float | None, default: float) -> float:
-    """Return the warm-up in seconds.
-
-    Parameters
-    ----------
-    asked : float or None
-        By the user.
-    default : float
-        Where nothing is asked.
-
-    Raises
-    ------
-    SpecError
-        It is negative or not finite.
-    """
+    """Return the warm-up in seconds."""
     if asked is None:
         return default
     if not (is_finite_number(asked) and asked >= 0.0):

@@ -1,4 +1,4 @@
-"""What an observer in motion carries from sample to sample, as data: to save it, and to undo a sample."""
+"""What a running observer carries from sample to sample, as data: to save it, and to undo a sample."""
 
 from __future__ import annotations
 
@@ -15,30 +15,17 @@ _FORTRAN = "by columns"
 _NOTHING = object()
 
 
-def carried(moving: object) -> dict[str, Any]:
+def captured_state(moving: object) -> dict[str, Any]:
     """Return every attribute that is data: numbers, arrays, and tuples and windows of them.
 
-    What else an observer in motion has (its model, its prepared factorisations) follows from the observer at rest.
-
-    Parameters
-    ----------
-    moving : object
-        An observer in motion.
+    What else a running observer has (its model, its prepared factorisations) follows from the observer.
     """
     found = {name: _saved(value) for name, value in vars(moving).items()}
     return {name: value for name, value in found.items() if value is not _NOTHING}
 
 
 def resume(moving: object, data: Mapping[str, Any]) -> None:
-    """Bring an observer in motion back to what `carried` described.
-
-    Parameters
-    ----------
-    moving : object
-        Made by the same observer at rest.
-    data : mapping
-        From `carried`, also when it has been through a file.
-    """
+    """Bring a running observer back to what `captured_state` described."""
     for name, value in data.items():
         own = getattr(moving, name)
         if isinstance(own, deque):
@@ -59,7 +46,7 @@ def _saved(value: Any) -> Any:
     if value is None or isinstance(value, (bool, int, float, np.floating)):
         return value
     if isinstance(value, ParameterReset):
-        return carried(value)
+        return captured_state(value)
     if hasattr(value, "_asdict"):
         items = {key: _saved(item) for key, item in value._asdict().items()}
         return _NOTHING if any(item is _NOTHING for item in items.values()) else items

@@ -16,10 +16,7 @@ FAR = 0.2
 class OperatingPointCheck:
     """Gathers the first second of data.
 
-    Parameters
-    ----------
-    signals : Signals
-        With the operating point.
+    Fields: signals: With the operating point.
     """
 
     def __init__(self, signals: Signals) -> None:

@@ -19,20 +19,10 @@ from obsynth.results.design import ObserverDesign
 
 
 class RecursiveDataObserver(SteppingEngine[RawEstimate]):
-    """A recursive observer in motion on measured data.
+    """A running recursive observer on measured data.
 
-    Parameters
-    ----------
-    design : ObserverDesign
-        A recursive design.
-    warm_up : float or None
-        Seconds that are marked after a start, and after rows with unknown inputs; by default until an error at the
-        start has shrunk to 2 %.
-
-    Raises
-    ------
-    SpecError
-        The design is not recursive, or the option is out of range.
+    Fields: design: A recursive design; warm_up: Seconds that are marked after a start, and after rows with unknown
+    inputs; by default until an error at the start has shrunk to 2 %.
     """
 
     uses_first_outputs = False
@@ -60,25 +50,13 @@ class RecursiveDataObserver(SteppingEngine[RawEstimate]):
         self.theta = np.zeros(len(self.fault_names))
 
     def started(self) -> RunningRecursiveObserver:
-        """Return the observer in motion, at k = 0."""
+        """Return the running observer, at k = 0."""
         return self.observer.start()
 
     def taken(self, y: FloatArray, u: FloatArray, row: int) -> RawEstimate | Exception | None:
         """Take one sample, or return why it cannot be taken.
 
-        Parameters
-        ----------
-        y, u : FloatArray
-            ``(ny,)`` and ``(nu,)``.
-        row : int
-            Of the data, for errors.
-
-        Raises
-        ------
-        SpecError
-            The model's horizon is passed.
-        PreconditionError
-            The sample contradicts equations or outputs that are stated without noise.
+        Shapes: ``y (ny,)``, ``u (nu,)``.
         """
         try:
             require_horizon(self.plant.horizon, self.running.k + 1, early=self.observer.early_constraints)
@@ -94,13 +72,7 @@ class RecursiveDataObserver(SteppingEngine[RawEstimate]):
         return found if all(bool(np.isfinite(array).all()) for array in arrays) else None
 
     def values(self, found: RawEstimate) -> FloatArray:
-        """Return a row: estimates, standard deviations, innovation at the parameters of one sample before.
-
-        Parameters
-        ----------
-        found : RawEstimate
-            Of one sample.
-        """
+        """Return a row: estimates, standard deviations, innovation at the parameters of one sample before."""
         residual = np.full(self.directions, np.nan)
         gap = found.innovation - found.regressor @ self.theta if found.regressor.size else found.innovation
         # The correction of the start by early constraints has no more directions, but may have fewer.
@@ -110,12 +82,6 @@ class RecursiveDataObserver(SteppingEngine[RawEstimate]):
         return np.concatenate([found.x, found.parameters.theta, deviations_of(found), deviations, residual])
 
     def evidence(self, found: RawEstimate) -> Evidence:
-        """Return what the sample says, for decisions.
-
-        Parameters
-        ----------
-        found : RawEstimate
-            Of one sample.
-        """
+        """Return what the sample says, for decisions."""
         known = found.parameters
         return Evidence(known.theta, known.spread @ known.spread.T, found.innovation, found.regressor)

@@ -22,39 +22,14 @@ def digest_of_gains(design: ObserverDesign) -> str:
 
 
 def save_state(path: Path, job: Job, digest: str) -> None:
-    """Write what a run carries from row to row, atomically.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    job : Job
-        In motion.
-    digest : str
-        Of the gain set.
-    """
+    """Write what a run carries from row to row, atomically."""
     body = plain({"gains": digest, "state": job.as_dict()})
     document = {"kind": KIND, "schema_version": SCHEMA_VERSION, "sha256": digest_of(body), "run": body}
     write_atomically(path, json.dumps(document, indent=1, allow_nan=False) + "\n")
 
 
 def resume_state(path: Path, job: Job, digest: str) -> None:
-    """Let a run go on from a saved state.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    job : Job
-        At its start.
-    digest : str
-        Of the gain set.
-
-    Raises
-    ------
-    SpecError
-        The file cannot be read, is no saved state, was changed, or belongs to another gain set.
-    """
+    """Let a run go on from a saved state."""
     try:
         document: Any = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:

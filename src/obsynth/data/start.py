@@ -13,22 +13,7 @@ from obsynth.results.design import ObserverDesign
 
 
 def engine_of(design: ObserverDesign, *, gap: float | None = None, warm_up: float | None = None) -> Engine:
-    """Return a design in motion, at its start.
-
-    Parameters
-    ----------
-    design : ObserverDesign
-        Of any method.
-    gap : float, optional, seconds
-        Continuous-time designs: longer intervals are gaps.
-    warm_up : float, optional, seconds
-        What is marked after a start.
-
-    Raises
-    ------
-    SpecError
-        An option is out of range, or not for this design.
-    """
+    """Return a running design, at its start."""
     if not isinstance(design.observer, (RecursiveObserver, DAEObserver)):
         return DataObserver(design, gap=gap, warm_up=warm_up)
     if gap is not None:

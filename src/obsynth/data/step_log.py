@@ -11,7 +11,7 @@ import numpy as np
 
 from obsynth.data.clock import Clock
 from obsynth.data.log_estimator import GAP, LONGEST_BRIDGE, OK, PARTIAL, RECOVERING, WARM_UP, Row, estimate_columns
-from obsynth.data.observer_state import carried, resume
+from obsynth.data.observer_state import captured_state, resume
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.monitors.online import Evidence
 from obsynth.numerics.arrays import FloatArray
@@ -22,16 +22,9 @@ Found = TypeVar("Found")
 class SteppingEngine(ABC, Generic[Found]):
     """An observer that takes missing outputs itself; the first row is k = 0.
 
-    Parameters
-    ----------
-    signals : tuple of tuple of str
-        Inputs, outputs, states, faults or parameters, residuals.
-    dt : float
-        Seconds between samples.
-    warm_up : float
-        Seconds that are marked after a start, and after rows with unknown inputs.
-    may_restart : bool
-        Whether the observer may start again after a very long gap.
+    Fields: signals: Inputs, outputs, states, faults or parameters, residuals; dt: Seconds between samples; warm_up:
+    Seconds that are marked after a start, and after rows with unknown inputs; may_restart: Whether the observer may
+    start again after a very long gap.
     """
 
     #: Whether the outputs of the first row are used.
@@ -52,7 +45,7 @@ class SteppingEngine(ABC, Generic[Found]):
 
     @abstractmethod
     def started(self) -> Any:
-        """Return the observer in motion, at k = 0."""
+        """Return the running observer, at k = 0."""
 
     @abstractmethod
     def values(self, found: Found) -> FloatArray:
@@ -71,28 +64,8 @@ class SteppingEngine(ABC, Generic[Found]):
         return np.zeros_like(values)
 
     def step(self, time: float, values: FloatArray, row: int) -> Row:
-        """Take one row of data.
-
-        Parameters
-        ----------
-        time : float
-            Seconds.
-        values : FloatArray
-            ``[u, y]``; not finite where a sample is missing.
-        row : int
-            Number of the row, for errors.
-
-        Returns
-        -------
-        Row
-            The estimates at this row.
-
-        Raises
-        ------
-        ObsynthError
-            The time stamp is refused, or the row cannot be taken even without its outputs; the row is named.
-        """
-        before, stamps = carried(self.running), (self.clock.last, self.clock.longest)
+        """Take one row of data."""
+        before, stamps = captured_state(self.running), (self.clock.last, self.clock.longest)
         try:
             return self._step(time, values, row)
         except ObsynthError:
@@ -161,7 +134,7 @@ class SteppingEngine(ABC, Generic[Found]):
 
     def _safe(self, y: FloatArray, u: FloatArray, row: int) -> Found | None:
         """Take one sample, or none of it: what overflows leaves the state as it was."""
-        before = carried(self.running)
+        before = captured_state(self.running)
         with np.errstate(all="ignore"):
             found = self.taken(y, u, row)
         if found is None or isinstance(found, Exception):
@@ -183,25 +156,14 @@ class SteppingEngine(ABC, Generic[Found]):
         return found
 
     def as_dict(self) -> dict[str, Any]:
-        """Return what is carried from row to row, as data."""
+        """Return the state that goes from row to row, as data."""
         return {
-            "last": self.clock.last, "longest": self.clock.longest, "observer": carried(self.running), "u": self.u,
-            "settled_at": self.settled_at, "phase": self.phase, "warm_up": self.warm_up,
+            "last": self.clock.last, "longest": self.clock.longest, "observer": captured_state(self.running),
+            "u": self.u, "settled_at": self.settled_at, "phase": self.phase, "warm_up": self.warm_up,
         }  # fmt: skip
 
     def resume(self, data: dict[str, Any]) -> None:
-        """Go on from what `as_dict` returned.
-
-        Parameters
-        ----------
-        data : dict
-            From a run with the same gain set and options.
-
-        Raises
-        ------
-        SpecError
-            The options differ.
-        """
+        """Go on from what `as_dict` returned."""
         if data["warm_up"] != self.warm_up:
             raise SpecError("The saved state is of a run with another warm-up: use the same option.", path="state")
         self.clock.last, self.clock.longest = data["last"], data["longest"]

@@ -22,12 +22,8 @@ from obsynth.simulation.scenario_signals import Drive, resolve
 class Runs:
     """What happened in several runs, ``(steps, runs, signals)`` each.
 
-    Parameters
-    ----------
-    states, outputs, inputs, faults, disturbances : FloatArray
-        Of the plant; outputs as measured.
-    rows : FloatArray
-        What the observer says: state estimates, fault estimates, residuals.
+    Fields: states, outputs, inputs, faults, disturbances: Of the plant; outputs as measured; rows: What the observer
+    says: state estimates, fault estimates, residuals.
     """
 
     states: FloatArray
@@ -42,22 +38,9 @@ class Runs:
 class Bench:
     """A design and a scenario, ready to run; it can be sent to another process.
 
-    Parameters
-    ----------
-    drive : Drive
-        Signals.
-    stepper : Stepper
-        Plant.
-    observer : LinearObserver
-        In discrete time; a continuous one sampled by a first-order hold.
-    observer_start : FloatArray
-        ``z(0)``.
-    observer_ramp : FloatArray
-        ``(nz, nu + ny)``: what a first sample adds to the state that a sampled observer keeps.
-    initial_state : FloatArray
-        ``(nx,)``, as asked for.
-    sizes : tuple of int
-        ``nu, nf, nd``.
+    Fields: drive: Signals; stepper: Plant; observer: In discrete time; a continuous one sampled by a first-order hold;
+    observer_start: ``z(0)``; observer_ramp: ``(nz, nu + ny)``: what a first sample adds to the state that a sampled
+    observer keeps; initial_state: ``(nx,)``, as asked for; sizes: ``nu, nf, nd``.
     """
 
     drive: Drive
@@ -69,18 +52,7 @@ class Bench:
     sizes: tuple[int, int, int]
 
     def run(self, seeds: Sequence[int]) -> Runs:
-        """Run the plant and the observer, once for each seed.
-
-        Parameters
-        ----------
-        seeds : sequence of int
-            One per run.
-
-        Raises
-        ------
-        SpecError
-            The states outgrow double precision.
-        """
+        """Run the plant and the observer, once for each seed."""
         drawn, noise, sensor_noise = self.drive.drawn(seeds, self.stepper.noisy.shape[1])
         left = self.drive.left[:, None, :] + drawn
         difference = np.broadcast_to((self.drive.right - self.drive.left)[:, None, :], left.shape)
@@ -94,10 +66,7 @@ class Bench:
     def observed(self, outputs: FloatArray, inputs: FloatArray) -> FloatArray:
         """Return what the observer says to records, ``(steps, runs, nx + nf + nr)``.
 
-        Parameters
-        ----------
-        outputs, inputs : FloatArray
-            ``(steps, runs, ny)`` and ``(steps, runs, nu)``.
+        Shapes: ``outputs (steps, runs, ny)``, ``inputs (steps, runs, nu)``.
         """
         system = self.observer
         drive = inputs @ system.Bu.T + outputs @ system.By.T
@@ -110,22 +79,7 @@ class Bench:
 
 
 def make_bench(design: ObserverDesign, scenario: Scenario) -> Bench:
-    """Return the bench of a linear design and a scenario.
-
-    Parameters
-    ----------
-    design : ObserverDesign
-        Of a linear method.
-    scenario : Scenario
-        What happens.
-
-    Raises
-    ------
-    SpecError
-        A recursive design, an unknown name, or a start of the wrong length.
-    PreconditionError
-        The plant cannot be simulated; see `make_stepper`.
-    """
+    """Return the bench of a linear design and a scenario."""
     plant, observer = design.linear
     drive = resolve(plant, scenario)
     start = np.array([scenario.initial_state.get(name, 0.0) for name in plant.state_names])

@@ -18,12 +18,7 @@ from obsynth.results.files import write_atomically
 def named_columns(time: FloatArray, groups: Iterable[tuple[str, Sequence[str], FloatArray]]) -> dict[str, FloatArray]:
     """Return every column by name; inputs and outputs go by their own names, unless those are taken.
 
-    Parameters
-    ----------
-    time : FloatArray
-        ``(steps,)``, seconds.
-    groups : iterable of (str, sequence of str, FloatArray)
-        Form such as ``u[{}]``, names, and values ``(steps, len(names))``.
+    Shapes: ``time (steps,)``.
     """
     found = {"time": time}
     for form, names, values in groups:
@@ -36,17 +31,7 @@ def named_columns(time: FloatArray, groups: Iterable[tuple[str, Sequence[str], F
 def write_columns(table: Mapping[str, FloatArray], path: str | Path) -> Path:
     """Write columns as comma-separated text, atomically, floats with all their digits; NaN is an empty cell.
 
-    Parameters
-    ----------
-    table : mapping of str to FloatArray
-        ``(steps,)`` each, by name.
-    path : str or Path
-        Where; an existing file is replaced.
-
-    Raises
-    ------
-    SpecError
-        The file cannot be written.
+    Shapes: ``table (steps,)``.
     """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -70,18 +55,7 @@ class SignalTable(ABC):
         """Return every column by name, ``(steps,)`` each."""
 
     def write_csv(self, path: str | Path) -> Path:
-        """Write `columns` as comma-separated text, atomically, floats with all their digits.
-
-        Parameters
-        ----------
-        path : str or Path
-            Where; an existing file is replaced.
-
-        Raises
-        ------
-        SpecError
-            The file cannot be written.
-        """
+        """Write `columns` as comma-separated text, atomically, floats with all their digits."""
         return write_columns(self.columns(), path)
 
 

@@ -25,24 +25,7 @@ GROWTH = 1e3
 
 
 def demonstration_scenario(design: ObserverDesign) -> Scenario | None:
-    """Return a scenario in which each fault is on for a while, one after another, or each parameter changes for good.
-
-    Parameters
-    ----------
-    design : ObserverDesign
-        Of any method.
-
-    Returns
-    -------
-    Scenario or None
-        Linear designs: unit steps, from rest, nothing else.  Recursive ones: steps of one initial standard deviation
-        each, with the stated noise; Kalman filters: that noise.  `None` where there is no fault, or no time for it.
-
-    Raises
-    ------
-    PreconditionError
-        The plant of a linear design has index 2 or more.
-    """
+    """Return a scenario with each fault on for a while, one after another, or each parameter changed for good."""
     observer = design.observer
     if isinstance(observer, LinearObserver):
         return _of_linear(design.linear[0], observer) if observer.fault_names else None

@@ -30,15 +30,7 @@ class Interval:
 
 
 def share(hits: int, count: int, confidence: float) -> Interval:
-    """Return a share with its exact (Clopper-Pearson) interval.
-
-    Parameters
-    ----------
-    hits, count : int
-        How many of how many.
-    confidence : float
-        Such as 0.95.
-    """
+    """Return a share with its exact (Clopper-Pearson) interval."""
     from scipy.special import betaincinv
 
     if count == 0:
@@ -50,15 +42,7 @@ def share(hits: int, count: int, confidence: float) -> Interval:
 
 
 def mean(values: FloatArray, confidence: float) -> Interval:
-    """Return a mean with Student's interval; NaN among the values does not count.
-
-    Parameters
-    ----------
-    values : FloatArray
-        One per run.
-    confidence : float
-        Such as 0.95.
-    """
+    """Return a mean with Student's interval; NaN among the values does not count."""
     from scipy.special import stdtrit
 
     known = values[~np.isnan(values)]

@@ -31,15 +31,9 @@ RowEstimates: TypeAlias = RecursiveEstimates | DAEEstimates
 class RecursiveRuns:
     """What happened in several runs.
 
-    Parameters
-    ----------
-    states, outputs : FloatArray
-        ``(steps, runs, nx)`` and ``(steps, runs, ny)``, outputs as measured; those of a time-varying plant begin with
-        y(1).
-    inputs, parameters : FloatArray
-        ``(steps, nu)`` and ``(steps, nq)``, of all runs.
-    estimates : tuple of RecursiveEstimates or DAEEstimates
-        One per run.
+    Fields: states, outputs: ``(steps, runs, nx)`` and ``(steps, runs, ny)``, outputs as measured; those of a
+    time-varying plant begin with y(1); inputs, parameters: ``(steps, nu)`` and ``(steps, nq)``, of all runs; estimates:
+    One per run.
     """
 
     states: FloatArray
@@ -53,16 +47,9 @@ class RecursiveRuns:
 class RecursiveBench:
     """A recursive design and a scenario, ready to run; it can be sent to another process if the model is data.
 
-    Parameters
-    ----------
-    drive : Drive
-        Signals, as they differ from their nominal values.
-    observer : RecursiveObserver or DAEObserver
-        The observer, with the plant.
-    initial_state : FloatArray
-        ``(nx,)``: true state at the start, as asked for.
-    inputs, parameters : FloatArray
-        ``(steps, nu)`` and ``(steps, nq)``: the true signals.
+    Fields: drive: Signals, as they differ from their nominal values; observer: The observer, with the plant;
+    initial_state: ``(nx,)``: true state at the start, as asked for; inputs, parameters: ``(steps, nu)`` and ``(steps,
+    nq)``: the true signals.
     """
 
     drive: Drive
@@ -77,20 +64,7 @@ class RecursiveBench:
         return self.drive.first_fault(slice(self.inputs.shape[1], None))
 
     def run(self, seeds: Sequence[int]) -> RecursiveRuns:
-        """Run the plant and the observer, once for each seed.
-
-        Parameters
-        ----------
-        seeds : sequence of int
-            One per run.
-
-        Raises
-        ------
-        PreconditionError
-            The plant cannot be simulated step by step.
-        SolverError
-            A step of a DAE has no solution.
-        """
+        """Run the plant and the observer, once for each seed."""
         if isinstance(self.observer, DAEObserver):
             return self._run_dae(self.observer, seeds)
         return self._run_varying(self.observer, seeds)
@@ -150,21 +124,7 @@ class RecursiveBench:
 
 
 def make_recursive_bench(design: ObserverDesign, scenario: Scenario) -> RecursiveBench:
-    """Return the bench of a recursive design and a scenario.
-
-    Parameters
-    ----------
-    design : ObserverDesign
-        Of a recursive method.
-    scenario : Scenario
-        What happens: ``inputs`` and ``faults`` are added to nominal inputs and parameters, ``noise`` multiplies the
-        stated deviations, and states without a value start where the observer (or the model, for a DAE) does.
-
-    Raises
-    ------
-    SpecError
-        A linear design, an unknown name, or something that such a plant does not have.
-    """
+    """Return the bench of a recursive design and a scenario."""
     observer = design.observer
     if isinstance(observer, DAEObserver):
         model = observer.model

@@ -73,14 +73,7 @@ class ParameterMonitor:
 class RecursiveTask:
     """What a worker needs.
 
-    Parameters
-    ----------
-    bench : RecursiveBench
-        Plant, scenario and observer.
-    watched : ParameterMonitor or None
-        How to decide.
-    seeds : tuple of int
-        One per run.
+    Fields: bench: Plant, scenario and observer; watched: How to decide; seeds: One per run.
     """
 
     bench: RecursiveBench
@@ -126,24 +119,7 @@ class RecursiveTask:
 def recursive_tasks(
     bench: RecursiveBench, monitor: ParameterMonitor | Monitor | None, seeds: Sequence[int], size: int
 ) -> list[RecursiveTask]:
-    """Return batches of runs.
-
-    Parameters
-    ----------
-    bench : RecursiveBench
-        Plant, scenario and observer.
-    monitor : ParameterMonitor or None
-        How to decide; a `Monitor` is for linear designs.
-    seeds : sequence of int
-        One per run.
-    size : int
-        Runs per batch.
-
-    Raises
-    ------
-    SpecError
-        Decisions are asked for that such an observer does not make.
-    """
+    """Return batches of runs."""
     observer = bench.observer
     if isinstance(monitor, Monitor):
         raise SpecError("This design is recursive: give monitor=obsynth.ParameterMonitor(...).", path="monitor")

@@ -106,25 +106,7 @@ class RecursiveSimulation(SignalTable):
 
 
 def simulate_recursive(design: ObserverDesign, scenario: Scenario) -> RecursiveSimulation:
-    """Simulate the plant of a recursive design over a scenario: what `simulate` does for it.
-
-    Parameters
-    ----------
-    design : ObserverDesign
-        Of a recursive method: a time-varying plant, or a DAE.
-    scenario : Scenario
-        What happens.
-
-    Raises
-    ------
-    SpecError
-        A linear design, an unknown name, something that such a plant does not have, or a horizon that it does not
-        reach.
-    PreconditionError
-        The equations of a time-varying plant do not determine its state at some k.
-    SolverError
-        A step of a DAE has no solution.
-    """
+    """Simulate the plant of a recursive design over a scenario: what `simulate` does for it."""
     bench = make_recursive_bench(design, scenario)
     runs = bench.run([scenario.seed])
     plant = _plant(bench.observer)

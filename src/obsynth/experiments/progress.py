@@ -11,13 +11,7 @@ Progress = Callable[[int, int], None]
 
 @contextmanager
 def shown_progress(wanted: Progress | bool | None) -> Iterator[Progress | None]:
-    """Yield what is to be called after each batch of runs.
-
-    Parameters
-    ----------
-    wanted : callable, bool or None
-        Called itself; `True` for a bar with the time that is left, on standard error.
-    """
+    """Yield what is to be called after each batch of runs."""
     if not isinstance(wanted, bool):
         yield wanted
         return

@@ -163,13 +163,7 @@ def simulate(design: ObserverDesign, scenario: Scenario) -> Simulation | Recursi
 
 
 def warm_up_ends(bench: Bench) -> tuple[int | None, int | None]:
-    """Return the samples at which the start no longer shows in the estimates of states, and of faults.
-
-    Parameters
-    ----------
-    bench : Bench
-        Whose observer and length count.
-    """
+    """Return the samples at which the start no longer shows in the estimates of states, and of faults."""
     observer, steps = bench.observer, bench.drive.steps
     ends: list[int | None] = []
     for rows, delays in (
@@ -190,12 +184,7 @@ def warm_up_ends(bench: Bench) -> tuple[int | None, int | None]:
 def aligned_errors(estimates: FloatArray, truth: FloatArray, delays: tuple[int, ...]) -> FloatArray:
     """Return estimate(k) less truth(k - delay); NaN where there is no truth yet.
 
-    Parameters
-    ----------
-    estimates, truth : FloatArray
-        ``(steps, ..., n)``.
-    delays : tuple of int
-        Samples, one per signal.
+    Shapes: ``estimates (steps, ..., n)``, ``truth (steps, ..., n)``.
     """
     errors = np.full(estimates.shape, np.nan)
     for i, delay in enumerate(delays):

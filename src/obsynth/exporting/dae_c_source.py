@@ -51,23 +51,7 @@ NOTHING    failed = advance(state, INPUT, y, after, said);
 
 
 def write_dae_c(design: ObserverDesign, target: Path, sample_time: float | None) -> tuple[Path, ...]:
-    """Write source and header.
-
-    Parameters
-    ----------
-    design : ObserverDesign
-        Of a nonlinear plant.
-    target : Path
-        The source; the header stands beside it.
-    sample_time : float or None
-        Must be left out: the observer is sampled.
-
-    Raises
-    ------
-    SpecError
-        The model is made of Python functions, which have no digest; the suffix is not ``.c``; a sample time is given;
-        or a file cannot be written.
-    """
+    """Write source and header."""
     if target.suffix.lower() != ".c":
         raise SpecError(f"{target}: the observer of a nonlinear plant is no matrices; it is exported as C (.c).",
                         path=str(target))  # fmt: skip

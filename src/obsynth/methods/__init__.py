@@ -1,1 +1,1 @@
-"""The doors: analyse, synthesise, verify, and hand over an `ObserverDesign`."""
+"""The methods: analyse, synthesise, verify, and hand over an `ObserverDesign`."""

@@ -91,15 +91,7 @@ def design(
 
 
 def check(plant: Plant, options: Mapping[str, Mapping[str, Any]] | None = None) -> dict[str, VerificationReport]:
-    """Return, for every method, the report of its existence conditions; nothing is designed or raised.
-
-    Parameters
-    ----------
-    plant : DescriptorSystem, TimeVaryingDescriptorSystem or DAEModel
-        The plant.
-    options : mapping, optional
-        Method id -> options of a spec; those that decide about existence, such as the fault model, are used.
-    """
+    """Return, for every method, the report of its existence conditions; nothing is designed or raised."""
     found = {}
     for method in REGISTRY:
         conditions = _kind_conditions(plant, method)
@@ -139,16 +131,10 @@ def _other_kind(method: str, wanted: str) -> Condition:
 
 
 def public_function(method: str) -> Callable[..., ObserverDesign]:
-    """Return the public function of a method: of the same name, in a module of the same name.
-
-    Parameters
-    ----------
-    method : str
-        A method id.
-    """
+    """Return the public function of a method: of the same name, in a module of the same name."""
     name = method.replace("-", "_")
-    door: Callable[..., ObserverDesign] = getattr(import_module(f"obsynth.methods.{name}.public"), name)
-    return door
+    function: Callable[..., ObserverDesign] = getattr(import_module(f"obsynth.methods.{name}.public"), name)
+    return function
 
 
 def _checked_options(method: str, options: dict[str, Any]) -> dict[str, Any]:
@@ -166,21 +152,7 @@ def _checked_options(method: str, options: dict[str, Any]) -> dict[str, Any]:
 def draft_of(
     plant: Plant, method: str, found: Synthesis, *, name: str, recovery: StateRecovery | None = None
 ) -> ObserverDesign:
-    """Return the design that a synthesis stands for, without a report.
-
-    Parameters
-    ----------
-    plant : DescriptorSystem, TimeVaryingDescriptorSystem or DAEModel
-        The plant that the method was given.
-    method : str
-        Method id.
-    found : Synthesis
-        Unverified.
-    name : str
-        Name of the design.
-    recovery : StateRecovery, optional
-        Map from the states of ``plant`` back to those before its transformation.
-    """
+    """Return the design that a synthesis stands for, without a report."""
     if found.plant is not None:
         plant = found.plant
     if found.transformation is not None:
@@ -203,18 +175,7 @@ def draft_of(
 def verified(
     plant: Plant, method: str, found: Synthesis, *, name: str, recovery: StateRecovery | None = None
 ) -> ObserverDesign:
-    """Return the design with its report.
-
-    Parameters
-    ----------
-    plant, method, found, name, recovery
-        As for `draft_of`.
-
-    Raises
-    ------
-    VerificationError
-        A check fails.
-    """
+    """Return the design with its report."""
     draft = draft_of(plant, method, found, name=name, recovery=recovery)
     report = verify(draft)
     if not report.passed:

@@ -21,15 +21,7 @@ ROUNDS = 3
 
 
 def lyapunov_factor(a: FloatArray, dt: float) -> FloatArray:
-    """Return Q ``(n, n)``, upper triangular, with which `prove_stable` succeeds; the last try when none does.
-
-    Parameters
-    ----------
-    a : FloatArray
-        ``(n, n)``, stable.
-    dt : float
-        Seconds between samples, 0 for continuous time.
-    """
+    """Return Q ``(n, n)``, upper triangular, with which `prove_stable` succeeds; the last try when none does."""
     n = a.shape[0]
     best, spare = np.eye(n), None
     edge = abscissa(a, dt)

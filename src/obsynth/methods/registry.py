@@ -21,18 +21,7 @@ NONLINEAR = ("dae-adaptive-observer",)
 
 
 def method_module(method: str) -> Any:
-    """Return the module of a method.
-
-    Parameters
-    ----------
-    method : str
-        A key of `REGISTRY`.
-
-    Raises
-    ------
-    SpecError
-        There is no such method; the known ones are listed.
-    """
+    """Return the module of a method."""
     from obsynth.errors import SpecError
 
     if method not in REGISTRY:

@@ -24,17 +24,7 @@ def stabilising_gain(a: FloatArray, c: FloatArray, noise_a: FloatArray, noise_c:
 
     The first regularisation that forgets fast enough is taken, or the fastest filter of all.
 
-    Parameters
-    ----------
-    a, c : FloatArray
-        ``(n, n)`` and ``(m, n)``.
-    noise_a, noise_c : FloatArray
-        ``(n, k)`` and ``(m, k)``: how one common input enters both equations (may be singular).
-
-    Returns
-    -------
-    FloatArray or None
-        ``None`` when no regularisation gave a stable result.
+    Shapes: ``a (n, n)``, ``c (m, n)``, ``noise_a (n, k)``, ``noise_c (m, k)``.
     """
     n, m = a.shape[0], c.shape[0]
     if m == 0:
@@ -70,14 +60,7 @@ def bounded_real_matrix(
     Solves ``P = A'PA + C'C + slack*I + (A'PB + C'D)(level^2 I - D'D - B'PB)^-1 (A'PB + C'D)'`` for its
     stabilising solution; the slack makes the inequality strict.
 
-    Parameters
-    ----------
-    a, b, c, d : FloatArray
-        ``(n, n)``, ``(n, m)``, ``(p, n)``, ``(p, m)``, ``a`` Schur stable.
-    level : float
-        Above the H-infinity norm.
-    slack : float
-        Positive.
+    Shapes: ``a (n, n)``, ``b (n, m)``, ``c (p, n)``, ``d (p, m)``.
     """
     n = a.shape[0]
     if n == 0:
@@ -97,10 +80,7 @@ def bounded_real_matrix(
 class _Exceeded:
     """Says whether the gain is above the level over as many steps as a solution stands for, beyond rounding.
 
-    Parameters
-    ----------
-    b, gap : FloatArray
-        ``(n, m)``, and ``D'D - level^2 I (m, m)``.
+    Fields: b, gap: ``(n, m)``, and ``D'D - level^2 I (m, m)``.
     """
 
     def __init__(self, b: FloatArray, gap: FloatArray) -> None:
@@ -137,15 +117,7 @@ def riccati_solution(
     *,
     impossible: Callable[[FloatArray], bool] | None = None,
 ) -> FloatArray | None:
-    """Return the stabilising solution by doubling, or where that breaks down by SciPy; ``None`` without one.
-
-    Parameters
-    ----------
-    a, h, process, weight, cross : FloatArray
-        As for `obsynth.numerics.doubling.doubled_riccati_solution`.
-    impossible : callable, optional
-        Called with the solutions over 2, 4, 8, ... steps; true says that there is no solution to look for.
-    """
+    """Return the stabilising solution by doubling, or where that breaks down by SciPy; ``None`` without one."""
     ended = False
 
     def possible(found: FloatArray) -> bool:

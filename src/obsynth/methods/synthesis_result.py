@@ -19,25 +19,11 @@ from obsynth.results.design import Certificate
 class Synthesis:
     """The unverified outcome of a method.
 
-    Parameters
-    ----------
-    options : mapping
-        Options as resolved, plain data.
-    gains : mapping
-        Gains with the paper's letters.
-    observer : LinearObserver, RecursiveObserver or DAEObserver
-        The realisation.
-    certificate : Certificate
-        Witnesses and claims.
-    solver : mapping
-        Records of the solver runs.
-    notes : tuple of str
-        What a user should know.
-    transformation : Transformation, optional
-        What the method did to the plant before it designed for it (such as the elimination of algebraic states):
-        the design is then for the transformed plant, with the way back.
-    plant : TimeVaryingDescriptorSystem, optional
-        The plant as the recursive methods see it, where they were given another kind.
+    Fields: options: Options as resolved, plain data; gains: Gains with the paper's letters; observer: The realisation;
+    certificate: Witnesses and claims; solver: Records of the solver runs; notes: What a user should know;
+    transformation: What the method did to the plant before it designed for it (such as the elimination of algebraic
+    states): the design is then for the transformed plant, with the way back; plant: The plant as the recursive methods
+    see it, where they were given another kind.
     """
 
     options: Mapping[str, Any]

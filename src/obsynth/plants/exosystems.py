@@ -21,18 +21,8 @@ from obsynth.plants.names import index_of
 class Exosystem:
     """The exosystems of all faults of a plant, stacked.
 
-    Parameters
-    ----------
-    Phi : FloatArray
-        ``(nw, nw)``, block-diagonal, in the plant's time.
-    Cw : FloatArray
-        ``(nf, nw)``.
-    names : tuple of str
-        Names of its states.
-    eigenvalues : ComplexArray
-        Distinct eigenvalues of ``Phi``.
-    descriptions : tuple of str
-        One per fault.
+    Fields: Phi: ``(nw, nw)``, block-diagonal, in the plant's time; Cw: ``(nf, nw)``; names: Names of its states;
+    eigenvalues: Distinct eigenvalues of ``Phi``; descriptions: One per fault.
     """
 
     Phi: FloatArray
@@ -48,22 +38,7 @@ class Exosystem:
 
 
 def exosystem(data: Any, fault_names: Sequence[str], dt: float) -> Exosystem:
-    """Return the exosystem of all faults.
-
-    Parameters
-    ----------
-    data : str, mapping or FaultModel
-        One model for every fault, or a mapping from the name of each fault to its model.
-    fault_names : sequence of str
-        The faults, in order.
-    dt : float, seconds
-        Time between samples of the plant; 0 for continuous time.
-
-    Raises
-    ------
-    SpecError
-        A model is malformed, names an unknown fault, oscillates too fast for the samples, or a fault has none.
-    """
+    """Return the exosystem of all faults."""
     models = _by_fault(data, fault_names)
     _require_below_nyquist(fault_names, models, dt)
     count = sum(model.order for model in models)

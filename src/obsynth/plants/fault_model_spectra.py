@@ -15,13 +15,7 @@ SAME_EIGENVALUE = 1e-9
 
 
 def stated_eigenvalues(phi: FloatArray) -> ComplexArray:
-    """Return the distinct eigenvalues of a stacked transition ``(nw, nw)``, block by block where it falls apart.
-
-    Parameters
-    ----------
-    phi : FloatArray
-        Block-diagonal; multiple eigenvalues, which rounding scatters, count once for each block.
-    """
+    """Return the distinct eigenvalues of a stacked transition ``(nw, nw)``, block by block where it falls apart."""
     linked = (phi != 0.0) | (phi.T != 0.0) | np.eye(len(phi), dtype=bool)
     for _ in range(len(phi)):
         linked = (linked.astype(float) @ linked.astype(float)) > 0.0

@@ -88,18 +88,7 @@ class FaultModel:
 
 
 def polynomial(order: int) -> FaultModel:
-    """Return the model of a polynomial in time: order 0 is a step, 1 a ramp.
-
-    Parameters
-    ----------
-    order : int
-        0 to `HIGHEST_ORDER`.
-
-    Raises
-    ------
-    SpecError
-        The order is no such number.
-    """
+    """Return the model of a polynomial in time: order 0 is a step, 1 a ramp."""
     if isinstance(order, bool) or not isinstance(order, int) or not 0 <= order <= HIGHEST_ORDER:
         raise SpecError(
             f"A polynomial fault model has order {order!r}: give a whole number from 0 (step) to {HIGHEST_ORDER}.",
@@ -111,18 +100,7 @@ def polynomial(order: int) -> FaultModel:
 
 
 def sinusoid(frequency: float) -> FaultModel:
-    """Return the model of a sinusoid of known frequency, unknown amplitude and phase.
-
-    Parameters
-    ----------
-    frequency : float, rad/s
-        Positive.
-
-    Raises
-    ------
-    SpecError
-        The frequency is no positive number.
-    """
+    """Return the model of a sinusoid of known frequency, unknown amplitude and phase."""
     value = _number(frequency, "sinusoid")
     if value <= 0.0:
         raise SpecError(f"The sinusoid has frequency {value}: give a positive number in rad/s.", path="fault_model")
@@ -130,13 +108,7 @@ def sinusoid(frequency: float) -> FaultModel:
 
 
 def exponential(rate: float) -> FaultModel:
-    """Return the model of ``exp(rate t)``; a negative rate decays.
-
-    Parameters
-    ----------
-    rate : float, 1/s
-        Any number.
-    """
+    """Return the model of ``exp(rate t)``; a negative rate decays."""
     value = _number(rate, "exponential")
     return FaultModel(np.array([[value]]), np.eye(1), f"exponential of rate {value:g} 1/s")
 
@@ -144,17 +116,7 @@ def exponential(rate: float) -> FaultModel:
 def from_matrices(Phi: Any, Cw: Any) -> FaultModel:
     """Return the model of any exosystem, in the time of the plant: ``w' = Phi w``, or ``w(k+1) = Phi w(k)``.
 
-    Parameters
-    ----------
-    Phi : array_like
-        ``(n, n)``.
-    Cw : array_like
-        ``(1, n)``.
-
-    Raises
-    ------
-    SpecError
-        Shapes do not fit, or some state never shows in the fault.
+    Shapes: ``Phi (n, n)``, ``Cw (1, n)``.
     """
     transition, row = as_matrix(Phi, "Phi"), as_matrix(Cw, "Cw")
     count = transition.shape[0]
@@ -169,18 +131,7 @@ def from_matrices(Phi: Any, Cw: Any) -> FaultModel:
 
 
 def summed(models: Sequence[FaultModel]) -> FaultModel:
-    """Return the model of a fault that is the sum of several signals, such as a step and a sinusoid.
-
-    Parameters
-    ----------
-    models : sequence of FaultModel
-        At least one; all in continuous time, or all given for the plant's own time.
-
-    Raises
-    ------
-    SpecError
-        Two parts cannot be told apart, or given and built-in models are mixed.
-    """
+    """Return the model of a fault that is the sum of several signals, such as a step and a sinusoid."""
     from scipy.linalg import block_diag
 
     if not models or len({model.sampled for model in models}) > 1:

@@ -25,26 +25,11 @@ INDEX_NAME = "k"
 class MatrixSequence:
     """A matrix for each k.
 
-    Parameters
-    ----------
-    name : str
-        For messages, such as ``A``.
-    shape : tuple of int
-        Rows and columns, the same for every k.
-    length : int or None
-        Number of entries, k = 0 ... length - 1; ``None`` when there is one for every k.
-    values : FloatArray or None
-        ``(rows, columns)`` for a constant, ``(length, rows, columns)`` for a stack.
-    function : callable or None
-        From k to a matrix.
-    entries : tuple or None
-        Rows of expressions.
-    constants : mapping
-        Values of the names in the expressions.
-    still : FloatArray or None
-        Of expressions, the entries that do not depend on k.
-    moving : tuple
-        Row and column of those that do.
+    Fields: name: For messages, such as ``A``; shape: Rows and columns, the same for every k; length: Number of entries,
+    k = 0 ... length - 1; ``None`` when there is one for every k; values: ``(rows, columns)`` for a constant, ``(length,
+    rows, columns)`` for a stack; function: From k to a matrix; entries: Rows of expressions; constants: Values of the
+    names in the expressions; still: Of expressions, the entries that do not depend on k; moving: Row and column of
+    those that do.
     """
 
     name: str
@@ -61,24 +46,7 @@ class MatrixSequence:
     def of(
         cls, value: Any, name: str, *, first: int = 0, constants: Mapping[str, float] | None = None
     ) -> MatrixSequence:
-        """Return the sequence that ``value`` stands for.
-
-        Parameters
-        ----------
-        value : array_like, callable or rows of expressions
-            Two dimensions for a constant, three for a stack.
-        name : str
-            For messages.
-        first : int, optional
-            The first k that is ever needed; the shape is taken from there.
-        constants : mapping, optional
-            Values of names in expressions.
-
-        Raises
-        ------
-        SpecError
-            It is none of these, or its first matrix is no finite real matrix.
-        """
+        """Return the sequence that ``value`` stands for."""
         if isinstance(value, MatrixSequence):
             return value
         if callable(value):
@@ -115,18 +83,7 @@ class MatrixSequence:
         return self.function is None
 
     def at(self, k: int) -> FloatArray:
-        """Return the matrix at ``k``.
-
-        Parameters
-        ----------
-        k : int
-            Time index, not negative.
-
-        Raises
-        ------
-        SpecError
-            There is none, its shape differs, or it holds something that is no finite number.
-        """
+        """Return the matrix at ``k``."""
         if self.values is not None:
             if self.values.ndim == 2:
                 return self.values
@@ -153,13 +110,7 @@ class MatrixSequence:
         return as_matrix(matrix, f"{self.name}({k})")
 
     def as_data(self) -> Any:
-        """Return an array or rows of texts.
-
-        Raises
-        ------
-        SpecError
-            It is a callable.
-        """
+        """Return an array or rows of texts."""
         if self.function is not None:
             raise SpecError(
                 f"{self.name} is a Python function, and only data can be saved: give a stack of matrices, or "

@@ -40,15 +40,8 @@ _BOUND: dict[str, Any] = {"color": "tab:green", "linewidth": 1.2, "linestyle": "
 class EstimateGains:
     """Singular values from what acts on a plant to what an observer says.
 
-    Parameters
-    ----------
-    frequencies : FloatArray
-        ``(k,)``, rad/s.
-    gains : dict of str to FloatArray
-        Largest ones from ``faults``, ``disturbances``, ``noise`` as far as the plant has them: ``(k,)``, zero where
-        only rounding is left.
-    least : FloatArray
-        ``(k,)``: the least ones from the faults.
+    Fields: frequencies: ``(k,)``, rad/s; gains: Largest ones from ``faults``, ``disturbances``, ``noise`` as far as the
+    plant has them: ``(k,)``, zero where only rounding is left; least: ``(k,)``: the least ones from the faults.
     """
 
     frequencies: FloatArray

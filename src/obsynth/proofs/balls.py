@@ -104,10 +104,7 @@ class Formula(Protocol):
 class Ball(Enclosure):
     """All real matrices within ``radius`` of ``midpoint``, entry by entry.
 
-    Parameters
-    ----------
-    midpoint, radius : FloatArray
-        ``(rows, cols)`` each; the radius is not negative.
+    Fields: midpoint, radius: ``(rows, cols)`` each; the radius is not negative.
     """
 
     midpoint: FloatArray

@@ -58,20 +58,11 @@ Means = Literal["Cholesky", "preconditioned Cholesky", "ball arithmetic", "none"
 class DefinitenessProof:
     """The outcome of an attempt to prove positive definiteness.
 
-    Parameters
-    ----------
-    proved : bool
-        Whether every symmetric member of the ball is proved positive definite.
-    lower_bound : float
-        Proved lower bound on the smallest eigenvalue after a congruence: scaling the diagonal near one or, where
-        that leaves too little, preconditioning to near the identity.  Without a proof, the computed eigenvalue
-        less the error bounds, or zero.
-    error_bound : float
-        What rounding and forming could have contributed in double precision, on the same scale.
-    means : {"Cholesky", "preconditioned Cholesky", "ball arithmetic", "none"}
-        What proved it.
-    reason : str
-        With ball arithmetic, its precision; without a proof, why there is none.
+    Fields: proved: Whether every symmetric member of the ball is proved positive definite; lower_bound: Proved lower
+    bound on the smallest eigenvalue after a congruence: scaling the diagonal near one or, where that leaves too little,
+    preconditioning to near the identity.  Without a proof, the computed eigenvalue less the error bounds, or zero;
+    error_bound: What rounding and forming could have contributed in double precision, on the same scale; means: What
+    proved it; reason: With ball arithmetic, its precision; without a proof, why there is none.
     """
 
     proved: bool
@@ -102,19 +93,7 @@ def unproved(reason: str) -> DefinitenessProof:
 
 
 def prove_positive_definite(matrix: Formula | Ball | FloatArray) -> DefinitenessProof:
-    """Try to prove that every symmetric member of ``matrix (n, n)`` is positive definite.
-
-    Parameters
-    ----------
-    matrix : Formula, Ball or FloatArray
-        Symmetric up to its radii; a plain array is taken as exact.  A formula is evaluated in double precision, and
-        again in more digits where those do not decide: the error of forming the matrix then shrinks as well.
-
-    Returns
-    -------
-    DefinitenessProof
-        ``proved`` is never true for a ball with a member that is not positive definite.
-    """
+    """Try to prove that every symmetric member of ``matrix (n, n)`` is positive definite."""
     formula = _as_formula(matrix)
     ball = formula(Ball)
     if ball.shape[0] == 0:

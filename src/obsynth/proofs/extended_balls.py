@@ -29,16 +29,9 @@ MOST_ROWS = 128
 class ExtendedProof:
     """What ball arithmetic found out.
 
-    Parameters
-    ----------
-    proved : bool
-        Whether every symmetric member is positive definite.
-    lower_bound : float
-        Below the smallest eigenvalue of every member; zero without a proof.
-    bits : int
-        Precision that decided, or the last that was tried.
-    reason : str
-        Why there is no proof; empty with one.
+    Fields: proved: Whether every symmetric member is positive definite; lower_bound: Below the smallest eigenvalue of
+    every member; zero without a proof; bits: Precision that decided, or the last that was tried; reason: Why there is
+    no proof; empty with one.
     """
 
     proved: bool
@@ -57,10 +50,7 @@ def is_available() -> bool:
 def prove_by_ball_arithmetic(formula: Formula) -> ExtendedProof:
     """Try to prove that every symmetric member of a matrix is positive definite, with as many digits as it takes.
 
-    Parameters
-    ----------
-    formula : Formula
-        How the matrix ``(n, n)``, n at most `MOST_ROWS`, is formed.
+    Shapes: ``formula (n, n)``.
     """
     import flint
 
@@ -120,10 +110,7 @@ def _lower_bound(matrix: ExtendedBall) -> float:
 class ExtendedBall(Enclosure):
     """All real matrices within radii of midpoints that have the digits of python-flint's current precision.
 
-    Parameters
-    ----------
-    content : flint.arb_mat
-        ``(rows, cols)``.
+    Fields: content: ``(rows, cols)``.
     """
 
     content: Any

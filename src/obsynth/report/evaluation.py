@@ -33,21 +33,7 @@ def evaluation_report(
     console: Console,
     units: Mapping[str, str],
 ) -> None:
-    """Print rates, delays and errors over many runs.
-
-    Parameters
-    ----------
-    name : str
-        Of the design.
-    found : Evaluation
-        The evaluation.
-    monitor : Monitor, ParameterMonitor or None
-        What decided.
-    console : Console
-        Where to.
-    units : mapping
-        Unit of signals by name.
-    """
+    """Print rates, delays and errors over many runs."""
     share = f"{100.0 * found.confidence:g} % interval"
     console.print(Text(f"{name}: {found.runs} runs", style="bold"))
     console.print()

@@ -41,16 +41,8 @@ MOST_STATES = 6
 class Picture(NamedTuple):
     """A picture in a page.
 
-    Parameters
-    ----------
-    title : str
-        What it shows.
-    text : str
-        The same for who cannot see it, and as a caption.
-    source : str
-        A data URL.
-    wide : bool, optional
-        Whether it takes a row of its own.
+    Fields: title: What it shows; text: The same for who cannot see it, and as a caption; source: A data URL; wide:
+    Whether it takes a row of its own.
     """
 
     title: str
@@ -60,25 +52,7 @@ class Picture(NamedTuple):
 
 
 def pictures_of(design: ObserverDesign, *, scenario: Scenario | None = None) -> Iterator[Picture]:
-    """Yield the pictures of a design.
-
-    Parameters
-    ----------
-    design : ObserverDesign
-        Any design.
-    scenario : Scenario, optional
-        What the design is shown on, with what a monitor sees where there is one; by default each fault in turn.
-
-    Yields
-    ------
-    Picture
-        The design at work; of a linear one its poles, and singular values over the frequency.
-
-    Raises
-    ------
-    ObsynthError
-        A given scenario cannot be simulated.
-    """
+    """Yield the pictures of a design."""
     yield from _at_work(design, scenario)
     if not isinstance(design.observer, LinearObserver):
         return

@@ -63,18 +63,7 @@ def _existence_line(method: str, report: VerificationReport) -> Text:
 
 
 def structure_facts(structure: Structure) -> dict[str, str]:
-    """Return the facts about a plant's structure.
-
-    Parameters
-    ----------
-    structure : Structure
-        The structure.
-
-    Returns
-    -------
-    dict
-        Value by label, both texts; every structure has the same labels.
-    """
+    """Return the facts about a plant's structure."""
     blocks = [f"{size}" for size in structure.infinite_block_sizes]
     return {
         "pencil A - zE": "regular" if structure.regular else "NOT regular",

@@ -1,4 +1,4 @@
-"""Plants of index 0 or 1 in motion, many runs at once, and exact between samples.
+"""Plants of index 0 or 1, many runs at once, and exact between samples.
 
 The algebraic equations are solved first; what is left steps by a recursion (discrete plants) or by the matrix
 exponential over a sampling interval (continuous ones), which is exact for signals that are constant or linear between
@@ -24,17 +24,9 @@ from obsynth.simulation.scenario_signals import Drive
 class Stepper:
     """A plant as what steps from sample to sample; plain arrays, so that it can go to another process.
 
-    Parameters
-    ----------
-    transition, held, ramped, noisy : FloatArray
-        ``x+ = transition x + held s + ramped (s_right - s_left) + noisy w``, with s = [u; f; d] and x the dynamic
-        states.
-    state_of, output_of : tuple of FloatArray
-        Plant states and outputs from x, s and w.
-    start : FloatArray
-        Dynamic states at the start.
-    feedback : FloatArray or None
-        ``(nu, n)``: ``u = s_u - feedback x``, already inside the other matrices.
+    Fields: transition, held, ramped, noisy: ``x+ = transition x + held s + ramped (s_right - s_left) + noisy w``, with
+    s = [u; f; d] and x the dynamic states; state_of, output_of: Plant states and outputs from x, s and w; start:
+    Dynamic states at the start; feedback: ``(nu, n)``: ``u = s_u - feedback x``, already inside the other matrices.
     """
 
     transition: FloatArray
@@ -51,17 +43,8 @@ class Stepper:
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return states, outputs (free of sensor faults) and inputs' feedback part of all runs.
 
-        Parameters
-        ----------
-        signals, differences : FloatArray
-            ``(steps, runs, nu + nf + nd)``: s at each sample, and how much it changes until the next.
-        noise : FloatArray
-            ``(steps, runs, nw)``, unit covariance.
-
-        Raises
-        ------
-        SpecError
-            The states outgrow double precision.
+        Shapes: ``signals (steps, runs, nu + nf + nd)``, ``differences (steps, runs, nu + nf + nd)``, ``noise (steps,
+        runs, nw)``.
         """
         drive = signals @ self.held.T + differences @ self.ramped.T + noise @ self.noisy.T
         x = np.empty_like(drive)
@@ -87,22 +70,7 @@ class Stepper:
 def make_stepper(plant: DescriptorSystem, drive: Drive, *, initial_state: FloatArray, stabilise: bool) -> Stepper:
     """Return the stepper of ``plant`` for the sampling of ``drive``.
 
-    Parameters
-    ----------
-    plant : DescriptorSystem
-        Regular, index 0 or 1, either time.
-    drive : Drive
-        Whose ``dt`` counts.
-    initial_state : FloatArray
-        ``(nx,)``; ``E x(0)`` is kept, the algebraic part follows from the equations.
-    stabilise : bool
-        Whether a linear-quadratic state feedback with unit weights is added.
-
-    Raises
-    ------
-    PreconditionError
-        The plant is not regular, has index 2 or more, has no dynamic state, cannot be stabilised, or continuous white
-        noise reaches an output or a state directly.
+    Shapes: ``initial_state (nx,)``.
     """
     elimination = eliminate_algebraic_states(plant)
     reduced, recovery = elimination.plant, elimination.recovery

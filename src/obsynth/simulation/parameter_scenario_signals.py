@@ -21,21 +21,7 @@ _NAMES = {
 
 
 def check_recursive(plant: TimeVaryingDescriptorSystem | DAEModel, scenario: Scenario) -> None:
-    """Raise where a scenario says what a plant with parameters does not have.
-
-    Parameters
-    ----------
-    plant : TimeVaryingDescriptorSystem or DAEModel
-        The plant.
-    scenario : Scenario
-        What happens; ``faults`` are what is added to the parameters.
-
-    Raises
-    ------
-    SpecError
-        An unknown name (with the closest ones), a disturbance, a failing actuator, an observer's state, or a feedback;
-        ``path`` says where.
-    """
+    """Raise where a scenario says what a plant with parameters does not have."""
     for group, names in _NAMES.items():
         for name in getattr(scenario, group):
             try:
@@ -58,22 +44,7 @@ def check_recursive(plant: TimeVaryingDescriptorSystem | DAEModel, scenario: Sce
 
 
 def resolve_recursive(plant: TimeVaryingDescriptorSystem | DAEModel, scenario: Scenario, *, dt: float) -> Drive:
-    """Return the signals of ``scenario``: ``[u, theta]`` as they differ from their nominal values.
-
-    Parameters
-    ----------
-    plant : TimeVaryingDescriptorSystem or DAEModel
-        Whose signals the scenario names.
-    scenario : Scenario
-        What happens.
-    dt : float, seconds
-        Between the samples of the observer.
-
-    Raises
-    ------
-    SpecError
-        As for `check_recursive`; another sample time, or a horizon that the plant does not reach.
-    """
+    """Return the signals of ``scenario``: ``[u, theta]`` as they differ from their nominal values."""
     check_recursive(plant, scenario)
     if scenario.sample_time is not None and scenario.sample_time != dt:
         raise SpecError(

@@ -23,20 +23,9 @@ MAXIMUM_SAMPLES = 5_000_000
 class Drive:
     """A scenario for one plant, in arrays, apart from its random numbers.
 
-    Parameters
-    ----------
-    dt : float, seconds
-        Between samples.
-    left, right : FloatArray
-        ``(steps, nu + nf + nd)``: [u, f, d] at both ends of each interval, linear in between.
-    random : tuple of (int, Random)
-        Column of each random disturbance, and its profile.
-    sensors : tuple of (int, Profile)
-        Output and profile of each sensor fault.
-    noise : float
-        Multiple of the plant's own noise.
-    deviations : FloatArray
-        ``(ny,)``: further white noise of the sensors.
+    Fields: dt: Between samples; left, right: ``(steps, nu + nf + nd)``: [u, f, d] at both ends of each interval, linear
+    in between; random: Column of each random disturbance, and its profile; sensors: Output and profile of each sensor
+    fault; noise: Multiple of the plant's own noise; deviations: ``(ny,)``: further white noise of the sensors.
     """
 
     dt: float
@@ -53,15 +42,7 @@ class Drive:
         return len(self.left)
 
     def drawn(self, seeds: Sequence[int], nw: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return what the seeds add: signals, plant noise, sensor noise, ``(steps, runs, *)`` each.
-
-        Parameters
-        ----------
-        seeds : sequence of int
-            One per run; the numbers of a run depend on its seed alone.
-        nw : int
-            Noise signals of the plant.
-        """
+        """Return what the seeds add: signals, plant noise, sensor noise, ``(steps, runs, *)`` each."""
         steps, ny = self.steps, len(self.deviations)
         signals = np.zeros((steps, len(seeds), self.left.shape[1]))
         noise, sensors = np.zeros((steps, len(seeds), nw)), np.zeros((steps, len(seeds), ny))
@@ -98,20 +79,7 @@ class Drive:
 
 
 def resolve(plant: DescriptorSystem, scenario: Scenario) -> Drive:
-    """Return the signals of ``scenario`` for ``plant``.
-
-    Parameters
-    ----------
-    plant : DescriptorSystem
-        Whose signals the scenario names.
-    scenario : Scenario
-        What happens.
-
-    Raises
-    ------
-    SpecError
-        An unknown name, no sample time, or a failing actuator that is none.
-    """
+    """Return the signals of ``scenario`` for ``plant``."""
     scenario.check_names(plant)
     dt = scenario.step_of(plant)
     if scenario.horizon / dt > MAXIMUM_SAMPLES:

@@ -25,22 +25,7 @@ _GROUPS = ("inputs", "faults", "disturbances", "sensors")
 def built_scenario(
     section: ScenarioSection | None, plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel, source: Path
 ) -> Scenario | None:
-    """Return the scenario of a spec; `None` if it has none.
-
-    Parameters
-    ----------
-    section : ScenarioSection or None
-        As checked by the schema.
-    plant : DescriptorSystem, TimeVaryingDescriptorSystem or DAEModel
-        Whose signals it names, after the transformation.
-    source : Path
-        The spec, for messages.
-
-    Raises
-    ------
-    SpecError
-        A profile lacks a key or has one of another kind, a number is out of range, or a name is unknown.
-    """
+    """Return the scenario of a spec; `None` if it has none."""
     if section is None:
         return None
     problems = DocumentProblems(source, what="spec")

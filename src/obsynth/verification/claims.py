@@ -29,15 +29,7 @@ def claimed(claims: Mapping[str, Any], name: str) -> float:
 
 
 def claim_rows(plant: DescriptorSystem, claims: Mapping[str, Any]) -> Iterator[Check]:
-    """Yield the rows on what is claimed: known names, numbers, and gains in order.
-
-    Parameters
-    ----------
-    plant : DescriptorSystem
-        The plant; with disturbances a gain must be claimed.
-    claims : mapping
-        Of the certificate.
-    """
+    """Yield the rows on what is claimed: known names, numbers, and gains in order."""
     needed = {"state_lag"} | ({"gamma"} if plant.nd else set())
     wrong = [name for name in claims if name not in KNOWN_CLAIMS or not math.isfinite(claimed(claims, name))]
     wrong += sorted(needed - claims.keys())
@@ -80,15 +72,7 @@ def _disorder(claims: Mapping[str, Any], *, bracketed: bool) -> float:
 
 
 def recovery_rows(plant: DescriptorSystem, recovery: StateRecovery | None) -> Iterator[Check]:
-    """Yield the rows on the map back to the states of the plant before its transformation, where there is one.
-
-    Parameters
-    ----------
-    plant : DescriptorSystem
-        The plant after the transformation; the one before is not stored.
-    recovery : StateRecovery or None
-        The map.
-    """
+    """Yield the rows on the map back to the states of the plant before its transformation, where there is one."""
     if recovery is None:
         return
     wrong = _misfits(plant, recovery)

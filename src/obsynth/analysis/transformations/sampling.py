@@ -88,11 +88,6 @@ def sampling_zero_warnings(plant: DescriptorSystem) -> tuple[str, ...]:
     """Return a text for every fault zero strictly inside, but near, the unit circle of a sampled plant.
 
     The fault estimate rings for ``dt / -ln abs(z)`` seconds there.
-
-    Parameters
-    ----------
-    plant : DescriptorSystem
-        ``dt > 0``; a continuous plant gets no warnings.
     """
     if not plant.is_discrete:
         return ()

@@ -1,4 +1,4 @@
-"""Watching a residual: one statistic, one threshold, and a sentence that says what it promises."""
+"""Monitoring a residual: one statistic, one threshold, and a sentence that says what it promises."""
 
 from __future__ import annotations
 
@@ -28,15 +28,7 @@ BETWEEN_SAMPLES = "; as far as outputs are straight lines between samples, where
 
 
 def statement_of(kind: str, *, continuous: bool) -> str:
-    """Return what a threshold promises.
-
-    Parameters
-    ----------
-    kind : str
-        One of `KINDS`.
-    continuous : bool
-        Whether the design is for continuous time.
-    """
+    """Return what a threshold promises."""
     return STATEMENTS[kind] + (BETWEEN_SAMPLES if continuous else "")
 
 

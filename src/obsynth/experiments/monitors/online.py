@@ -15,14 +15,8 @@ from obsynth.numerics.arrays import FloatArray
 class Seen(NamedTuple):
     """What a monitor says of one row.
 
-    Parameters
-    ----------
-    statistic, threshold : float
-        NaN where nothing is decided.
-    alarm : bool
-        Whether the threshold is passed.
-    fault : str
-        The fault that stands out; empty without an alarm, or without faults.
+    Fields: statistic, threshold: NaN where nothing is decided; alarm: Whether the threshold is passed; fault: The fault
+    that stands out; empty without an alarm, or without faults.
     """
 
     statistic: float
@@ -34,12 +28,8 @@ class Seen(NamedTuple):
 class Evidence(NamedTuple):
     """What a recursive observer learnt from a sample.
 
-    Parameters
-    ----------
-    theta, covariance : FloatArray
-        Parameters ``(nq,)`` and their covariance ``(nq, nq)``.
-    innovation, regressor : FloatArray
-        ``(m,)`` and ``(m, nq)``: innovation less regressor times the true parameters is white, N(0, I).
+    Fields: theta, covariance: Parameters ``(nq,)`` and their covariance ``(nq, nq)``; innovation, regressor: ``(m,)``
+    and ``(m, nq)``: innovation less regressor times the true parameters is white, N(0, I).
     """
 
     theta: FloatArray
@@ -65,7 +55,7 @@ class Rule(Protocol):
         ...
 
     def as_dict(self) -> dict[str, Any]:
-        """Return what is carried from row to row, as data."""
+        """Return the state that goes from row to row, as data."""
         ...
 
     def resume(self, data: Mapping[str, Any]) -> None:
@@ -148,7 +138,7 @@ class OnlineMonitor:
         return Seen(statistic, threshold, True, "" if which is None else self._names[which])
 
     def as_dict(self) -> dict[str, Any]:
-        """Return what is carried from row to row, as data."""
+        """Return the state that goes from row to row, as data."""
         return {"kind": self.kind, "decided": self._decided, "rule": self._rule.as_dict()}
 
     def resume(self, data: Mapping[str, Any]) -> None:

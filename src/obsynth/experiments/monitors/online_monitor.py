@@ -14,7 +14,7 @@ from obsynth.experiments.monitors.residual_model import ResidualModel, residual_
 from obsynth.experiments.monitors.residual_monitor import bounds_of, require_options
 from obsynth.experiments.monitors.residual_rules import NormRule, WhitenedRule
 from obsynth.experiments.monitors.thresholds import scaled_inputs
-from obsynth.experiments.monitors.unlimited_horizon import endless_bound, endless_paper, samples_of
+from obsynth.experiments.monitors.unlimited_horizon import samples_of, unlimited_bound, unlimited_paper
 from obsynth.experiments.monitors.whitening import cusum_whitener, steady_mean, whitener_of, window_covariance
 from obsynth.numerics.arguments import is_finite_number, require_kind, require_mapping
 from obsynth.numerics.arrays import FloatArray
@@ -120,12 +120,12 @@ def online_monitor(
     irregular = None
     if kind in ("pointwise", "window", "paper"):
         if kind == "paper":
-            table, limit = endless_paper(model, bounds, start, gamma)
+            table, limit = unlimited_paper(model, bounds, start, gamma)
         else:
-            table, limit = endless_bound(kind, model, scaled_inputs(model, bounds, noise_bound), start, window)
+            table, limit = unlimited_bound(kind, model, scaled_inputs(model, bounds, noise_bound), start, window)
             if model.flow is not None:
                 inputs = scaled_inputs(model, bounds, noise_bound, any_stamps=True)
-                irregular = endless_bound(kind, model, inputs, start, window)
+                irregular = unlimited_bound(kind, model, inputs, start, window)
         if not limit > 0.0:
             raise SpecError(
                 "As stated, no disturbance and no noise reaches the residual: its bound would be zero, which rounding "

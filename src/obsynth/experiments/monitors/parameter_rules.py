@@ -21,17 +21,10 @@ NIS_WINDOW = 20
 class ParameterRule:
     """Parameters against their nominal values, or innovations against what noise explains.
 
-    Parameters
-    ----------
-    kind : {"chi-square", "cusum", "nis"}
-        ``chi-square`` of theta less nominal in the metric of its covariance; ``cusum`` of the innovations for a change
-        of given size; ``nis``, squares of the innovations over 20 samples, for all that the model does not explain.
-    nominal : FloatArray
-        ``(nq,)``; empty for a filter without parameters.
-    change : FloatArray
-        ``(nq,)``: what ``cusum`` is tuned for, in parameter units.
-    false_alarms : float
-        Probability of a false alarm in a run, however long.
+    Fields: kind: ``chi-square`` of theta less nominal in the metric of its covariance; ``cusum`` of the innovations for
+    a change of given size; ``nis``, squares of the innovations over 20 samples, for all that the model does not
+    explain; nominal: ``(nq,)``; empty for a filter without parameters; change: ``(nq,)``: what ``cusum`` is tuned for,
+    in parameter units; false_alarms: Probability of a false alarm in a run, however long.
     """
 
     def __init__(self, kind: str, nominal: FloatArray, change: FloatArray, false_alarms: float) -> None:
@@ -94,7 +87,7 @@ class ParameterRule:
         return [self._kind, self._probability, self._nominal.tolist(), self._change.tolist()]
 
     def as_dict(self) -> dict[str, Any]:
-        """Return what is carried from row to row, as data."""
+        """Return the state that goes from row to row, as data."""
         return {
             "levels": self._levels, "looks": self._looks, "squares": [list(item) for item in self._squares],
             "options": self._options(),

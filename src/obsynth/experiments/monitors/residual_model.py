@@ -22,28 +22,13 @@ from obsynth.simulation.scenario_signals import resolve
 class ResidualModel:
     """``e+ = A e + Bd d + Bw w``, ``r = C e + Dd d + Dw w`` at the samples, without faults, w of unit covariance.
 
-    Parameters
-    ----------
-    A, C, Bd, Dd, Bw, Dw : FloatArray
-        Of the residual.
-    fault_C, fault_Dd, fault_Dw : FloatArray
-        Of the fault estimates.
-    steps : int
-        Samples of the scenario.
-    start : FloatArray
-        ``(n,)``: e at the start of the scenario.
-    bounds, means, deviations : FloatArray
-        ``(nd,)``: largest absolute value of each disturbance in the scenario (infinite if there is none), mean and
-        standard deviation of what is random in it.
-    steady : tuple of bool
-        Whether each disturbance has no part but random ones over the whole record.
-    flow : tuple of FloatArray, optional
-        Of a continuous design: A and Bd in continuous time.
-    start_noise : FloatArray, optional
-        Of a continuous design, ``(n, any)``: what the noise w of the first sample (its first signals) adds to e there.
-    sensor_noise : tuple of FloatArray, optional
-        Of a continuous design: what the noise of the sensors (the first signals of w), drawn as straight lines between
-        samples, does to e' and r.
+    Fields: A, C, Bd, Dd, Bw, Dw: Of the residual; fault_C, fault_Dd, fault_Dw: Of the fault estimates; steps: Samples
+    of the scenario; start: ``(n,)``: e at the start of the scenario; bounds, means, deviations: ``(nd,)``: largest
+    absolute value of each disturbance in the scenario (infinite if there is none), mean and standard deviation of what
+    is random in it; steady: Whether each disturbance has no part but random ones over the whole record; flow: Of a
+    continuous design: A and Bd in continuous time; start_noise: Of a continuous design, ``(n, any)``: what the noise w
+    of the first sample (its first signals) adds to e there; sensor_noise: Of a continuous design: what the noise of the
+    sensors (the first signals of w), drawn as straight lines between samples, does to e' and r.
     """
 
     A: FloatArray
@@ -102,20 +87,7 @@ class ResidualModel:
 
 
 def residual_model(design: ObserverDesign, scenario: Scenario) -> ResidualModel:
-    """Return the model of a design's residual on a scenario.
-
-    Parameters
-    ----------
-    design : ObserverDesign
-        Of a linear method.  Of a continuous one the residual at the samples, see `sampled_residual`.
-    scenario : Scenario
-        Whose disturbances, noise and start count.
-
-    Raises
-    ------
-    SpecError
-        A recursive design, one without residuals, or one whose certificate has no tracking map.
-    """
+    """Return the model of a design's residual on a scenario."""
     plant, observer = design.linear
     drive = resolve(plant, scenario)
     noisy = plant.replace(

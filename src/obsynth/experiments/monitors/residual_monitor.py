@@ -148,13 +148,7 @@ def require_options(
 
 
 def bounds_of(design: ObserverDesign, model: ResidualModel, given: Mapping[str, float] | None) -> FloatArray:
-    """Return the largest absolute value of each disturbance ``(nd,)``: the scenario's, or what is given.
-
-    Raises
-    ------
-    SpecError
-        A name is unknown, or a bound negative.
-    """
+    """Return the largest absolute value of each disturbance ``(nd,)``: the scenario's, or what is given."""
     bounds = model.bounds.copy()
     for name, value in (given or {}).items():
         place = index_of(name, design.linear[0].disturbance_names, what="disturbance_bounds")

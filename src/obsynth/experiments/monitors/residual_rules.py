@@ -25,18 +25,9 @@ ROUNDING = 1e-9
 class NormRule:
     """The norm of the residual, or of a window of it, against a bound by the number of samples since the start.
 
-    Parameters
-    ----------
-    table : FloatArray
-        The bound at each sample.
-    limit : float
-        The bound after the table.
-    window : int
-        Samples of which squares are summed up; 1 for the norm itself.
-    dt : float, seconds
-        Between samples.
-    irregular : UnlimitedHorizonBound, optional
-        Continuous designs: table and limit that hold where samples are not all ``dt`` apart.
+    Fields: table: The bound at each sample; limit: The bound after the table; window: Samples of which squares are
+    summed up; 1 for the norm itself; dt: Between samples; irregular: Continuous designs: table and limit that hold
+    where samples are not all ``dt`` apart.
     """
 
     def __init__(
@@ -77,7 +68,7 @@ class NormRule:
         self._regular = True
 
     def as_dict(self) -> dict[str, Any]:
-        """Return what is carried from row to row, as data."""
+        """Return the state that goes from row to row, as data."""
         return {
             "norms": list(self._norms), "begin": self._begin, "last": self._last, "limit": self._limit,
             "regular": self._regular,
@@ -94,22 +85,10 @@ class NormRule:
 class WhitenedRule:
     """A window of residuals in the metric of its covariance: chi-square, or cumulative sums for small changes.
 
-    Parameters
-    ----------
-    whitener : FloatArray
-        ``(m, window nr)``, oldest sample first.
-    mean : FloatArray
-        ``(nr,)``.
-    window : int
-        Samples.
-    change : float or None
-        Shift of the whitened residual that the sums are tuned for; `None` for chi-square.
-    false_alarms : float
-        Probability of a false alarm in a run, however long.
-    dt : float, seconds
-        Between samples.
-    white : bool, optional
-        Whether what is summed up is white, see `obsynth.experiments.monitors.whitening.cusum_whitener`.
+    Fields: whitener: ``(m, window nr)``, oldest sample first; mean: ``(nr,)``; window: Samples; change: Shift of the
+    whitened residual that the sums are tuned for; `None` for chi-square; false_alarms: Probability of a false alarm in
+    a run, however long; dt: Between samples; white: Whether what is summed up is white, see
+    `obsynth.experiments.monitors.whitening.cusum_whitener`.
     """
 
     def __init__(
@@ -157,7 +136,7 @@ class WhitenedRule:
         self._last = None
 
     def as_dict(self) -> dict[str, Any]:
-        """Return what is carried from row to row, as data."""
+        """Return the state that goes from row to row, as data."""
         return {
             "window": list(self._window), "levels": self._levels, "looks": self._looks, "last": self._last,
             "options": [self._probability, float(self._window.maxlen or 0), self._change or 0.0],

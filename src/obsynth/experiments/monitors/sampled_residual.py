@@ -32,12 +32,7 @@ from obsynth.verification.error_system import ErrorSystem
 class TrackedErrors:
     """The error system of a design, with what its error is at a start.
 
-    Parameters
-    ----------
-    errors : ErrorSystem
-        In the plant's own time.
-    tracking : FloatArray
-        ``V (nz, nx)``, of the newest state.
+    Fields: errors: In the plant's own time; tracking: ``V (nz, nx)``, of the newest state.
     """
 
     errors: ErrorSystem
@@ -45,20 +40,7 @@ class TrackedErrors:
 
 
 def tracked_errors(design: ObserverDesign, plant: DescriptorSystem) -> TrackedErrors:
-    """Return the error system of a linear design on its plant with some noise.
-
-    Parameters
-    ----------
-    design : ObserverDesign
-        Linear.
-    plant : DescriptorSystem
-        Its plant, with the noise that counts.
-
-    Raises
-    ------
-    SpecError
-        The design has no residual, or its certificate no tracking map.
-    """
+    """Return the error system of a linear design on its plant with some noise."""
     observer, matrices = design.linear[1], design.certificate.matrices
     if not observer.residual_names:
         raise SpecError(f"Design {design.name!r} has no residual to watch.", path="observer")
@@ -80,16 +62,9 @@ def tracked_errors(design: ObserverDesign, plant: DescriptorSystem) -> TrackedEr
 class SampledErrors:
     """The recursion of the module's text; w is noise of unit covariance, sensors first.
 
-    Parameters
-    ----------
-    A, Bd, Bw : FloatArray
-        Of the error.
-    sensor_outputs : FloatArray
-        ``Dy_h Dw``: what the noise of a sample adds to states, faults and residuals at once.
-    start : FloatArray
-        ``(n, sensors)``: what the noise of the first sample adds to the start.
-    gathered : int
-        How many noise signals come after those of the sensors.
+    Fields: A, Bd, Bw: Of the error; sensor_outputs: ``Dy_h Dw``: what the noise of a sample adds to states, faults and
+    residuals at once; start: ``(n, sensors)``: what the noise of the first sample adds to the start; gathered: How many
+    noise signals come after those of the sensors.
     """
 
     A: FloatArray
@@ -106,24 +81,7 @@ class SampledErrors:
 
 
 def sampled_errors(plant: DescriptorSystem, observer: LinearObserver, found: TrackedErrors, dt: float) -> SampledErrors:
-    """Return the error of a continuous observer from sample to sample.
-
-    Parameters
-    ----------
-    plant : DescriptorSystem
-        Continuous, with the noise that counts.
-    observer : LinearObserver
-        Continuous.
-    found : TrackedErrors
-        Of both.
-    dt : float
-        Seconds between samples.
-
-    Raises
-    ------
-    SpecError
-        One noise drives the plant and a sensor at once.
-    """
+    """Return the error of a continuous observer from sample to sample."""
     process, sensors = plant.Bw.any(axis=0), plant.Dw.any(axis=0)
     if (process & sensors).any():
         raise SpecError("A noise drives the plant and a sensor at once, which is not known between samples: state two.",

@@ -16,14 +16,9 @@ from obsynth.numerics.peak_gain import peak_gain
 class ScaledInputs(NamedTuple):
     """What drives a residual, each input scaled to at most one in absolute value.
 
-    Parameters
-    ----------
-    B, D : FloatArray
-        Inputs that change from sample to sample, ``(n, m)`` and ``(nr, m)``.
-    constant : float
-        What signals of any shape in continuous time add to the norm of the residual, at most.
-    start : FloatArray
-        ``(n, any)``: inputs of the first sample alone, straight to the error.
+    Fields: B, D: Inputs that change from sample to sample, ``(n, m)`` and ``(nr, m)``; constant: What signals of any
+    shape in continuous time add to the norm of the residual, at most; start: ``(n, any)``: inputs of the first sample
+    alone, straight to the error.
     """
 
     B: FloatArray
@@ -37,22 +32,7 @@ def scaled_inputs(
 ) -> ScaledInputs:
     """Return what drives the residual, with every input scaled to at most one in absolute value.
 
-    Parameters
-    ----------
-    model : ResidualModel
-        The residual's.
-    bounds : FloatArray
-        ``(nd,)``, of the disturbances.
-    noise_bound : float or None
-        What the noise never exceeds, in its standard deviations.
-    any_stamps : bool, optional
-        Whether samples of a continuous design may come closer than the model's: noise of the sensors then counts as a
-        signal of any shape, which the straight lines between any samples are.
-
-    Raises
-    ------
-    SpecError
-        An input that reaches the residual has no bound.
+    Shapes: ``bounds (nd,)``.
     """
     reached = np.any(model.Bd != 0.0, axis=0) | np.any(model.Dd != 0.0, axis=0)
     if np.any(reached & ~np.isfinite(bounds)):
@@ -88,21 +68,7 @@ def scaled_inputs(
 def paper_threshold(model: ResidualModel, bounds: FloatArray, initial_error: float, gamma: float | None) -> FloatArray:
     """Return (66) of Wang et al. 2015 with the norm of the power where the paper has the power of the norm.
 
-    Parameters
-    ----------
-    model : ResidualModel
-        The residual's.
-    bounds : FloatArray
-        ``(nd,)``, of the disturbances.
-    initial_error : float
-        Norm of the error at the start.
-    gamma : float or None
-        l2 gain from the disturbances to the residual; computed by default.
-
-    Raises
-    ------
-    SpecError
-        A disturbance has no bound.
+    Shapes: ``bounds (nd,)``.
     """
     if model.flow is not None:
         raise SpecError("Eq. (66) is for discrete designs: use pointwise, or sample the plant first.",
@@ -115,17 +81,7 @@ def paper_threshold(model: ResidualModel, bounds: FloatArray, initial_error: flo
 
 
 def pointwise_threshold(model: ResidualModel, inputs: ScaledInputs, initial_error: float) -> FloatArray:
-    """Return what the norm of the residual never passes: exact initial-error term and l1 (peak) gains of each input.
-
-    Parameters
-    ----------
-    model : ResidualModel
-        The residual's.
-    inputs : ScaledInputs
-        From `scaled_inputs`.
-    initial_error : float
-        Norm of the error at the start, at most.
-    """
+    """Return what the norm of the residual never passes: exact initial-error term and l1 (peak) gains of each input."""
     powers = model.powers()
     start = np.array([np.linalg.norm(model.C @ power, 2) for power in powers]) * initial_error
     start += np.array([np.sum(np.linalg.norm(model.C @ power @ inputs.start, axis=0)) for power in powers])
@@ -141,17 +97,6 @@ def window_threshold(model: ResidualModel, inputs: ScaledInputs, initial_error: 
     root of its energy, bounded as the pointwise bound is.  No window has more than the pointwise bounds of its samples,
     summed up in squares: that is used where it is less, and for continuous designs, whose disturbances may do anything
     between samples.
-
-    Parameters
-    ----------
-    model : ResidualModel
-        The residual's.
-    inputs : ScaledInputs
-        From `scaled_inputs`.
-    initial_error : float
-        Norm of the error at the start, at most.
-    window : int
-        Samples.
     """
     one_by_one = pointwise_threshold(model, inputs, initial_error)
     summed = np.array([np.linalg.norm(one_by_one[max(k - window + 1, 0) : k + 1]) for k in range(model.steps)])

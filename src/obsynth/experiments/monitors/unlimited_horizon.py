@@ -21,12 +21,7 @@ MOST_SAMPLES, MOST_NUMBERS = 16_384, 20_000_000
 class UnlimitedHorizonBound(NamedTuple):
     """A bound by the number of samples since the start.
 
-    Parameters
-    ----------
-    table : FloatArray
-        At samples 0, 1, ...
-    limit : float
-        At every later one.
+    Fields: table: At samples 0, 1, ; limit: At every later one.
     """
 
     table: FloatArray
@@ -36,17 +31,7 @@ class UnlimitedHorizonBound(NamedTuple):
 def samples_of(transition: FloatArray, window: int) -> int:
     """Return how many samples a table needs until an error at the start has shrunk to `LEFT`.
 
-    Parameters
-    ----------
-    transition : FloatArray
-        ``(n, n)``: of the error, from sample to sample.
-    window : int
-        Samples that a statistic looks back.
-
-    Raises
-    ------
-    SpecError
-        The error shrinks too slowly.
+    Shapes: ``transition (n, n)``.
     """
     power, count = transition, 1
     while len(power) and not np.linalg.norm(power, 2) <= LEFT:
@@ -59,24 +44,10 @@ def samples_of(transition: FloatArray, window: int) -> int:
     return max(count, 1) + window
 
 
-def endless_bound(
+def unlimited_bound(
     kind: str, model: ResidualModel, inputs: ScaledInputs, initial_error: float, window: int
 ) -> UnlimitedHorizonBound:
-    """Return the pointwise or window bound for records of any length.
-
-    Parameters
-    ----------
-    kind : {"pointwise", "window"}
-        Which one.
-    model : ResidualModel
-        With as many samples as `samples_of` says.
-    inputs : ScaledInputs
-        From `scaled_inputs`.
-    initial_error : float
-        Norm of the error at the start, at most.
-    window : int
-        Samples.
-    """
+    """Return the pointwise or window bound for records of any length."""
     powers = model.powers()
     last = powers[-1] @ model.A
     left = float(np.linalg.norm(last, 2)) if last.size else 0.0
@@ -117,21 +88,12 @@ def _window_limit(
     return gain * float(np.sqrt(window * count)) + gathered + aged + start
 
 
-def endless_paper(
+def unlimited_paper(
     model: ResidualModel, bounds: FloatArray, initial_error: float, gamma: float | None
 ) -> UnlimitedHorizonBound:
     """Return (66) of Wang et al. 2015 for records of any length.
 
-    Parameters
-    ----------
-    model : ResidualModel
-        With as many samples as `samples_of` says.
-    bounds : FloatArray
-        ``(nd,)``, of the disturbances.
-    initial_error : float
-        Norm of the error at the start.
-    gamma : float or None
-        l2 gain from the disturbances to the residual; computed by default.
+    Shapes: ``bounds (nd,)``.
     """
     table = paper_threshold(model, bounds, initial_error, gamma)
     return UnlimitedHorizonBound(table, float(table[-1]))

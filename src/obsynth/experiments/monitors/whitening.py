@@ -19,20 +19,7 @@ CORRELATION_LEFT, MOST_LAGS = 1e-9, 200_000
 
 
 def window_covariance(model: ResidualModel, window: int) -> FloatArray:
-    """Return the covariance ``(window nr, window nr)`` of consecutive residuals in steady state, oldest first.
-
-    Parameters
-    ----------
-    model : ResidualModel
-        With random disturbances and noise only.
-    window : int
-        Samples.
-
-    Raises
-    ------
-    SpecError
-        A disturbance that reaches the residual is no random signal of the whole record, or nothing random reaches it.
-    """
+    """Return the covariance ``(window nr, window nr)`` of consecutive residuals in steady state, oldest first."""
     reached = np.any(model.Bd != 0.0, axis=0) | np.any(model.Dd != 0.0, axis=0)
     if any(bool(hit) and not calm for hit, calm in zip(reached, model.steady, strict=True)):
         raise SpecError(
@@ -57,10 +44,7 @@ def window_covariance(model: ResidualModel, window: int) -> FloatArray:
 def whitener_of(covariance: FloatArray) -> FloatArray:
     """Return ``Wh (rank, n)`` with ``Wh S Wh' = I``; directions without any variance are left out.
 
-    Parameters
-    ----------
-    covariance : FloatArray
-        ``S (n, n)``.
+    Shapes: ``covariance (n, n)``.
     """
     sizes, vectors = np.linalg.eigh((covariance + covariance.T) / 2.0)
     kept = sizes > CANCELLATION_TOLERANCE * max(float(sizes[-1]), np.finfo(np.float64).tiny)
@@ -70,17 +54,7 @@ def whitener_of(covariance: FloatArray) -> FloatArray:
 def innovation_whitener(covariance: FloatArray, count: int) -> FloatArray:
     """Return ``Wh (m, n)``: the newest ``count`` residuals less their prediction from the others, white.
 
-    Parameters
-    ----------
-    covariance : FloatArray
-        Of the window, ``(n, n)``, oldest first.
-    count : int
-        Residuals per sample.
-
-    Raises
-    ------
-    SpecError
-        The newest residuals follow exactly from the older ones.
+    Shapes: ``covariance (n, n)``.
     """
     old = len(covariance) - count
     past = whitener_of(covariance[:old, :old]) if old else np.zeros((0, 0))
@@ -98,20 +72,6 @@ def correlation_left(model: ResidualModel, window: int, whitener: FloatArray) ->
     """Return the norms of all correlations, at every lag, that whitened residuals still have, summed up.
 
     Of a residual that remembers more than a window, a prediction from the window is not the best one.
-
-    Parameters
-    ----------
-    model : ResidualModel
-        The residual's, stable.
-    window : int
-        Samples.
-    whitener : FloatArray
-        From `innovation_whitener`.
-
-    Raises
-    ------
-    SpecError
-        The residual remembers for too long.
     """
     count, n = len(model.C), len(model.A)
     covariance = window_covariance(model, 2 * window)
@@ -143,18 +103,6 @@ def cusum_whitener(model: ResidualModel, window: int) -> tuple[FloatArray, bool]
     """Return what cumulative sums add up, and whether it is white.
 
     Where correlation is left, it is scaled down so that no sum of n samples has more variance than n.
-
-    Parameters
-    ----------
-    model : ResidualModel
-        The residual's.
-    window : int
-        Samples.
-
-    Raises
-    ------
-    SpecError
-        The newest residuals follow exactly from the older ones, or the residual remembers for too long.
     """
     whitener = innovation_whitener(window_covariance(model, window), len(model.C))
     left = correlation_left(model, window, whitener)
@@ -162,34 +110,13 @@ def cusum_whitener(model: ResidualModel, window: int) -> tuple[FloatArray, bool]
 
 
 def steady_mean(model: ResidualModel) -> FloatArray:
-    """Return the mean ``(nr,)`` of the residual in steady state.
-
-    Parameters
-    ----------
-    model : ResidualModel
-        Stable.
-    """
+    """Return the mean ``(nr,)`` of the residual in steady state."""
     state = np.linalg.solve(np.eye(len(model.A)) - model.A, model.Bd @ model.means)
     return np.asarray(model.C @ state + model.Dd @ model.means)
 
 
 def settled(model: ResidualModel, initial_error: float, window: int) -> int:
-    """Return the first sample whose window is free of the start.
-
-    Parameters
-    ----------
-    model : ResidualModel
-        The residual's.
-    initial_error : float
-        Norm of the error at the start.
-    window : int
-        Samples.
-
-    Raises
-    ------
-    SpecError
-        The scenario is too short for that, or the observer is not stable.
-    """
+    """Return the first sample whose window is free of the start."""
     deviation = float(np.sqrt(np.max(np.diag(window_covariance(model, 1)))))
     # The covariance and the mean have to settle as well, from a start of about the size of their own states.
     spread = output_covariance(

@@ -57,15 +57,8 @@ START_MARGIN = 1e-8
 class ConeSolution:
     """Where a search ended.
 
-    Parameters
-    ----------
-    x, z : FloatArray
-        Unknowns ``(n,)`` and multipliers ``(m,)``.
-    status : {"optimal", "optimal_inaccurate", "infeasible", "failed"}
-        Whether the gap and the residuals are as small as asked, nearly, because there is no x (as far as numbers can
-        tell), or not.
-    iterations : int
-        Number of factorisations.
+    Fields: x, z: Unknowns ``(n,)`` and multipliers ``(m,)``; status: Whether the gap and the residuals are as small as
+    asked, nearly, because there is no x (as far as numbers can tell), or not; iterations: Number of factorisations.
     """
 
     x: FloatArray
@@ -208,17 +201,7 @@ class _Newton:
 def solve_cone_programme(c: FloatArray, a: FloatArray, b: FloatArray, orders: Sequence[int]) -> ConeSolution:
     """Return the solution of a cone programme.
 
-    Parameters
-    ----------
-    c, a, b : FloatArray
-        ``(n,)``, ``(m, n)`` and ``(m,)``: minimise ``c'x`` with ``b - a x`` in the cones.
-    orders : sequence of int
-        Orders of the semidefinite blocks, in the order of their rows; one for each number that is not negative.
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        The columns of ``a`` depend on each other.
+    Shapes: ``c (n,)``, ``a (m, n)``, ``b (m,)``.
     """
     ends = np.cumsum([0, *(order * (order + 1) // 2 for order in orders)])
     blocks = tuple(SemidefiniteBlock(order, int(first)) for order, first in zip(orders, ends[:-1], strict=True))

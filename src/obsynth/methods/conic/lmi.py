@@ -62,13 +62,7 @@ def scalar_variable() -> Any:
 
 
 def symmetric_blocks(lower: Sequence[Sequence[Any]]) -> Any:
-    """Return the symmetric block matrix whose lower triangle of blocks is ``lower``; empty blocks are dropped.
-
-    Parameters
-    ----------
-    lower : sequence of sequences
-        Row i holds i + 1 blocks (arrays or expressions); diagonal blocks are square.
-    """
+    """Return the symmetric block matrix whose lower triangle of blocks is ``lower``; empty blocks are dropped."""
     import cvxpy
 
     kept = [i for i, row in enumerate(lower) if row[i].shape[0] > 0]
@@ -126,29 +120,7 @@ def value_of(variable: Any) -> FloatArray:
 
 
 def minimise(objective: Any, constraints: Sequence[Any], *, what: str, solver: str = "CLARABEL") -> dict[str, Any]:
-    """Minimise a linear or convex objective under the constraints and return the record of the run.
-
-    Parameters
-    ----------
-    objective : expression or None
-        Scalar; ``None`` asks for any feasible point.
-    constraints : sequence
-        As made by `at_least` and `at_most`.
-    what : str
-        What is being solved, for messages.
-    solver : str, optional
-        One of `FILTER_SOLVERS`; "auto" tries `AUTO_SOLVERS` in turn.
-
-    Returns
-    -------
-    dict
-        ``what, solver, version, status, iterations, seconds, settings``.
-
-    Raises
-    ------
-    SolverError
-        The solver ended without numbers, or crashed.
-    """
+    """Minimise a linear or convex objective under the constraints and return the record of the run."""
     import cvxpy
 
     problem: cvxpy.Problem = cvxpy.Problem(cvxpy.Minimize(0 if objective is None else objective), list(constraints))

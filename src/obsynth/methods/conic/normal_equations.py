@@ -14,15 +14,7 @@ REFINEMENTS = 2
 class NormalEquations:
     """``G'G x = r``, by a Cholesky factorisation in units of the diagonal.
 
-    Parameters
-    ----------
-    columns : FloatArray
-        The columns of G, as rows: ``(n, m)``.
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        The columns depend on each other, as far as rounding lets see, or are not finite.
+    Fields: columns: The columns of G, as rows: ``(n, m)``.
     """
 
     def __init__(self, columns: FloatArray) -> None:

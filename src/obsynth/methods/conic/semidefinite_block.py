@@ -21,12 +21,7 @@ class SemidefiniteBlock:
     A matrix is stored as its lower triangle, row by row, with off-diagonal entries times sqrt(2), so that inner
     products are kept.
 
-    Parameters
-    ----------
-    order : int
-        Order of the matrices.
-    first : int
-        Where they begin in the vectors of a whole programme.
+    Fields: order: Order of the matrices; first: Where they begin in the vectors of a whole programme.
     """
 
     def __init__(self, order: int, first: int) -> None:

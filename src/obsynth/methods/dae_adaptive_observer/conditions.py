@@ -19,15 +19,7 @@ _SOURCE = "Moussa Ali, Zhang 2013 (DAE)"
 
 
 def dae_conditions(model: object, dt: float) -> Iterator[Condition]:
-    """Yield the existence conditions; the list ends at the first failure.
-
-    Parameters
-    ----------
-    model : object
-        Any plant; other kinds than `DAEModel` fail.
-    dt : float
-        Seconds between samples.
-    """
+    """Yield the existence conditions; the list ends at the first failure."""
     if not isinstance(model, DAEModel):
         yield Condition("plant of this kind", "a DAEModel: F(x', x, u, theta) = 0, y = h(x, theta)", False, 0.0, 1.0,
                         f"{_SOURCE}, (3)", f"the plant is a {type(model).__name__}")  # fmt: skip

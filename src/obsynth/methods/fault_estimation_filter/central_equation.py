@@ -34,20 +34,10 @@ from obsynth.numerics.doubling import doubled_riccati_solution, is_positive
 class CentralEquation:
     """The equation of a problem for every level, in as few states as it takes.
 
-    Parameters
-    ----------
-    problem : GainProblem
-        With measurements; a limit on the weight is not looked at.
-    a, h, process, weight, cross : FloatArray
-        Of the Riccati equation to be solved, without ``-g^2 I`` in the last block of ``weight``.
-    full_process, full_weight, full_cross : FloatArray
-        Of the equation in all states.
-    lift : FloatArray or None
-        F ``(n, k)`` where the measurements are exact.
-    outputs : FloatArray
-        ``[C; Z] (m + q, n)``.
-    last : FloatArray
-        ``diag(0, I) (m + q, m + q)``.
+    Fields: problem: With measurements; a limit on the weight is not looked at; a, h, process, weight, cross: Of the
+    Riccati equation to be solved, without ``-g^2 I`` in the last block of ``weight``; full_process, full_weight,
+    full_cross: Of the equation in all states; lift: F ``(n, k)`` where the measurements are exact; outputs: ``[C; Z] (m
+    + q, n)``; last: ``diag(0, I) (m + q, m + q)``.
     """
 
     problem: GainProblem
@@ -163,15 +153,5 @@ class CentralEquation:
 
 
 def central_injection(problem: GainProblem, level: float, *, noise: float) -> Injection | None:
-    """Return the gains of the central filter at ``level``, or ``None`` when the equation gives none.
-
-    Parameters
-    ----------
-    problem : GainProblem
-        With measurements; a limit on the weight is not looked at.
-    level : float
-        Gain level, positive.
-    noise : float
-        Artificial noise relative to the disturbance.
-    """
+    """Return the gains of the central filter at ``level``, or ``None`` when the equation gives none."""
     return CentralEquation.of(problem, noise=noise).filter_at(level)

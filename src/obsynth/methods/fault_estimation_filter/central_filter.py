@@ -1,7 +1,6 @@
 """Central H-infinity filters: the least gain of a `GainProblem`, and filters that weigh noise at a given gain.
 
-See `obsynth.methods.fault_estimation_filter.central_equation` for the equation behind them.  The true gain of the true problem
-decides.
+See `central_equation` for the equation behind them.  The true gain of the true problem decides.
 """
 
 from __future__ import annotations
@@ -67,19 +66,6 @@ def search_central_filter(
 
     The least level of the equation with little noise is found.  Less of it may cost less, and with more of it the
     equation is less sensitive to rounding: a level just below is tried, and if that is reached, the least from there.
-
-    Parameters
-    ----------
-    problem : GainProblem
-        With measurements and a disturbance.
-    start : Injection
-        A stable filter: what is returned is at least as good.
-    gain : float, optional
-        Its true gain, where that is known.
-    tolerance : float, optional
-        Relative width of the bracket at which to stop.
-    start_is_good : bool, optional
-        Look just below the start first, and stop where nothing is found.
     """
     if tolerance is None:
         tolerance = LEVEL_TOLERANCE if problem.order <= FEW_STATES else COARSE_LEVEL_TOLERANCE
@@ -133,16 +119,6 @@ def noise_weighted_filters(
     The noise of the problem, times a weight, is one more disturbance.  At the level ``gain`` for both together the gain
     of the true disturbance alone is lower; at a higher level the weight may be larger, and must then be searched with
     the true gain.
-
-    Parameters
-    ----------
-    problem : GainProblem
-        With measurements; without a noise model its noise is a unit one on the free measurements, so that little
-        noise means small gains.
-    gain : float
-        Bound on the true gain of the disturbance.
-    reaches : callable
-        Whether the true gain of a filter is within that bound.
     """
     work = with_least_weight(problem)
     sizes = [float(np.linalg.norm(np.vstack(pair))) for pair in ((work.B, work.D), (work.Bn, work.Dn))]

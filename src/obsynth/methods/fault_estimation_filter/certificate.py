@@ -33,15 +33,6 @@ def bounded_real_certificate(
     """Return Q ``(core, core)``, upper triangular with P = Q'Q, for the shipped observer at level ``gain``.
 
     The Riccati solution with the largest slack that gives a proof; the last try when none does, for the report.
-
-    Parameters
-    ----------
-    plant, observer, tracking, lag
-        As for `obsynth.verification.bounded_real.prove_bounded_real`.
-    gain : float
-        Level to certify.
-    core : int
-        Leading observer states that carry the fault estimate.
     """
     errors = ErrorSystem.of(plant, observer, tracking, lag)
     a, b = observer.Az[:core, :core], errors.disturbance[:core] / gain

@@ -27,33 +27,14 @@ MOST_NAMES = 4
 def fault_filter_conditions(
     plant: DescriptorSystem, *, structure: PencilStructure | None = None
 ) -> tuple[Condition, ...]:
-    """Return the existence conditions of the fault-estimation filter, in order; the list ends at the first failure.
-
-    Parameters
-    ----------
-    plant : DescriptorSystem
-        Any plant.
-    structure : PencilStructure, optional
-        Of the plant's E and A, where it is known.
-    """
+    """Return the existence conditions of the fault-estimation filter, in order; the list ends at the first failure."""
     return examine_fault_filter(plant, structure=structure)[0]
 
 
 def examine_fault_filter(
     plant: DescriptorSystem, *, structure: PencilStructure | None = None
 ) -> tuple[tuple[Condition, ...], PreparedPlant | None]:
-    """Return the existence conditions, and the prepared plant on which the last of them were decided.
-
-    Parameters
-    ----------
-    plant, structure
-        As for `fault_filter_conditions`.
-
-    Returns
-    -------
-    tuple
-        The list of conditions, which ends at the first failure, and ``prepare(plant)`` where the ranks allow it.
-    """
+    """Return the existence conditions, and the prepared plant on which the last of them were decided."""
     prepared: PreparedPlant | None = None
 
     def visibility_conditions() -> list[Condition]:

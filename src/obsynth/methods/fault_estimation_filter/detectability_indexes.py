@@ -25,18 +25,9 @@ REFUSE_CONDITION = 1e8
 class FaultDetectability:
     """Detectability indexes and matrices of the pair ``(TA, C)`` for the fault directions ``TF``.
 
-    Parameters
-    ----------
-    indexes : tuple of int or None
-        ``rho_i``: steps from fault i to the outputs; ``None`` when it never reaches them.
-    Psi : FloatArray
-        ``(nx, nf)``, columns ``(TA)^(rho_i - 1) T f_i``; zero for infinite indexes.
-    Upsilon : FloatArray
-        ``C Psi (ny, nf)``.
-    rank : RankDecision
-        Rank of Upsilon.
-    condition_number : float
-        Of Upsilon, columns scaled to unit length.
+    Fields: indexes: ``rho_i``: steps from fault i to the outputs; ``None`` when it never reaches them; Psi: ``(nx,
+    nf)``, columns ``(TA)^(rho_i - 1) T f_i``; zero for infinite indexes; Upsilon: ``C Psi (ny, nf)``; rank: Rank of
+    Upsilon; condition_number: Of Upsilon, columns scaled to unit length.
     """
 
     indexes: tuple[int | None, ...]
@@ -61,10 +52,7 @@ class FaultDetectability:
 def fault_detectability(ta: FloatArray, c: FloatArray, tf: FloatArray) -> FaultDetectability:
     """Return the detectability indexes (19) and matrices (20).
 
-    Parameters
-    ----------
-    ta, c, tf : FloatArray
-        ``(nx, nx)``, ``(ny, nx)`` and ``(nx, nf)``.
+    Shapes: ``ta (nx, nx)``, ``c (ny, nx)``, ``tf (nx, nf)``.
     """
     size = float(np.linalg.norm(c, 2))
     results = [_first_visible(ta, c, tf[:, i], size) for i in range(tf.shape[1])]

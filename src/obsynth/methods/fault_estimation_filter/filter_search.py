@@ -36,18 +36,8 @@ MOST_STATES_TO_POLISH = 64
 class FoundGains:
     """What the search for gains found.
 
-    Parameters
-    ----------
-    problem : GainProblem
-        What it was about in the end.
-    least : LeastGain
-        The least gain found.
-    gamma : float
-        The gain that is claimed.
-    chosen : Injection
-        The gains that are shipped.
-    records : list of dict
-        Solver runs of the choice of small gains.
+    Fields: problem: What it was about in the end; least: The least gain found; gamma: The gain that is claimed; chosen:
+    The gains that are shipped; records: Solver runs of the choice of small gains.
     """
 
     problem: GainProblem
@@ -65,21 +55,7 @@ class FoundGains:
 def found_gains(
     problem: GainProblem, asked: FilterOptions, engine: str, *, noisy: bool, progress: Callable[[str], None]
 ) -> FoundGains:
-    """Search the least gain, and small gains for a slightly larger one.
-
-    Parameters
-    ----------
-    problem : GainProblem
-        With or without a limit on the weight.
-    asked : FilterOptions
-        Of the method.
-    engine : str
-        ``auto``, ``riccati`` or ``lmi``.
-    noisy : bool
-        Whether noise is stated.
-    progress : callable
-        Told what is being done.
-    """
+    """Search the least gain, and small gains for a slightly larger one."""
     size = max(problem.disturbance_size, NOMINAL_GAIN)
     progress("searching the least gain")
     least = _least_gain(problem, asked, engine)
@@ -106,15 +82,7 @@ def found_gains(
 def found_within(
     problem: GainProblem, limited: GainProblem, asked: FilterOptions, *, noisy: bool, progress: Callable[[str], None]
 ) -> FoundGains:
-    """Search gains with a limit on the weight, which Riccati equations do not cover.
-
-    Parameters
-    ----------
-    problem, limited : GainProblem
-        Without and with the limit.
-    asked, noisy, progress
-        As for `found_gains`.
-    """
+    """Search gains with a limit on the weight, which Riccati equations do not cover."""
     if asked.engine == "auto" and limited.weight_limit is not None:
         # They do where the limit costs nothing: what is found without it keeps it.
         try:

@@ -20,19 +20,6 @@ def bisected_gain(
 
     Algorithm 1 of the paper, made to end: every upper end of the bracket is the true norm of a filter in hand, and
     the lower end is a level at which none was found.
-
-    Parameters
-    ----------
-    problem : GainProblem
-        Normalised.
-    start : Injection
-        A stable filter: its own norm is the first upper end.
-    tolerance : float
-        Relative width of the bracket at which to stop.
-    solver : str
-        Name of the solver.
-    polish : bool
-        Whether the matrix inequality is asked where the central filter does not reach a level.
     """
     best, high, low = start, problem.achieved_gain(start), 0.0
     records = []

@@ -36,12 +36,7 @@ HALVINGS = 2
 class Reached:
     """A level at which the equation has a solution of the right signs.
 
-    Parameters
-    ----------
-    level, margin : float
-        See `CentralEquation.filter_and_margin`.
-    injection : Injection
-        The central filter.
+    Fields: level, margin: See `CentralEquation.filter_and_margin`; injection: The central filter.
     """
 
     level: float
@@ -53,22 +48,11 @@ class Reached:
 class Descent:
     """The way down from ``high`` to the least level of an equation.
 
-    Parameters
-    ----------
-    equation : CentralEquation
-        For all levels.
-    low, high : float
-        No gain is below ``low``; nothing at or above ``high`` is of use.  The bracket, as it shrinks.
-    tolerance : float
-        Relative width of the bracket at which to stop.
-    reached : list of Reached
-        Levels with a solution, from the highest to the lowest.
-    settled : bool
-        Whether the margin tells that nothing is below the last level.
-    wary : bool
-        Whether to expect rounding: the first filter is judged, and a few failures in a narrow bracket end the descent.
-    judged : bool
-        Whether a level counts only when its filter keeps its promise.
+    Fields: equation: For all levels; low, high: No gain is below ``low``; nothing at or above ``high`` is of use.  The
+    bracket, as it shrinks; tolerance: Relative width of the bracket at which to stop; reached: Levels with a solution,
+    from the highest to the lowest; settled: Whether the margin tells that nothing is below the last level; wary:
+    Whether to expect rounding: the first filter is judged, and a few failures in a narrow bracket end the descent;
+    judged: Whether a level counts only when its filter keeps its promise.
     """
 
     equation: CentralEquation

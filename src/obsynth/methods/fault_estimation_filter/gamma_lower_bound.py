@@ -19,8 +19,8 @@ from obsynth.methods.fault_estimation_filter.injection_problem import (
 )
 from obsynth.methods.fault_estimation_filter.output_nulling import (
     invisible_pairs,
-    invisible_part,
     null_space,
+    output_nulling_part,
     strict_point,
 )
 from obsynth.numerics.arrays import FloatArray
@@ -40,17 +40,6 @@ def proved_lower_bound(
 
     The dual is solved in the coordinates of the starting filter, then in those of the best one; and in turn without the
     disturbances that are negligible beside the largest, which only make the bound lower.
-
-    Parameters
-    ----------
-    problem : GainProblem
-        In the original coordinates.
-    solver : str
-        Name of the solver.
-    best : Injection, optional
-        Gains of the best filter found.
-    enough : float, optional
-        A bound above this is not improved upon.
 
     Notes
     -----
@@ -82,7 +71,7 @@ def _with_fewer_disturbances(problem: GainProblem) -> Iterator[GainProblem]:
 
 
 def _bound_in(normalised: NormalisedProblem, solver: str) -> float:
-    work = invisible_part(normalised.problem)
+    work = output_nulling_part(normalised.problem)
     if work.disturbances == 0:
         return 0.0
     if work.order == 0:
@@ -105,7 +94,7 @@ def _direct_bound(work: GainProblem) -> float:
 class _DualProblem:
     """Data of the dual inequalities, in coordinates in which a strictly feasible point is about the identity.
 
-    ``Q = image Z1 image' - top Z1 top'``; ``shown`` and ``bottom`` are xi and d on the invisible directions,
+    ``Q = image Z1 image' - top Z1 top'``; ``shown`` and ``bottom`` are xi and d on the output-nulling directions,
     ``outputs`` is xi on states and disturbance.
     """
 
@@ -174,26 +163,7 @@ def _checked_bound(dual: _DualProblem, z1: FloatArray, corner: FloatArray, last:
 
 
 def require_reachable(problem: GainProblem, least: LeastGain, gain: float, *, solver: str) -> None:
-    """Raise unless ``gain`` is within reach of the best filter found.
-
-    Parameters
-    ----------
-    problem : GainProblem
-        In the original coordinates.
-    least : LeastGain
-        The best filter found, with its true norm.
-    gain : float
-        Level asked for.
-    solver : str
-        Name of the solver.
-
-    Raises
-    ------
-    InfeasibleError
-        A checked lower bound lies above ``gain``.
-    SolverError
-        Neither a filter nor a proof was found.
-    """
+    """Raise unless ``gain`` is within reach of the best filter found."""
     best = least.gain
     if problem.disturbances == 0 or best <= gain:
         return

@@ -46,20 +46,9 @@ NOTHING_TO_POLISH = "reached: the disturbance does as much before any measuremen
 class LeastGain:
     """The outcome of the search for the least gain.
 
-    Parameters
-    ----------
-    gain : float
-        True norm of the best filter found (0 without disturbance).
-    first : NormalisedProblem
-        Coordinates made from the starting (Kalman) filter.
-    injection : Injection
-        Its gains, in the original coordinates.
-    starting_gain : float
-        Norm of the starting filter, the natural scale.
-    bracket : tuple of float
-        Bisection: the final bracket; direct search: the same number twice.
-    records : list
-        Solver records.
+    Fields: gain: True norm of the best filter found (0 without disturbance); first: Coordinates made from the starting
+    (Kalman) filter; injection: Its gains, in the original coordinates; starting_gain: Norm of the starting filter, the
+    natural scale; bracket: Bisection: the final bracket; direct search: the same number twice; records: Solver records.
     """
 
     gain: float
@@ -78,22 +67,7 @@ def coordinates(
 
 
 def search_least_gain(problem: GainProblem, *, solver: str, polish: bool = True) -> LeastGain:
-    """Minimise the gain directly, improving the coordinates between passes.
-
-    Parameters
-    ----------
-    problem : GainProblem
-        In the original coordinates.
-    solver : str
-        Name of the solver.
-    polish : bool, optional
-        Whether the matrix inequality has the last word, or the Riccati equations are left alone.
-
-    Raises
-    ------
-    SolverError
-        No pass gave a stable filter.
-    """
+    """Minimise the gain directly, improving the coordinates between passes."""
     first = normalised = coordinates(problem, solver=solver)
     best, gain = first.start, first.start_gain
     starting = gain

@@ -42,16 +42,8 @@ RECOVERY_ROOM = 1e-6
 class GainSolution:
     """A solution in normalised coordinates.
 
-    Parameters
-    ----------
-    gain : float
-        The level g of the inequality.
-    P : FloatArray
-        Lyapunov matrix ``(n, n)``.
-    injection : Injection
-        Gains.
-    record : dict
-        Record of the solver run.
+    Fields: gain: The level g of the inequality; P: Lyapunov matrix ``(n, n)``; injection: Gains; record: Record of the
+    solver run.
     """
 
     gain: float
@@ -173,22 +165,7 @@ def injection_for(problem: GainProblem, p: FloatArray, gain: float, *, v: FloatA
 
 
 def least_gain(problem: GainProblem, *, solver: str, ceiling: float = P_CEILING) -> GainSolution:
-    """Minimise the gain by the eliminated inequality.
-
-    Parameters
-    ----------
-    problem : GainProblem
-        Normalised.
-    ceiling : float, optional
-        Bound on P: on its mean eigenvalue in the eliminated form.
-    solver : str
-        Name of the solver.
-
-    Raises
-    ------
-    SolverError
-        No usable answer.
-    """
+    """Minimise the gain by the eliminated inequality."""
     squared = lmi.scalar_variable()
     inequality = _eliminated_inequality(problem, squared, ceiling=ceiling)
     record = lmi.minimise(squared, inequality.constraints, what="least gain", solver=solver)
@@ -220,23 +197,6 @@ def small_gains(problem: GainProblem, gain: float, *, solver: str, decay: float 
     Minimises the trace of X, a bound on ``(Bn - R Dn)' P (Bn - R Dn) + (Zn + V Dn)'(Zn + V Dn)``: the variance of
     xi under the noise of the problem.  Without a noise model the caller gives unit noise on the free
     measurements, and the objective is then the size of R (and V) itself.
-
-    Parameters
-    ----------
-    problem : GainProblem
-        Normalised, with noise columns.
-    gain : float
-        Level g; of no effect without disturbances.
-    solver : str
-        Name of the solver.
-    decay : float, optional
-        Bound on the spectral radius, at most 1: the inequality is asked for with ``(A - R C) / decay``, which costs a
-        little gain.
-
-    Raises
-    ------
-    SolverError
-        No usable answer.
     """
     n, q, nw = problem.order, problem.Z.shape[0], problem.Bn.shape[1]
     p, x = lmi.symmetric_variable(n), lmi.symmetric_variable(nw)

@@ -30,12 +30,7 @@ ROUNDING = 1e-12
 class WeightLimit:
     """A bound on the spectral norm of the weight ``fixed + V free``.
 
-    Parameters
-    ----------
-    fixed, free : FloatArray
-        ``(q, ny)`` and ``(m, ny)``.
-    bound : float
-        Positive.
+    Fields: fixed, free: ``(q, ny)`` and ``(m, ny)``; bound: Positive.
     """
 
     fixed: FloatArray
@@ -54,18 +49,9 @@ class WeightLimit:
 class GainProblem:
     """Data of the problem: find R (and V) so that the gain d -> xi is small.
 
-    Parameters
-    ----------
-    A, C, Z : FloatArray
-        ``(n, n)``, ``(m, n)``, ``(q, n)``.
-    B, D, Zd : FloatArray
-        Disturbance: ``(n, nd)``, ``(m, nd)``, ``(q, nd)``.
-    Bn, Dn, Zn : FloatArray
-        Noise of unit covariance: ``(n, nw)``, ``(m, nw)``, ``(q, nw)``.
-    free_weight : bool
-        Whether V ``(q, m)`` is free.
-    weight_limit : WeightLimit, optional
-        Bound on the weight that V is a part of.
+    Fields: A, C, Z: ``(n, n)``, ``(m, n)``, ``(q, n)``; B, D, Zd: Disturbance: ``(n, nd)``, ``(m, nd)``, ``(q, nd)``;
+    Bn, Dn, Zn: Noise of unit covariance: ``(n, nw)``, ``(m, nw)``, ``(q, nw)``; free_weight: Whether V ``(q, m)`` is
+    free; weight_limit: Bound on the weight that V is a part of.
     """
 
     A: FloatArray
@@ -152,12 +138,7 @@ class GainProblem:
 class Injection:
     """Gains of the error system.
 
-    Parameters
-    ----------
-    R : FloatArray
-        ``(n, m)``.
-    V : FloatArray
-        ``(q, m)``; zero when the weight is fixed.
+    Fields: R: ``(n, m)``; V: ``(q, m)``; zero when the weight is fixed.
     """
 
     R: FloatArray
@@ -177,20 +158,10 @@ class NormalisedProblem:
     inequality is close to the identity; the disturbance is scaled so that the gain is close to one; the
     measurements are made orthonormal.
 
-    Parameters
-    ----------
-    problem : GainProblem
-        In the new coordinates.
-    states : FloatArray
-        ``S (n, n)``, old state = S new state.
-    measurements : FloatArray
-        ``K (m, m)``, new measurement = K old measurement.
-    gain : float
-        Gain of the starting filter: old gain = gain * new gain (1 without disturbance).
-    start : Injection
-        The starting filter in the original coordinates; stable.
-    start_gain : float
-        Its true gain (0 without disturbance).
+    Fields: problem: In the new coordinates; states: ``S (n, n)``, old state = S new state; measurements: ``K (m, m)``,
+    new measurement = K old measurement; gain: Gain of the starting filter: old gain = gain * new gain (1 without
+    disturbance); start: The starting filter in the original coordinates; stable; start_gain: Its true gain (0 without
+    disturbance).
     """
 
     problem: GainProblem
@@ -218,25 +189,7 @@ class NormalisedProblem:
 def normalise(
     problem: GainProblem, *, start: Injection | None = None, gain: float | None = None, rotate: bool = True
 ) -> NormalisedProblem:
-    """Return the problem in well-scaled coordinates.
-
-    Parameters
-    ----------
-    problem : GainProblem
-        In any coordinates.
-    start : Injection, optional
-        Gains of a stable filter, the closer to the optimum the better; a Kalman filter by default.
-    gain : float, optional
-        The true gain of ``start``, where it is known.
-    rotate : bool, optional
-        Change the states as a whole, not only their scale.  First-order solvers do better without: in normalised
-        coordinates the solution reaches from one up to the ceiling on P.
-
-    Raises
-    ------
-    SolverError
-        No stable starting filter was found; existence conditions should have told why before.
-    """
+    """Return the problem in well-scaled coordinates."""
     start = start if start is not None else _starting_filter(problem)
     # As a scale, a gain that is attained is as good as the largest one, and for many states much cheaper.
     gain = highest_gain_found(*problem.closed_loop(start)) if gain is None else gain

@@ -1,8 +1,8 @@
 """What no measurement sees: the states that a disturbance can move, or that can grow, with the measurement at zero.
 
-An invisible pair is (x, d) with ``C x + D d = 0``; it leads to the state ``A x + B d`` whatever the gains.  Two kinds
-of states matter for what no filter can do better: those reached from rest by invisible pairs, and those that grow
-invisibly from far back in time (invariant zeros from d to the measurement outside the unit circle).
+An output-nulling pair is (x, d) with ``C x + D d = 0``; it leads to the state ``A x + B d`` whatever the gains.  Two
+kinds of states matter for what no filter can do better: those reached from rest by output-nulling pairs, and those
+that grow unseen from far back in time (invariant zeros from d to the measurement outside the unit circle).
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ def _range(matrix: FloatArray) -> FloatArray:
 
 
 def invisible_pairs(problem: GainProblem) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the states, the disturbances and the next states of a basis of the invisible pairs."""
+    """Return the states, the disturbances and the next states of a basis of the output-nulling pairs."""
     basis = null_space(np.hstack([problem.C, problem.D]))
     return basis[: problem.order], basis[problem.order :], np.hstack([problem.A, problem.B]) @ basis
 
 
 def _reached_from_rest(top: FloatArray, image: FloatArray) -> FloatArray:
-    """Return a basis of the least subspace that contains the next state of each invisible pair whose state is in it."""
+    """Return a basis of the least subspace with the next state of each output-nulling pair whose state is in it."""
     subspace = np.zeros((top.shape[0], 0))
     while True:
         pairs = null_space(np.hstack([top, -subspace]))[: top.shape[1]]
@@ -74,7 +74,7 @@ def _growing(top: FloatArray, image: FloatArray, reached: FloatArray) -> FloatAr
     return np.asarray(top @ pairs @ vectors[:, :count])
 
 
-def invisible_part(problem: GainProblem) -> GainProblem:
+def output_nulling_part(problem: GainProblem) -> GainProblem:
     """Return the problem on the states that matter for what no filter can do better.
 
     Outside of them the dual inequalities have no strict solution; restricted to them they lose nothing.
@@ -94,12 +94,9 @@ def invisible_part(problem: GainProblem) -> GainProblem:
 
 
 def strict_point(top: FloatArray, image: FloatArray) -> FloatArray:
-    """Return ``Z1 > 0`` with ``image Z1 image' - top Z1 top' > 0``: what invisible pairs of all kinds add up to.
+    """Return ``Z1 > 0`` with ``image Z1 image' - top Z1 top' > 0``: what output-nulling pairs of all kinds add up to.
 
-    Parameters
-    ----------
-    top, image : FloatArray
-        ``(n, k)``: states and next states of the invisible pairs of a problem made by `invisible_part`.
+    Shapes: ``top (n, k)``, ``image (n, k)``.
     """
     point, reached = _pairs_from_rest(top, image)
     outside = null_space(reached.T) if reached.shape[1] else np.eye(top.shape[0])

@@ -33,22 +33,11 @@ from obsynth.plants.descriptor import DescriptorSystem
 class PreparedPlant:
     """A plant in the form the filter's theory works on: sensor faults as states, balanced, ``T E + N C = I``.
 
-    Parameters
-    ----------
-    plant : DescriptorSystem
-        With sensor faults appended as algebraic states; not balanced.
-    scaling : Scaling
-        Power-of-two factors of the balanced coordinates, in which everything below is given.
-    T, N : FloatArray
-        ``(na, na)`` and ``(na, ny)``, na states after appending.
-    TA, C, TF : FloatArray
-        ``(na, na)``, ``(ny, na)``, ``(na, nf)``.
-    Bd, Dd : FloatArray
-        Disturbance in the error system ``(na, nd)`` and in the innovation ``(ny, nd)``.
-    Bw, Dw : FloatArray
-        Noise likewise, ``(na, nw)`` and ``(ny, nw)``.
-    detectability : FaultDetectability
-        Indexes, Psi and Upsilon.
+    Fields: plant: With sensor faults appended as algebraic states; not balanced; scaling: Power-of-two factors of the
+    balanced coordinates, in which everything below is given; T, N: ``(na, na)`` and ``(na, ny)``, na states after
+    appending; TA, C, TF: ``(na, na)``, ``(ny, na)``, ``(na, nf)``; Bd, Dd: Disturbance in the error system ``(na, nd)``
+    and in the innovation ``(ny, nd)``; Bw, Dw: Noise likewise, ``(na, nw)`` and ``(ny, nw)``; detectability: Indexes,
+    Psi and Upsilon.
     """
 
     plant: DescriptorSystem
@@ -66,13 +55,7 @@ class PreparedPlant:
 
 
 def with_sensor_faults_as_states(plant: DescriptorSystem) -> DescriptorSystem:
-    """Return the plant with every fault that reaches an output directly appended as an algebraic state.
-
-    Raises
-    ------
-    PreconditionError
-        ``rank [E 0; 0 0; C Df]`` is too small; the faults are named.
-    """
+    """Return the plant with every fault that reaches an output directly appended as an algebraic state."""
     direct = tuple(name for name, column in zip(plant.fault_names, plant.Df.T, strict=True) if np.any(column != 0.0))
     return augment_faults(plant, direct).plant if direct else plant
 
@@ -80,12 +63,7 @@ def with_sensor_faults_as_states(plant: DescriptorSystem) -> DescriptorSystem:
 def prepare(plant: DescriptorSystem, s: FloatArray | None = None) -> PreparedPlant:
     """Return the prepared plant; the rank conditions must hold.
 
-    Parameters
-    ----------
-    plant : DescriptorSystem
-        Discrete time, with faults.
-    s : FloatArray, optional
-        The paper's free matrix S ``(na, na + ny)``, for the plant as given.
+    Shapes: ``s (na, na + ny)``.
     """
     work = with_sensor_faults_as_states(plant)
     scaling = balance_system(work.E, work.A, inputs=[work.Bf], outputs=[work.C])

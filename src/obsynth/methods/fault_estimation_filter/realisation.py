@@ -21,19 +21,7 @@ def realise_filter(
     gains: dict[str, FloatArray],
     detectability: FaultDetectability,
 ) -> tuple[LinearObserver, FloatArray, int]:
-    """Return the observer, its tracking map ``(nz, nx (lag + 1))`` and the lag of its state estimates.
-
-    Parameters
-    ----------
-    plant : DescriptorSystem
-        The user's plant.
-    work : DescriptorSystem
-        The plant with its sensor faults appended as states (the same plant when there are none).
-    gains : dict
-        ``T (na, na)``, ``N (na, ny)``, ``L (na, ny)``, ``W (nf, ny)``.
-    detectability : FaultDetectability
-        Indexes of the faults; all finite.
-    """
+    """Return the observer, its tracking map ``(nz, nx (lag + 1))`` and the lag of its state estimates."""
     t, n, feedback, w = (gains[letter] for letter in "TNLW")
     nx, na, nf = plant.nx, work.nx, plant.nf
     indexes = [int(index or 1) for index in detectability.indexes]

@@ -21,10 +21,7 @@ def restricted_equivalent(e: FloatArray, c: FloatArray) -> tuple[FloatArray, Flo
     of U span the null space of :math:`E^T`, those of K span :math:`C^T C \ker E`, and Q is the orthogonal polar
     factor of :math:`K^T U`.
 
-    Parameters
-    ----------
-    e, c : FloatArray
-        ``(nx, nx)`` and ``(ny, nx)`` with ``rank [E; C] = nx``.
+    Shapes: ``e (nx, nx)``, ``c (ny, nx)``.
     """
     stacked = np.vstack([e, c])
     # W^-1 [E' C'] is the pseudo-inverse; by QR, and one refinement, it is accurate where forming W is not.
@@ -45,17 +42,7 @@ def restricted_equivalent(e: FloatArray, c: FloatArray) -> tuple[FloatArray, Flo
 def restricted_equivalent_from(e: FloatArray, c: FloatArray, s: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return T and N by the paper's general solution (16)-(17) with its free matrix S.
 
-    Parameters
-    ----------
-    e, c : FloatArray
-        ``(nx, nx)`` and ``(ny, nx)`` with ``rank [E; C] = nx``.
-    s : FloatArray
-        ``(nx, nx + ny)``.
-
-    Raises
-    ------
-    SpecError
-        S has the wrong shape, or makes T singular.
+    Shapes: ``e (nx, nx)``, ``c (ny, nx)``, ``s (nx, nx + ny)``.
     """
     nx, ny = e.shape[0], c.shape[0]
     if s.shape != (nx, nx + ny):

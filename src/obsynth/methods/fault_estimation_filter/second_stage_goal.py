@@ -14,16 +14,8 @@ from obsynth.numerics.norms import spectral_radius
 class Goal:
     """What a filter must meet, and what it shall cost little of.
 
-    Parameters
-    ----------
-    problem : GainProblem
-        In the original coordinates.
-    gain : float
-        Bound on the true gain.
-    slowest : float
-        Spectral radius above which a filter forgets too slowly.
-    judged : dict
-        Filters that were asked for before, by identity.
+    Fields: problem: In the original coordinates; gain: Bound on the true gain; slowest: Spectral radius above which a
+    filter forgets too slowly; judged: Filters that were asked for before, by identity.
     """
 
     problem: GainProblem

@@ -42,24 +42,6 @@ def small_gain_design(
 
     Central filters that weigh the noise, and solutions of the inequality, compete; where both fail, the filter of the
     search is left.  The records say what was tried.
-
-    Parameters
-    ----------
-    problem : GainProblem
-        In the original coordinates.
-    least : LeastGain
-        Where the search ended.
-    gain : float
-        Level asked for.
-    solver : str
-        Name of the solver.
-    engine : {"auto", "riccati", "lmi"}
-        Whether the inequality may compete; "auto" lets it where a small problem has no central filter.
-
-    Raises
-    ------
-    SolverError
-        Nothing reached ``gain``.
     """
     records: list[dict[str, Any]] = []
     if problem.measured == 0:

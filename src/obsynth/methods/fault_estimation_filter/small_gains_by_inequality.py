@@ -31,17 +31,6 @@ def gains_by_inequality(goal: Goal, least: LeastGain, records: list[dict[str, An
 
     The bounds on P mean something else in other coordinates, and those of the least gain can be extreme: as long as
     that gains much, the inequality is solved again in the coordinates of what it gave.
-
-    Parameters
-    ----------
-    goal : Goal
-        What must be met, and what shall be small.
-    least : LeastGain
-        Where the search ended.
-    records : list
-        Takes the records of the solver runs.
-    solver : str
-        Name of the solver.
     """
     problem, gain, fresh = goal.problem, goal.gain, least.first
     candidates: list[Injection] = []

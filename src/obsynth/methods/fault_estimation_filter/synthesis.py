@@ -10,7 +10,7 @@ Our deviations
     4. Only the part of Y that matters is a variable (Y = y V', V = null Upsilon'), or none at all (eliminated form).
     5. gamma^2 is minimised directly; Algorithm 1 never advances past one step, our bisection ends with a bracket.
     6. A second stage at a slightly larger gamma picks small gains: the bare optimum has condition numbers of 1e7.
-    7. Feedthrough of inputs, faults, disturbances and noise, exactly (see `obsynth.methods.fault_estimation_filter.prepared_plant`).
+    7. Feedthrough of inputs, faults, disturbances and noise, exactly (see `prepared_plant`).
     8. What is shipped corrects the state estimate, which the paper leaves biased by Psi.
 """
 
@@ -197,13 +197,7 @@ def centred(problem: GainProblem, prepared: PreparedPlant, parts: _Parts) -> tup
 
 
 def with_weight_limit(problem: GainProblem, prepared: PreparedPlant, parts: _Parts, bound: float) -> GainProblem:
-    """Return the problem with the norm of W bounded, in the user's output units.
-
-    Raises
-    ------
-    InfeasibleError
-        Every W with ``W Upsilon = I`` has a larger norm.
-    """
+    """Return the problem with the norm of W bounded, in the user's output units."""
     outputs = prepared.scaling.outputs
     smallest = 1.0 / float(np.linalg.svd(prepared.detectability.Upsilon / outputs[:, None], compute_uv=False)[-1])
     if smallest >= bound:

@@ -14,17 +14,7 @@ from obsynth.plants.descriptor import DescriptorSystem
 def with_faults_as_states(plant: DescriptorSystem, gain: FloatArray | None = None) -> DescriptorSystem:
     """Return the plant with state ``[x; phi]``, f = G phi, ``phi' = v``: what drives it is the rate v of the fault.
 
-    Parameters
-    ----------
-    plant : DescriptorSystem
-        Continuous time, ``E = I``.
-    gain : FloatArray, optional
-        G ``(nf, nf)``; the identity by default.
-
-    Returns
-    -------
-    DescriptorSystem
-        ``A (nx + nf, nx + nf)`` = ``[A, Bf G; 0, 0]``, ``C`` = ``[C, Df G]``, and the rate of phi in ``Bf``.
+    Shapes: ``gain (nf, nf)``.
     """
     nx, nf = plant.nx, plant.nf
     g = np.eye(nf) if gain is None else gain
@@ -54,13 +44,7 @@ def with_faults_as_states(plant: DescriptorSystem, gain: FloatArray | None = Non
 
 
 def with_sensor_noise(plant: DescriptorSystem) -> DescriptorSystem:
-    """Return the plant itself where it states noise, else the plant with unit noise on every output.
-
-    Parameters
-    ----------
-    plant : DescriptorSystem
-        Any plant.
-    """
+    """Return the plant itself where it states noise, else the plant with unit noise on every output."""
     if plant.nw:
         return plant
     return plant.replace(Bw=np.zeros((plant.nx, plant.ny)), Dw=np.eye(plant.ny), noise_names=None)

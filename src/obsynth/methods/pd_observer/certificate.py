@@ -30,17 +30,7 @@ SLACKS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)
 def explicit_certificate(
     Az: FloatArray, estimate: FloatArray, *, decay: float
 ) -> tuple[FloatArray, FloatArray, float] | None:
-    """Return P1, P3 ``(n, n)`` and delta for a shipped observer; ``None`` when its errors do not decay so fast.
-
-    Parameters
-    ----------
-    Az : FloatArray
-        ``(n, n)``, the observer's dynamics.
-    estimate : FloatArray
-        ``(n, n)``, from the observer's states to the estimates of states and faults, ``(I + L C)^-1``.
-    decay : float, 1/seconds
-        Rate to certify.
-    """
+    """Return P1, P3 ``(n, n)`` and delta for a shipped observer; ``None`` when its errors do not decay so fast."""
     from scipy.linalg import matrix_balance
 
     moving = Az + decay * np.eye(len(Az))
@@ -62,14 +52,8 @@ def explicit_certificate(
 class SymmetricCertificate:
     """A certificate with a symmetric P3 for an observer with L = 0, for every delta below a limit.
 
-    Parameters
-    ----------
-    P3 : FloatArray
-        ``(n, n)``, positive definite: ``A' P3 + P3 A = -weight`` for the observer's dynamics A.
-    weight : FloatArray
-        ``(n, n)``, positive definite.
-    limit : float, seconds
-        The delta from which it does not serve; infinite where it always does.
+    Fields: P3: ``(n, n)``, positive definite: ``A' P3 + P3 A = -weight`` for the observer's dynamics A; weight: ``(n,
+    n)``, positive definite; limit: The delta from which it does not serve; infinite where it always does.
     """
 
     P3: FloatArray
@@ -87,12 +71,7 @@ def symmetric_certificate(Az: FloatArray, *, decay: float) -> SymmetricCertifica
     With ``P1 = P3 + (delta / 2) weight``, the lower left block of the inequality is delta times the skew part S of
     ``P3 A``, so that it holds when ``weight > (delta / 2) S' P3^-1 S``.
 
-    Parameters
-    ----------
-    Az : FloatArray
-        ``(n, n)``, the observer's dynamics.
-    decay : float, 1/seconds
-        Rate to certify.
+    Shapes: ``Az (n, n)``.
     """
     from scipy.linalg import eigvalsh, matrix_balance
 
@@ -115,13 +94,6 @@ def coupled_certificate(a: FloatArray, delta: float) -> tuple[FloatArray, FloatA
     """Return P1 and P3 ``(n, n)`` of Theorem 1 for a stable observer with L = 0 and this delta.
 
     Nothing but noise where ``-1 / delta`` is an eigenvalue: the inequality is then another one.
-
-    Parameters
-    ----------
-    a : FloatArray
-        ``(n, n)``, the observer's dynamics, stable.
-    delta : float, seconds
-        Positive.
     """
     from scipy.linalg import matrix_balance
 
@@ -136,14 +108,7 @@ def gain_certificate(a: FloatArray, b: Ball, c: FloatArray, gain: float) -> Floa
 
     The Riccati solution with the largest slack that gives a proof.
 
-    Parameters
-    ----------
-    a, c : FloatArray
-        ``(n, n)``, ``(p, n)``.
-    b : Ball
-        ``(n, m)``.
-    gain : float
-        Level.
+    Shapes: ``a (n, n)``, ``c (p, n)``, ``b (n, m)``.
     """
     from scipy.linalg import matrix_balance, solve_continuous_are
 

@@ -29,13 +29,7 @@ _SOURCE = "Filasova et al., eqs. (1), (2)"
 
 
 def pd_observer_conditions(plant: DescriptorSystem) -> tuple[Condition, ...]:
-    """Return the existence conditions of the PD observer, in order; the list ends at the first failure.
-
-    Parameters
-    ----------
-    plant : DescriptorSystem
-        Any plant; one with singular E is judged after its algebraic states are eliminated.
-    """
+    """Return the existence conditions of the PD observer, in order; the list ends at the first failure."""
     found: list[Condition] = []
     for condition in _all_conditions(plant):
         found.append(condition)
@@ -45,13 +39,7 @@ def pd_observer_conditions(plant: DescriptorSystem) -> tuple[Condition, ...]:
 
 
 def explicit_form(plant: DescriptorSystem) -> Transformation | None:
-    """Return the elimination of the algebraic states; ``None`` for a plant with ``E = I``.
-
-    Parameters
-    ----------
-    plant : DescriptorSystem
-        Regular, index 0 or 1.
-    """
+    """Return the elimination of the algebraic states; ``None`` for a plant with ``E = I``."""
     return None if np.array_equal(plant.E, np.eye(plant.nx)) else eliminate_algebraic_states(plant)
 
 

@@ -19,19 +19,7 @@ from obsynth.results.delta_scan import DeltaScan
 
 
 def scan_delta(plant: DescriptorSystem, asked: PdOptions, deltas: NDArray[np.float64], *, decay: float) -> DeltaScan:
-    """Return what each delta gives; where it gives nothing, the reason.
-
-    Parameters
-    ----------
-    plant : DescriptorSystem
-        Continuous time, ``E = I``, the existence conditions hold.
-    asked : PdOptions
-        Everything but delta.
-    deltas : array_like
-        Seconds.
-    decay : float
-        Decay rate that is imposed for all, 1/seconds.
-    """
+    """Return what each delta gives; where it gives nothing, the reason."""
     columns = [_measured(plant, asked, float(delta), decay) for delta in deltas]
     numbers = np.array([numbers for numbers, _ in columns], dtype=np.float64).reshape(len(columns), -1)
     measured = dict(zip(DeltaScan.quantities(), (np.asarray(deltas, dtype=np.float64), *numbers.T), strict=True))

@@ -33,23 +33,7 @@ HIDDEN_SHARE = 0.5
 
 
 def design_gains(plant: DescriptorSystem, asked: PdOptions) -> tuple[PdGains, list[Mapping[str, Any]]]:
-    """Return the gains to ship and the records of all solver runs.
-
-    Parameters
-    ----------
-    plant : DescriptorSystem
-        Continuous time, ``E = I``, the existence conditions hold.
-    asked : PdOptions
-        Without a decay rate the plain gains are kept if their errors decay at `DECAY_SHARE` of the plant's fastest
-        mode; else that rate is imposed, or as much of it as `DECAY_PRICE` allows.
-
-    Raises
-    ------
-    InfeasibleError
-        What is asked is proved impossible.
-    SolverError
-        Nothing is known.
-    """
+    """Return the gains to ship and the records of all solver runs."""
     plain = gains_for(plant, asked, decay=0.0 if asked.decay is None else float(asked.decay))
     records = [plain.record]
     target = _default_decay(plant)
@@ -77,13 +61,7 @@ def _default_decay(plant: DescriptorSystem) -> float:
 
 
 def gains_for(plant: DescriptorSystem, asked: PdOptions, *, decay: float) -> PdGains:
-    """Return gains for one decay rate: of the first coordinates in which the answer is proved.
-
-    Raises
-    ------
-    InfeasibleError, SolverError
-        As for `design_gains`.
-    """
+    """Return gains for one decay rate: of the first coordinates in which the answer is proved."""
     delta = default_delta(plant, asked, decay)
     require_possible(plant, asked, delta=delta, decay=decay)
     failure = SolverError("The gains that the solver returned could not be proved to be stable: nothing is known.")

@@ -30,30 +30,13 @@ from obsynth.plants.descriptor import DescriptorSystem
 class PdGains:
     """Gains in the loop with what proves them.
 
-    Parameters
-    ----------
-    J, L : FloatArray
-        ``(nx + nf, ny)``: the paper's ``[J; G M]`` and ``[L; G N]``.
-    P1, P3 : FloatArray
-        Certificate ``(nx + nf, nx + nf)`` for the state ``[x; f]``.
-    ends : tuple of FloatArray
-        P1 at the ends of the range of adaptation gains, empty without one.
-    gain_certificates : mapping of str to FloatArray
-        ``P_rate`` and ``P_noise`` ``(nx + nf, nx + nf)``, for the bounds on l2 gains that were asked for.
-    theorem : int
-        The theorem that the certificate belongs to.
-    asked_delta, delta, decay : float
-        The delta that the gains were designed with and that of the certificate (seconds), and alpha (1/seconds).
-    observer : LinearObserver
-        The realisation.
-    proved : bool
-        Whether the certificate was proved.
-    record : mapping
-        Of the solver run.
-    proved_in_double_precision : bool
-        Whether that took no more digits.
-    engine : str
-        The engine that found the gains.
+    Fields: J, L: ``(nx + nf, ny)``: the paper's ``[J; G M]`` and ``[L; G N]``; P1, P3: Certificate ``(nx + nf, nx +
+    nf)`` for the state ``[x; f]``; ends: P1 at the ends of the range of adaptation gains, empty without one;
+    gain_certificates: ``P_rate`` and ``P_noise`` ``(nx + nf, nx + nf)``, for the bounds on l2 gains that were asked
+    for; theorem: The theorem that the certificate belongs to; asked_delta, delta, decay: The delta that the gains were
+    designed with and that of the certificate (seconds), and alpha (1/seconds); observer: The realisation; proved:
+    Whether the certificate was proved; record: Of the solver run; proved_in_double_precision: Whether that took no more
+    digits; engine: The engine that found the gains.
     """
 
     J: FloatArray

@@ -32,33 +32,13 @@ MARGIN = 1e-3
 class PdTask:
     """What is asked of the gains, in the coordinates in which it is solved.
 
-    Parameters
-    ----------
-    plants : tuple of (FloatArray, FloatArray)
-        Augmented ``A (n, n)`` and ``C (ny, n)``; more than one for a range of adaptation gains.
-    theorem : {1, 2}
-        Which theorem.
-    delta, decay : float
-        delta and alpha.
-    disk : tuple of float, optional
-        c and r: every eigenvalue within r of -c.
-    gain_bound : float, optional
-        Bound on the norm of ``[gain_unit J, L]``.
-    gain_unit : float
-        Factor from J here to the J that is bounded.
-    rate_gain : float, optional
-        Bound on the l2 gain from the rate of the fault to the fault error.
-    noise_gain : float, optional
-        Bound on the l2 gain from noise and its derivative, as separate inputs, to the fault error.
-    rate : FloatArray
-        ``(n, nf)``, where the rate enters.
-    shown : FloatArray
-        ``(nf, n)``, from the error to the fault error.
-    process, sensor, sensor_rate : FloatArray
-        ``(n, nw)``, ``(ny, nw)``, ``(ny, nw)``: where the noise enters the states and the outputs, and its derivative
-        the outputs.
-    has_derivative : bool
-        False for L = 0.
+    Fields: plants: Augmented ``A (n, n)`` and ``C (ny, n)``; more than one for a range of adaptation gains; theorem:
+    Which theorem; delta, decay: delta and alpha; disk: c and r: every eigenvalue within r of -c; gain_bound: Bound on
+    the norm of ``[gain_unit J, L]``; gain_unit: Factor from J here to the J that is bounded; rate_gain: Bound on the l2
+    gain from the rate of the fault to the fault error; noise_gain: Bound on the l2 gain from noise and its derivative,
+    as separate inputs, to the fault error; rate: ``(n, nf)``, where the rate enters; shown: ``(nf, n)``, from the error
+    to the fault error; process, sensor, sensor_rate: ``(n, nw)``, ``(ny, nw)``, ``(ny, nw)``: where the noise enters
+    the states and the outputs, and its derivative the outputs; has_derivative: False for L = 0.
     """
 
     plants: tuple[tuple[FloatArray, FloatArray], ...]
@@ -82,16 +62,7 @@ class PdTask:
 class PdSolution:
     """Gains and certificate in the coordinates of the task.
 
-    Parameters
-    ----------
-    J, L : FloatArray
-        ``(n, ny)``.
-    P1 : tuple of FloatArray
-        One per plant, ``(n, n)``.
-    P3 : FloatArray
-        ``(n, n)``.
-    record : mapping
-        Of the solver run.
+    Fields: J, L: ``(n, ny)``; P1: One per plant, ``(n, n)``; P3: ``(n, n)``; record: Of the solver run.
     """
 
     J: FloatArray
@@ -109,13 +80,7 @@ class _Variables:
 
 
 def solve(task: PdTask, *, solver: str) -> PdSolution:
-    """Return the gains of least size that meet the task.
-
-    Raises
-    ------
-    SolverError
-        The solver gave nothing usable; whether gains exist is then unknown.
-    """
+    """Return the gains of least size that meet the task."""
     n, ny = task.plants[0][1].shape[1], task.plants[0][1].shape[0]
     p3 = lmi.symmetric_variable(n) if task.theorem == 2 else lmi.matrix_variable(n, n)
     z = lmi.matrix_variable(n, ny) if task.has_derivative else np.zeros((n, ny))

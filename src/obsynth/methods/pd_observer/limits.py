@@ -61,13 +61,7 @@ def theorem_2_limit(plant: DescriptorSystem, decay: float) -> float:
 
 
 def require_possible(plant: DescriptorSystem, asked: PdOptions, *, delta: float, decay: float) -> None:
-    """Refuse what no gains, or no solution of these inequalities, can give.
-
-    Raises
-    ------
-    InfeasibleError
-        With the number that decides.
-    """
+    """Refuse what no gains, or no solution of these inequalities, can give."""
     hidden = analyse_structure(plant).unobservable_modes
     slowest = max((mode.real for mode in hidden), default=-math.inf)
     if -slowest <= decay:

@@ -24,17 +24,7 @@ from obsynth.plants.descriptor import DescriptorSystem
 def realise_pd_observer(
     plant: DescriptorSystem, augmented: DescriptorSystem, J: FloatArray, L: FloatArray
 ) -> LinearObserver:
-    """Return the observer with gains ``J, L (nx + nf, ny)`` of the augmented plant; ``I + L C`` is nonsingular.
-
-    Parameters
-    ----------
-    plant : DescriptorSystem
-        Continuous time, ``E = I``.
-    augmented : DescriptorSystem
-        `obsynth.methods.pd_observer.augmentation.with_faults_as_states` of it.
-    J, L : FloatArray
-        Gains in the loop: the paper's ``[J; G M]`` and ``[L; G N]``.
-    """
+    """Return the observer with gains ``J, L (nx + nf, ny)`` of the augmented plant; ``I + L C`` is nonsingular."""
     n, a, c, d = augmented.nx, augmented.A, augmented.C, augmented.D
     correction = np.linalg.solve(np.eye(n) + L @ c, L)
     gain = J + (a - J @ c) @ correction

@@ -43,16 +43,9 @@ SHARE = 0.5
 class ReducedPlant:
     """A plant in coordinates in which its outputs show the last states alone.
 
-    Parameters
-    ----------
-    A : FloatArray
-        ``(n, n)``, of the shifted plant in these coordinates.
-    hidden : int
-        Number of leading states that the outputs do not show.
-    basis : FloatArray
-        ``(n, n)``, orthogonal: old states = basis times new ones.
-    inverse : FloatArray
-        ``(n - hidden, ny)``, the pseudoinverse of R.
+    Fields: A: ``(n, n)``, of the shifted plant in these coordinates; hidden: Number of leading states that the outputs
+    do not show; basis: ``(n, n)``, orthogonal: old states = basis times new ones; inverse: ``(n - hidden, ny)``, the
+    pseudoinverse of R.
     """
 
     A: FloatArray
@@ -76,20 +69,7 @@ class ReducedPlant:
 
 
 def reduced_lmi(task: PdTask, *, solver: str) -> PdSolution:
-    """Return gains by the smaller inequality, for a task of stability and a decay rate.
-
-    Parameters
-    ----------
-    task : PdTask
-        One plant; nothing asked besides.
-    solver : str
-        Semidefinite solver.
-
-    Raises
-    ------
-    SolverError
-        The solver gave nothing usable.
-    """
+    """Return gains by the smaller inequality, for a task of stability and a decay rate."""
     plant = _shifted(task)
     a11, _, a21, _ = plant.blocks()
     if plant.hidden == 0:
@@ -104,18 +84,6 @@ def closed_form(task: PdTask, *, free_delta: bool) -> tuple[PdSolution, float]:
     """Return gains from a Riccati equation, with their certificate, and the delta that it is for.
 
     The gain J is that of a Kalman filter for unit noise on all states and outputs, and L = 0.
-
-    Parameters
-    ----------
-    task : PdTask
-        One plant; nothing asked besides stability and a decay rate.
-    free_delta : bool
-        Whether a smaller delta than the task's may be taken.
-
-    Raises
-    ------
-    SolverError
-        The equation was not solved, or Theorem 2 would take a smaller delta with these gains.
     """
     a, c = task.plants[0]
     shifted = a + task.decay * np.eye(len(a))

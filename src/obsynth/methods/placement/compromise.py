@@ -26,14 +26,8 @@ MOST_HALVINGS = 40
 class Compromise:
     """What the default found.
 
-    Parameters
-    ----------
-    K : FloatArray
-        ``(n, ny)``.
-    decay : float
-        1/s.
-    price : float
-        Largest ratio of the standard deviation of an estimate to that with the Kalman gain without a rate.
+    Fields: K: ``(n, ny)``; decay: 1/s; price: Largest ratio of the standard deviation of an estimate to that with the
+    Kalman gain without a rate.
     """
 
     K: FloatArray
@@ -46,13 +40,6 @@ def compromise(problem: KalmanProblem, rate: float) -> Compromise | None:
 
     The plain Kalman filter leaves modes slow that cost much to see (-0.0085 on the Kundur network); a fixed rate may
     cost any amount of noise.
-
-    Parameters
-    ----------
-    problem : KalmanProblem
-        The pair and its noise.
-    rate : float, 1/s
-        As fast as makes sense for the plant.
     """
     start = np.eye(problem.F.shape[0])
     plain, change = problem.solved(0.0, start)

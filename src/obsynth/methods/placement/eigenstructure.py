@@ -49,14 +49,8 @@ PLACEMENT_TOLERANCE = 1e-5
 class Placement:
     """Gains that place poles.
 
-    Parameters
-    ----------
-    K : FloatArray
-        ``(n, ny)``.
-    condition : float
-        Condition number of the (generalised) eigenvectors.
-    error : float
-        Largest relative miss of a wanted pole, of the mean for a multiple one.
+    Fields: K: ``(n, ny)``; condition: Condition number of the (generalised) eigenvectors; error: Largest relative miss
+    of a wanted pole, of the mean for a multiple one.
     """
 
     K: FloatArray
@@ -65,13 +59,7 @@ class Placement:
 
 
 def jordan_form(poles: Sequence[complex]) -> FloatArray:
-    """Return a real cyclic matrix ``(n, n)`` with these eigenvalues: one chain for each group of equal poles.
-
-    Parameters
-    ----------
-    poles : sequence of complex
-        Closed under conjugation.
-    """
+    """Return a real cyclic matrix ``(n, n)`` with these eigenvalues: one chain for each group of equal poles."""
     upper = [pole for pole in poles if pole.imag >= 0.0]
     groups: list[list[complex]] = []
     for pole in sorted(upper, key=lambda value: (value.real, value.imag)):
@@ -105,23 +93,7 @@ def place(
 ) -> Placement:
     """Return K ``(n, ny)`` such that ``F - K C`` has these poles.
 
-    Parameters
-    ----------
-    f, c : FloatArray
-        ``(n, n)`` and ``(ny, n)``, observable.
-    poles : sequence of complex
-        n of them, closed under conjugation; any multiplicity.
-    dt : float, optional, seconds
-        0 for continuous time: how misses are judged.
-    objective : {"conditioning", "gain"}, optional
-        Well-conditioned eigenvectors, or a small Frobenius norm of ``weight @ K``.
-    weight : FloatArray, optional
-        ``(m, n)``, of full column rank; the identity by default.
-
-    Raises
-    ------
-    SolverError
-        The computed poles miss the wanted ones: the pair is too close to an unobservable one.
+    Shapes: ``f (n, n)``, ``c (ny, n)``, ``weight (m, n)``.
     """
     n, outputs = f.shape[0], c.shape[0]
     if n == 0:

@@ -28,20 +28,11 @@ MOST_STEPS = 12
 class KalmanProblem:
     """A pair with noise: ``e+ = F e + B w + drive v``, innovation ``C e + D w + background n``.
 
-    Parameters
-    ----------
-    F, C : FloatArray
-        ``(n, n)`` and ``(ny, n)``, observable.
-    B, D : FloatArray
-        ``(n, k)`` and ``(ny, k)``: how the noise that counts, of unit covariance (intensity for ``dt == 0``), enters.
-    drive : FloatArray
-        ``(n, p)``: what the states are driven by besides, so that the filter stays awake.
-    background : FloatArray
-        ``(ny, q)``: keeps the equation regular where an innovation has no noise.
-    estimates : FloatArray
-        ``(k, n)``: what the noise is counted in, the fault estimates.
-    dt : float
-        Seconds between samples, 0 for continuous time.
+    Fields: F, C: ``(n, n)`` and ``(ny, n)``, observable; B, D: ``(n, k)`` and ``(ny, k)``: how the noise that counts,
+    of unit covariance (intensity for ``dt == 0``), enters; drive: ``(n, p)``: what the states are driven by besides, so
+    that the filter stays awake; background: ``(ny, q)``: keeps the equation regular where an innovation has no noise;
+    estimates: ``(k, n)``: what the noise is counted in, the fault estimates; dt: Seconds between samples, 0 for
+    continuous time.
     """
 
     F: FloatArray
@@ -55,14 +46,6 @@ class KalmanProblem:
 
     def gain(self, decay: float, *, persistent: bool = False) -> FloatArray | None:
         """Return the gain whose poles all decay at ``decay`` (1/s) or faster; ``None`` when the equation has none.
-
-        Parameters
-        ----------
-        decay : float, 1/s
-            Not negative.
-        persistent : bool, optional
-            Where the equation cannot be solved as it stands, since the wanted rate is far above those of the pair, go
-            there from slower rates, each solved in the coordinates of the one before.
 
         References
         ----------
@@ -85,12 +68,7 @@ class KalmanProblem:
     def solved(self, decay: float, change: FloatArray) -> tuple[FloatArray | None, FloatArray]:
         """Return the gain of a rate, and coordinates in which its error covariance is the identity.
 
-        Parameters
-        ----------
-        decay : float, 1/s
-            Not negative.
-        change : FloatArray
-            ``(n, n)``: the equation is first solved in states ``change^-1 e``.
+        Shapes: ``change (n, n)``.
         """
         if not self.F.size:
             return np.zeros((0, self.C.shape[0])), change
@@ -116,12 +94,7 @@ class KalmanProblem:
     def deviations(self, gain: FloatArray, change: FloatArray) -> FloatArray:
         """Return the standard deviation of each estimate under the noise that counts (for unit intensity, dt = 0).
 
-        Parameters
-        ----------
-        gain : FloatArray
-            ``(n, ny)``.
-        change : FloatArray
-            ``(n, n)``: states ``change^-1 e`` in which the computation is well conditioned.
+        Shapes: ``gain (n, ny)``, ``change (n, n)``.
         """
         entering = np.asarray(np.linalg.solve(change, self.B - gain @ self.D), dtype=np.float64)
         moved = np.asarray(np.linalg.solve(change, (self.F - gain @ self.C) @ change), dtype=np.float64)
@@ -144,14 +117,7 @@ def _filtered(
 ) -> tuple[FloatArray, FloatArray] | None:
     """Return the gain of a Kalman filter, and states in which its error covariance is the identity.
 
-    Parameters
-    ----------
-    f, c, driven, measured : FloatArray
-        The pair and its noise covariances, uncorrelated.
-    asked : tuple of float
-        Bound of the poles, and seconds between samples.
-    change : FloatArray
-        ``(n, n)``: the equation is solved in states ``change^-1 e``.
+    Shapes: ``change (n, n)``.
     """
     bound, dt = asked
     with warnings.catch_warnings(), np.errstate(all="ignore"):

@@ -29,16 +29,8 @@ class ObservableSplit:
 
     With ``x = units * basis @ [observable; hidden]``: ``F = [F_o 0; F_ho F_h]`` and ``C = [C_o 0]``.
 
-    Parameters
-    ----------
-    basis : FloatArray
-        ``(n, n)``, orthogonal.
-    units : FloatArray
-        ``(n,)``: the states are balanced first.
-    F, C : FloatArray
-        The observable part, ``(no, no)`` and ``(ny, no)``.
-    fixed_modes : ComplexArray
-        Eigenvalues of the hidden part.
+    Fields: basis: ``(n, n)``, orthogonal; units: ``(n,)``: the states are balanced first; F, C: The observable part,
+    ``(no, no)`` and ``(ny, no)``; fixed_modes: Eigenvalues of the hidden part.
     """
 
     basis: FloatArray
@@ -68,17 +60,7 @@ class ObservableSplit:
 def observable_split(f: FloatArray, c: FloatArray, fixed_modes: ComplexArray) -> ObservableSplit:
     """Split the pair ``(F, C)`` at its fixed modes.
 
-    Parameters
-    ----------
-    f, c : FloatArray
-        ``(n, n)`` and ``(ny, n)``.
-    fixed_modes : ComplexArray
-        Zeros of ``[F - s I; C]``, with multiplicity, conjugate pairs together.
-
-    Raises
-    ------
-    PreconditionError
-        The zeros are none of the pair's: the two numerical views of the plant contradict each other.
+    Shapes: ``f (n, n)``, ``c (ny, n)``.
     """
     n = f.shape[0]
     units = _balancing(f, c)

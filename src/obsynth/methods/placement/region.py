@@ -35,14 +35,9 @@ LARGE = 20
 class Region:
     """Where all movable poles must lie.
 
-    Parameters
-    ----------
-    decay : float, optional, 1/s (of whatever time the problem has)
-        Every mode decays at least as ``exp(-decay t)``.
-    radius : float, optional, 1/s
-        No mode is faster than this: ``abs(s) <= radius``; continuous time only.
-    damping : float, optional, dimensionless
-        Least damping ratio, between 0 and 1: a cone around the negative real axis; continuous time only.
+    Fields: decay: Every mode decays at least as ``exp(-decay t)``; radius: No mode is faster than this: ``abs(s) <=
+    radius``; continuous time only; damping: Least damping ratio, between 0 and 1: a cone around the negative real axis;
+    continuous time only.
     """
 
     decay: float = 0.0
@@ -51,13 +46,7 @@ class Region:
 
     @classmethod
     def of(cls, data: Mapping[str, Any], dt: float) -> Region:
-        """Return a checked region.
-
-        Raises
-        ------
-        SpecError
-            An unknown key, a value out of range, or an empty region.
-        """
+        """Return a checked region."""
         known = [field.name for field in fields(cls)]
         problems = [f"unknown key {key!r}; there are: {', '.join(known)}." for key in data if key not in known]
         for key, value in data.items():
@@ -114,21 +103,6 @@ def region_gain(problem: KalmanProblem, region: Region, *, solver: str) -> tuple
     """Return K ``(n, ny)`` with all poles of ``F - K C`` in the region and little noise, and the solver's record.
 
     Above `LARGE` states a Kalman gain of the region's rate comes first, and the record is empty where it is enough.
-
-    Parameters
-    ----------
-    problem : KalmanProblem
-        The pair and its noise; states are scaled first, by the covariance of the Kalman filter with the same rate:
-        without that the solver fails.
-    region : Region
-        Where the poles must lie.
-    solver : str
-        A key of `obsynth.methods.conic.lmi.SOLVER_SETTINGS`.
-
-    Raises
-    ------
-    SolverError
-        The solver found nothing, or poles outside the region.
     """
     n, dt = problem.F.shape[0], problem.dt
     if n == 0:

@@ -29,19 +29,7 @@ def recursive_conditions(
     literal: bool = False,
     early: bool = False,
 ) -> Iterator[Condition]:
-    """Yield the existence conditions of the recursive methods; the list ends at the first failure.
-
-    Parameters
-    ----------
-    plant : DescriptorSystem or TimeVaryingDescriptorSystem
-        Any plant.
-    parameters : bool
-        Whether parameters are to be estimated.
-    literal : bool, optional
-        Whether by the form that is printed as (18).
-    early : bool, optional
-        Whether the algebraic equations are used one step early.
-    """
+    """Yield the existence conditions of the recursive methods; the list ends at the first failure."""
     try:
         varying = as_time_varying(plant)
     except SpecError as error:
@@ -97,13 +85,7 @@ def _rank_of_steps(plant: TimeVaryingDescriptorSystem, ranks: HorizonRanks, *, e
 
 
 def detectability_condition(plant: TimeVaryingDescriptorSystem) -> Condition:
-    """Return the condition that every mode that does not die out by itself shows in the outputs.
-
-    Parameters
-    ----------
-    plant : TimeVaryingDescriptorSystem
-        With constant E, A and C.
-    """
+    """Return the condition that every mode that does not die out by itself shows in the outputs."""
     E, A, C = plant.E.at(1), plant.A.at(0), plant.C.at(1)
     tall_e, tall_a = np.vstack([E, np.zeros_like(C)]), np.vstack([A, C])
     zeros = finite_zeros(tall_e, tall_a)
@@ -129,13 +111,7 @@ def detectability_condition(plant: TimeVaryingDescriptorSystem) -> Condition:
 
 
 def residual_condition(ranks: HorizonRanks) -> Condition:
-    """Return the condition that (18) can learn at all, which the paper never states.
-
-    Parameters
-    ----------
-    ranks : HorizonRanks
-        Of the plant.
-    """
+    """Return the condition that (18) can learn at all, which the paper never states."""
     return Condition(
         "residual directions", "rank E_k + ny - nx >= 1 for every k", ranks.directions >= 1, float(ranks.directions),
         1.0,         "our finding: missing in Moussa Ali, Zhang 2013",

@@ -36,13 +36,6 @@ def identifiability_condition(plant: TimeVaryingDescriptorSystem, *, early: bool
     Where these matrices are constant, parameters and state may stay constant together without a trace exactly where
     ``[A - E, Phi; C, Psi]`` loses rank.  Of others, the outputs that each parameter alone leads to are compared along
     the horizon.
-
-    Parameters
-    ----------
-    plant : TimeVaryingDescriptorSystem
-        With parameters, and detectable where E, A and C are constant.
-    early : bool, optional
-        Whether the algebraic equations are used one step early.
     """
     still = all(matrix.is_constant for matrix in (plant.E, plant.A, plant.C, plant.Phi, plant.Psi))
     decision, kernel = _steady(plant) if still else _along(plant, early=early)

@@ -122,15 +122,7 @@ def steady_state_filter(
 
 
 def reached_condition(plant: TimeVaryingDescriptorSystem, Q_root: FloatArray, R_root: FloatArray) -> Condition:
-    """Return the condition that noise reaches every mode on the unit circle, so that the gains never fall asleep.
-
-    Parameters
-    ----------
-    plant : TimeVaryingDescriptorSystem
-        Time-invariant and detectable.
-    Q_root, R_root : FloatArray
-        Square roots of Q and R.
-    """
+    """Return the condition that noise reaches every mode on the unit circle, so that the gains never fall asleep."""
     E, A, C = plant.E.at(1), plant.A.at(0), plant.C.at(1)
     noise = stacked_noise(Q_root, R_root)
     wide_e = np.hstack([np.vstack([E, C]), np.zeros_like(noise)])

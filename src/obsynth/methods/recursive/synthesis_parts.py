@@ -31,20 +31,7 @@ LOST_EXCITATION = 1.0
 def with_stated_noise(
     plant: DescriptorSystem | TimeVaryingDescriptorSystem, options: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return the options with Q and R from the noise that a time-invariant plant states, where none are given.
-
-    Parameters
-    ----------
-    plant : DescriptorSystem or TimeVaryingDescriptorSystem
-        The plant.
-    options : mapping
-        With ``Q`` and ``R``, which may be ``None``.
-
-    Raises
-    ------
-    SpecError
-        The plant's noise drives states and outputs at once.
-    """
+    """Return the options with Q and R from the noise that a time-invariant plant states, where none are given."""
     resolved = dict(options)
     wanted = [name for name in ("Q", "R") if resolved[name] is None]
     if not isinstance(plant, DescriptorSystem) or not plant.nw or not wanted:
@@ -61,15 +48,7 @@ def with_stated_noise(
 
 
 def recursive_synthesis(plant: TimeVaryingDescriptorSystem, options: Mapping[str, Any]) -> Synthesis:
-    """Return observer, gains, claims and notes.
-
-    Parameters
-    ----------
-    plant : TimeVaryingDescriptorSystem
-        The plant; its existence conditions hold.
-    options : mapping
-        As for `obsynth.observers.recursive.building.observer_from_options`.
-    """
+    """Return observer, gains, claims and notes."""
     observer = observer_from_options(plant, options)
     ranks = horizon_ranks(plant, early=observer.early_constraints)
     facts = gain_schedule_summary(observer)

@@ -30,16 +30,8 @@ from obsynth.plants.exosystems import Exosystem
 class AugmentedPlant:
     """A plant whose state holds the exosystem of its faults: ``xa = [x; w]``.
 
-    Parameters
-    ----------
-    E, A : FloatArray
-        ``(na, na)``, ``na = nx + nw``.
-    B, Bd : FloatArray
-        ``(na, nu)`` and ``(na, nd)``.
-    C, D, Dd : FloatArray
-        ``(ny, na)``, ``(ny, nu)``, ``(ny, nd)``.
-    names : tuple of str
-        Names of the states.
+    Fields: E, A: ``(na, na)``, ``na = nx + nw``; B, Bd: ``(na, nu)`` and ``(na, nd)``; C, D, Dd: ``(ny, na)``, ``(ny,
+    nu)``, ``(ny, nd)``; names: Names of the states.
     """
 
     E: FloatArray
@@ -77,16 +69,8 @@ class Decoupled:
     Every solution is ``U + Z free_U``, ``Dhat + Z free_D`` with any Z ``(nx, n_free)``: the freedom that the paper has
     in G.  ``injection`` is the part ``Bd Dd^+`` of the equations that is fed with y.
 
-    Parameters
-    ----------
-    U, Dhat : FloatArray
-        ``(nx, nx)`` and ``(nx, ny)``.
-    free_U, free_D : FloatArray
-        ``(n_free, nx)`` and ``(n_free, ny)``.
-    seen : FloatArray
-        ``(ny2, ny)``, orthonormal rows: the combinations of outputs that no disturbance reaches directly.
-    injection : FloatArray
-        ``(nx, ny)``.
+    Fields: U, Dhat: ``(nx, nx)`` and ``(nx, ny)``; free_U, free_D: ``(n_free, nx)`` and ``(n_free, ny)``; seen: ``(ny2,
+    ny)``, orthonormal rows: the combinations of outputs that no disturbance reaches directly; injection: ``(nx, ny)``.
     """
 
     U: FloatArray
@@ -98,18 +82,7 @@ class Decoupled:
 
 
 def direct_part(plant: DescriptorSystem) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the outputs without direct disturbance, ``Bd Dd^+``, and a basis of the disturbances left.
-
-    Parameters
-    ----------
-    plant : DescriptorSystem
-        The plant.
-
-    Returns
-    -------
-    seen, injection, remaining : FloatArray
-        ``(ny2, ny)``, ``(nx, ny)``, and ``(nx, nd2)`` of full column rank, orthonormal.
-    """
+    """Return the outputs without direct disturbance, ``Bd Dd^+``, and a basis of the disturbances left."""
     if not plant.Dd.any():
         return np.eye(plant.ny), np.zeros((plant.nx, plant.ny)), _range_basis(plant.Bd)
     left, values, right = np.linalg.svd(plant.Dd)
@@ -131,11 +104,6 @@ def decouple(plant: DescriptorSystem) -> Decoupled:
 
     With the annihilator Bp of Bd2 and ``Q = [Bp E; C2]``: ``[Ut Dt] = Q^+ + Z N``, N a basis of the left null space of
     Q, and Z such that Ut has full column rank: the polar factor of what makes ``[Ut; N_U]`` orthogonal.
-
-    Parameters
-    ----------
-    plant : DescriptorSystem
-        Scaled.
     """
     seen, injection, remaining = direct_part(plant)
     nx, left_over = plant.nx, plant.nx - remaining.shape[1]
@@ -184,18 +152,7 @@ def paper_decoupling(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return L, U and Dhat of the paper, eqs. (10), (11), for given ``E#``, ``C#`` and ``G``.
 
-    Parameters
-    ----------
-    plant : DescriptorSystem
-        Without ``Dd``.
-    e_sharp, c_sharp, g : FloatArray
-        ``(nx, nx)``, ``(nx, ny)``, ``(nx, ny)``.
-
-    Raises
-    ------
-    SpecError
-        Wrong shapes, ``E# E + C# C != I``, ``Dd != 0``, ``C E# Bd`` of too low a rank for this ``E#`` (the rank
-        depends on the choice), or ``I - G C`` singular.
+    Shapes: ``e_sharp (nx, nx)``, ``c_sharp (nx, ny)``, ``g (nx, ny)``.
     """
     nx, ny = plant.nx, plant.ny
     shapes = {"E_sharp": (e_sharp, (nx, nx)), "C_sharp": (c_sharp, (nx, ny)), "G": (g, (nx, ny))}

@@ -55,16 +55,10 @@ __all__ = ["Existence", "decoupling_rank", "existence"]
 class Existence:
     """What was decided about a plant.
 
-    Parameters
-    ----------
-    conditions : tuple of Condition
-        In order; after a failed (D2) there is no (D3), and fixed modes come last, when all others hold.
-    plant : DescriptorSystem
-        For which they were decided: the plant as given, or without its algebraic states.
-    transformation : Transformation or None
-        The elimination, where there was one.
-    fixed_modes : ComplexArray, 1/s (dimensionless for sampled plants)
-        Poles that every such observer has; all stable when the conditions hold.
+    Fields: conditions: In order; after a failed (D2) there is no (D3), and fixed modes come last, when all others hold;
+    plant: For which they were decided: the plant as given, or without its algebraic states; transformation: The
+    elimination, where there was one; fixed_modes: Poles that every such observer has; all stable when the conditions
+    hold.
     """
 
     conditions: tuple[Condition, ...]
@@ -74,15 +68,7 @@ class Existence:
 
 
 def existence(plant: DescriptorSystem, model: Exosystem) -> Existence:
-    """Return the existence conditions of the unknown-input PI observer, and the plant to design for.
-
-    Parameters
-    ----------
-    plant : DescriptorSystem
-        Any plant, either time, regular or not, of any index.
-    model : Exosystem
-        Of its faults.
-    """
+    """Return the existence conditions of the unknown-input PI observer, and the plant to design for."""
     nothing = np.zeros(0, dtype=np.complex128)
     enough = _enough_outputs(plant)
     if not enough.holds:

@@ -32,15 +32,7 @@ from obsynth.plants.exosystems import Exosystem
 
 
 def model_conditions(plant: DescriptorSystem, model: Exosystem, units: PlantUnits) -> list[Condition]:
-    """Test (D3) at each unstable eigenvalue of the fault model, upper half plane only.
-
-    Parameters
-    ----------
-    plant, model : DescriptorSystem, Exosystem
-        Both scaled.
-    units : PlantUnits
-        In which they are scaled.
-    """
+    """Test (D3) at each unstable eigenvalue of the fault model, upper half plane only."""
     unstable = [complex(value) for value in model.eigenvalues if value.imag >= 0.0 and is_outside(value, plant.dt)]
     found = []
     for value in sorted(unstable, key=lambda value: (value.real, value.imag)):
@@ -98,13 +90,6 @@ def order_conditions(plant: DescriptorSystem, model: Exosystem, units: PlantUnit
 
     At a zero z0 of (f, d) -> y outside the region of stability, a polynomial model of order n is seen with a strength
     of about abs(z0)^(n + 1) only: a high order is observable on paper and lost in double precision.
-
-    Parameters
-    ----------
-    plant, model : DescriptorSystem, Exosystem
-        Both scaled.
-    units : PlantUnits
-        In which they are scaled.
     """
     inputs, direct = np.hstack([plant.Bf, plant.Bd]), np.hstack([plant.Df, plant.Dd])
     wide_e, wide_a = system_pencil(plant.E, plant.A, inputs, plant.C, direct)
@@ -145,19 +130,7 @@ def order_conditions(plant: DescriptorSystem, model: Exosystem, units: PlantUnit
 
 
 def lost_in_rounding(model: Exosystem, fault_names: tuple[str, ...], mode: complex, order: int) -> Condition:
-    """Return the failing condition for a mode that seems fixed and unstable, against all other conditions.
-
-    Parameters
-    ----------
-    model : Exosystem
-        Of the faults.
-    fault_names : tuple of str
-        All faults.
-    mode : complex, 1/s (dimensionless for sampled plants)
-        What the augmented pencil seems to hide.
-    order : int
-        Number of states of plant and fault model.
-    """
+    """Return the failing condition for a mode that seems fixed and unstable, against all other conditions."""
     return Condition(
         "fault model in double precision",
         "no mode of plant and fault model seems hidden by rounding alone",

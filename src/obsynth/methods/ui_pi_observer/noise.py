@@ -27,13 +27,9 @@ BACKGROUND_NOISE = 0.1
 class NoiseWeights:
     """What the Kalman filter believes, beside what the plant states.
 
-    Parameters
-    ----------
-    measurement : float or mapping, optional
-        Standard deviation of each output's noise, one number or by name, in the output's unit (times the square root
-        of a second in continuous time); the plant's own noise, or one in scaled units, by default.
-    process, fault : float
-        How strongly states and fault models are driven, relative to the default.
+    Fields: measurement: Standard deviation of each output's noise, one number or by name, in the output's unit (times
+    the square root of a second in continuous time); the plant's own noise, or one in scaled units, by default; process,
+    fault: How strongly states and fault models are driven, relative to the default.
     """
 
     measurement: Any = None

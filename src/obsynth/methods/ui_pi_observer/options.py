@@ -137,13 +137,7 @@ class UiPiOptions:
 
 
 def plain(value: Any) -> Any:
-    """Return options as lists, mappings and numbers.
-
-    Parameters
-    ----------
-    value : object
-        An option as given.
-    """
+    """Return options as lists, mappings and numbers."""
     if isinstance(value, FaultModel):
         return {"Phi": value.Phi.tolist(), "Cw": value.Cw.tolist()}
     if isinstance(value, Mapping):
@@ -156,24 +150,7 @@ def plain(value: Any) -> Any:
 
 
 def checked_poles(given: Any, count: int, fixed: ComplexArray, dt: float) -> list[complex]:
-    """Return the wanted poles, in exact conjugate pairs.
-
-    Parameters
-    ----------
-    given : sequence
-        Numbers, complex numbers, or pairs ``[re, im]``.
-    count : int
-        How many poles can be placed.
-    fixed : ComplexArray
-        Those that cannot; they are not to be listed.
-    dt : float, seconds
-        Of the plant.
-
-    Raises
-    ------
-    SpecError
-        Wrong count, not closed under conjugation, or not stable; all problems at once.
-    """
+    """Return the wanted poles, in exact conjugate pairs."""
     listed = [_as_complex(pole) for pole in given]
     problems = []
     if len(listed) != count:

@@ -43,26 +43,11 @@ MOST_PER_SAMPLE = 2.0
 class PlacementProblem:
     """A decoupled plant in units of its own, and the pair whose poles are to be placed.
 
-    Parameters
-    ----------
-    plant : DescriptorSystem
-        Scaled.
-    model : Exosystem
-        Of its faults, scaled.
-    units : PlantUnits
-        Between the user's plant and the scaled one.
-    decoupled : Decoupled
-        Of the scaled plant.
-    U, D : FloatArray
-        ``(na, na)`` and ``(na, ny)`` of the scaled augmented plant, without the free part.
-    F, C : FloatArray
-        The pair ``(na, na)`` and ``(rows, na)``; the first ``free`` rows of C are those of the free part Z.
-    free : int
-        Number of rows of the free part; 0 unless K and Z are designed together.
-    split : ObservableSplit
-        Of the pair.
-    rate : float
-        The plant's own speed, in scaled time: the median of ``abs(s)`` over its modes.
+    Fields: plant: Scaled; model: Of its faults, scaled; units: Between the user's plant and the scaled one; decoupled:
+    Of the scaled plant; U, D: ``(na, na)`` and ``(na, ny)`` of the scaled augmented plant, without the free part; F, C:
+    The pair ``(na, na)`` and ``(rows, na)``; the first ``free`` rows of C are those of the free part Z; free: Number of
+    rows of the free part; 0 unless K and Z are designed together; split: Of the pair; rate: The plant's own speed, in
+    scaled time: the median of ``abs(s)`` over its modes.
     """
 
     plant: DescriptorSystem
@@ -100,26 +85,7 @@ def placement_problem(
     joint: bool = False,
     given: Mapping[str, Any] | None = None,
 ) -> PlacementProblem:
-    """Return the pair to place; the existence conditions must hold.
-
-    Parameters
-    ----------
-    plant : DescriptorSystem
-        For which (D1) holds.
-    model : Exosystem
-        Of its faults.
-    fixed_modes : ComplexArray, 1/s (dimensionless for sampled plants)
-        Poles that no gain moves.
-    joint : bool, optional
-        Whether the free part Z of the decoupling is designed together with K.
-    given : mapping, optional
-        The paper's ``E_sharp, C_sharp, G``, in the user's units.
-
-    Raises
-    ------
-    SpecError
-        The given matrices do not decouple.
-    """
+    """Return the pair to place; the existence conditions must hold."""
     units = PlantUnits.of(plant, model).for_decoupling(plant)
     if given is not None:
         # Powers of two: the given numbers come back as they are.

@@ -22,10 +22,7 @@ from obsynth.plants.exosystems import Exosystem
 class ObserverGains:
     """Gains for the augmented plant.
 
-    Parameters
-    ----------
-    U, D, K : FloatArray
-        ``(na, na)``, ``(na, ny)``, ``(na, ny)``.
+    Fields: U, D, K: ``(na, na)``, ``(na, ny)``, ``(na, ny)``.
     """
 
     U: FloatArray
@@ -38,16 +35,7 @@ def realise(
 ) -> tuple[LinearObserver, dict[str, FloatArray]]:
     """Return the observer, and its matrices by the paper's letters.
 
-    Parameters
-    ----------
-    plant : DescriptorSystem
-        The plant, not balanced.
-    model : Exosystem
-        Of its faults.
-    gains : ObserverGains
-        In the plant's units.
-    seen : FloatArray
-        ``(nr, ny)``: the combinations of outputs that make the residuals.
+    Shapes: ``seen (nr, ny)``.
     """
     augmented = AugmentedPlant.of(plant, model)
     nx, na = plant.nx, augmented.order

@@ -58,30 +58,7 @@ def run_dae_batch(
 ) -> DAEBatchEstimates:  # fmt: skip
     """Run many trials; see `obsynth.run_batch`.
 
-    Parameters
-    ----------
-    observer : DAEObserver
-        At rest.
-    y : array_like
-        ``(trials, samples, ny)``; NaN marks a missing sample.
-    u : array_like, optional
-        ``(trials, samples, nu)``, or ``(samples, nu)`` for all trials; may be left out when there are none.
-    compiled : bool, optional
-        Whether the observer runs as C: always, never, or, by default, in large batches where a compiler is there.
-    progress : bool or callable, optional
-        As in `DAEObserver.run`; a function is called with the number of trials that are done.
-
-    Returns
-    -------
-    DAEBatchEstimates
-        The same numbers as `DAEObserver.run` gives for each trial, up to rounding.
-
-    Raises
-    ------
-    SpecError
-        Shapes do not fit, an input is not finite, or there is no compiler, but one is asked for.
-    SolverError
-        A step of a trial has no solution; the trial, k and the worst equation are named.
+    Shapes: ``y (trials, samples, ny)``.
     """
     outputs, inputs = _checked(observer, y, u)
     trials, samples = outputs.shape[:2]

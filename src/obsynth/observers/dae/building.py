@@ -26,21 +26,7 @@ OPTIONS = (
 
 
 def dae_observer_from_options(model: DAEModel, options: Mapping[str, Any]) -> DAEObserver:
-    """Return the observer that options stand for.
-
-    Parameters
-    ----------
-    model : DAEModel
-        The plant.
-    options : mapping
-        All of `OPTIONS`; covariances as matrices, as one variance for all, or as variances by name; vectors as lists
-        or by name; ``None`` for what is not stated.
-
-    Raises
-    ------
-    SpecError
-        An option is missing, out of range, names no signal, or has the wrong shape.
-    """
+    """Return the observer that options stand for."""
     states, parameters = model.state_names, model.parameter_names
     bounds = _bounds(options["bounds"], parameters)
     return DAEObserver(
@@ -67,13 +53,7 @@ def dae_observer_from_options(model: DAEModel, options: Mapping[str, Any]) -> DA
 
 
 def resolved_options(observer: DAEObserver) -> dict[str, Any]:
-    """Return every option as it was resolved, plain data: the observer can be built from them again.
-
-    Parameters
-    ----------
-    observer : DAEObserver
-        Built by `dae_observer_from_options`.
-    """
+    """Return every option as it was resolved, plain data: the observer can be built from them again."""
     bounds = read_only(np.column_stack([observer.lower, observer.upper]))
     return {name: bounds if name == "bounds" else getattr(observer, name) for name in OPTIONS}
 

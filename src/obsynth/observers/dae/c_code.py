@@ -27,13 +27,7 @@ _NUMBERS_PER_LINE = 4
 
 
 def observer_code(observer: DAEObserver) -> str:
-    """Return everything static: constants, CasADi's functions, ``struct observer``, ``reset`` and ``advance``.
-
-    Parameters
-    ----------
-    observer : DAEObserver
-        At rest.
-    """
+    """Return everything static: constants, CasADi's functions, ``struct observer``, ``reset`` and ``advance``."""
     graph = observer.graph
     short = step_graph(DAEFunctions(observer.model), PROJECTION_SHARE * observer.dt, np.inf)
     functions = {"project": short.newton, "newton": graph.step.newton, "first": graph.first, "sample": graph.sample}
@@ -44,13 +38,7 @@ def observer_code(observer: DAEObserver) -> str:
 
 
 def record_code(observer: DAEObserver) -> str:
-    """Return the whole source of a library with functions ``record`` and ``batch``.
-
-    Parameters
-    ----------
-    observer : DAEObserver
-        At rest.
-    """
+    """Return the whole source of a library with functions ``record`` and ``batch``."""
     graph, copies, total = observer.graph, [], 0
     for name in BATCH_PARTS:
         layout, source = (graph.memory, "after") if name in graph.memory.shapes else (graph.row, "said")
@@ -95,12 +83,7 @@ def _constants(observer: DAEObserver, graph: ObserverGraph, functions: Iterable[
 def c_table(name: str, values: FloatArray) -> list[str]:
     """Return a constant table of C; numbers are read back bit for bit.
 
-    Parameters
-    ----------
-    name : str
-        Its name.
-    values : FloatArray
-        ``(n,)``, finite.
+    Shapes: ``values (n,)``.
     """
     texts = [repr(value) for value in values.tolist()] or ["0.0"]
     lines = [", ".join(texts[i : i + _NUMBERS_PER_LINE]) for i in range(0, len(texts), _NUMBERS_PER_LINE)]

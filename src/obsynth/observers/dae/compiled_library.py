@@ -39,15 +39,7 @@ def compiler() -> list[str] | None:
 class DAELibrary:
     """An observer in C.
 
-    Parameters
-    ----------
-    observer : DAEObserver
-        At rest.
-
-    Raises
-    ------
-    SpecError
-        There is no compiler, or it fails.
+    Fields: observer: At rest.
     """
 
     def __init__(self, observer: DAEObserver) -> None:
@@ -83,12 +75,7 @@ class DAELibrary:
     def record(self, state: ctypes.Array[ctypes.c_char], y: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Go on over some samples; return memory and row of each that could be taken.
 
-        Parameters
-        ----------
-        state : ctypes.Array
-            From `started`; changed.
-        y, u : FloatArray
-            ``(samples, ny)`` and ``(samples, nu)``.
+        Shapes: ``y (samples, ny)``, ``u (samples, nu)``.
         """
         graph = self.observer.graph
         after, said = np.zeros((len(y), graph.memory.size)), np.zeros((len(y), graph.row.size))
@@ -96,13 +83,7 @@ class DAELibrary:
         return after[:taken], said[:taken]
 
     def batch(self, y: FloatArray, u: FloatArray) -> tuple[int, dict[str, FloatArray]]:
-        """Run over records; return how many could be finished, and what is said by name.
-
-        Parameters
-        ----------
-        y, u : FloatArray
-            ``(runs, samples, ny)``, and ``(runs, samples, nu)`` or ``(samples, nu)`` for all.
-        """
+        """Run over records; return how many could be finished, and what is said by name."""
         graph, (runs, samples, _) = self.observer.graph, y.shape
         layouts = [graph.memory if name in graph.memory.shapes else graph.row for name in BATCH_PARTS]
         sizes = [layout.shapes[name][0] * layout.shapes[name][1] for layout, name in

@@ -21,18 +21,9 @@ if TYPE_CHECKING:
 class DAERow:
     """What the graph of an observer gave at one sample, or (with a leading axis) at several in a row.
 
-    Parameters
-    ----------
-    graph : ObserverGraph
-        Which laid it out.
-    k : int
-        Number of the (first) sample.
-    memory, said : FloatArray
-        What is carried on, and what is said besides.
-    seen : numpy.ndarray
-        ``(ny,)``, of bool: which outputs were there.
-    moved : FloatArray
-        ``(nx,)``: how far the state was put onto its constraint; zeros but at k = 0.
+    Fields: graph: Which laid it out; k: Number of the (first) sample; memory, said: What is carried on, and what is
+    said besides; seen: ``(ny,)``, of bool: which outputs were there; moved: ``(nx,)``: how far the state was put onto
+    its constraint; zeros but at k = 0.
     """
 
     graph: ObserverGraph
@@ -43,13 +34,7 @@ class DAERow:
     moved: FloatArray
 
     def part(self, name: str) -> FloatArray:
-        """Return one array by its name in the layouts `obsynth.observers.dae.memory_layout`.
-
-        Parameters
-        ----------
-        name : str
-            Such as ``theta``, ``spread``, ``F``.
-        """
+        """Return one array by its name in the layouts `obsynth.observers.dae.memory_layout`."""
         layout, values = (self.graph.memory, self.memory) if name in self.graph.memory.shapes else (
             self.graph.row, self.said)  # fmt: skip
         return layout.part(values, name)
@@ -168,10 +153,7 @@ class DAEEstimates:
 class GatheredRows:
     """What `DAEEstimates` keeps of the rows of a record, while it is being run.
 
-    Parameters
-    ----------
-    observer : DAEObserver
-        Whose rows they are.
+    Fields: observer: Whose rows they are.
     """
 
     def __init__(self, observer: DAEObserver) -> None:
@@ -180,31 +162,14 @@ class GatheredRows:
         self.projection = np.zeros(observer.model.nx)
 
     def add(self, rows: DAERow) -> None:
-        """Keep some rows.
-
-        Parameters
-        ----------
-        rows : DAERow
-            Of one sample or of several.
-        """
+        """Keep some rows."""
         if rows.k == 0:
             self.projection = rows.moved
         # Copies, so that what is not kept can go.
         self.parts.append({name: np.array(value) for name, value in _columns(rows.several).items()})
 
     def add_regular(self, rows: DAERow) -> None:
-        """Keep some rows, unless the matrix of (7) was singular to working precision in one of them.
-
-        Parameters
-        ----------
-        rows : DAERow
-            Of one sample or of several.
-
-        Raises
-        ------
-        SolverError
-            It was; k, equations and states are named.
-        """
+        """Keep some rows, unless the matrix of (7) was singular to working precision in one of them."""
         self.add(rows)
         conditions = self.parts[-1]["conditions"]
         if len(conditions) and conditions.max() > SINGULAR_CONDITION:
@@ -213,10 +178,7 @@ class GatheredRows:
     def estimates(self, informations: FloatArray | None = None) -> DAEEstimates:
         """Return what was gathered.
 
-        Parameters
-        ----------
-        informations : FloatArray, optional
-            ``(any, nq, nq)``: of the latest samples, when only the last row was.
+        Shapes: ``informations (any, nq, nq)``.
         """
         whole = {name: np.concatenate([part[name] for part in self.parts]) for name in self.parts[0]}
         seen = whole.pop("information")

@@ -20,10 +20,7 @@ if TYPE_CHECKING:
 class Layout:
     """Named arrays in one vector, each by columns, as CasADi has them.
 
-    Parameters
-    ----------
-    shapes : mapping of str to (int, int)
-        In order.
+    Fields: shapes: In order.
     """
 
     shapes: Mapping[str, tuple[int, int]]
@@ -45,24 +42,14 @@ class Layout:
     def part(self, vectors: FloatArray, name: str) -> FloatArray:
         """Return one array of each of many vectors.
 
-        Parameters
-        ----------
-        vectors : FloatArray
-            ``(..., size)``.
-        name : str
-            Which; columns come as ``(..., rows)``, matrices as ``(..., rows, columns)``.
+        Shapes: ``vectors (..., size)``.
         """
         return self.shaped(vectors[..., self.slices[name]], name)
 
     def shaped(self, flat: FloatArray, name: str) -> FloatArray:
         """Return one array of each of many parts of vectors.
 
-        Parameters
-        ----------
-        flat : FloatArray
-            ``(..., entries)``.
-        name : str
-            Which; columns come as ``(..., rows)``, matrices as ``(..., rows, columns)``.
+        Shapes: ``flat (..., entries)``.
         """
         rows, columns = self.shapes[name]
         if columns == 1 and name not in MATRICES:
@@ -70,13 +57,7 @@ class Layout:
         return np.swapaxes(flat.reshape(*flat.shape[:-1], columns, rows), -1, -2)
 
     def packed(self, arrays: Mapping[str, FloatArray]) -> FloatArray:
-        """Return the vector of named arrays.
-
-        Parameters
-        ----------
-        arrays : mapping of str to FloatArray
-            All of `shapes`.
-        """
+        """Return the vector of named arrays."""
         return np.concatenate([np.ravel(arrays[name], order="F") for name in self.shapes])
 
     def symbols(self, vector: Any) -> dict[str, Any]:
@@ -105,15 +86,10 @@ MATRICES = frozenset({
 
 
 def memory_layout(observer: DAEObserver) -> Layout:
-    """Return what is carried from sample to sample.
+    """Return the state.
 
     ``posterior`` is the state after the measurement, ``x`` the one before it with the parameters as they are estimated
     now; P belongs to ``x``, and ``spread`` is the covariance of the parameters, which S with forgetting is not.
-
-    Parameters
-    ----------
-    observer : DAEObserver
-        At rest.
     """
     nx, ny, nq = observer.model.nx, observer.model.ny, observer.model.nq
     learning = {"cross": (nx, nq)} if observer.form == "augmented-kalman" else {"S": (nq, nq)}
@@ -128,11 +104,6 @@ def row_layout(observer: DAEObserver) -> Layout:
 
     ``kept`` is F (I - K H) with K and H of the sample before, ``scaled`` the equilibrated matrix of (7), and
     ``trusted`` one where the step of the compiled graph was solved.
-
-    Parameters
-    ----------
-    observer : DAEObserver
-        At rest.
     """
     nx, ny, nq = observer.model.nx, observer.model.ny, observer.model.nq
     n = nx * len(BUTCHER[observer.integration])
@@ -145,12 +116,7 @@ def row_layout(observer: DAEObserver) -> Layout:
 def initial_memory(observer: DAEObserver, x: FloatArray) -> FloatArray:
     """Return what is remembered before the first sample.
 
-    Parameters
-    ----------
-    observer : DAEObserver
-        At rest.
-    x : FloatArray
-        ``(nx,)``: the initial state, on its constraint.
+    Shapes: ``x (nx,)``.
     """
     layout = memory_layout(observer)
     start = {name: np.zeros(shape) for name, shape in layout.shapes.items()}

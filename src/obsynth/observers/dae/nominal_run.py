@@ -21,30 +21,12 @@ NOMINAL_STEPS = 100
 class DAEFacts:
     """Facts of a nominal run.
 
-    Parameters
-    ----------
-    index : IndexReport
-        At the nominal point.
-    condition : float
-        Largest condition number of (7) along the run.
-    condition_k : int
-        The sample at which it is largest.
-    residual : float
-        Largest scaled Newton residual.
-    contraction : float
-        Spectral radius of F (I - K H) at the end.
-    deviations : FloatArray
-        ``(nq,)``: standard deviations of the parameters at the end.
-    correlations : FloatArray
-        ``(nq, nq)``: of the parameters' errors at the end: how much a change of one is taken for another.
-    projection : FloatArray
-        ``(nx,)``: how far the initial state is moved onto its constraint.
-    identifiable : Identifiability
-        Of states and parameters along the nominal trajectory.
-    K : FloatArray
-        ``(nx, ny)`` at the end.
-    Upsilon : FloatArray
-        ``(nx, nq)`` at the end.
+    Fields: index: At the nominal point; condition: Largest condition number of (7) along the run; condition_k: The
+    sample at which it is largest; residual: Largest scaled Newton residual; contraction: Spectral radius of F (I - K H)
+    at the end; deviations: ``(nq,)``: standard deviations of the parameters at the end; correlations: ``(nq, nq)``: of
+    the parameters' errors at the end: how much a change of one is taken for another; projection: ``(nx,)``: how far the
+    initial state is moved onto its constraint; identifiable: Of states and parameters along the nominal trajectory; K:
+    ``(nx, ny)`` at the end; Upsilon: ``(nx, nq)`` at the end.
     """
 
     index: IndexReport
@@ -68,23 +50,7 @@ class DAEFacts:
 
 
 def dae_facts(observer: DAEObserver) -> DAEFacts:
-    """Run an observer on its own model at nominal inputs and parameters.
-
-    Parameters
-    ----------
-    observer : DAEObserver
-        The observer at rest.
-
-    Returns
-    -------
-    DAEFacts
-        What was found.
-
-    Raises
-    ------
-    SolverError
-        A step has no solution.
-    """
+    """Run an observer on its own model at nominal inputs and parameters."""
     model, running = observer.model, observer.start()
     u = np.array(model.nominal_input)
     truth = _nominal_outputs(observer, u)

@@ -33,7 +33,7 @@ _DEFINITE = ("R", "initial_parameter_covariance")
 
 @dataclass(frozen=True, eq=False)
 class DAEObserver:
-    """An observer at rest: what `start` and `run` need, and nothing that depends on data.
+    """An observer: what `start` and `run` need, and nothing that depends on data.
 
     Parameters
     ----------
@@ -165,7 +165,7 @@ class DAEObserver:
 
     @property
     def order(self) -> int:
-        """Number of states and parameters that are carried from sample to sample."""
+        """Number of states and parameters in its state."""
         return self.model.nx + self.model.nq
 
     def as_dict(self) -> dict[str, Any]:
@@ -191,7 +191,7 @@ class DAEObserver:
         return cls(**{**data, "model": DAEModel(**data["model"])})
 
     def start(self) -> RunningDAEObserver:
-        """Return an observer in motion, at k = 0."""
+        """Return a running observer, at k = 0."""
         from obsynth.observers.dae.running import RunningDAEObserver
 
         return RunningDAEObserver(self)

@@ -25,14 +25,7 @@ def run_record(
 ) -> DAEEstimates:  # fmt: skip
     """Run over a whole record.
 
-    Parameters
-    ----------
-    observer : DAEObserver
-        At rest.
-    y, u : FloatArray
-        ``(samples, ny)`` and ``(samples, nu)``, checked.
-    compiled, progress
-        See `DAEObserver.run`.
+    Shapes: ``y (samples, ny)``, ``u (samples, nu)``.
     """
     running, found = observer.start(), GatheredRows(observer)
     found.add(_nothing(observer))
@@ -80,16 +73,7 @@ def advanced(
 ) -> None:  # fmt: skip
     """Lead an observer that was just started through a record.
 
-    Parameters
-    ----------
-    running : RunningDAEObserver
-        At k = 0.
-    y, u : FloatArray
-        ``(samples, ny)`` and ``(samples, nu)``, checked.
-    keep : callable
-        Called with what is said, in order.
-    note : callable, optional
-        Called with the number of samples that are done.
+    Shapes: ``y (samples, ny)``, ``u (samples, nu)``.
     """
     calls: dict[int, Compiled] = {}
 

@@ -1,4 +1,4 @@
-"""An observer of a DAE in motion: sample by sample, or whole stretches inside CasADi."""
+"""A running observer of a DAE: sample by sample, or whole stretches inside CasADi."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def _remembered(name: str, text: str) -> property:
 
 
 class RunningDAEObserver:
-    """An observer in motion.
+    """A running observer.
 
     Parameters
     ----------

@@ -26,20 +26,10 @@ Arrays = dict[str, Any]
 class ObserverGraph:
     """The functions of an observer.
 
-    Parameters
-    ----------
-    memory, row : Layout
-        Of what is carried on, and of what is said besides.
-    functions : DAEFunctions
-        The model with its method of integration.
-    step : StepGraph
-        Its implicit step.
-    first : casadi.Function
-        From memory, outputs and one for each that is seen, at k = 0, to memory and row.
-    sample : casadi.Function
-        From memory, stages of the solved step, input, outputs and what is seen to memory and row.
-    whole : casadi.Function
-        The implicit step and `sample`: from memory and ``[u; y; seen]`` to memory and row.
+    Fields: memory, row: Of what is carried on, and of what is said besides; functions: The model with its method of
+    integration; step: Its implicit step; first: From memory, outputs and one for each that is seen, at k = 0, to memory
+    and row; sample: From memory, stages of the solved step, input, outputs and what is seen to memory and row; whole:
+    The implicit step and `sample`: from memory and ``[u; y; seen]`` to memory and row.
     """
 
     memory: Layout
@@ -52,26 +42,14 @@ class ObserverGraph:
     _stretches: dict[int, Any] = field(default_factory=dict, repr=False)
 
     def over(self, samples: int) -> Any:
-        """Return `whole` over several samples: from memory and arriving columns to columns of memory and row.
-
-        Parameters
-        ----------
-        samples : int
-            How many.
-        """
+        """Return `whole` over several samples: from memory and arriving columns to columns of memory and row."""
         if samples not in self._stretches:
             self._stretches[samples] = self.whole.mapaccum(samples)
         return self._stretches[samples]
 
 
 def observer_graph(observer: DAEObserver) -> ObserverGraph:
-    """Return the functions of an observer.
-
-    Parameters
-    ----------
-    observer : DAEObserver
-        At rest; its numbers become constants of the graph.
-    """
+    """Return the functions of an observer."""
     import casadi as ca
 
     functions = DAEFunctions(observer.model, observer.integration)

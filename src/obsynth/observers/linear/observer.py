@@ -118,7 +118,7 @@ class LinearObserver:
         return cls(**values)
 
     def start(self, initial_state: ArrayLike | None = None) -> RunningObserver:
-        """Return an observer at rest that takes one sample at a time.
+        """Return an observer that takes one sample at a time.
 
         Parameters
         ----------
@@ -162,7 +162,7 @@ class LinearObserver:
 
 
 class RunningObserver:
-    """A linear observer in motion: `step` takes y(k) and u(k) and returns the estimates at k.
+    """A running linear observer: `step` takes y(k) and u(k) and returns the estimates at k.
 
     Parameters
     ----------

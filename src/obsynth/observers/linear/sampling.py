@@ -57,18 +57,7 @@ def sample_observer(observer: LinearObserver, dt: float) -> LinearObserver:
 def first_order_hold(a: FloatArray, b: FloatArray, dt: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     r"""Return the matrices of ``x' = a x + b v`` over an interval in which v is linear.
 
-    Parameters
-    ----------
-    a, b : FloatArray
-        ``(n, n)``, ``(n, m)``.
-    dt : float
-        Seconds, positive.
-
-    Returns
-    -------
-    tuple of FloatArray
-        ``Phi (n, n)``, ``Gamma_0 (n, m)``, ``Gamma_1 (n, m)`` of
-        ``x(t + dt) = Phi x(t) + Gamma_0 v(t) + Gamma_1 (v(t + dt) - v(t))``.
+    Shapes: ``a (n, n)``, ``b (n, m)``.
     """
     from scipy.linalg import expm
 

@@ -23,21 +23,7 @@ PARAMETER_OPTIONS = (
 
 
 def observer_from_options(plant: TimeVaryingDescriptorSystem, options: Mapping[str, Any]) -> RecursiveObserver:
-    """Return the observer that options stand for.
-
-    Parameters
-    ----------
-    plant : TimeVaryingDescriptorSystem
-        The plant.
-    options : mapping
-        All of `FILTER_OPTIONS`; all of `PARAMETER_OPTIONS` too where parameters are estimated.  ``None`` stands for the
-        identity, or for zeros in means and in the walk.
-
-    Raises
-    ------
-    SpecError
-        An option is out of range or has the wrong shape.
-    """
+    """Return the observer that options stand for."""
     adaptation = None
     if "form" in options:
         nq = plant.nq
@@ -62,13 +48,7 @@ def observer_from_options(plant: TimeVaryingDescriptorSystem, options: Mapping[s
 
 
 def plain_options(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return options as they are kept with a design: arrays and sequences as data, callables as they are.
-
-    Parameters
-    ----------
-    options : mapping
-        As for `observer_from_options`.
-    """
+    """Return options as they are kept with a design: arrays and sequences as data, callables as they are."""
     plain: dict[str, Any] = {}
     for name, given in options.items():
         value = given.item() if isinstance(given, np.generic) else given

@@ -26,7 +26,7 @@ from obsynth.observers.recursive.step_stacks import stacked_matrices, stacked_st
 #: Samples from which the kernel is used unasked: they take seconds without it, which is what loading numba, or the
 #: first compilation of an installation, takes.
 LONG_RECORD = 100_000
-#: Numbers carried from sample to sample up to which the kernel is faster than LAPACK.
+#: Numbers in the state up to which the kernel is faster than LAPACK.
 SMALL_ORDER = 25
 #: Steps that are prepared together: bounds the memory of plants that vary.
 CHUNK = 4096
@@ -35,33 +35,12 @@ SHORT_STRETCH = 8
 
 
 def kernel_covers(observer: RecursiveObserver) -> bool:
-    """Return whether the kernel knows the recursion: that of a filter, with parameters as a random walk or none.
-
-    Parameters
-    ----------
-    observer : RecursiveObserver
-        At rest.
-    """
+    """Return whether the kernel knows the recursion: that of a filter, with parameters as a random walk or none."""
     return observer.adaptation is None or observer.adaptation.form == "random-walk"
 
 
 def kernel_is_chosen(observer: RecursiveObserver, samples: int, compiled: bool | None) -> bool:
-    """Return whether a record goes through the kernel.
-
-    Parameters
-    ----------
-    observer : RecursiveObserver
-        At rest.
-    samples : int
-        Length of the record.
-    compiled : bool or None
-        What the user asks for.
-
-    Raises
-    ------
-    SpecError
-        It is asked for, but numba is not installed or the observer learns by least squares.
-    """
+    """Return whether a record goes through the kernel."""
     if compiled is False:
         return False
     covered, installed = kernel_covers(observer), importlib.util.find_spec("numba") is not None
@@ -83,14 +62,7 @@ def kernel_is_chosen(observer: RecursiveObserver, samples: int, compiled: bool |
 def run_record(observer: RecursiveObserver, y: FloatArray, u: FloatArray, compiled: bool | None) -> RecursiveEstimates:
     """Run over a whole record.
 
-    Parameters
-    ----------
-    observer : RecursiveObserver
-        At rest.
-    y, u : FloatArray
-        ``(samples, ny)`` and ``(samples, nu)``, checked.
-    compiled : bool or None
-        See `kernel_is_chosen`.
+    Shapes: ``y (samples, ny)``, ``u (samples, nu)``.
     """
     if kernel_is_chosen(observer, len(y), compiled):
         return run_compiled(observer, y, u)
@@ -118,7 +90,7 @@ class _Record:
         )  # fmt: skip
 
     def note(self, k: int, row: RawEstimate) -> None:
-        """Keep one sample of an observer in motion."""
+        """Keep one sample of a running observer."""
         self.states[k], self.deviations[k] = row.x, deviations_of(row)
         self.parameters[k], self.covariances[k] = row.parameters.theta, row.parameters.spread @ row.parameters.spread.T
         self.innovations[k, : len(row.innovation)], self.degrees[k] = row.innovation, len(row.innovation)
@@ -141,12 +113,7 @@ class _Record:
 def run_compiled(observer: RecursiveObserver, y: FloatArray, u: FloatArray) -> RecursiveEstimates:
     """Run over a whole record with the kernel; single steps where samples are missing or a rank has to be decided.
 
-    Parameters
-    ----------
-    observer : RecursiveObserver
-        At rest, one that `kernel_covers`.
-    y, u : FloatArray
-        ``(samples, ny)`` and ``(samples, nu)``, checked.
+    Shapes: ``y (samples, ny)``, ``u (samples, nu)``.
     """
     running, plant = observer.start(), observer.plant
     nq = 0 if observer.adaptation is None else plant.nq

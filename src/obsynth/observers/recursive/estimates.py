@@ -126,13 +126,7 @@ def received_in(y: FloatArray) -> NDArray[np.bool_]:
 
 
 def deviations_of(row: RawEstimate) -> FloatArray:
-    """Return standard deviations ``(nx,)`` of the states; infinite where one is undetermined.
-
-    Parameters
-    ----------
-    row : RawEstimate
-        Of an observer in motion.
-    """
+    """Return standard deviations ``(nx,)`` of the states; infinite where one is undetermined."""
     deviations = np.sqrt(np.einsum("ij,ij->i", row.factor, row.factor))
     open_states = (np.abs(row.diffuse) > UNDETERMINED_SHARE).any(axis=1)
     return np.where(open_states, np.inf, deviations)
@@ -141,12 +135,7 @@ def deviations_of(row: RawEstimate) -> FloatArray:
 def excitation_levels(regressors: Sequence[FloatArray], window: int) -> FloatArray:
     """Return the least eigenvalue of ``sum G' G`` over the last ``window`` samples, zero while the window fills.
 
-    Parameters
-    ----------
-    regressors : sequence of FloatArray
-        ``G (any, nq)`` of each sample.
-    window : int
-        Samples.
+    Shapes: ``regressors (any, nq)``.
     """
     nq = regressors[0].shape[1] if regressors else 0
     levels = np.zeros(len(regressors))

@@ -25,26 +25,11 @@ from obsynth.observers.recursive.step_model import EarlyConstraintSteps, StepMat
 class GainStep(NamedTuple):
     """The gains of one step; data are the rows ``[A x + B u; outputs]``.
 
-    Parameters
-    ----------
-    step : StepMatrices
-        Of the model as it is run.
-    gain : FloatArray
-        ``[L K] (nx, rows)`` of (11).
-    parity : FloatArray
-        ``(m, rows)``: from data to the whitened innovation.
-    G : FloatArray
-        ``(m, nq)``: its regressor.
-    Upsilon : FloatArray
-        ``(nx, nq)``, after the step.
-    factor : FloatArray
-        ``(nx, nx)``: square root of the covariance of the state, the parameters being known.
-    learn : FloatArray
-        ``(nq, rows)``: from data to the correction of the parameters.
-    forget : FloatArray
-        ``(nq, nq)``: ``theta^+ = forget theta + learn data``.
-    spread : FloatArray
-        ``(nq, nq)``: square root of the covariance of the parameters.
+    Fields: step: Of the model as it is run; gain: ``[L K] (nx, rows)`` of (11); parity: ``(m, rows)``: from data to the
+    whitened innovation; G: ``(m, nq)``: its regressor; Upsilon: ``(nx, nq)``, after the step; factor: ``(nx, nx)``:
+    square root of the covariance of the state, the parameters being known; learn: ``(nq, rows)``: from data to the
+    correction of the parameters; forget: ``(nq, nq)``: ``theta^+ = forget theta + learn data``; spread: ``(nq, nq)``:
+    square root of the covariance of the parameters.
     """
 
     step: StepMatrices
@@ -63,15 +48,7 @@ def gain_steps(
 ) -> Iterator[GainStep]:
     """Yield the gains of the first steps.
 
-    Parameters
-    ----------
-    observer : RecursiveObserver
-        At rest.
-    steps : int
-        How many; with early constraints the correction of x(0) comes before them.
-    received : numpy.ndarray, optional
-        ``(samples, ny)``, of bool: which outputs of a record were there; all by default.  The gains are those of that
-        record, with zero columns for what was missing.
+    Shapes: ``received (samples, ny)``.
     """
     start = RunningRecursiveObserver(observer)
     factor, Upsilon, parameters, diffuse = start.factor, start.Upsilon, start.parameters, start.diffuse
@@ -131,24 +108,7 @@ class BatchEstimates:
 def run_batch(observer: RecursiveObserver, y: ArrayLike, u: ArrayLike | None = None) -> BatchEstimates:
     """Run many trials at once: the gains do not depend on data, so a step is one product for all trials.
 
-    Parameters
-    ----------
-    observer : RecursiveObserver
-        At rest.
-    y : array_like
-        ``(trials, samples, ny)``, complete: a missing sample would change the gains of its trial.
-    u : array_like, optional
-        ``(trials, samples, nu)``, or ``(samples, nu)`` for all trials; may be left out when there are none.
-
-    Returns
-    -------
-    BatchEstimates
-        The same numbers as `RecursiveObserver.run` gives for each trial, up to rounding.
-
-    Raises
-    ------
-    SpecError
-        Shapes do not fit, something is not finite, the record is longer than the horizon, or the observer resets.
+    Shapes: ``y (trials, samples, ny)``.
     """
     if observer.adaptation is not None and observer.adaptation.reset:
         raise SpecError("Resets depend on the data of each trial: run them one by one, or without reset.", path="reset")

@@ -26,29 +26,14 @@ STEPS_TO_CONTRACT = 50
 class GainScheduleSummary:
     """What the gains along the horizon say.
 
-    Parameters
-    ----------
-    steps : int
-        How many steps were looked at.
-    contraction : float
-        ``norm(product of L_k A_k)^(1 / steps)``: the mean factor by which an error shrinks in a step; where that is not
-        below one, over the second half of the horizon.
-    growth : float
-        The largest norm of the product on the way: how much an error may grow before it dies out.
-    span : str
-        What the contraction was taken over.
-    survivors : FloatArray
-        ``(nx,)``: size of the product in each state after the last step, relative to its largest: where errors last.
-    excitation : float
-        The least eigenvalue of the information on the parameters in any window, (26); NaN without parameters.
-    excitation_k : int
-        The sample that ends that window.
-    L, K : FloatArray
-        The gains (11) of the last step.
-    deviations : FloatArray
-        ``(nq,)``: standard deviations of the parameters after the last step.
-    state_deviations : FloatArray
-        ``(nx,)``: standard deviations of the states after the last step, the parameters being known.
+    Fields: steps: How many steps were looked at; contraction: ``norm(product of L_k A_k)^(1 / steps)``: the mean factor
+    by which an error shrinks in a step; where that is not below one, over the second half of the horizon; growth: The
+    largest norm of the product on the way: how much an error may grow before it dies out; span: What the contraction
+    was taken over; survivors: ``(nx,)``: size of the product in each state after the last step, relative to its
+    largest: where errors last; excitation: The least eigenvalue of the information on the parameters in any window,
+    (26); NaN without parameters; excitation_k: The sample that ends that window; L, K: The gains (11) of the last step;
+    deviations: ``(nq,)``: standard deviations of the parameters after the last step; state_deviations: ``(nx,)``:
+    standard deviations of the states after the last step, the parameters being known.
     """
 
     steps: int
@@ -74,31 +59,19 @@ class Contraction(NamedTuple):
 
 
 def looked_at(observer: RecursiveObserver) -> int:
-    """Return how many steps of an observer's model are looked at.
-
-    Parameters
-    ----------
-    observer : RecursiveObserver
-        At rest.
-    """
+    """Return how many steps of an observer's model are looked at."""
     steps = observer.plant.horizon or STEPS_WITHOUT_HORIZON
     return max(steps - 1, 1) if observer.early_constraints else steps
 
 
 def gain_schedule_summary(observer: RecursiveObserver) -> GainScheduleSummary:
-    """Return what the gains along the horizon say.
-
-    Parameters
-    ----------
-    observer : RecursiveObserver
-        At rest.
-    """
+    """Return what the gains along the horizon say."""
     steps = looked_at(observer)
     learning = observer.adaptation is not None
-    walking = observer.adaptation is not None and observer.adaptation.form == "random-walk"
+    random_walk = observer.adaptation is not None and observer.adaptation.form == "random-walk"
     # Of a walk, the state filter and the regressors are those of the model without the walk.
     plain = observer
-    if observer.adaptation is not None and walking:
+    if observer.adaptation is not None and random_walk:
         plain = replace(observer, adaptation=replace(observer.adaptation, form="innovation", forgetting=1.0))
     schedule = list(gain_steps(plain, steps))
     last = schedule[-1]
@@ -107,7 +80,7 @@ def gain_schedule_summary(observer: RecursiveObserver) -> GainScheduleSummary:
     window = observer.adaptation.window if observer.adaptation is not None else 1
     levels = excitation_levels([found.G for found in schedule], window)[window - 1 :]
     deviations, state_deviations = _lengths(last.spread), _lengths(last.factor)
-    if walking:
+    if random_walk:
         *_, end = gain_steps(observer, steps)
         lengths = _lengths(end.factor)
         state_deviations, deviations = lengths[: observer.plant.nx], lengths[observer.plant.nx :]

@@ -22,31 +22,19 @@ SMALLEST_INFORMATION = float(np.finfo(np.float64).tiny / np.finfo(np.float64).ep
 def pull_of_the_start(observer: RecursiveObserver, estimates: RecursiveEstimates, error: FloatArray) -> FloatArray:
     """Return what is left, in the estimates at each sample, of an error of the initial parameters, ``(samples, nq)``.
 
-    Parameters
-    ----------
-    observer : RecursiveObserver
-        That gave the estimates.
-    estimates : RecursiveEstimates
-        Of a whole run.
-    error : FloatArray
-        ``(nq,)``: initial minus true parameters.
-
-    Raises
-    ------
-    SpecError
-        The observer resets, at times that its data have chosen.
+    Shapes: ``error (nq,)``.
     """
     adaptation, nx = observer.adaptation, observer.plant.nx
     if adaptation is not None and adaptation.reset:
         raise SpecError("chi-square with reset needs nominal parameters that are the observer's initial ones: what a "
                         "reset forgets of the start is not known. Use glr or cusum, or design with "
                         "initial_parameters at their nominal values.", path="nominal")  # fmt: skip
-    walking = adaptation is not None and adaptation.form == "random-walk"
-    left = np.concatenate([np.zeros(nx if walking else 0), error])
+    random_walk = adaptation is not None and adaptation.form == "random-walk"
+    left = np.concatenate([np.zeros(nx if random_walk else 0), error])
     pulls = np.tile(error, (len(estimates.parameters), 1))
     begin = 0 if observer.early_constraints else 1
     for k, gains in enumerate(gain_steps(observer, len(pulls) - 1, received=estimates.received), begin):
-        left = gains.gain[:, : len(gains.step.A)] @ gains.step.A @ left if walking else gains.forget @ left
+        left = gains.gain[:, : len(gains.step.A)] @ gains.step.A @ left if random_walk else gains.forget @ left
         pulls[k] = left[-len(error) :]
     return pulls
 
@@ -59,16 +47,7 @@ def likelihood_ratio(
     The signature of a jump starts at zero at its onset (the regressor that runs along has another past); where samples
     are missing it is that of the record.
 
-    Parameters
-    ----------
-    observer : RecursiveObserver
-        That gave the estimates.
-    estimates : RecursiveEstimates
-        Of a whole run.
-    gaps : FloatArray
-        ``(samples, m)``: innovations at the nominal parameters.
-    false_alarms : float
-        Probability of a false alarm in the whole run, dimensionless.
+    Shapes: ``gaps (samples, m)``.
     """
     samples, nq = gaps.shape[0], estimates.parameters.shape[1]
     begin = 0 if observer.early_constraints else 1

@@ -21,23 +21,7 @@ def posterior_residual(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return what (18f) learns from: ``y - C x`` weighted by R, its regressor (18d), and a root of its covariance.
 
-    Parameters
-    ----------
-    found : LeastSquaresStep
-        Of the data and the regressors.
-    H, S, right : FloatArray
-        What it was found from.
-    ne : int
-        Number of equations; the outputs follow.
-    unknown : FloatArray
-        ``(rows, r)``: directions that earlier missing samples have left undetermined.
-    columns : int, optional
-        How many columns of ``right`` are data; the regressors follow.
-
-    Raises
-    ------
-    PreconditionError
-        R is singular.
+    Shapes: ``unknown (rows, r)``.
 
     References
     ----------

@@ -92,7 +92,7 @@ class Adaptation:
 
 @dataclass(frozen=True, eq=False)
 class RecursiveObserver:
-    """A recursive observer at rest: what `start` and `run` need, and nothing that depends on data.
+    """A recursive observer: what `start` and `run` need, and nothing that depends on data.
 
     Parameters
     ----------
@@ -157,7 +157,7 @@ class RecursiveObserver:
 
     @property
     def order(self) -> int:
-        """Number of states and parameters that are carried from sample to sample."""
+        """Number of states and parameters in its state."""
         return self.plant.nx + len(self.fault_names)
 
     def as_dict(self) -> dict[str, Any]:
@@ -197,7 +197,7 @@ class RecursiveObserver:
         )  # fmt: skip
 
     def start(self) -> RunningRecursiveObserver:
-        """Return an observer in motion, at k = 0."""
+        """Return a running observer, at k = 0."""
         from obsynth.observers.recursive.running import RunningRecursiveObserver
 
         return RunningRecursiveObserver(self)
@@ -214,7 +214,7 @@ class RecursiveObserver:
             Known inputs ``(samples, nu)``; may be left out when there are none.
         compiled : bool, optional
             Whether a kernel compiled by numba (`obsynth[fast]`) runs the same square-root recursion: always, never, or,
-            by default, for long records of small observers.  `obsynth.observers.recursive.compiled_run` says what it covers.
+            by default, for long records of small observers.  `compiled_run` says what it covers.
 
         Returns
         -------

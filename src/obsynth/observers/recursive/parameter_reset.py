@@ -16,12 +16,8 @@ RESET_WINDOW = 20
 class ParameterReset:
     """Sums up normalised innovations, and starts S and the covariance again when they are too large.
 
-    Parameters
-    ----------
-    probability : float
-        That the threshold is passed at a sample although nothing has changed.
-    start : ParameterState
-        Whose triangle and spread are taken back.
+    Fields: probability: That the threshold is passed at a sample although nothing has changed; start: Whose triangle
+    and spread are taken back.
     """
 
     def __init__(self, probability: float, start: ParameterState) -> None:
@@ -33,12 +29,7 @@ class ParameterReset:
     def watched(self, state: ParameterState, v: FloatArray, G: FloatArray) -> ParameterState:
         """Return the state to go on with: the same, or one that knows no more than at the start.
 
-        Parameters
-        ----------
-        state : ParameterState
-            Before the sample is learnt from.
-        v, G : FloatArray
-            ``(m,)`` and ``(m, nq)``: whitened innovation and its regressor.
+        Shapes: ``v (m,)``, ``G (m, nq)``.
         """
         gap, seen = v - G @ state.theta, G @ state.spread
         covariance = np.eye(len(v)) + seen @ seen.T

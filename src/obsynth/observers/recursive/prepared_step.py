@@ -15,16 +15,9 @@ from obsynth.observers.recursive.step_model import StepMatrices
 class PreparedStep:
     """One step with its factorisation.
 
-    Parameters
-    ----------
-    step : StepMatrices
-        Which step it is.
-    projection : Projection or None
-        Of H; ``None`` where its rank has to be decided.
-    moved : FloatArray
-        ``(rows, n)``: rotated A, empty without a projection.
-    known : FloatArray
-        ``(any, rows)``: the transpose of the rotated noise, empty without a projection.
+    Fields: step: Which step it is; projection: Of H; ``None`` where its rank has to be decided; moved: ``(rows, n)``:
+    rotated A, empty without a projection; known: ``(any, rows)``: the transpose of the rotated noise, empty without a
+    projection.
     """
 
     step: StepMatrices
@@ -34,15 +27,7 @@ class PreparedStep:
 
     @classmethod
     def of(cls, step: StepMatrices, last: PreparedStep | None) -> PreparedStep:
-        """Prepare a step.
-
-        Parameters
-        ----------
-        step : StepMatrices
-            The step.
-        last : PreparedStep, optional
-            Whose factorisation and rotated noise serve again where H and the noise are the same objects.
-        """
+        """Prepare a step."""
         same = last if last is not None and last.step.H is step.H else None
         projection = projection_of(step.H) if same is None else same.projection
         if projection is None:
@@ -55,12 +40,7 @@ class PreparedStep:
     def taken(self, factor: FloatArray, right: FloatArray) -> LeastSquaresStep | None:
         """Take the step, or return ``None`` where a rank has to be decided.
 
-        Parameters
-        ----------
-        factor : FloatArray
-            ``(n, any)``: square root of the covariance of the state.
-        right : FloatArray
-            ``(rows, columns)``: data and regressors.
+        Shapes: ``factor (n, any)``, ``right (rows, columns)``.
         """
         if self.projection is None:
             return None

@@ -20,25 +20,14 @@ class RandomWalkParameterSteps:
     The state at k + 1 is ``[x(k+1); theta(k)]``: the parameters that acted in the step that led there.  Their
     increment then is noise of an equation of its own, and no noise is correlated in time.
 
-    Parameters
-    ----------
-    model : StepModel
-        With parameters.
-    walk : FloatArray
-        ``(nq, nq)``: square root of the covariance of one step of the walk.
+    Fields: model: With parameters; walk: ``(nq, nq)``: square root of the covariance of one step of the walk.
     """
 
     model: StepModel
     walk: FloatArray
 
     def at(self, k: int) -> StepMatrices:
-        """Return the matrices of the step from k to k + 1.
-
-        Parameters
-        ----------
-        k : int
-            Time index.
-        """
+        """Return the matrices of the step from k to k + 1."""
         return with_walking_parameters(self.model.at(k), self.walk)
 
 
@@ -49,22 +38,13 @@ class WalkingEarlySteps(EarlyConstraintSteps):
     An early equation of k + 1 holds for the parameters of k + 1, so the state at k + 1 is ``[x(k+1); theta(k+1)]``.
     The outputs still hold theta(k), which is theta(k + 1) without its last increment: that noise they share.
 
-    Parameters
-    ----------
-    walk : FloatArray
-        ``(nq, nq)``: square root of the covariance of one step of the walk.
+    Fields: walk: ``(nq, nq)``: square root of the covariance of one step of the walk.
     """
 
     walk: FloatArray
 
     def at(self, k: int) -> StepMatrices:
-        """Return the matrices of the step from k to k + 1.
-
-        Parameters
-        ----------
-        k : int
-            Time index.
-        """
+        """Return the matrices of the step from k to k + 1."""
         return self._augmented(super().at(k), self.walk)
 
     def first(self) -> StepMatrices:
@@ -92,12 +72,7 @@ class WalkingEarlySteps(EarlyConstraintSteps):
 def with_walking_parameters(step: StepMatrices, walk: FloatArray) -> StepMatrices:
     """Return one step with its parameters among the states.
 
-    Parameters
-    ----------
-    step : StepMatrices
-        With parameters.
-    walk : FloatArray
-        ``(nq, nq)``: square root of the covariance of one step of the walk.
+    Shapes: ``walk (nq, nq)``.
     """
     ne, nx, nq = *step.A.shape, step.Phi.shape[1]
     E, C = step.H[:ne], step.H[ne:]

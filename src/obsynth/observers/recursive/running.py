@@ -1,4 +1,4 @@
-"""A recursive observer in motion: one factorisation per sample gives state, regressor, innovation and its regressor."""
+"""A running recursive observer: one factorisation per sample gives state, regressor, innovation and its regressor."""
 
 from __future__ import annotations
 
@@ -39,26 +39,11 @@ from obsynth.observers.recursive.step_model import (
 class RawEstimate(NamedTuple):
     """What is known at one sample.
 
-    Parameters
-    ----------
-    k : int
-        The sample.
-    x : FloatArray
-        ``(nx,)``: the state estimate, with the parameters as they are estimated now.
-    factor : FloatArray
-        ``(nx, any)``: square root of its covariance.
-    diffuse : FloatArray
-        ``(nx, r)``: directions about which nothing is known.
-    parameters : ParameterState
-        Estimate and spreads; empty without parameters.
-    innovation : FloatArray
-        ``(m,)``: whitened parity innovation of the model without parameters.
-    regressor : FloatArray
-        ``(m, nq)``.
-    nis : float
-        Squared length of the innovation at the parameters estimated one sample before.
-    y : FloatArray
-        ``(ny,)``: the outputs that were given, NaN where one was missing.
+    Fields: k: The sample; x: ``(nx,)``: the state estimate, with the parameters as they are estimated now; factor:
+    ``(nx, any)``: square root of its covariance; diffuse: ``(nx, r)``: directions about which nothing is known;
+    parameters: Estimate and spreads; empty without parameters; innovation: ``(m,)``: whitened parity innovation of the
+    model without parameters; regressor: ``(m, nq)``; nis: Squared length of the innovation at the parameters estimated
+    one sample before; y: ``(ny,)``: the outputs that were given, NaN where one was missing.
     """
 
     k: int
@@ -73,13 +58,7 @@ class RawEstimate(NamedTuple):
 
 
 def step_model_of(observer: RecursiveObserver) -> StepModel:
-    """Return the steps that an observer runs on, with its plant rewritten as its options ask.
-
-    Parameters
-    ----------
-    observer : RecursiveObserver
-        The observer.
-    """
+    """Return the steps that an observer runs on, with its plant rewritten as its options ask."""
     parts, adaptation = (observer.plant, observer.Q, observer.R), observer.adaptation
     walk = None
     if adaptation is not None and adaptation.form == "random-walk":
@@ -91,7 +70,7 @@ def step_model_of(observer: RecursiveObserver) -> StepModel:
 
 
 class RunningRecursiveObserver:
-    """A recursive observer in motion: `step` takes y(k) and u(k) and returns the estimates at k.
+    """A running recursive observer: `step` takes y(k) and u(k) and returns the estimates at k.
 
     Parameters
     ----------
@@ -103,7 +82,7 @@ class RunningRecursiveObserver:
         self.observer, self.model, self.k = observer, step_model_of(observer), 0
         adaptation, nx = observer.adaptation, observer.plant.nx
         nq = 0 if adaptation is None else observer.plant.nq
-        self.walking = adaptation is not None and adaptation.form == "random-walk"
+        self.random_walk = adaptation is not None and adaptation.form == "random-walk"
         self.literal = adaptation is not None and adaptation.form == "literal"
         self.x = observer.initial_state.copy()
         self.factor = covariance_factor(observer.initial_covariance, "initial_covariance")
@@ -120,7 +99,7 @@ class RunningRecursiveObserver:
         if adaptation is None:
             return
         spread = covariance_factor(adaptation.initial_covariance, "initial_covariance")
-        if self.walking:
+        if self.random_walk:
             self.x = np.concatenate([self.x, adaptation.initial_parameters])
             joint = np.zeros((nx + nq, nx + nq))
             joint[:nx, :nx], joint[nx:, nx:] = self.factor, spread
@@ -239,7 +218,7 @@ class RunningRecursiveObserver:
         return found
 
     def _estimate(self, innovation: FloatArray, regressor: FloatArray, nis: float, y: FloatArray) -> RawEstimate:
-        if self.walking:
+        if self.random_walk:
             nx = self.observer.plant.nx
             nq = len(self.x) - nx
             spread = self.factor[nx:]

@@ -36,14 +36,9 @@ STILL_STEPS = 5
 class SteadyObserver:
     """A recursive observer whose gains have settled.
 
-    Parameters
-    ----------
-    observer : LinearObserver
-        From ``[u; y]`` to states, parameters, and the whitened innovation at the parameters of one sample before.
-    start : FloatArray
-        ``z(0)``, from the state and the parameters that the recursion starts with; read-only.
-    steps : int
-        After how many steps the gains had settled.
+    Fields: observer: From ``[u; y]`` to states, parameters, and the whitened innovation at the parameters of one sample
+    before; start: ``z(0)``, from the state and the parameters that the recursion starts with; read-only; steps: After
+    how many steps the gains had settled.
     """
 
     observer: LinearObserver
@@ -55,27 +50,7 @@ class SteadyObserver:
 
 
 def steady_observer(observer: RecursiveObserver) -> SteadyObserver:
-    """Return the steady state of a recursive observer.
-
-    Parameters
-    ----------
-    observer : RecursiveObserver
-        Of a time-invariant plant, with constant covariances; any form, with or without parameters.
-
-    Returns
-    -------
-    SteadyObserver
-        Stable.
-
-    Raises
-    ------
-    SpecError
-        Something changes with k, or the observer resets: it has no constant gains.
-    PreconditionError
-        The steady filter is not stable: some mode is neither seen nor damped.
-    SolverError
-        The gains do not settle.
-    """
+    """Return the steady state of a recursive observer."""
     _require_constant(observer)
     settled, steps = _settled(observer)
     realisation, start = _realised(observer, settled)
@@ -143,7 +118,7 @@ def _realised(observer: RecursiveObserver, found: GainStep) -> tuple[LinearObser
     parts = slice(0, ne), slice(ne, ne + ny), slice(ne + ny, width)
     gain, parity = [found.gain[:, part] for part in parts], [found.parity[:, part] for part in parts]
     learn, q = [found.learn[:, part] for part in parts], len(found.forget)
-    walking = found.gain.shape[0] - nx
+    random_walk = found.gain.shape[0] - nx
     # States: z, then the parameters of one sample before.
     state = np.hstack([gain[0], np.zeros((len(gain[0]), q))])
     theta = np.hstack([learn[0], found.forget])
@@ -156,7 +131,7 @@ def _realised(observer: RecursiveObserver, found: GainStep) -> tuple[LinearObser
     seen = [gain[1][:nx] + upsilon @ learn[1], np.vstack([gain[1][nx:], learn[1]]), parity[1]]
     fed = [(gain[2][:nx] + upsilon @ learn[2]) @ early, np.vstack([gain[2][nx:], learn[2]]) @ early, parity[2] @ early]
     residuals = tuple(f"innovation {i + 1}" for i in range(len(found.parity)))
-    names = observer.fault_names if walking or q else ()
+    names = observer.fault_names if random_walk or q else ()
     realisation = LinearObserver(
         Az=az, Bu=bu, By=by, Cz=np.vstack(shown), Du=np.vstack(fed), Dy=np.vstack(seen), dt=observer.dt,
         input_names=plant.input_names, output_names=plant.output_names, state_names=plant.state_names,

@@ -24,18 +24,9 @@ from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 class StepMatrices(NamedTuple):
     """One step ``E x(k+1) = A x(k) + B u(k) + Phi theta + q``, ``[y(k+1); Dn u(k+1)] = C x(k+1) + Psi theta + r``.
 
-    Parameters
-    ----------
-    H : FloatArray
-        ``(ne + ny, nx)``: E above C.
-    A, B, Phi : FloatArray
-        ``(ne, nx)``, ``(ne, nu)``, ``(ne, nq)``.
-    Psi : FloatArray
-        ``(ny, nq)``.
-    Dn : FloatArray
-        ``(ny - measured, nu)``: outputs that are made of the next input.
-    noise : FloatArray
-        ``(ne + ny, any)``: square root of the covariance of q and r.
+    Fields: H: ``(ne + ny, nx)``: E above C; A, B, Phi: ``(ne, nx)``, ``(ne, nu)``, ``(ne, nq)``; Psi: ``(ny, nq)``; Dn:
+    ``(ny - measured, nu)``: outputs that are made of the next input; noise: ``(ne + ny, any)``: square root of the
+    covariance of q and r.
     """
 
     H: FloatArray
@@ -65,16 +56,7 @@ def stacked_noise(first: FloatArray, second: FloatArray) -> FloatArray:
 def require_in_range(S: FloatArray, factor: FloatArray, k: int, state_names: Sequence[str]) -> None:
     """Raise `PreconditionError` when deviations outgrow double precision on the way to sample ``k``.
 
-    Parameters
-    ----------
-    S : FloatArray
-        Square root of the covariance of the data of a step.
-    factor : FloatArray
-        ``(nx or more, any)``: that of the state before it.
-    k : int
-        The sample that the step leads to.
-    state_names : sequence of str
-        Names of the first rows of ``factor``.
+    Shapes: ``factor (nx or more, any)``.
     """
     if float(np.max(np.abs(S), initial=0.0)) < OUTGROWN:
         return
@@ -91,12 +73,7 @@ def require_in_range(S: FloatArray, factor: FloatArray, k: int, state_names: Seq
 class PlantSteps:
     """The steps of a plant as it is.
 
-    Parameters
-    ----------
-    plant : TimeVaryingDescriptorSystem
-        The plant.
-    Q, R : MatrixSequence
-        ``(ne, ne)`` and ``(ny, ny)`` for each k.
+    Fields: plant: The plant; Q, R: ``(ne, ne)`` and ``(ny, ny)`` for each k.
     """
 
     plant: TimeVaryingDescriptorSystem
@@ -113,13 +90,7 @@ class PlantSteps:
         self._is_constant = self._noise_is_constant and self._H_is_constant and self.plant.is_time_invariant
 
     def at(self, k: int) -> StepMatrices:
-        """Return the matrices of the step from k to k + 1.
-
-        Parameters
-        ----------
-        k : int
-            Time index.
-        """
+        """Return the matrices of the step from k to k + 1."""
         if self._constant is not None:
             return self._constant
         plant = self.plant
@@ -141,19 +112,8 @@ class PlantSteps:
 class EarlyConstraintSteps:
     """The steps of a plant with its algebraic equations used as outputs one step earlier.
 
-    Parameters
-    ----------
-    plant : TimeVaryingDescriptorSystem
-        The plant.
-    Q, R : MatrixSequence
-        Covariances; Q must not couple algebraic equations with the others.
-    rows : IntArray
-        The algebraic equations, see `obsynth.analysis.time_varying.algebraic_rows`.
-
-    Raises
-    ------
-    SpecError
-        No equation is algebraic.
+    Fields: plant: The plant; Q, R: Covariances; Q must not couple algebraic equations with the others; rows: The
+    algebraic equations, see `obsynth.analysis.time_varying.algebraic_rows`.
     """
 
     plant: TimeVaryingDescriptorSystem
@@ -185,13 +145,7 @@ class EarlyConstraintSteps:
         )
 
     def at(self, k: int) -> StepMatrices:
-        """Return the matrices of the step from k to k + 1.
-
-        Parameters
-        ----------
-        k : int
-            Time index.
-        """
+        """Return the matrices of the step from k to k + 1."""
         plant, late, others = self.plant, self.late, self.others
         H = np.vstack([plant.E.at(k + 1)[others], plant.C.at(k + 1), plant.A.at(k + 1)[late]])
         outputs = stacked_noise(covariance_factor(self.R.at(k), f"R({k})"), self._factors(k + 1)[1])

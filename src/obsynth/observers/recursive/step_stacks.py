@@ -16,16 +16,8 @@ from obsynth.plants.sequences import MatrixSequence
 class StepStack(NamedTuple):
     """Steps as `obsynth.numerics.compiled_steps.square_root_steps` takes them.
 
-    Parameters
-    ----------
-    moved : FloatArray
-        ``(1 or steps, n, rows)``.
-    known : FloatArray
-        ``(1 or steps, any, rows)``.
-    head : FloatArray
-        ``(1 or steps, n, n)``.
-    data : FloatArray
-        ``(steps, rows)``: as many steps as have an H of full rank, from the first one.
+    Fields: moved: ``(1 or steps, n, rows)``; known: ``(1 or steps, any, rows)``; head: ``(1 or steps, n, n)``; data:
+    ``(steps, rows)``: as many steps as have an H of full rank, from the first one.
     """
 
     moved: FloatArray
@@ -35,15 +27,7 @@ class StepStack(NamedTuple):
 
 
 def stacked_matrices(model: StepModel, first: int, count: int) -> StepMatrices:
-    """Return the matrices of steps, each with a new first axis: one entry if it is the same for all, or ``count``.
-
-    Parameters
-    ----------
-    model : StepModel
-        Of an observer.
-    first, count : int
-        The steps ``first ... first + count - 1``.
-    """
+    """Return the matrices of steps, each with a new first axis: one entry if it is the same for all, or ``count``."""
     if not isinstance(model, PlantSteps):
         steps = [model.at(k) for k in range(first, first + count)]
         return StepMatrices(*(np.array(matrices) for matrices in zip(*steps, strict=True)))
@@ -83,19 +67,7 @@ def _products(matrices: FloatArray, rows: FloatArray) -> FloatArray:
 def stacked_steps(step: StepMatrices, before: FloatArray, y: FloatArray, u: FloatArray) -> StepStack | None:
     """Return steps with H factorised and everything rotated, up to the first H whose rank has to be decided.
 
-    Parameters
-    ----------
-    step : StepMatrices
-        With a first axis, see `stacked_matrices`.
-    before : FloatArray
-        ``(steps, nu)``: u(k), for steps from k to k + 1.
-    y, u : FloatArray
-        ``(steps, measured)`` and ``(steps, nu)``: y(k+1) and u(k+1), complete.
-
-    Returns
-    -------
-    StepStack or None
-        ``None`` if not even the first step has an H of full rank that is beyond doubt.
+    Shapes: ``before (steps, nu)``, ``y (steps, measured)``, ``u (steps, nu)``.
     """
     ne, rows, n = step.A.shape[1], step.H.shape[1], step.H.shape[2]
     if rows < n:

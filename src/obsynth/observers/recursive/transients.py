@@ -17,20 +17,7 @@ GONE = 1e-4
 
 
 def transient_steps(observer: RecursiveObserver, share: float) -> float:
-    """Return the steps after which an error at the start has shrunk to a share of its largest, and stays there.
-
-    Parameters
-    ----------
-    observer : RecursiveObserver
-        At rest.
-    share : float
-        Such as 0.02.
-
-    Returns
-    -------
-    float
-        Infinite where that does not happen within the horizon, or `MOST_STEPS`.
-    """
+    """Return the steps after which an error at the start has shrunk to a share of its largest, and stays there."""
     horizon = observer.plant.horizon
     steps = min(MOST_STEPS, MOST_STEPS if horizon is None else horizon)
     if observer.early_constraints and horizon is not None:

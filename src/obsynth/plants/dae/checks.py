@@ -176,17 +176,7 @@ def step_length(dt: Any) -> float:
 
 
 def checked_inputs(model: DAEModel, u: Any, samples: int | None = None) -> FloatArray:
-    """Return known inputs ``(samples, nu)``; raise `SpecError` naming the signal and k where one is not finite.
-
-    Parameters
-    ----------
-    model : DAEModel
-        Whose.
-    u : array_like or None
-        ``None`` where there are none, if ``samples`` is given.
-    samples : int, optional
-        How many there must be.
-    """
+    """Return known inputs ``(samples, nu)``; raise `SpecError` naming the signal and k where one is not finite."""
     if u is None and (model.nu or samples is None):
         raise SpecError(f"u is missing: the model has {model.nu} input(s), {', '.join(model.input_names)}.", path="u")
     raw = np.zeros((samples or 0, 0)) if u is None else np.asarray(u)

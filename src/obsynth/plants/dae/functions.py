@@ -26,10 +26,7 @@ BUTCHER: dict[str, FloatArray] = {
 class Compiled:
     """A CasADi function that is called on float arrays without conversion.
 
-    Parameters
-    ----------
-    function : casadi.Function
-        Of columns, with dense results.
+    Fields: function: Of columns, with dense results.
     """
 
     def __init__(self, function: Any) -> None:
@@ -62,25 +59,7 @@ class Compiled:
 class DAEFunctions:
     """What an observer or a simulation needs of a model, compiled.
 
-    Parameters
-    ----------
-    model : DAEModel
-        The model.
-    method : {"backward-euler", "radau"}, optional
-        The implicit method.
-
-    Attributes
-    ----------
-    residual_function, derivative_function : casadi.Function
-        From stages ``(stages * nx,)``, state before, input, parameters and dt to the residual and its Jacobian; and to
-        the Jacobians with respect to stages, state before and parameters.
-    output_function : casadi.Function
-        From state and parameters to y, H and L.
-
-    Raises
-    ------
-    SpecError
-        The method is unknown.
+    Fields: model: The model; method: The implicit method.
     """
 
     def __init__(self, model: DAEModel, method: str = "backward-euler") -> None:
@@ -96,10 +75,7 @@ class DAEFunctions:
     def outputs(self, x: FloatArray, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return ``y (ny,)``, ``H = dh/dx (ny, nx)`` and ``L = dh/dtheta (ny, nq)``.
 
-        Parameters
-        ----------
-        x, theta : FloatArray
-            ``(nx,)`` and ``(nq,)``.
+        Shapes: ``x (nx,)``, ``theta (nq,)``.
         """
         y, H, L = self._outputs(x, theta)
         return y[:, 0], H, L

@@ -25,16 +25,8 @@ MOST_SUBSOLVES = 10_000
 class Solution:
     """The state at the end of a step.
 
-    Parameters
-    ----------
-    x : FloatArray
-        ``(nx,)``.
-    stages : FloatArray
-        ``(stages * nx,)``.
-    residual : float
-        Largest residual in units of the states' sizes.
-    subsolves : int
-        Newton iterations that were started: 1, or more where a homotopy was needed.
+    Fields: x: ``(nx,)``; stages: ``(stages * nx,)``; residual: Largest residual in units of the states' sizes;
+    subsolves: Newton iterations that were started: 1, or more where a homotopy was needed.
     """
 
     x: FloatArray
@@ -47,16 +39,9 @@ class Solution:
 class Sensitivities:
     """Derivatives of a step.
 
-    Parameters
-    ----------
-    F : FloatArray
-        ``(nx, nx)``: with respect to the state before, (8).
-    G : FloatArray
-        ``(nx, nq)``: with respect to the parameters, (9).
-    noise : FloatArray
-        ``(nx, nx)``: with respect to what is added to the right sides of the equations.
-    condition : float
-        Condition number of the equilibrated matrix of (7).
+    Fields: F: ``(nx, nx)``: with respect to the state before, (8); G: ``(nx, nq)``: with respect to the parameters,
+    (9); noise: ``(nx, nx)``: with respect to what is added to the right sides of the equations; condition: Condition
+    number of the equilibrated matrix of (7).
     """
 
     F: FloatArray
@@ -68,15 +53,9 @@ class Sensitivities:
 class ImplicitStep:
     """Steps of a fixed length.
 
-    Parameters
-    ----------
-    functions : DAEFunctions
-        The compiled model, with its method of integration.
-    dt : float
-        Seconds, positive.
-    largest_move : float, optional
-        In sizes of the states: a solution further away than this is taken only along a homotopy none of whose parts
-        is longer, so that of several roots the one connected with the last is found.
+    Fields: functions: The compiled model, with its method of integration; dt: Seconds, positive; largest_move: In sizes
+    of the states: a solution further away than this is taken only along a homotopy none of whose parts is longer, so
+    that of several roots the one connected with the last is found.
     """
 
     def __init__(self, functions: DAEFunctions, dt: float, *, largest_move: float | None = None) -> None:
@@ -102,21 +81,7 @@ class ImplicitStep:
     ) -> Solution:
         """Return the state after one step.
 
-        Parameters
-        ----------
-        x : FloatArray
-            ``(nx,)``: the state before.
-        u, theta : FloatArray
-            ``(nu,)`` during the step, and ``(nq,)``.
-        before : FloatArray, optional
-            ``(nu,)`` during the step before, from where a homotopy may start.
-        k : int, optional
-            Number of the sample that is reached, for messages.
-
-        Raises
-        ------
-        SolverError
-            There is no solution within reach; k, iteration and worst equation are named.
+        Shapes: ``x (nx,)``, ``u (nu,)``, ``theta (nq,)``, ``before (nu,)``.
         """
         stages, residual, trusted = self._fast(x, u, theta)
         if trusted[0, 0] == 1.0:
@@ -126,18 +91,7 @@ class ImplicitStep:
     def solve_carefully(
         self, x: FloatArray, u: FloatArray, theta: FloatArray, *, before: FloatArray | None = None, k: int = 0
     ) -> Solution:
-        """Return the state after one step, by damped Newton and by a homotopy where that is needed.
-
-        Parameters
-        ----------
-        x, u, theta, before, k
-            See `solve`, which comes here where plain Newton does not converge.
-
-        Raises
-        ------
-        SolverError
-            There is no solution within reach; k, iteration and worst equation are named.
-        """
+        """Return the state after one step, by damped Newton and by a homotopy where that is needed."""
         start = np.tile(x, self.functions.stages)
         found = self._newton(start, x, u, theta)
         if found.converged and self._move(found.x, start) <= self.largest_move:
@@ -149,20 +103,7 @@ class ImplicitStep:
         return self._homotopy(start, x, before, u, theta, k)
 
     def sensitivities(self, solution: Solution, x: FloatArray, u: FloatArray, theta: FloatArray) -> Sensitivities:
-        """Return the derivatives of a step that was solved.
-
-        Parameters
-        ----------
-        solution : Solution
-            Where it ended.
-        x, u, theta : FloatArray
-            As they were given to `solve`.
-
-        Raises
-        ------
-        SolverError
-            The matrix of (7) is singular.
-        """
+        """Return the derivatives of a step that was solved."""
         F, G, noise, scaled = self._local(solution.stages, x, u, theta)
         if not (np.isfinite(F).all() and np.isfinite(G).all() and np.isfinite(noise).all()):
             raise SolverError("The matrix of (7), dF/dx' / dt + dF/dx, is singular: the step has no unique solution.")

@@ -25,17 +25,11 @@ BLOCKS = (4, 4, 8, MOST_ITERATIONS - 16)
 class StepGraph:
     """The functions of one implicit step of fixed length.
 
-    Parameters
-    ----------
-    newton : casadi.Function
-        From stages, state before, input and parameters to the residual, its scale by rows, and the Newton step.
-    sensitivities : casadi.Function
-        From the same to F ``(nx, nx)`` of (8), G ``(nx, nq)`` of (9), the derivative with respect to what is added to
-        the equations ``(nx, nx)``, and the equilibrated matrix of (7).
-    step : casadi.Function
-        From state before, input and parameters to stages, scaled residual, and one if the step is to be trusted.
-    small : bool
-        Whether everything is scalar operations.
+    Fields: newton: From stages, state before, input and parameters to the residual, its scale by rows, and the Newton
+    step; sensitivities: From the same to F ``(nx, nx)`` of (8), G ``(nx, nq)`` of (9), the derivative with respect to
+    what is added to the equations ``(nx, nx)``, and the equilibrated matrix of (7); step: From state before, input and
+    parameters to stages, scaled residual, and one if the step is to be trusted; small: Whether everything is scalar
+    operations.
     """
 
     newton: Any
@@ -45,17 +39,7 @@ class StepGraph:
 
 
 def step_graph(functions: DAEFunctions, dt: float, largest_move: float) -> StepGraph:
-    """Return the functions of one implicit step.
-
-    Parameters
-    ----------
-    functions : DAEFunctions
-        The model with its method of integration.
-    dt : float
-        Seconds.
-    largest_move : float
-        In sizes of the states: longer steps are not to be trusted.
-    """
+    """Return the functions of one implicit step."""
     graphs, key = functions.model.graphs, (functions.method, dt, largest_move)
     if key not in graphs:
         graphs[key] = _graph(functions, dt, largest_move)

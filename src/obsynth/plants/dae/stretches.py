@@ -13,19 +13,7 @@ def take_samples(
     first: int, samples: int, together: Callable[[int, int], int], alone: Callable[[int], object],
     note: Callable[[int], object] = bool,
 ) -> None:  # fmt: skip
-    """Go through samples in stretches.
-
-    Parameters
-    ----------
-    first, samples : int
-        Number of the first sample, and of the one after the last.
-    together : callable
-        Takes the number of a sample and a length from `STRETCHES`, and returns how many samples it could take.
-    alone : callable
-        Takes the number of a sample, and takes that sample or raises.
-    note : callable, optional
-        Called with the number of the sample that is next.
-    """
+    """Go through samples in stretches."""
     k, allowed = first, STRETCHES[-1]
     while k < samples:
         length = next((size for size in reversed(STRETCHES) if size <= min(allowed, samples - k)), 0)

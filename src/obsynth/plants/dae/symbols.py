@@ -23,16 +23,8 @@ _EQUALS = re.compile("(?<![<>=])=(?!=)")
 class DAESymbols:
     """``F(q', x, u, theta) = 0`` and ``y = h(x, theta)`` with ``q = q(x, theta)``, as CasADi SX columns.
 
-    Parameters
-    ----------
-    rates, x, u, theta : casadi.SX
-        The free symbols; ``rates`` ``(nq,)`` stands for q'.
-    equations : casadi.SX
-        ``(n,)``.
-    stored : casadi.SX
-        ``(nq,)``: the quantities whose derivatives occur.
-    outputs : casadi.SX
-        ``(ny,)``.
+    Fields: rates, x, u, theta: The free symbols; ``rates`` ``(nq,)`` stands for q'; equations: ``(n,)``; stored:
+    ``(nq,)``: the quantities whose derivatives occur; outputs: ``(ny,)``.
     """
 
     rates: Any
@@ -45,18 +37,7 @@ class DAESymbols:
 
 
 def symbols_of(model: DAEModel) -> DAESymbols:
-    """Return the symbols of a model.
-
-    Parameters
-    ----------
-    model : DAEModel
-        From texts or from Python functions.
-
-    Raises
-    ------
-    SpecError
-        An expression is malformed or uses an unknown name, or a function does not return what it should.
-    """
+    """Return the symbols of a model."""
     return _from_functions(model) if callable(model.equations) else _from_texts(model, model.equations)
 
 

@@ -65,13 +65,7 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
 
 
 def misfit(design: ObserverDesign) -> str:
-    """Return what does not fit between a design's plant, options and shipped observer; empty when all does.
-
-    Parameters
-    ----------
-    design : ObserverDesign
-        Of the method ``dae-adaptive-observer``.
-    """
+    """Return what does not fit between a design's plant, options and shipped observer; empty when all does."""
     plant, observer = design.nonlinear
     try:
         stated = resolved_options(dae_observer_from_options(plant, design.options))

@@ -25,15 +25,7 @@ _SOURCE = "Wang 2015, eqs. (32), (44)"
 
 
 def fault_identities(errors: ErrorSystem, delays: tuple[int, ...]) -> dict[str, tuple[Identity, ...]]:
-    """Return, per row of the report, the identities of the fault responses, one for each step.
-
-    Parameters
-    ----------
-    errors : ErrorSystem
-        Of the observer in question.
-    delays : tuple of int
-        Samples by which each fault estimate lags, 1 or more.
-    """
+    """Return, per row of the report, the identities of the fault responses, one for each step."""
     cf, direct_fault = errors.fault_output[:2]
     cr, direct_residual = errors.residual_output[:2]
     cx, direct_state = errors.state_output[:2]
@@ -71,17 +63,7 @@ def fault_rows(
     scaling: Scaling | None,
     allowances: Mapping[str, FloatArray],
 ) -> Iterator[Check]:
-    """Yield the rows on the transfer from the faults.
-
-    Parameters
-    ----------
-    plant, observer, tracking, errors
-        What is shipped, and its error system.
-    scaling : Scaling or None
-        Units in which the plant, with its sensor faults as states, is balanced; ``None`` where there is no such plant.
-    allowances : mapping
-        What printed gains may add, by row and step; see `obsynth.methods.fault_estimation_filter.checks.printed_gains.printed_allowances`.
-    """
+    """Yield the rows on the transfer from the faults."""
     sizes = _trace_sizes(plant, observer, tracking, fault_traces(errors, observer.fault_delays), scaling)
     delays = ", ".join(map(str, observer.fault_delays))
     claims = {

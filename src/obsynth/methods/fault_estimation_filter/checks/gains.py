@@ -23,17 +23,7 @@ RESTRICTED, WEIGHT = "gains: T and N", "gains: W"
 
 
 def gains_fit(work: DescriptorSystem, gains: Mapping[str, FloatArray], observer: LinearObserver) -> Check:
-    """Return the row on letters and shapes of the gain set.
-
-    Parameters
-    ----------
-    work : DescriptorSystem
-        The plant with its sensor faults as states.
-    gains : mapping
-        The gain set.
-    observer : LinearObserver
-        What is shipped.
-    """
+    """Return the row on letters and shapes of the gain set."""
     na, ny, nf = work.nx, work.ny, work.nf
     shapes = {
         "T": (na, na), "N": (na, ny), "L": (na, ny), "W": (nf, ny), "Psi": (na, nf), "Upsilon": (ny, nf), "R": (na, ny),
@@ -60,19 +50,7 @@ def gains_fit(work: DescriptorSystem, gains: Mapping[str, FloatArray], observer:
 def gain_identities(
     work: DescriptorSystem, gains: Mapping[str, FloatArray], equations: Equations, scaling: Scaling
 ) -> dict[str, Identity]:
-    """Return the identities that T, N and W satisfy, and that the rounding of printed gains disturbs.
-
-    Parameters
-    ----------
-    work : DescriptorSystem
-        The plant with its sensor faults as states.
-    gains : mapping
-        At least T, N and W.
-    equations : Equations
-        Of the plant.
-    scaling : Scaling
-        Units in which the plant is balanced.
-    """
+    """Return the identities that T, N and W satisfy, and that the rounding of printed gains disturbs."""
     t, n, w = gains["T"], gains["N"], gains["W"]
     upsilon = work.C @ equations.detectability_matrix(gains)
     # The columns are in the units of the faults, which differ: each is compared with its own largest products.
@@ -94,19 +72,7 @@ def gain_rows(
     scaling: Scaling,
     allowances: Mapping[str, FloatArray],
 ) -> Iterator[Check]:
-    """Yield the rows on the gain set, which must fit.
-
-    Parameters
-    ----------
-    work, gains, observer, tracking
-        What is claimed and shipped.
-    equations : Equations
-        Of the plant.
-    scaling : Scaling
-        Units in which the plant is balanced.
-    allowances : mapping
-        What printed gains may add; see `obsynth.methods.fault_estimation_filter.checks.printed_gains.printed_allowances`.
-    """
+    """Yield the rows on the gain set, which must fit."""
     identities = gain_identities(work, gains, equations, scaling)
     claims = {
         RESTRICTED: ("T E + N C = I", "Wang 2015, eq. (8)"),

@@ -34,21 +34,7 @@ def printed_allowances(
     scaling: Scaling,
     digits: int,
 ) -> dict[str, FloatArray]:
-    """Return, by identity, what the rounding of the gains can add to each of its entries, to first order.
-
-    Parameters
-    ----------
-    plant, work : DescriptorSystem
-        The plant, and the plant with its sensor faults as states.
-    observer : LinearObserver
-        What is shipped: its signals and delays count here, its matrices are formed again.
-    gains : mapping
-        ``T (na, na)``, ``N (na, ny)``, ``L (na, ny)``, ``W (nf, ny)`` as printed.
-    scaling : Scaling
-        Units in which ``work`` is balanced.
-    digits : int
-        Decimals to which they were printed.
-    """
+    """Return, by identity, what the rounding of the gains can add to each of its entries, to first order."""
     half_a_unit = 0.5 * 10.0**-digits
     equations = Equations.of(plant, work, observer.fault_delays)
 

@@ -27,16 +27,8 @@ MATRICES = ("Az", "Bu", "By", "Cz", "Du", "Dy")
 class Equations:
     """The matrices from which the filter's equations are made.
 
-    Parameters
-    ----------
-    A, B, C, F : FloatArray
-        Of the plant with its sensor faults as states: ``(na, na)``, ``(na, nu)``, ``(ny, na)``, ``(na, nf)``.
-    D : FloatArray
-        ``(ny, nu)``.
-    nx : int
-        States of the plant itself.
-    delays : tuple of int
-        ``rho_i``, 1 or more.
+    Fields: A, B, C, F: Of the plant with its sensor faults as states: ``(na, na)``, ``(na, nu)``, ``(ny, na)``, ``(na,
+    nf)``; D: ``(ny, nu)``; nx: States of the plant itself; delays: ``rho_i``, 1 or more.
     """
 
     A: FloatArray
@@ -74,15 +66,7 @@ class Equations:
         return found
 
     def realised(self, gains: Mapping[str, FloatArray], *, minus: float = -1.0) -> dict[str, FloatArray]:
-        """Return Az, Bu, By, Cz, Du and Dy of the filter.
-
-        Parameters
-        ----------
-        gains : mapping
-            ``T (na, na)``, ``N (na, ny)``, ``L (na, ny)``, ``W (nf, ny)``.
-        minus : float, optional
-            The sign in ``y - C x0``: with absolute values everywhere, +1 gives the sizes of what is added up.
-        """
+        """Return Az, Bu, By, Cz, Du and Dy of the filter."""
         t, n, feedback, w = (gains[letter] for letter in "TNLW")
         na, nx, ny, lag = len(self.A), self.nx, len(self.C), max(self.delays, default=1) - 1
         nz = na + lag * nx

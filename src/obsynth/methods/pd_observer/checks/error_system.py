@@ -24,18 +24,9 @@ from obsynth.verification.error_system import ErrorSystem
 class PdErrorSystem:
     """The error system of a shipped PD observer; see the module's text.
 
-    Parameters
-    ----------
-    Az : FloatArray
-        ``(n, n)``, n = nx + nf.
-    estimate : FloatArray
-        ``(nx + nf, n)``: error = ``estimate eps``.
-    rate, disturbance, noise : tuple of FloatArray
-        Input matrix ``(n, *)`` and feedthrough to the error ``(nx + nf, *)`` of f', d and w.
-    J, L : FloatArray
-        ``(n, ny)``, recovered from the realisation.
-    nx : int
-        Number of states of the plant.
+    Fields: Az: ``(n, n)``, n = nx + nf; estimate: ``(nx + nf, n)``: error = ``estimate eps``; rate, disturbance, noise:
+    Input matrix ``(n, *)`` and feedthrough to the error ``(nx + nf, *)`` of f', d and w; J, L: ``(n, ny)``, recovered
+    from the realisation; nx: Number of states of the plant.
     """
 
     Az: FloatArray

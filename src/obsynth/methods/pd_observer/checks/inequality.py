@@ -33,16 +33,7 @@ def prove_shipped_stability(
 ) -> DefinitenessProof:
     """Try to prove that the shipped observer's errors decay faster than ``exp(-decay t)``.
 
-    Parameters
-    ----------
-    observer : LinearObserver
-        What is shipped, ``nz = nx + nf`` states.
-    P1, P3 : FloatArray
-        Certificate ``(nz, nz)`` each; that P1 is positive definite is proved by `prove_symmetric_positive`.
-    delta : float, seconds
-        Parameter of the inequality.
-    decay : float, 1/seconds
-        Claimed rate alpha.
+    Shapes: ``P1 (nz, nz)``, ``P3 (nz, nz)``.
     """
     size = observer.order
 
@@ -60,17 +51,7 @@ def prove_gains(
     A: FloatArray, C: FloatArray, J: FloatArray, L: FloatArray, P1: FloatArray, P3: FloatArray, *, delta: float,
     decay: float,
 ) -> DefinitenessProof:  # fmt: skip
-    """Try to prove the inequality for gains on an augmented plant ``A (n, n)``, ``C (ny, n)``.
-
-    Parameters
-    ----------
-    A, C, J, L, P1, P3 : FloatArray
-        Augmented plant, gains ``(n, ny)`` and certificate ``(n, n)``.
-    delta : float, seconds
-        Parameter of the inequality.
-    decay : float, 1/seconds
-        Claimed rate alpha.
-    """
+    """Try to prove the inequality for gains on an augmented plant ``A (n, n)``, ``C (ny, n)``."""
 
     def formula(kind: type[Enclosed]) -> Enclosed:
         c, p3 = kind.exact(C), kind.exact(P3)
@@ -94,14 +75,7 @@ def error_inputs(
 ) -> Ball:  # fmt: skip
     """Return where the rate of the faults, or ``[w; w']``, enters ``eps' = Az eps + B v``, with rounding bounds.
 
-    Parameters
-    ----------
-    plant : DescriptorSystem
-        Continuous time, ``E = I``, with noise stated (see `obsynth.methods.pd_observer.augmentation.with_sensor_noise`).
-    J, L : FloatArray
-        Gains in the loop ``(nx + nf, ny)``.
-    kind : {"rate", "noise"}
-        Which.
+    Shapes: ``J (nx + nf, ny)``, ``L (nx + nf, ny)``.
     """
     if kind == "rate":
         return Ball.exact(np.vstack([np.zeros((plant.nx, plant.nf)), np.eye(plant.nf)]))
@@ -116,16 +90,7 @@ def prove_gain(a: FloatArray, b: Ball, c: FloatArray, P: FloatArray, gain: float
     The bounded real inequality ``a' P + P a + c' c + P b b' P / gain^2 < 0`` before its Schur complements; that P is
     positive definite is a proof of its own.
 
-    Parameters
-    ----------
-    a, c : FloatArray
-        ``(n, n)``, ``(p, n)``.
-    b : Ball
-        ``(n, m)``.
-    P : FloatArray
-        Certificate ``(n, n)``.
-    gain : float
-        Level.
+    Shapes: ``a (n, n)``, ``c (p, n)``, ``b (n, m)``, ``P (n, n)``.
     """
     positive = prove_symmetric_positive(P)
     if not positive.proved:

@@ -134,13 +134,7 @@ def _stated(design: ObserverDesign) -> RecursiveObserver | None:
 
 
 def misfit(design: ObserverDesign) -> str:
-    """Return what does not fit between a design's plant, options and shipped observer; empty when all does.
-
-    Parameters
-    ----------
-    design : ObserverDesign
-        Of a recursive method.
-    """
+    """Return what does not fit between a design's plant, options and shipped observer; empty when all does."""
     plant, observer = design.recursive
     stated = _stated(design)
     if stated is None:

@@ -20,21 +20,7 @@ SEED = 2013
 
 
 def batch_residuals(stated: RecursiveObserver, shipped: RecursiveObserver) -> dict[str, float]:
-    """Return how far the shipped recursion is from the batch solution of the stated problem.
-
-    Parameters
-    ----------
-    stated : RecursiveObserver
-        Built from plant and options: its matrices make the batch.
-    shipped : RecursiveObserver
-        Which is run.
-
-    Returns
-    -------
-    dict
-        The largest gaps of ``state``, ``covariance`` and ``regressor`` after the last step, relative to the terms
-        that these are made of in that step.
-    """
+    """Return how far the shipped recursion is from the batch solution of the stated problem."""
     steps = min(BATCH_STEPS, looked_at(stated))
     y, u = _record(stated, steps + 1)
     running, reference = RunningRecursiveObserver(shipped), RunningRecursiveObserver(stated)

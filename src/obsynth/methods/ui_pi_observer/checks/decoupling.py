@@ -30,14 +30,8 @@ UNMOVED = 1e-4
 class DecouplingNorm:
     """The largest gain found from the unknown inputs to the errors of the estimates.
 
-    Parameters
-    ----------
-    relative : float
-        Largest error of an estimate, relative to the terms it is computed from.
-    fault_gain : float
-        Largest error of a fault estimate for unit size of the trajectory ``(x, d)`` in scaled units.
-    frequency : float
-        Where, rad/s.
+    Fields: relative: Largest error of an estimate, relative to the terms it is computed from; fault_gain: Largest error
+    of a fault estimate for unit size of the trajectory ``(x, d)`` in scaled units; frequency: Where, rad/s.
     """
 
     relative: float
@@ -58,15 +52,7 @@ def frequency_grid(observer: LinearObserver) -> FloatArray:
 
 
 def decoupling_norm(plant: DescriptorSystem, observer: LinearObserver) -> DecouplingNorm:
-    """Return how much of any unknown input reaches the estimates of state, fault and residual.
-
-    Parameters
-    ----------
-    plant : DescriptorSystem
-        The plant, regular or not.
-    observer : LinearObserver
-        What is shipped.
-    """
+    """Return how much of any unknown input reaches the estimates of state, fault and residual."""
     if not all(np.all(np.isfinite(part)) for part in (observer.Az, observer.By, observer.Cz, observer.Dy)):
         return DecouplingNorm(float("nan"), float("nan"), float("nan"))
     frequencies = frequency_grid(observer)

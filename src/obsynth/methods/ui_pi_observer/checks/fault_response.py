@@ -85,12 +85,8 @@ def _transfer(
 class SteadyError:
     """The constant error of a fault estimate when the fault is one order higher than its model.
 
-    Parameters
-    ----------
-    order : int
-        The fault is ``t^order / order!``: 0 a step, 1 a ramp.
-    error : float
-        ``fhat - f`` in the end, in units of that derivative.
+    Fields: order: The fault is ``t^order / order!``: 0 a step, 1 a ramp; error: ``fhat - f`` in the end, in units of
+    that derivative.
     """
 
     order: int
@@ -102,16 +98,7 @@ def steady_errors(
 ) -> tuple[SteadyError, ...]:
     """Return, for each fault, the error for a polynomial of the least order that its model does not hold.
 
-    Parameters
-    ----------
-    plant : DescriptorSystem
-        The plant.
-    observer : LinearObserver
-        What is shipped.
-    tracking : FloatArray
-        ``(nz, nx + nw)``.
-    phi, cw : FloatArray
-        The fault model ``(nw, nw)``, ``(nf, nw)``.
+    Shapes: ``tracking (nz, nx + nw)``, ``phi (nw, nw)``, ``cw (nf, nw)``.
     """
     a, b, c, d = _system(plant, observer, tracking)
     shift = np.eye(len(a)) if plant.dt > 0.0 else np.zeros_like(a)
