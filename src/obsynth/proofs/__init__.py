@@ -1,1 +1,1 @@
-"""Proofs in outward rounding and exact arithmetic: balls, definiteness."""
+"""Proofs: outward rounding, definiteness, and exact rational arithmetic."""
