@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.plants.names import checked_names
+from obsynth.plants.uncertainty import UNCERTAIN_MATRICES, Uncertainty, uncertainty_of
 from obsynth.plants.validation import (
     Problems,
     checked_dt,
@@ -69,6 +70,8 @@ class DescriptorSystem:
         Factor of named inputs and outputs: what a log holds, times the factor, is in the signal's unit.
     units : mapping, optional
         Unit of named signals, as text.
+    uncertainty : Uncertainty, optional
+        Constants with tolerances in the matrices, see `obsynth.uncertain_system`.
 
     Raises
     ------
@@ -104,6 +107,7 @@ class DescriptorSystem:
     operating_point: Mapping[str, float]
     scales: Mapping[str, float]
     units: Mapping[str, str]
+    uncertainty: Uncertainty | None
 
     def __init__(
         self,
@@ -129,6 +133,7 @@ class DescriptorSystem:
         operating_point: Mapping[str, float] | None = None,
         scales: Mapping[str, float] | None = None,
         units: Mapping[str, str] | None = None,
+        uncertainty: Uncertainty | Mapping[str, Any] | None = None,
     ) -> None:
         problems = Problems()
         a = problems.collect(lambda: square(as_matrix(A, "A"), "A"))
@@ -168,6 +173,7 @@ class DescriptorSystem:
         values["scales"] = problems.collect(lambda: checked_scales(scales, measured))
         values["units"] = problems.collect(lambda: checked_units(units, known))
         problems.raise_if_any()
+        values["uncertainty"] = uncertainty_of(uncertainty)
         for field, value in values.items():
             object.__setattr__(self, field, read_only(value) if isinstance(value, np.ndarray) else value)
 
@@ -207,18 +213,28 @@ class DescriptorSystem:
         return self.dt > 0.0
 
     def as_dict(self) -> dict[str, Any]:
-        """Return every field, as the constructor takes it."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
+        """Return every field, as the constructor takes it; `uncertainty` only where there is one."""
+        found = {field.name: getattr(self, field.name) for field in fields(self)}
+        if self.uncertainty is None:
+            del found["uncertainty"]
+        else:
+            found["uncertainty"] = self.uncertainty.as_dict()
+        return found
 
     def replace(self, **changes: Any) -> DescriptorSystem:
         """Return a plant with some fields changed, checked again as a whole.
+
+        Tolerances are those of the matrices as they were: they are dropped with a change of one of these.
 
         Parameters
         ----------
         **changes
             Any argument of the constructor.
         """
-        return DescriptorSystem(**{**self.as_dict(), **changes})
+        kept = self.as_dict()
+        if self.uncertainty is not None and changes.keys() & {*UNCERTAIN_MATRICES, "dt"}:
+            del kept["uncertainty"]
+        return DescriptorSystem(**{**kept, **changes})
 
     def __repr__(self) -> str:
         time = f"dt={self.dt:g} s" if self.is_discrete else "continuous"

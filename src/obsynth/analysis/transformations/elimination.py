@@ -19,6 +19,7 @@ from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
 from obsynth.numerics.scaling import equilibrate_pencil, power_of_two_below
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.uncertainty import ELIMINATED, matrices_of
 
 
 def eliminate_algebraic_states(plant: DescriptorSystem) -> Transformation:
@@ -64,13 +65,22 @@ def eliminate_algebraic_states(plant: DescriptorSystem) -> Transformation:
     from_state, from_input, from_fault, from_disturbance, from_noise = columns_of(
         _sum(padded, algebraic, solution), sizes
     )
-    new = with_states(plant, names, E=None, A=A, B=B, Bf=Bf, Bd=Bd, Bw=Bw, C=C, D=D, Df=Df, Dd=Dd, Dw=Dw)
+    uncertain = plant.uncertainty
+    kept = {} if uncertain is None else {"uncertainty": uncertain.then(matrices_of(plant), ELIMINATED)}
+    new = with_states(plant, names, **kept, E=None, A=A, B=B, Bf=Bf, Bd=Bd, Bw=Bw, C=C, D=D, Df=Df, Dd=Dd, Dw=Dw)
     recovery = StateRecovery(
         plant.state_names, from_state, from_input, from_fault, from_disturbance, from_noise, np.eye(plant.nw),
         state_point(plant),
     )  # fmt: skip
     done = f"eliminated {plant.nx - count} algebraic states" if count < plant.nx else "multiplied by the inverse of E"
     return Transformation(plant, new, done, recovery)
+
+
+def algebraic_coordinates(plant: DescriptorSystem) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the row transformation and the bases of dynamic and algebraic states that an elimination uses."""
+    if np.array_equal(plant.E, np.eye(plant.nx)):
+        return np.eye(plant.nx), np.eye(plant.nx), np.zeros((plant.nx, 0))
+    return _coordinates(plant, _dynamic_count(plant))[:3]
 
 
 def _dynamic_count(plant: DescriptorSystem) -> int:

@@ -14,6 +14,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, SLOW_ZERO_RADIUS
 from obsynth.numerics.scaling import power_of_two_below
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.uncertainty import SAMPLED, matrices_of
 
 
 def discretise(plant: DescriptorSystem, sample_time: float) -> Transformation:
@@ -68,7 +69,9 @@ def discretise(plant: DescriptorSystem, sample_time: float) -> Transformation:
     factor = _noise_factor(smooth.A, smooth.Bw, sample_time)
     kept = [smooth.noise_names[i] for i in direct]
     noise_names = [*(f"process noise {i + 1}" for i in range(factor.shape[1])), *kept]
+    uncertain = smooth.uncertainty
     sampled = smooth.replace(
+        uncertainty=None if uncertain is None else uncertain.then(matrices_of(smooth), SAMPLED, sample_time),
         A=transition,
         B=B,
         Bf=Bf,
