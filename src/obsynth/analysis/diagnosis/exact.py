@@ -5,6 +5,7 @@ The reduction of `obsynth.analysis.diagnosis.reduction` over the rational number
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -16,18 +17,87 @@ from flint import fmpq, fmpq_mat, fmpq_poly, fmpz_poly
 from obsynth.analysis.diagnosis.decoupled import unknowns_pencil
 from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import ComplexArray
-from obsynth.proofs.exact_pencils import blocks, identity, null_basis, pivot_columns, zeros_matrix
-from obsynth.proofs.root_location import RootLocation, locate_roots, primitive
+from obsynth.proofs.exact_matrices import blocks, identity, null_basis, pivot_columns, zeros_matrix
+from obsynth.proofs.exact_pencils import ExactPencil
+from obsynth.proofs.root_location import Root, RootLocation, locate_roots, primitive
 from obsynth.proofs.written_numbers import computed_entries, written_fraction, written_matrix
 
-#: Plants with more unknowns are decided in floating point: rational numbers grow with every step.
+#: Plants with more unknowns are decided in floating point.
 MOST_UNKNOWNS = 70
+#: Plants with more unknowns are not reduced exactly, as the numbers grow: their fault polynomials come from pencils.
+MOST_REDUCED = 24
 
 
 def can_be_exact(plant: DescriptorSystem) -> bool:
     """Whether a plant is small enough, and made of numbers as they were written."""
     matrices = (plant.E, plant.A, plant.C, plant.Bd, plant.Dd, plant.Bf, plant.Df)
     return plant.nx + plant.nd + plant.nf <= MOST_UNKNOWNS and not any(map(computed_entries, matrices))
+
+
+class ExactZeros(ABC):
+    """What follows from a fault polynomial."""
+
+    @property
+    @abstractmethod
+    def polynomial(self) -> fmpz_poly:
+        """The fault polynomial, with coprime integer coefficients; zero where nothing shows the fault."""
+
+    @property
+    @abstractmethod
+    def discrete(self) -> bool:
+        """Whether time is discrete."""
+
+    @property
+    def visible(self) -> bool:
+        """Whether the outputs show the fault at all."""
+        return not self.polynomial.is_zero()
+
+    @cached_property
+    def location(self) -> RootLocation:
+        """The zeros and where they are."""
+        return locate_roots(self.polynomial, discrete=self.discrete)
+
+    @property
+    def zeros(self) -> ComplexArray:
+        """The zeros with multiplicity, 1/s (or dimensionless)."""
+        return _values(self.location.roots)
+
+    @property
+    def blocking(self) -> ComplexArray:
+        """Those on or outside the boundary of stability."""
+        return _values(self.location.outside)
+
+    def shows_at(self, point: complex) -> bool:
+        """Whether the fault polynomial has no root at a point, whose parts are taken as they are written."""
+        real, imaginary = written_fraction(complex(point).real), written_fraction(complex(point).imag)
+        if imaginary == 0:
+            at = fmpq_poly([_rational(-real), 1])
+        else:
+            at = fmpq_poly([_rational(real * real + imaginary * imaginary), _rational(-2 * real), 1])
+        return self.visible and bool(fmpq_poly(self.polynomial) % at != 0)
+
+
+@dataclass(frozen=True, eq=False)
+class PencilColumn(ExactZeros):
+    """One fault by its polynomial alone: the zeros that it adds to those of the pencil of the unknowns."""
+
+    source: DescriptorSystem
+    removed: tuple[int, ...]
+    number: int
+
+    @property
+    def discrete(self) -> bool:
+        """Whether time is discrete."""
+        return self.source.dt > 0.0
+
+    @cached_property
+    def polynomial(self) -> fmpz_poly:
+        """The fault polynomial."""
+        without = ExactPencil.written(*unknowns_pencil(self.source, self.removed))
+        whole = ExactPencil.written(*unknowns_pencil(self.source, (*self.removed, self.number)))
+        if whole.normal_rank == without.normal_rank:
+            return fmpz_poly([])
+        return primitive(fmpq_poly(whole.zero_polynomial) / fmpq_poly(without.zero_polynomial))
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,11 +116,6 @@ class ExactDecoupled:
     def order(self) -> int:
         """Number of states."""
         return int(self.A.nrows())
-
-    @cached_property
-    def characteristic(self) -> fmpq_poly:
-        """The characteristic polynomial of A."""
-        return self.A.charpoly()
 
     def column(self, number: int) -> ExactColumn:
         """Return what is known of one fault."""
@@ -71,7 +136,7 @@ def exact_decoupled(plant: DescriptorSystem, removed: Sequence[int], kept: Seque
 
 
 @dataclass(frozen=True, eq=False)
-class ExactColumn:
+class ExactColumn(ExactZeros):
     """One fault on an exactly decoupled plant."""
 
     plant: ExactDecoupled
@@ -79,43 +144,20 @@ class ExactColumn:
     G: fmpq_mat
 
     @property
-    def visible(self) -> bool:
-        """Whether the outputs show the fault at all."""
-        return any(value != 0 for value in (*self.F.entries(), *self.G.entries()))
+    def discrete(self) -> bool:
+        """Whether time is discrete."""
+        return self.plant.discrete
 
     @cached_property
     def polynomial(self) -> fmpz_poly:
         """The fault polynomial, with coprime integer coefficients."""
+        if all(value == 0 for value in (*self.F.entries(), *self.G.entries())):
+            return fmpz_poly([])
         plant = self.plant
         n, p = plant.order, plant.C.nrows()
         e = blocks([[identity(n), zeros_matrix(n, 1)], [zeros_matrix(p, n), zeros_matrix(p, 1)]])
         a = blocks([[plant.A, self.F], [plant.C, self.G]])
         return primitive(_reduced(e, a, zeros_matrix(n + p, 0))[4])
-
-    @cached_property
-    def location(self) -> RootLocation:
-        """The zeros and where they are."""
-        return locate_roots(self.polynomial, discrete=self.plant.discrete)
-
-    @property
-    def zeros(self) -> ComplexArray:
-        """The zeros with multiplicity, 1/s (or dimensionless)."""
-        return _values(self.location.roots)
-
-    @property
-    def blocking(self) -> ComplexArray:
-        """Those on or outside the boundary of stability."""
-        return _values(self.location.outside)
-
-    def shows_at(self, point: complex) -> bool:
-        """Whether the fault polynomial has no root at a point, whose parts are taken as they are written."""
-        real, imaginary = written_fraction(complex(point).real), written_fraction(complex(point).imag)
-        if imaginary == 0:
-            at = fmpq_poly([fmpq(-real.numerator, real.denominator), 1])
-        else:
-            square = real * real + imaginary * imaginary
-            at = fmpq_poly([_rational(square), _rational(-2 * real), 1])
-        return self.visible and bool(fmpq_poly(self.polynomial) % at != 0)
 
     @cached_property
     def derivatives(self) -> int | None:
@@ -212,8 +254,8 @@ def _stacked(*parts: fmpq_mat) -> fmpq_mat:
     return blocks([[part] for part in parts])
 
 
-def _values(roots: Sequence[object]) -> ComplexArray:
-    listed = [root.value for root in roots for _ in range(root.multiplicity)]  # type: ignore[attr-defined]
+def _values(roots: Sequence[Root]) -> ComplexArray:
+    listed = [root.value for root in roots for _ in range(root.multiplicity)]
     return np.array(listed, dtype=np.complex128)
 
 
