@@ -9,8 +9,8 @@ from itertools import combinations
 import numpy as np
 
 from obsynth.analysis.diagnosis.columns import Question
-from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray
+from obsynth.plants.descriptor import DescriptorSystem
 
 #: Plants with more states are not searched for pairs.
 MOST_FOR_PAIRS = 24

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import combinations
 
 from obsynth.analysis.diagnosis.columns import Question
-from obsynth.models.descriptor import DescriptorSystem
+from obsynth.plants.descriptor import DescriptorSystem
 
 #: With more faults only residuals that are blind to one fault, or see one fault, are looked for.
 MOST_FAULTS = 6

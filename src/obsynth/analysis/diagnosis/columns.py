@@ -8,9 +8,9 @@ from functools import cached_property
 
 from obsynth.analysis.diagnosis.decoupled import DecoupledPlant, decoupled
 from obsynth.analysis.diagnosis.fault_columns import TRACE_TOLERANCE, FaultColumn
-from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import ComplexArray
 from obsynth.numerics.ranks import CLEAR_GAP
+from obsynth.plants.descriptor import DescriptorSystem
 
 
 @dataclass(frozen=True, eq=False)

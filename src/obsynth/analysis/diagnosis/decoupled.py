@@ -9,10 +9,10 @@ import numpy as np
 
 from obsynth.analysis.diagnosis.reduction import LeftPart, PencilUnits, finite_values, left_part
 from obsynth.errors import SpecError
-from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import ComplexArray, FloatArray, read_only
 from obsynth.numerics.ranks import CLEAR_GAP, RankDecision
+from obsynth.plants.descriptor import DescriptorSystem
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +140,9 @@ def decouple(
     """
     require_kind(plant, DescriptorSystem, "plant", "an obsynth.DescriptorSystem")
     removed = fault_numbers(plant, without, "without")
-    kept = [i for i in range(plant.nf) if i not in removed] if faults is None else fault_numbers(plant, faults, "faults")
+    kept = (
+        [i for i in range(plant.nf) if i not in removed] if faults is None else fault_numbers(plant, faults, "faults")
+    )
     both = [plant.fault_names[i] for i in kept if i in removed]
     if both:
         raise SpecError(f"{', '.join(both)}: a fault cannot be kept and removed.", path="without")

@@ -15,8 +15,8 @@ import numpy as np
 from flint import fmpq, fmpq_mat, fmpq_poly, fmpz_poly
 
 from obsynth.analysis.diagnosis.decoupled import unknowns_pencil
-from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import ComplexArray
+from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.exact_matrices import blocks, identity, null_basis, pivot_columns, zeros_matrix
 from obsynth.proofs.exact_pencils import ExactPencil
 from obsynth.proofs.root_location import Root, RootLocation, locate_roots, primitive
@@ -74,7 +74,7 @@ class ExactZeros(ABC):
             at = fmpq_poly([_rational(-real), 1])
         else:
             at = fmpq_poly([_rational(real * real + imaginary * imaginary), _rational(-2 * real), 1])
-        return self.visible and bool(fmpq_poly(self.polynomial) % at != 0)
+        return self.visible and not (fmpq_poly(self.polynomial) % at).is_zero()
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,9 +200,7 @@ class ExactColumn(ExactZeros):
         return None
 
 
-def _reduced(
-    e: fmpq_mat, a: fmpq_mat, right: fmpq_mat
-) -> tuple[fmpq_mat, fmpq_mat, fmpq_mat, fmpq_mat, fmpq_poly]:
+def _reduced(e: fmpq_mat, a: fmpq_mat, right: fmpq_mat) -> tuple[fmpq_mat, fmpq_mat, fmpq_mat, fmpq_mat, fmpq_poly]:
     """Return A, C, the columns ``right`` beside both, and the polynomial of the finite zeros that were taken out."""
     while True:
         kernel = null_basis(e)

@@ -41,7 +41,7 @@ class FaultColumn:
     @cached_property
     def trace(self) -> float:
         """Size of what is left of the column, relative to before the reduction."""
-        return float(np.hypot(*(np.linalg.norm(part) for part in self._scaled)))
+        return float(np.linalg.norm(np.vstack(self._scaled)))
 
     @property
     def visible(self) -> bool:

@@ -9,9 +9,9 @@ import numpy as np
 
 from obsynth.analysis.diagnosis.decoupled import unknowns_pencil
 from obsynth.analysis.diagnosis.reduction import PencilUnits
-from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import ComplexArray
 from obsynth.numerics.ranks import RANK_TOLERANCE
+from obsynth.plants.descriptor import DescriptorSystem
 
 #: A motion is stated where it cancels the fault to this, relative to the fault's own column.
 EXACTNESS = 1e-8
@@ -65,9 +65,7 @@ class HiddenMotion:
         return f"a course exp({_amplitude(point)} t)"
 
 
-def hidden_motion(
-    plant: DescriptorSystem, fault: int, point: complex, removed: Sequence[int]
-) -> HiddenMotion | None:
+def hidden_motion(plant: DescriptorSystem, fault: int, point: complex, removed: Sequence[int]) -> HiddenMotion | None:
     """Return the motion that hides a fault at a point, least in balanced units; ``None`` where there is none."""
     e, a = unknowns_pencil(plant, removed)
     matrix = a - point * e
@@ -94,7 +92,7 @@ def _solved(matrix: ComplexArray, right: ComplexArray) -> ComplexArray | None:
 
     def solve(kept: list[int]) -> tuple[ComplexArray, float]:
         part, *_ = np.linalg.lstsq(work[:, kept], goal, rcond=RANK_TOLERANCE)
-        return part, float(np.linalg.norm(work[:, kept] @ part - goal)) / reach
+        return np.asarray(part, dtype=np.complex128), float(np.linalg.norm(work[:, kept] @ part - goal)) / reach
 
     kept = list(range(matrix.shape[1]))
     part, miss = solve(kept)

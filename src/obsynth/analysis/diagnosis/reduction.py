@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.log_balance import LogBalance
 from obsynth.numerics.ranks import RankDecision, rank_from
 
@@ -124,14 +124,14 @@ def _without_zeros(
     )  # fmt: skip
 
 
-def finite_values(left: LeftPart) -> FloatArray:
+def finite_values(left: LeftPart) -> ComplexArray:
     """Return the finite zeros that were taken out, complex, conjugate pairs exact."""
     import scipy.linalg as sl
 
     if left.Ez.shape[0] == 0:
         return np.zeros(0, dtype=np.complex128)
     alpha, beta = sl.eigvals(left.Az, left.Ez, homogeneous_eigvals=True)
-    return np.asarray(alpha / beta)
+    return np.asarray(alpha / beta, dtype=np.complex128)
 
 
 def _svd(matrix: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
