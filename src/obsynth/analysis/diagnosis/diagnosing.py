@@ -17,7 +17,7 @@ from obsynth.numerics.arguments import is_finite_number, require_kind
 from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.threads import one_thread_if_small
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.exosystems import exosystem
+from obsynth.plants.exosystems import Exosystem, exosystem
 
 #: Zeros that are named in a sentence; the others are counted.
 MOST_ZEROS = 4
@@ -77,7 +77,7 @@ def diagnose(
         shown = [Question(plant, (), i, exactly) for i in range(plant.nf)]
         free = [Question(plant, _others(plant, i), i, exactly) for i in range(plant.nf)]
         faults = tuple(
-            _verdict(plant, own, alone, frequencies, _modes(model, i), suggest=suggest)
+            _verdict(plant, own, alone, frequencies, model_points(model, i), suggest=suggest)
             for i, (own, alone) in enumerate(zip(shown, free, strict=True))
         )
         report_stage("telling faults from each other")
@@ -98,7 +98,7 @@ def _others(plant: DescriptorSystem, fault: int) -> tuple[int, ...]:
     return tuple(j for j in range(plant.nf) if j != fault)
 
 
-def _modes(model: Any, fault: int) -> list[complex]:
+def model_points(model: Exosystem, fault: int) -> list[complex]:
     """Return the eigenvalues of the part of the exosystem that a fault is made of."""
     reached = model.Cw[fault] != 0.0
     for _ in range(len(reached)):
