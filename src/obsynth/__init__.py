@@ -40,6 +40,7 @@ if TYPE_CHECKING:
         fault_estimation_filter,
         fault_estimation_filter_from_gains,
     )
+    from obsynth.methods.functional_filter.public import functional_filter
     from obsynth.methods.pd_observer.public import (
         apply_adaptation_gain,
         pd_delta_scan,
@@ -82,6 +83,7 @@ __version__ = "0.1.0"
 
 # Names are imported when they are first used, so that `import obsynth` stays fast.
 _HOMES = {
+    "functional_filter": "obsynth.methods.functional_filter.public",
     "DecoupledPlant": "obsynth.analysis.diagnosis.decoupled",
     "decouple": "obsynth.analysis.diagnosis.decoupled",
     "diagnose": "obsynth.analysis.diagnosis.diagnosing",
@@ -247,6 +249,7 @@ __all__ = [
     "fault_estimation_filter_from_gains",
     "fault_model",
     "fault_response",
+    "functional_filter",
     "html_report",
     "identifiability",
     "load",

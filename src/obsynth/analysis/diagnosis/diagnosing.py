@@ -18,6 +18,7 @@ from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.threads import one_thread_if_small
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.exosystems import Exosystem, exosystem
+from obsynth.plants.fault_model_spectra import stated_eigenvalues
 
 #: Zeros that are named in a sentence; the others are counted.
 MOST_ZEROS = 4
@@ -104,7 +105,7 @@ def model_points(model: Exosystem, fault: int) -> list[complex]:
     for _ in range(len(reached)):
         reached = reached | np.any(model.Phi[reached] != 0.0, axis=0)
     part = model.Phi[np.ix_(reached, reached)]
-    return [complex(value) for value in np.linalg.eigvals(part)] if part.size else []
+    return [complex(value) for value in stated_eigenvalues(part)] if part.size else []
 
 
 def _point(plant: DescriptorSystem, frequency: float) -> complex:

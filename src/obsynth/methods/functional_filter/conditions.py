@@ -27,10 +27,13 @@ def conditions(
     asked = FunctionalFilterOptions(faults=faults, residuals=residuals)
     sets = asked.residual_sets(plant)
     if plant.nf == 0:
-        return (Condition("faults", "the plant has a fault", False, 0.0, 1.0, _SOURCE, "there is none: give Bf or Df."),)
+        return (
+            Condition("faults", "the plant has a fault", False, 0.0, 1.0, _SOURCE, "there is none: give Bf or Df."),
+        )
     if sets is not None:
         return tuple(condition for seen in sets for condition in _residual_conditions(plant, seen))
-    model = exosystem(fault_model, plant.fault_names, plant.dt)
+    given = isinstance(fault_model, Exosystem)
+    model = fault_model if given else exosystem(fault_model, plant.fault_names, plant.dt)
     return tuple(
         condition for fault in asked.chosen_faults(plant) for condition in fault_conditions(plant, model, fault)
     )
@@ -41,8 +44,8 @@ def fault_conditions(plant: DescriptorSystem, model: Exosystem, fault: int) -> t
     name = plant.fault_names[fault]
     asked = question(plant, [j for j in range(plant.nf) if j != fault], fault)
     seen = Condition(
-        f"{name} shows", f"{name} shows free of {_rest(plant, fault)}", asked.visible, float(asked.visible), 1.0, _SOURCE,
-        _gap(asked) if asked.visible else _hidden(plant, asked, rest_point(plant.dt)) + _advice(plant, fault),
+        f"{name} shows", f"{name} shows free of {_rest(plant, fault)}", asked.visible, float(asked.visible), 1.0,
+        _SOURCE, _gap(asked) if asked.visible else _hidden(plant, asked, rest_point(plant.dt)) + _advice(plant, fault),
         signals=() if asked.visible else (name,),
     )  # fmt: skip
     if not asked.visible:
@@ -68,11 +71,14 @@ def _residual_conditions(plant: DescriptorSystem, seen: Sequence[int]) -> list[C
         found.append(
             Condition(
                 f"{name} shows" + (f" without {', '.join(plant.fault_names[j] for j in removed)}" if removed else ""),
-                f"{name} shows free of {', '.join(blind) or 'the initial state'}", asked.visible,
-                float(asked.visible), 1.0, _SOURCE,
+                f"{name} shows free of {', '.join(blind) or 'the initial state'}",
+                asked.visible,
+                float(asked.visible),
+                1.0,
+                _SOURCE,
                 _gap(asked) if asked.visible else _hidden(plant, asked, rest_point(plant.dt)) + _advice(plant, fault),
                 signals=() if asked.visible else (name,),
-            )  # fmt: skip
+            )
         )
     return found
 
@@ -90,7 +96,9 @@ def _hidden(plant: DescriptorSystem, asked: Question, point: complex) -> str:
     motion = hidden_motion(plant, asked.number, point, asked.removed)
     if motion is None:
         return "nothing shows it. "
-    return f"{motion} ({'z' if plant.dt > 0.0 else 's'} = {point.real:.4g}{f'{point.imag:+.4g}j' if point.imag else ''}). "
+    return (
+        f"{motion} ({'z' if plant.dt > 0.0 else 's'} = {point.real:.4g}{f'{point.imag:+.4g}j' if point.imag else ''}). "
+    )
 
 
 def _advice(plant: DescriptorSystem, fault: int) -> str:

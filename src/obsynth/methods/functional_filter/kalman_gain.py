@@ -45,15 +45,18 @@ def require_noise(model: FilterModel, plant_outputs: tuple[str, ...], noise: Flo
     if model.M.shape[0] and decide_rank(model.M, expected=model.M.shape[0]).rank < model.M.shape[0]:
         which = f"no noise is stated for {', '.join(silent)}" if silent else "equations without any output constrain it"
         raise PreconditionError(
-            f"A combination of the outputs is free of noise: {which}. A Kalman gain would trust it without limit; state "
-            "the noise of every sensor (sensor_noise), or give poles.",
+            f"A combination of the outputs is free of noise: {which}. A Kalman gain would trust it without limit; "
+            "state the noise of every sensor (sensor_noise), or give poles.",
             condition="noise of every output",
             signals=silent or plant_outputs,
         )
 
 
-def kalman_gain(model: FilterModel, rates: FloatArray, *, lag: int = 0) -> KalmanGain:
-    """Return the gain for walks of the fault models' states, ``rates (model states,)``, by one Riccati equation."""
+def kalman_gain(model: FilterModel, rates: FloatArray, *, lag: int = 0, decay: float = 0.0) -> KalmanGain:
+    """Return the gain for walks of the fault models' states, ``rates (model states,)``, by one Riccati equation.
+
+    With a ``decay`` (1/s) every error decays at this rate or faster.
+    """
     n, p = model.A.shape[0], model.C.shape[0]
     if n == 0:
         return KalmanGain(np.zeros((0, p)), (np.zeros((0, p)),) * (lag + 1), model.M @ model.M.T, 0.0)
@@ -63,9 +66,10 @@ def kalman_gain(model: FilterModel, rates: FloatArray, *, lag: int = 0) -> Kalma
     states = np.diag(np.r_[np.ones(model.order), np.zeros(n - model.order)])
     for share in SHARES_OF_NOISE:
         drive = process + (share * unit) ** 2 * states
-        found = _discrete(model, drive, measured, cross, lag) if model.dt > 0.0 else _continuous(
-            model, drive, measured, cross
-        )
+        if model.dt > 0.0:
+            found = _discrete(model, drive, measured, cross, lag, float(np.exp(decay * model.dt)))
+        else:
+            found = _continuous(model, drive, measured, cross, decay)
         if found is not None:
             return KalmanGain(*found, share * unit)
     raise SolverError(
@@ -75,26 +79,26 @@ def kalman_gain(model: FilterModel, rates: FloatArray, *, lag: int = 0) -> Kalma
 
 
 def _discrete(
-    model: FilterModel, process: FloatArray, measured: FloatArray, cross: FloatArray, lag: int
+    model: FilterModel, process: FloatArray, measured: FloatArray, cross: FloatArray, lag: int, growth: float
 ) -> tuple[FloatArray, tuple[FloatArray, ...], FloatArray] | None:
-    p = riccati_solution(model.A, model.C, process, measured, cross)
+    p = riccati_solution(growth * model.A, model.C, process, measured, growth * cross)
     if p is None or not np.all(np.isfinite(p)):
         return None
     p = 0.5 * (p + p.T)
     innovation = model.C @ p @ model.C.T + measured
     gain = np.linalg.solve(innovation, (model.A @ p @ model.C.T + cross).T).T
     closed = model.A - gain @ model.C
-    if not abscissa(closed, model.dt) < 1.0:
+    if not abscissa(closed, model.dt) < 1.0 / growth:
         return None
     gains, moved = [], p.copy()
     for _ in range(lag + 1):
         gains.append(np.asarray(np.linalg.solve(innovation, model.C @ moved).T))
         moved = closed @ moved
-    return gain, tuple(gains), innovation
+    return np.asarray(gain, dtype=np.float64), tuple(gains), innovation
 
 
 def _continuous(
-    model: FilterModel, process: FloatArray, measured: FloatArray, cross: FloatArray
+    model: FilterModel, process: FloatArray, measured: FloatArray, cross: FloatArray, decay: float
 ) -> tuple[FloatArray, tuple[FloatArray, ...], FloatArray] | None:
     from scipy.linalg import solve_continuous_are
 
@@ -102,11 +106,11 @@ def _continuous(
         with warnings.catch_warnings():
             # What a badly conditioned equation gives is judged by its poles.
             warnings.simplefilter("ignore")
-            p = solve_continuous_are(model.A.T, model.C.T, process, measured, s=cross)
+            p = solve_continuous_are((model.A + decay * np.eye(len(model.A))).T, model.C.T, process, measured, s=cross)
     except (np.linalg.LinAlgError, ValueError):
         return None
     gain = np.asarray(np.linalg.solve(measured, (p @ model.C.T + cross).T).T)
-    if not np.all(np.isfinite(gain)) or not abscissa(model.A - gain @ model.C, 0.0) < 0.0:
+    if not np.all(np.isfinite(gain)) or not abscissa(model.A - gain @ model.C, 0.0) < -decay:
         return None
     return gain, (), measured
 

@@ -42,8 +42,9 @@ class FunctionalFilterOptions(MethodOptions):
         """Yield a sentence for each rule across options that is broken."""
         if self.poles is not None:
             given = [name for name in ("fault_rate", "decay", "noise") if getattr(self, name) is not None]
-            if given or self.delay:
-                yield f"{', '.join([*given, *(['delay'] if self.delay else [])])} choose gains, and so do poles: give one."
+            given += ["delay"] if self.delay else []
+            if given:
+                yield f"{', '.join(given)} choose gains, and so do poles: give one."
         if self.residuals is not None:
             given = [name for name in ("faults", "fault_rate") if getattr(self, name) is not None]
             late = [name for name, default in (("delay", 0), ("mean", 1)) if getattr(self, name) != default]
@@ -102,9 +103,7 @@ def _by_name(given: Any, names: Sequence[str], option: str, *, missing: float | 
         unknown = [name for name in given if name not in names]
         lacking = [name for name in names if name not in given]
         if unknown or (lacking and missing is None):
-            raise SpecError(
-                f"{option} must name {', '.join(names)}: unknown {unknown}, missing {lacking}.", path=path
-            )
+            raise SpecError(f"{option} must name {', '.join(names)}: unknown {unknown}, missing {lacking}.", path=path)
         values = [given.get(name, missing) for name in names]
     else:
         values = [given] * len(names)

@@ -12,8 +12,8 @@ from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.spectra import speeds
 from obsynth.plants.descriptor import DescriptorSystem
 
-#: A step is to be seen to 90 % after so many time constants of the plant (ln 10), but no sooner than so many samples.
-TIME_CONSTANTS, LEAST_SAMPLES = 2.3, 4.0
+#: A step is to be seen to 90 % after so many time constants of the plant, but no sooner than so many samples.
+TIME_CONSTANTS, LEAST_SAMPLES = 7.0, 4.0
 #: Estimates of a step within this of one count as there; asked at these multiples of the time.
 REACHED, ASKED_AT = 0.1, (1.0, 1.5, 2.5)
 #: Decades of the search around a rate of the size of the noise, and its steps per decade at the end.

@@ -138,9 +138,7 @@ def _placed(rows: Rows, place: int, width: int, order: int) -> Rows:
 
 
 def _under(first: Rows, second: Rows) -> Rows:
-    return Rows(
-        np.vstack([first.C, second.C]), np.vstack([first.D, second.D]), np.vstack([first.T0, second.T0])
-    )
+    return Rows(np.vstack([first.C, second.C]), np.vstack([first.D, second.D]), np.vstack([first.T0, second.T0]))
 
 
 def _stacked(matrices: Sequence[FloatArray], width: int) -> FloatArray:
