@@ -9,6 +9,10 @@ if TYPE_CHECKING:
     from obsynth.analysis.identifiability import Identifiability, identifiability
     from obsynth.analysis.structure import analyse_structure
     from obsynth.analysis.transformations import discretise, eliminate_algebraic_states
+    from obsynth.analysis.transformations.linearisation import linearise
+    from obsynth.calibration.box import CalibratedBox
+    from obsynth.calibration.calibrating import calibrate
+    from obsynth.calibration.result import Calibration
     from obsynth.data.run import DataRun, run_on_data
     from obsynth.errors import (
         InfeasibleError,
@@ -78,6 +82,10 @@ __version__ = "0.1.0"
 
 # Names are imported when they are first used, so that `import obsynth` stays fast.
 _HOMES = {
+    "CalibratedBox": "obsynth.calibration.box",
+    "Calibration": "obsynth.calibration.result",
+    "calibrate": "obsynth.calibration.calibrating",
+    "linearise": "obsynth.analysis.transformations.linearisation",
     "dae_adaptive_observer": "obsynth.methods.dae_adaptive_observer.public",
     "DAETrajectory": "obsynth.simulation.dae",
     "simulate_dae": "obsynth.simulation.dae",
@@ -168,6 +176,8 @@ __all__ = [
     "Adaptation",
     "Alarm",
     "BatchEstimates",
+    "CalibratedBox",
+    "Calibration",
     "Certificate",
     "Check",
     "DAEBatchEstimates",
@@ -219,6 +229,7 @@ __all__ = [
     "adaptive_observer",
     "analyse_structure",
     "apply_adaptation_gain",
+    "calibrate",
     "dae_adaptive_observer",
     "decide",
     "descriptor_kalman",
@@ -233,6 +244,7 @@ __all__ = [
     "fault_response",
     "html_report",
     "identifiability",
+    "linearise",
     "load",
     "monitor",
     "online_monitor",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,8 +17,10 @@ NAMED_SHARE = 0.05
 #: Eigenvalues of the variances' information below this share of the largest are left out.
 LEAST_INFORMATION = 1e-10
 #: Variances that are found from n rows are themselves uncertain, which a quantile of Student's distribution covers in
-#: part; what it leaves was measured (benchmarks/campaigns): boxes of `SHORT` rows must be this much wider.
-SHORT, SHORT_WIDENING = 56.0, 1.2
+#: part; what it leaves was measured (benchmarks/campaigns/calibration_coverage.md): boxes of `SHORT` rows need this.
+SHORT, SHORT_WIDENING = 56.0, 1.05
+#: Root of the deviance at a one-sided limit of 95 %.
+LIMIT_ROOT = 1.645
 #: A profile ends when its root is within this share of what is sought.
 PROFILE_TOLERANCE = 0.02
 MOST_PROFILE_STEPS = 12
@@ -94,6 +96,18 @@ def profile_box(objective: Objective, maximum: Maximum, root: float) -> list[tup
         sides = [_side(objective, maximum, i, sign, root) for sign in (-1.0, 1.0)]
         found.append((Side(sides[0].value * width, sides[0].is_open), Side(sides[1].value * width, sides[1].is_open)))
     return found
+
+
+def upper_limit(objective: Objective, maximum: Maximum, i: int) -> float:
+    """Return the one-sided limit of a logarithm of a variance that the log cannot tell from zero."""
+    avoided = objective.avoided.copy()
+    objective.avoided[:] = 0.0
+    lowest = maximum.z.copy()
+    lowest[i] = objective.low[i]
+    value = min(objective(maximum.z)[0], objective(lowest)[0])
+    side = _side(objective, replace(maximum, value=value), i, 1.0, LIMIT_ROOT)
+    objective.avoided[:] = avoided
+    return side.value
 
 
 class _Profile:

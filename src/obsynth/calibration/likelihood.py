@@ -15,9 +15,10 @@ from typing import Any
 
 import numpy as np
 
+from obsynth.calibration.compilation import compiled
 from obsynth.calibration.step_graphs import SampleGraphs
-from obsynth.models.dae_functions import Compiled
 from obsynth.numerics.arrays import FloatArray
+from obsynth.plants.dae.functions import Compiled
 
 #: A scaled Newton residual above this is no solution of a step.
 LARGEST_RESIDUAL = 1e-7
@@ -61,7 +62,7 @@ def _whole(
     import casadi as ca
 
     nx, nt, n = graphs.nx, graphs.nt, len(y)
-    first, later = _first(graphs, noisy), _later(graphs, noisy)
+    first = _first(graphs, noisy)
     seen = np.isfinite(y)
     data = np.hstack([u, np.where(seen, y, 0.0), seen]).T
     v = ca.MX.sym("v", nt + len(noisy) + graphs.ny)
@@ -72,13 +73,12 @@ def _whole(
     size = nx + nx * nx
     back_first = first.reverse(1)
     if n > 1:
-        forward = _forward(graphs, later)
+        forward, backward = _accumulated(graphs, noisy, size)
         states, said, numbers = forward.mapaccum(n - 1)(state, data[:, 1:], ca.repmat(v, 1, n - 1))
         before = ca.horzcat(state, states[:, :-1])
         rows, total = ca.horzcat(row, said), row[0] + ca.sum2(said[0, :])
         flip = list(range(n - 2, -1, -1))
-        backward = _backward(graphs, later, size).mapaccum(n - 1)
-        costates = backward(ca.MX.zeros(size + v.shape[0]), before[:, flip], numbers[:, flip],
+        costates = backward.mapaccum(n - 1)(ca.MX.zeros(size + v.shape[0]), before[:, flip], numbers[:, flip],
                             ca.DM(data[:, 1:])[:, flip], ca.repmat(v, 1, n - 1))  # fmt: skip
         end = costates[:, -1]
         costate, gradient = end[:size], end[size:]
@@ -154,6 +154,19 @@ def _later(graphs: SampleGraphs, noisy: Sequence[int]) -> Any:
     P = F @ P @ F.T + added @ ca.diag(ca.exp(log_q)) @ added.T if noisy else F @ P @ F.T
     after, row = _update(graphs, x, P, t, log_r, y, seen)
     return ca.Function("later", [packed, data, v, tc, numbers], [ca.densify(after), ca.densify(row)])
+
+
+def _accumulated(graphs: SampleGraphs, noisy: Sequence[int], size: int) -> list[Any]:
+    """Return what goes forward and back over samples, made once for all logs of a problem."""
+    key = tuple(noisy)
+    if key not in graphs.made:
+        later = _later(graphs, noisy)
+        backward = _backward(graphs, later, size)
+        if graphs.in_c:
+            later, backward = compiled([later, backward])
+        graphs.made[key] = [_forward(graphs, later), backward]
+    found: list[Any] = graphs.made[key]
+    return found
 
 
 def _forward(graphs: SampleGraphs, later: Any) -> Any:

@@ -120,12 +120,13 @@ def read_log(
         if wanted not in table:
             raise SpecError(f"The log has no column {wanted!r} for {name!r}: there are {', '.join(table)}.",
                             path=f"columns.{name}")  # fmt: skip
-        return _numbers(table[wanted], wanted, length)[first:last] * float((scales or {}).get(name, 1.0))
+        numbers = _numbers(table[wanted], wanted, length)[first:last]
+        return np.asarray(numbers * float((scales or {}).get(name, 1.0)), dtype=np.float64)
 
     in_table = (columns or {}).get("time", "time") in table
     if not in_table and dt is None:
         raise SpecError("The log has no column 'time': name it by columns, or give dt.", path="columns.time")
-    time = column("time") if in_table else np.arange(first, last) * float(dt or 0.0)
+    time = column("time") if in_table else np.asarray(np.arange(first, last) * float(dt or 0.0))
     u = np.column_stack([column(name) for name in input_names]) if input_names else np.zeros((last - first, 0))
     y = np.column_stack([column(name) for name in output_names])
     return _on_grid(time, u, y, dt, tuple(input_names), tuple(output_names), (first, last), source)
@@ -165,7 +166,11 @@ def _on_grid(
 ) -> Log:  # fmt: skip
     """Return the log on its grid; missing rows become rows without outputs whose inputs are those that follow."""
     if not np.isfinite(time).all() or (np.diff(time) <= 0).any():
-        bad = int(np.argmax(~np.isfinite(time))) if not np.isfinite(time).all() else int(np.argmax(np.diff(time) <= 0)) + 1
+        bad = (
+            int(np.argmax(~np.isfinite(time)))
+            if not np.isfinite(time).all()
+            else int(np.argmax(np.diff(time) <= 0)) + 1
+        )
         raise bad_log("time", f"Stamps must rise and be finite, but that of row {rows[0] + bad} is {time[bad]:g} s.",
                       path="log.time")  # fmt: skip
     gaps = np.diff(time)
@@ -175,15 +180,15 @@ def _on_grid(
     notes = []
     if jitter.max(initial=0.0) > LARGEST_JITTER or (counts < 1).any():
         worst = int(np.argmax(jitter))
-        raise bad_log("irregular", f"The stamps are irregular: that of row {rows[0] + worst + 1} is {jitter[worst]:.0%} of "
-                      f"a step off the grid of {step:g} s. Resample the log.", path="log.time")  # fmt: skip
+        raise bad_log("irregular", f"The stamps are irregular: row {rows[0] + worst + 1} is {jitter[worst]:.0%} "
+                      f"of a step off the grid of {step:g} s. Resample the log.", path="log.time")  # fmt: skip
     if jitter.max(initial=0.0) > NOTED_JITTER:
         notes.append(f"The stamps jitter by {jitter.max():.1%} of a step.")
     for name, column in zip(inputs, u.T, strict=True):
         if not np.isfinite(column).all():
             row = rows[0] + int(np.argmax(~np.isfinite(column)))
-            raise bad_log("nan", f"The input {name!r} is not finite in row {row}: inputs must be known. Fill the gap, or "
-                          "take other rows.", path=f"log.{name}")  # fmt: skip
+            raise bad_log("nan", f"The input {name!r} is not finite in row {row}: inputs must be known. Fill the gap, "
+                          "or take other rows.", path=f"log.{name}")  # fmt: skip
     for name, column in zip(outputs, y.T, strict=True):
         if np.isinf(column).any() or not np.isfinite(column).any():
             what = "infinite" if np.isinf(column).any() else "nowhere finite"

@@ -6,12 +6,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from obsynth.calibration.likelihood import IMPOSSIBLE, Likelihood
 from obsynth.calibration.problem import Problem
 from obsynth.calibration.refusals import refused
 from obsynth.calibration.simulation_error import Fit
 from obsynth.numerics.arrays import FloatArray
+
+BoolArray = NDArray[np.bool_]
 
 #: Where the search for the variances begins: process noise and sensor noise as logarithms of factors of a first guess.
 #: With one start alone the result was 3.6 nats above the best on the measured tanks.
@@ -27,6 +30,10 @@ SAME_MINIMUM = 1e-3
 SEARCH_TOLERANCE = 1e-6
 MOST_SEARCH_STEPS = 150
 DIFFERENCE = 1e-4
+#: A variance counts as indistinguishable from zero if making it smaller by this logarithm costs fewer nats than this.
+COLLAPSE, COLLAPSE_NATS = 3.0, 0.05
+#: Where variances that must not collapse begin, as logarithms of factors of their first guess.
+RAISED = (0.0, 3.0, -3.0)
 #: Nearer to a bound than this, relative to its size, a variable counts as on it.
 AT_BOUND = 1e-6
 
@@ -54,6 +61,8 @@ class Objective:
         self.is_q = np.concatenate([np.zeros(g.nt, bool), np.ones(nq, bool), np.zeros(g.ny, bool)])[self.free]
         self.is_r = np.concatenate([np.zeros(g.nt + nq, bool), np.ones(g.ny, bool)])[self.free]
         self.scale = np.where(self.is_q | self.is_r, VARIANCE_SCALE, CONSTANT_SCALE)
+        self.first = np.concatenate([np.zeros(g.nt), self.variances])[self.free]
+        self.avoided = np.zeros(self.size)
 
     @property
     def size(self) -> int:
@@ -82,7 +91,12 @@ class Objective:
         gradient = gradient.copy()
         gradient[: self.nt] += p.prior_weights * away
         gradient[: self.nt] *= p.widths
-        return value + 0.5 * float(p.prior_weights @ away**2), gradient[self.free]
+        value += 0.5 * float(p.prior_weights @ away**2) - 0.5 * float(self.avoided @ z)
+        return value, gradient[self.free] - 0.5 * self.avoided
+
+    def plain(self, z: FloatArray) -> float:
+        """Return the negative log likelihood alone."""
+        return self.likelihood(self.full(z))[0]
 
     def constants(self, z: FloatArray) -> FloatArray:
         """Return the unknown constants ``(nt,)``."""
@@ -96,12 +110,16 @@ class Objective:
 
 @dataclass(frozen=True, eq=False)
 class Maximum:
-    """Where the likelihood is greatest: free variables, value, Hessian, and the value that each start reached."""
+    """Where the likelihood is greatest: free variables, value, Hessian, and the value that each start reached.
+
+    ``likeliest`` are the free variables before any variance was kept from zero.
+    """
 
     z: FloatArray
     value: float
     hessian: FloatArray
     starts: tuple[float, ...]
+    likeliest: FloatArray
 
 
 def _process_noise(problem: Problem, fit: Fit) -> FloatArray:
@@ -140,7 +158,8 @@ def greatest_likelihood(objective: Objective, fits: Sequence[Fit], note: Callabl
     """Return the best of several searches, polished."""
     from scipy.optimize import minimize
 
-    best, value, starts = None, np.inf, []
+    starts: list[float] = []
+    best, value = None, np.inf
     for i, fit in enumerate(fits):
         if i and fit.cost - fits[0].cost < SAME_MINIMUM * abs(fits[0].cost):
             continue
@@ -153,15 +172,48 @@ def greatest_likelihood(objective: Objective, fits: Sequence[Fit], note: Callabl
             if reached < value:
                 best, value = z, reached
     if best is None or value >= IMPOSSIBLE:
-        raise refused("cannot-simulate", "The filter has no finite likelihood from any start: check units, bounds and the "
-                      "initial covariance.", signals=list(objective.problem.unknown))  # fmt: skip
+        raise refused("cannot-simulate", "The filter has no finite likelihood from any start: check units, bounds and "
+                      "the initial covariance.", signals=list(objective.problem.unknown))  # fmt: skip
     found = minimize(
         objective, best, jac=True, method="L-BFGS-B", bounds=np.column_stack([objective.low, objective.high]),
         options={"maxiter": 100, "maxcor": 30, "ftol": 1e-14, "gtol": 1e-7},
     )  # fmt: skip
     if found.fun < value:
         best, value = np.asarray(found.x), float(found.fun)
-    return Maximum(best, value, hessian(objective, best), tuple(starts))
+    return Maximum(best, value, hessian(objective, best), tuple(starts), best)
+
+
+def collapsed(objective: Objective, maximum: Maximum) -> BoolArray:
+    """Return which variances the log cannot tell from zero where they are, as truth values."""
+    found = np.zeros(objective.size, dtype=bool)
+    for i in np.flatnonzero(objective.is_q | objective.is_r):
+        z = maximum.z.copy()
+        z[i] = max(z[i] - COLLAPSE, objective.low[i])
+        found[i] = objective(z)[0] - maximum.value < COLLAPSE_NATS
+    return found
+
+
+def without_collapse(objective: Objective, maximum: Maximum, note: Callable[[str], object]) -> Maximum:
+    """Return the maximum with variances kept away from zero where the log cannot tell them from it.
+
+    The weight sqrt(q) of a boundary-avoiding prior (Chung et al. 2013) is given to those variances alone: a variance
+    that a short log makes zero by chance would make every box too small.
+    """
+    for _ in range(len(objective.problem.noisy) + 1):
+        new = collapsed(objective, maximum) & (objective.avoided == 0.0)
+        if not new.any():
+            break
+        note("variances that the log cannot tell from zero")
+        objective.avoided[new] = 1.0
+        best, value = maximum.z, np.inf
+        for raised in RAISED:
+            start = maximum.z.copy()
+            start[new] = np.clip(objective.first[new] + raised, objective.low[new], objective.high[new])
+            reached, z = descent(objective, start, objective.low, objective.high, objective.scale)
+            if reached < value:
+                best, value = z, reached
+        maximum = Maximum(best, value, hessian(objective, best), maximum.starts, maximum.likeliest)
+    return maximum
 
 
 def hessian(both: Objective, z: FloatArray) -> FloatArray:
@@ -175,7 +227,7 @@ def hessian(both: Objective, z: FloatArray) -> FloatArray:
     return np.asarray(0.5 * (found + found.T))
 
 
-def at_bounds(z: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
+def at_bounds(z: FloatArray, low: FloatArray, high: FloatArray) -> BoolArray:
     """Return which variables are at a bound, as truth values."""
     room = AT_BOUND * (1.0 + np.abs(z))
-    return np.asarray((z - low <= room) | (high - z <= room))
+    return (z - low <= room) | (high - z <= room)

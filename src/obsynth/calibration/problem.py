@@ -12,11 +12,11 @@ from obsynth.calibration.logs import Log, quantum, repeats
 from obsynth.calibration.refusals import bad_log, refused
 from obsynth.calibration.step_graphs import SampleGraphs, promoted, sample_graphs
 from obsynth.errors import SpecError
-from obsynth.models.dae import DAEModel
-from obsynth.models.dae_checks import finite_vector
-from obsynth.models.names import index_of
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.covariances import covariance_factor
+from obsynth.plants.dae.checks import finite_vector
+from obsynth.plants.dae.model import DAEModel
+from obsynth.plants.names import index_of
 
 #: Measured values for each unknown constant and variance that are needed at least.
 VALUES_PER_UNKNOWN = 5
@@ -76,7 +76,9 @@ class Problem:
 
     def integrated(self, integration: str, substeps: int) -> Problem:
         """Return the same problem with other steps."""
-        graphs = sample_graphs(self.model, self.unknown, self.log.dt, integration=integration, substeps=substeps)
+        graphs = sample_graphs(
+            self.model, self.unknown, self.log.dt, integration=integration, substeps=substeps, samples=self.log.samples
+        )
         return Problem(**{**vars(self), "graphs": graphs, "integration": integration, "substeps": substeps})
 
     def with_log(self, log: Log) -> Problem:
@@ -110,15 +112,18 @@ def calibration_problem(
     quanta = np.array([quantum(column) for column in log.y.T])
     held = np.array([repeats(column) for column in log.y.T])
     largest = np.nanmax(np.abs(log.y), axis=0)
-    floors = np.maximum(np.where(held, quanta**2 / 12.0, 0.0), (LEAST_NOISE * np.where(largest > 0.0, largest, 1.0)) ** 2)
+    floors = np.maximum(
+        np.where(held, quanta**2 / 12.0, 0.0), (LEAST_NOISE * np.where(largest > 0.0, largest, 1.0)) ** 2
+    )
     variances = int(np.isnan(known_Q).sum() + np.isnan(known_R).sum())
     needed, seen = VALUES_PER_UNKNOWN * (len(names) + variances), int(np.isfinite(log.y).sum())
     if seen < needed:
-        raise bad_log("too-short", f"The log is too short: {seen} measured values for {len(names)} constants and {variances} "
-                      f"variances; at least {needed} are needed. Take more rows, fewer unknowns, or state Q and R.")  # fmt: skip
+        raise bad_log("too-short", f"The log is too short: {seen} measured values for {len(names)} constants and "
+                      f"{variances} variances; at least {needed} are needed. Take more rows, fewer unknowns, or state "
+                      "Q and R.")  # fmt: skip
     whole = promoted(model, names)
     x0 = _state(model, initial_state)
-    graphs = sample_graphs(whole, names, log.dt, integration=integration, substeps=substeps)
+    graphs = sample_graphs(whole, names, log.dt, integration=integration, substeps=substeps, samples=log.samples)
     return Problem(
         whole, log, names, np.array([values[name] for name in names]), low, high, means, weights, equations, known_Q,
         known_R, x0, _covariance(model, initial_covariance), quanta, floors, graphs, integration, int(substeps),

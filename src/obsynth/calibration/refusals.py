@@ -9,7 +9,7 @@ from obsynth.errors import PreconditionError, SpecError
 
 def bad_log(code: str, message: str, *, path: str = "log") -> SpecError:
     """Return the error of a log that is malformed: ``irregular``, ``nan``, ``time``, ``empty``, ``too-short``."""
-    return SpecError(message, path=path)
+    return SpecError(message, path=path, code=code)
 
 
 def refused(code: str, message: str, *, signals: Sequence[str] = ()) -> PreconditionError:

@@ -1,17 +1,18 @@
-"""The start of a calibration: constants and initial state whose simulation follows the log, with exact sensitivities."""
+"""The start of a calibration: constants and initial state whose simulation follows the log, by sensitivities."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from obsynth.calibration.likelihood import LARGEST_RESIDUAL
 from obsynth.calibration.problem import Problem
 from obsynth.calibration.refusals import refused
-from obsynth.models.dae_functions import Compiled
 from obsynth.numerics.arrays import FloatArray
+from obsynth.plants.dae.functions import Compiled
 
 #: Rounds in which the sensors' weights are estimated again; the first is robust against single wrong values.
 ROUNDS = 3
@@ -61,6 +62,15 @@ class SimulationError:
             self._last = key, y, S.reshape(-1, self.size) * self.scale
         return self._last[1], self._last[2]
 
+    def states(self, fit: Fit) -> FloatArray:
+        """Return the states of a fit ``(n, nx)``."""
+        p, g = self.problem, self.problem.graphs
+        x, found = fit.x0, [fit.x0]
+        for u in p.u[1:]:
+            x = np.array(g.solve(x, u, fit.t)[0])[-g.nx :, 0]
+            found.append(x)
+        return np.array(found)
+
     def residuals(self, v: FloatArray, weights: FloatArray) -> FloatArray:
         """Return differences in units of the sensors' deviations, then those from the priors."""
         p, (y, _) = self.problem, self.simulated(v)
@@ -104,14 +114,16 @@ class SimulationError:
         return Fit(v[: self.nt] * p.widths, v[self.nt :] * self.spread, weights, cost, J.T @ J)
 
 
-def simulation_fits(problem: Problem, starts: int, seed: int, note: Callable[[str], object]) -> list[Fit]:
-    """Return fits from the nominal constants and random ones within their bounds, the best first."""
+def simulation_fits(
+    problem: Problem, starts: int, seed: int, note: Callable[[str], object], *, start: FloatArray | None = None
+) -> list[Fit]:
+    """Return fits from given or nominal constants and random ones within their bounds, the best first."""
     error, rng = SimulationError(problem), np.random.default_rng(seed)
     fits = []
     for i in range(starts):
         note(f"simulation error, start {i + 1} of {starts}")
-        start = problem.nominal if i == 0 else problem.low + problem.widths * rng.uniform(0.05, 0.95, len(problem.low))
-        found = error.fit(start)
+        drawn = problem.low + problem.widths * rng.uniform(0.05, 0.95, len(problem.low))
+        found = error.fit(drawn if i else problem.nominal if start is None else start)
         if found is not None:
             fits.append(found)
     if not fits:
@@ -143,7 +155,7 @@ def _require_explained(problem: Problem, left: FloatArray) -> None:
         )  # fmt: skip
 
 
-def _simulated(problem: Problem) -> object:
+def _simulated(problem: Problem) -> Any:
     """Return the function from ``[t, x0]`` to rows: outputs, their derivatives by t and x0, and the residual."""
     import casadi as ca
 
@@ -151,20 +163,20 @@ def _simulated(problem: Problem) -> object:
     nx, ny, nt, size = g.nx, g.ny, g.nt, g.nt + g.nx
     packed, u, t = ca.MX.sym("packed", nx + nx * size), ca.MX.sym("u", g.nu), ca.MX.sym("t", nt)
 
-    def row(x: object, S: object, t: object, left: object) -> object:
+    def row(x: Any, S: Any, t: Any, left: Any) -> Any:
         y, H, L = g.outputs(x, t)
         return ca.vertcat(y, ca.vec(H @ S + ca.horzcat(L, ca.MX.zeros(ny, nx))), left)
 
     x, S = packed[:nx], ca.reshape(packed[nx:], nx, size)
     stages, left = g.solve(x, u, t)
-    after, F, G, _ = g.local(x, u, t, t, g.sensitivities(x, u, t, stages))
+    after, F, G, _ = g.fast(x, u, t, t, g.sensitivities(x, u, t, stages))
     S = F @ S + ca.horzcat(G, ca.MX.zeros(nx, nx))
     one = ca.Function("one", [packed, u, t], [ca.vertcat(after, ca.vec(S)), row(after, S, t, left)])
     v = ca.MX.sym("v", size)
-    S = ca.DM(np.hstack([np.zeros((nx, nt)), np.eye(nx)]))
-    rows = row(v[nt:], ca.MX(S), v[:nt], ca.MX(0.0))
+    first = ca.DM(np.hstack([np.zeros((nx, nt)), np.eye(nx)]))
+    rows = row(v[nt:], ca.MX(first), v[:nt], ca.MX(0.0))
     if n > 1:
-        begin = ca.vertcat(v[nt:], ca.vec(S))
+        begin = ca.vertcat(v[nt:], ca.vec(first))
         _, later = one.mapaccum(n - 1)(begin, ca.DM(problem.u[1:].T), ca.repmat(v[:nt], 1, n - 1))
         rows = ca.horzcat(rows, later)
     return ca.Function("simulated", [v], [ca.densify(rows)])

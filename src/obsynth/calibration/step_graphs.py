@@ -7,21 +7,26 @@ and their first derivatives enter the differentiated part as numbers, and the im
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from obsynth.calibration.compilation import compiled
 from obsynth.errors import SpecError
-from obsynth.models.dae import DAEModel
-from obsynth.models.dae_functions import DAEFunctions
-from obsynth.models.dae_symbols import symbols_of
-from obsynth.models.names import index_of
-from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.symbolic_solve import largest_entries
+from obsynth.plants.dae.functions import DAEFunctions
+from obsynth.plants.dae.model import DAEModel
+from obsynth.plants.dae.symbols import symbols_of
+from obsynth.plants.names import index_of
 
-#: Newton iterations of every step: from the last sample's state three or four are the rule.
-ITERATIONS = 8
+#: Newton iterations of every step, from the last sample's state, and further ones where the residual is above `SOLVED`.
+ITERATIONS, FURTHER = 3, 8
+SOLVED = 1e-11
+
+
+#: Operations in one evaluation above which functions are compiled: some seconds, before thousands of evaluations.
+COMPILED_OPERATIONS = 2_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,17 +37,21 @@ class SampleGraphs:
     sensitivities : from x, u, t, stages to what `local` takes as numbers: stages and their derivatives.
     local : from x, u, t and those numbers (with x itself) to the state after, F, G by t, and the noise's way.
     outputs : from x, t to y, H and L by t.
+    fast : `local`, to be evaluated and not to be differentiated; in_c : whether functions are machine code.
     """
 
     solve: Any
     sensitivities: Any
     local: Any
     outputs: Any
+    fast: Any
     nx: int
     nu: int
     ny: int
     nt: int
     numbers: int
+    in_c: bool
+    made: dict[Any, Any] = field(default_factory=dict, repr=False)
 
 
 def promoted(model: DAEModel, names: Sequence[str]) -> DAEModel:
@@ -63,21 +72,18 @@ def promoted(model: DAEModel, names: Sequence[str]) -> DAEModel:
 
 
 def sample_graphs(
-    model: DAEModel, unknown: Sequence[str], dt: float, *, integration: str, substeps: int
+    model: DAEModel, unknown: Sequence[str], dt: float, *, integration: str, substeps: int, samples: int = 1
 ) -> SampleGraphs:
-    """Return the functions of one sample of ``dt`` seconds of a promoted model."""
+    """Return the functions of one sample of ``dt`` seconds of a promoted model, in C where there are many."""
     import casadi as ca
 
     base = _Substep(model, unknown, dt / substeps, integration)
     nx, nu, nt, n = model.nx, model.nu, len(unknown), base.size
     x, u, t = ca.MX.sym("x", nx), ca.MX.sym("u", nu), ca.MX.sym("t", nt)
-    stages, state, left = [], x, ca.MX(0.0)
+    stages: list[Any] = []
+    state, left = x, ca.MX(0.0)
     for _ in range(substeps):
-        X = ca.repmat(state, base.stages, 1)
-        rest = left
-        for _ in range(ITERATIONS):
-            X, rest = base.newton(X, state, u, t)
-        _, rest = base.newton(X, state, u, t)
+        X, rest = base.solve(ca.repmat(state, base.stages, 1), state, u, t)
         stages, state, left = [*stages, X], X[n - nx :], ca.fmax(left, rest)
     solve = ca.Function("solve", [x, u, t], [ca.vertcat(*stages), left])
 
@@ -93,9 +99,12 @@ def sample_graphs(
     L = ca.jacobian(symbols.outputs, symbols.theta)[:, base.columns]
     full = ca.Function("h", [symbols.x, theta], [ca.densify(part) for part in (symbols.outputs, H, L)])
     xs, ts = ca.SX.sym("x", nx), ca.SX.sym("t", nt)
-    outputs = ca.Function("outputs", [xs, ts], full(xs, base.theta(ts)))
-    return SampleGraphs(solve, sensitivities, _local(base, substeps, nx, nu, nt), outputs, nx, nu, model.ny, nt,
-                        packed.shape[0])  # fmt: skip
+    outputs = ca.Function("outputs", [xs, ts], list(full(xs, base.theta(ts))))
+    local = _local(base, substeps, nx, nu, nt)
+    fast, in_c = local, 8 * samples * local.n_instructions() > COMPILED_OPERATIONS
+    if in_c:
+        solve, sensitivities, fast = compiled([solve, sensitivities, local])
+    return SampleGraphs(solve, sensitivities, local, outputs, fast, nx, nu, model.ny, nt, packed.shape[0], in_c)
 
 
 def _local(base: _Substep, substeps: int, nx: int, nu: int, nt: int) -> Any:
@@ -113,7 +122,9 @@ def _local(base: _Substep, substeps: int, nx: int, nu: int, nt: int) -> Any:
         by_x = ca.reshape(packed[place + n : place + n * (1 + nx)], n, nx)
         by_t = ca.reshape(packed[place + n * (1 + nx) : place + n * (1 + nx + nt)], n, nt)
         moved = X + by_x @ (state - before) + by_t @ (t - tc)
-        by_x, by_t, noise = base.symbolic(moved, state, u, t)
+        by_x, by_t, way = base.symbolic(moved, state, u, t)
+        # What is added to the equations is added during the whole sample, in every substep.
+        noise = by_x[n - nx :, :] @ noise + way
         F, G = by_x[n - nx :, :] @ F, by_x[n - nx :, :] @ G + by_t[n - nx :, :]
         state, before, place = moved[n - nx :], X[n - nx :], place + n * (1 + nx + nt)
     return ca.Function("local", [x, u, t, tc, packed], [state, ca.densify(F), ca.densify(G), ca.densify(noise)])
@@ -138,9 +149,30 @@ class _Substep:
         step = eliminated(J, -equations, self.order)
         weights = 1.0 / ca.fmax(largest_entries(ca.densify(J) @ ca.diag(sizes)), 1e-300)
         left = ca.mmax(ca.fabs(weights * equations)) if self.size > 1 else ca.fabs(weights * equations)
+        # The residual is that before the iteration, so that the last one is better than it says.
         self.newton = ca.Function("newton", [X, x, u, t], [X + step, left])
+        self.solve = self._solve()
         found = [ca.densify(part) for part in self.symbolic(X, x, u, t)[:2]]
         self.derivatives = ca.Function("derivatives", [X, x, u, t], found)
+
+    def _solve(self) -> Any:
+        """Return the solution of the stages from a start, in as many iterations as it takes."""
+        import casadi as ca
+
+        start = [ca.MX.sym(name, self.newton.size1_in(i)) for i, name in enumerate(("X", "x", "u", "t"))]
+        X, before = start[0], start[1:]
+        for _ in range(ITERATIONS):
+            X, left = self.newton(X, *before)
+        X, left = self.newton(X, *before)
+        more, rest = start[0], ca.MX(0.0)
+        for _ in range(FURTHER):
+            more, rest = self.newton(more, *before)
+        further = ca.Function("iterate", start, [more, rest])
+        done = ca.Function("done", start, [start[0], ca.MX(0.0)])
+        choice = ca.Function.if_else("choice", further, done)
+        unsolved = ca.logic_not(left <= SOLVED)
+        after, rest = choice(unsolved, X, *before)
+        return ca.Function("solution", start, [after, ca.if_else(unsolved, rest, left)])
 
     def theta(self, t: Any) -> Any:
         """Return all parameters: the unknown, and nominal values for the rest."""

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.models.dae import DAEModel
-from obsynth.models.dae_symbols import symbols_of
 from obsynth.numerics.arrays import FloatArray
+from obsynth.plants.dae.model import DAEModel
+from obsynth.plants.dae.symbols import symbols_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,8 @@ def local_equations(
     if ("local",) not in model.graphs:
         model.graphs[("local",)] = _function(model)
     found = [np.array(part.full()) for part in model.graphs[("local",)](rates, x, u, theta)]
-    return LocalEquations(found[0][:, 0], *found[1:5], found[5][:, 0], *found[6:])
+    value, E, by_state, by_input, by_parameter, y, C, outputs_by_parameter = found
+    return LocalEquations(value[:, 0], E, by_state, by_input, by_parameter, y[:, 0], C, outputs_by_parameter)
 
 
 def stores_parameters(model: DAEModel) -> bool:

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from obsynth.analysis.transformations.equations_at_a_point import local_equations
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.models.dae import DAEModel
-from obsynth.models.names import index_of
 from obsynth.numerics.arrays import FloatArray
+from obsynth.plants.dae.model import DAEModel
+from obsynth.plants.names import index_of
 
 #: Largest scaled residual of what counts as a root.
 ROOT = 1e-9
@@ -88,8 +88,8 @@ class _Problem:
         self.states = [i for i, name in enumerate(model.state_names) if name not in given]
         self.inputs = [model.input_names.index(name) for name in free if name in model.input_names]
         self.parameters = [model.parameter_names.index(name) for name in free if name in model.parameter_names]
-        self.seen = [i for i, name in enumerate(model.output_names)
-                     if name in given and name not in (*model.state_names, *model.input_names, *model.parameter_names)]  # fmt: skip
+        others = (*model.state_names, *model.input_names, *model.parameter_names)
+        self.seen = [i for i, name in enumerate(model.output_names) if name in given and name not in others]
         self.wanted = np.array([given[model.output_names[i]] for i in self.seen])
         self.names = [model.state_names[i] for i in self.states] + [model.input_names[i] for i in self.inputs]
         self.names += [model.parameter_names[i] for i in self.parameters]
@@ -97,7 +97,7 @@ class _Problem:
         begin = np.concatenate([self.base.x[self.states], self.base.u[self.inputs], self.base.theta[self.parameters]])
         freed = np.abs(begin[len(self.states) :])
         self.sizes = np.concatenate([model.state_scales[self.states], np.where(freed > 0.0, freed, 1.0)])
-        self.begin = begin / self.sizes
+        self.begin: FloatArray = np.asarray(begin / self.sizes)
         peaks = np.abs(self.raw(self.begin)[1]).max(axis=1, initial=0.0)
         if not np.isfinite(peaks).all():
             raise SpecError("The model is not defined at its nominal values: give other ones by start or given.",
@@ -125,7 +125,7 @@ class _Problem:
     def scaled(self, z: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return `raw` with rows scaled by their size at the start."""
         residual, jacobian = self.raw(z)
-        return self.weights * residual, self.weights[:, None] * jacobian
+        return np.asarray(self.weights * residual), np.asarray(self.weights[:, None] * jacobian)
 
     def solved(self) -> FloatArray:
         """Return the scaled unknowns that satisfy the rows best."""
@@ -136,8 +136,9 @@ class _Problem:
 
         def finite(part: int) -> Callable[[FloatArray], FloatArray]:
             # Outside the region where the model is defined a large number turns the search back.
-            return lambda z: np.nan_to_num(self.scaled(z)[part], nan=1e10, posinf=1e10, neginf=-1e10)
+            return lambda z: _finite(self.scaled(z)[part])
 
+        # As far as rounding allows.
         exact = np.finfo(np.float64).eps * 4.0
         z = np.asarray(least_squares(
             finite(0), self.begin, jac=finite(1), xtol=exact, ftol=exact, gtol=exact, max_nfev=MOST_EVALUATIONS,
@@ -188,7 +189,9 @@ class _Problem:
             return [], ""
         shares = weights / weights[int(np.argmax(np.abs(weights)))]
         kept = [i for i in range(len(shares)) if abs(shares[i]) > NAMED]
-        terms = [f"{self.rows[i]}" if abs(shares[i] - 1.0) < NAMED else f"{shares[i]:.6g} * {self.rows[i]}" for i in kept]
+        terms = [
+            f"{self.rows[i]}" if abs(shares[i] - 1.0) < NAMED else f"{shares[i]:.6g} * {self.rows[i]}" for i in kept
+        ]
         return [self.rows[i] for i in kept], " + ".join(terms)
 
 
@@ -224,9 +227,7 @@ def consistent_point(model: DAEModel, point: Point, fixed: Collection[str] = ())
     )  # fmt: skip
 
 
-def _algebraic_step(
-    constraint: FloatArray, right: FloatArray, E: FloatArray, movable: NDArray[np.bool_]
-) -> FloatArray:
+def _algebraic_step(constraint: FloatArray, right: FloatArray, E: FloatArray, movable: NDArray[np.bool_]) -> FloatArray:
     """Return the least move onto the constraints, of what is not differentiated if that is enough."""
     move = np.zeros(E.shape[1])
     if not constraint.size:
@@ -236,6 +237,10 @@ def _algebraic_step(
             move = np.zeros(E.shape[1])
             move[kept] = np.linalg.lstsq(constraint[:, kept], right, rcond=RANK)[0]
     return move
+
+
+def _finite(values: FloatArray) -> FloatArray:
+    return np.asarray(np.nan_to_num(values, nan=1e10, posinf=1e10, neginf=-1e10), dtype=np.float64)
 
 
 def _row_weights(matrix: FloatArray) -> FloatArray:

@@ -9,11 +9,11 @@ import numpy as np
 from obsynth.analysis.transformations.equations_at_a_point import LocalEquations, local_equations
 from obsynth.analysis.transformations.equilibrium import Point, consistent_point, equilibrium, nominal_point
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.models.dae import DAEModel
-from obsynth.models.descriptor import DescriptorSystem
-from obsynth.models.names import index_of
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray
+from obsynth.plants.dae.model import DAEModel
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.names import index_of
 
 #: What E x' may be, in sizes of its row, where a point counts as resting.
 MOVING = 1e-9
@@ -106,7 +106,9 @@ def linearise(
             raise SpecError("free and start belong to an equilibrium: at a point, give every value.", path="free")
         wrong = [name for name in values if name in model.output_names and not _is_state_or_input(model, name)]
         if wrong:
-            raise SpecError(f"The output {wrong[0]!r} cannot be given at a point: give states.", path=f"given.{wrong[0]}")
+            raise SpecError(
+                f"The output {wrong[0]!r} cannot be given at a point: give states.", path=f"given.{wrong[0]}"
+            )
         point = consistent_point(model, nominal_point(model, values), values)
     return linear_model(model, point, faults=faults, disturbances=disturbances, drift=drift)
 
@@ -154,9 +156,7 @@ def _state_name(model: DAEModel, i: int, point: Point, local: LocalEquations) ->
     return name
 
 
-def _operating_point(
-    model: DAEModel, point: Point, local: LocalEquations, names: Sequence[str]
-) -> dict[str, float]:
+def _operating_point(model: DAEModel, point: Point, local: LocalEquations, names: Sequence[str]) -> dict[str, float]:
     found: dict[str, FloatArray] = {}
     for signals, values in ((model.parameter_names, point.theta), (model.input_names, point.u), (names, point.x),
                             (model.output_names, local.y)):  # fmt: skip
@@ -177,7 +177,9 @@ def _names(value: Sequence[str] | Mapping[str, tuple[float, float]], what: str) 
 def _require_bounds(model: DAEModel, point: Point, free: Sequence[str] | Mapping[str, tuple[float, float]]) -> None:
     if not isinstance(free, Mapping):
         return
-    values = dict(zip(model.input_names, point.u, strict=True)) | dict(zip(model.parameter_names, point.theta, strict=True))
+    values = dict(zip(model.input_names, point.u, strict=True)) | dict(
+        zip(model.parameter_names, point.theta, strict=True)
+    )
     outside = []
     for name, bounds in free.items():
         if np.shape(bounds) != (2,) or not float(bounds[0]) <= float(bounds[1]):
