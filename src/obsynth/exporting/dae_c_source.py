@@ -11,10 +11,10 @@ from pathlib import Path
 
 from obsynth.errors import SpecError
 from obsynth.exporting.c_words import c_identifier, comment, included, quoted
+from obsynth.files.outputs import write_together
 from obsynth.observers.dae.c_code import observer_code
 from obsynth.plants.dae.model import DAEModel
 from obsynth.results.design import ObserverDesign
-from obsynth.results.files import write_atomically
 from obsynth.results.gain_sets import design_as_dict
 
 _STEP = r"""
@@ -65,9 +65,7 @@ def write_dae_c(design: ObserverDesign, target: Path, sample_time: float | None)
         "#define OBSERVER_IS_DECLARED", f"#define observer {prefix}_observer", "", observer_code(observer),
         _step_text(prefix, design.nonlinear[0]),
     ])  # fmt: skip
-    # The source is refused first if it cannot be written, so that no header stays behind alone.
-    written = write_atomically(target, source)
-    return written, write_atomically(header, "\n".join(_header(design, prefix, digest)) + "\n")
+    return write_together({target: source, header: "\n".join(_header(design, prefix, digest)) + "\n"})
 
 
 def _step_text(prefix: str, model: DAEModel) -> str:
