@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import itertools
+import re
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
 #: What a missing sample may look like in a stream; data frames know more words.
 MISSING = frozenset({"", "nan", "na", "n/a", "null", "none"})
 SUFFIXES = (".csv", ".parquet")
+#: Lines that may end with CR alone.
+_OLD_LINES = re.compile(r"[^\r]*\r\n?|[^\r]+")
 
 Data: TypeAlias = "str | Path | TextIO | pd.DataFrame"
 
@@ -191,8 +194,7 @@ def _text_lines(stream: TextIO) -> Iterator[str]:
     """Yield lines as they come; lines that end with CR alone, as of old, come together where a stream keeps these."""
     is_first = True
     for block in iter(stream.readline, ""):
-        lines = block.splitlines(keepends=True) if "\r" in block.rstrip("\r\n") else [block]
-        for line in lines:
+        for line in _OLD_LINES.findall(block):
             # A byte order mark is no part of the first name.
             yield line.removeprefix("\ufeff") if is_first else line
             is_first = False

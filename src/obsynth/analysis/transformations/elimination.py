@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from obsynth.analysis.transformations.exact_elimination import exact_elimination, rounded_once
 from obsynth.analysis.transformations.recovery import (
     StateRecovery,
     Transformation,
@@ -19,6 +20,8 @@ from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
 from obsynth.numerics.scaling import equilibrate_pencil, power_of_two_below
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.origin import with_origin
+from obsynth.proofs.written_numbers import computed_entries
 
 
 def eliminate_algebraic_states(plant: DescriptorSystem) -> Transformation:
@@ -43,11 +46,44 @@ def eliminate_algebraic_states(plant: DescriptorSystem) -> Transformation:
 
     Notes
     -----
-    Results so small beside the terms they come from that they are only rounding are set to zero: the
-    flags of the recovery depend on what is exactly zero.
+    Up to 64 states the equations are solved in rational arithmetic and every entry is rounded once.  Beyond that, and
+    where data were computed, results so small beside the terms they come from that they are only rounding are set to
+    zero: the flags of the recovery depend on what is exactly zero.
     """
     if np.array_equal(plant.E, np.eye(plant.nx)):
         return Transformation(plant, plant, "", unchanged_states(plant, plant, from_state=np.eye(plant.nx)))
+    return eliminated_exactly(plant) or _eliminated_in_floating_point(plant)
+
+
+def eliminated_exactly(plant: DescriptorSystem, basis: FloatArray | None = None) -> Transformation | None:
+    """Return the elimination in rational arithmetic, rounded once; ``None`` where it must be left to floating point.
+
+    ``basis (nx, count)`` are the dynamic states to take, where they are combinations of those given.
+    """
+    exact = exact_elimination(plant)
+    if exact is not None and computed_entries(plant.E) and _dynamic_count(plant) != len(exact.pivots):
+        return None
+    if exact is None:
+        return None
+    count = len(exact.pivots)
+    whole = int(np.sum(plant.E.any(axis=0))) == count
+    names = tuple(plant.state_names[i] for i in exact.pivots) if whole else tuple(f"xi {i + 1}" for i in range(count))
+    if not whole and basis is None:
+        basis = _coordinates(plant, count)[1]
+    matrices, states = rounded_once(exact, plant, None if whole else basis)
+    new = with_states(plant, names, E=None, **matrices)
+    recovery = StateRecovery(
+        plant.state_names, states["A"], states["B"], states["Bf"], states["Bd"], states["Bw"], np.eye(plant.nw),
+        state_point(plant),
+    )  # fmt: skip
+    return Transformation(plant, with_origin(new, exact.origin), _done(plant, count), recovery)
+
+
+def _done(plant: DescriptorSystem, count: int) -> str:
+    return f"eliminated {plant.nx - count} algebraic states" if count < plant.nx else "multiplied by the inverse of E"
+
+
+def _eliminated_in_floating_point(plant: DescriptorSystem) -> Transformation:
     count = _dynamic_count(plant)
     rows, dynamic, algebraic, names = _coordinates(plant, count)
     sizes = (count, plant.nu, plant.nf, plant.nd, plant.nw)
@@ -69,8 +105,7 @@ def eliminate_algebraic_states(plant: DescriptorSystem) -> Transformation:
         plant.state_names, from_state, from_input, from_fault, from_disturbance, from_noise, np.eye(plant.nw),
         state_point(plant),
     )  # fmt: skip
-    done = f"eliminated {plant.nx - count} algebraic states" if count < plant.nx else "multiplied by the inverse of E"
-    return Transformation(plant, new, done, recovery)
+    return Transformation(plant, new, _done(plant, count), recovery)
 
 
 def _dynamic_count(plant: DescriptorSystem) -> int:
