@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import PreconditionError
-from obsynth.models.descriptor import DescriptorSystem
+from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.numerics.sparse import csr

@@ -10,7 +10,7 @@ import numpy as np
 from obsynth.analysis.transformations.idle_variables import equation_name, listed, raise_structurally_singular
 from obsynth.analysis.transformations.recovery_operator import RecoveryOperator, without_rounding
 from obsynth.errors import PreconditionError
-from obsynth.models.descriptor import DescriptorSystem
+from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, RANK_TOLERANCE
 from obsynth.numerics.scaling import power_of_two_below
