@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import PreconditionError
-from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.numerics.sparse import csr
 from obsynth.numerics.sparse_factor import SparseFactor
 from obsynth.numerics.sparse_structure import Indices, blocks_of, coarse_structure
+from obsynth.plants.descriptor import DescriptorSystem
 
 #: A point without meaning, at which a pencil has its normal rank.
 GENERIC_POINT = 0.7391
@@ -67,6 +67,9 @@ def active_variables(plant: DescriptorSystem) -> ActiveVariables:
     """
     e, a, c = csr(plant.E), csr(plant.A), csr(plant.C)
     rows, columns = np.arange(plant.nx), np.arange(plant.nx)
+    if not plant.ny:
+        # Without any output nothing says what a variable is there for.
+        return ActiveVariables(rows, columns, (), ())
     unused = np.flatnonzero(_empty_columns(e) & _empty_columns(a) & _empty_columns(c))
     if unused.size:
         gone = _repeated_equations(plant, e, a, unused)
@@ -108,11 +111,13 @@ def _repeated_equations(plant: DescriptorSystem, e: Any, a: Any, unused: Indices
     everything = csr(hstack([e, a, *inputs]))
     left = np.abs(everything.T @ found)
     sizes = np.abs(everything.T) @ np.abs(found)
-    if np.any(left > RANK_TOLERANCE * np.max(sizes, initial=0.0)):
+    # An equation without any term is no repetition: something is missing there.
+    empty = bool(np.any(np.diff(everything.indptr) == 0))
+    if empty or np.any(left > RANK_TOLERANCE * np.max(sizes, initial=0.0)):
         names = [plant.state_names[i] for i in unused]
         raise PreconditionError(
-            f"The plant is not regular: {', '.join(map(repr, names[:4]))} are in no equation and no output, and no "
-            "equation repeats others. Check for missing terms.",
+            f"The plant is not regular, det(A - zE) is zero for every z: {listed(names)} {_are(names)} in no equation "
+            "and no output, and no equation repeats others. Check for missing terms.",
             condition="regularity",
             signals=names,
         )
@@ -134,9 +139,7 @@ def _left_null_space(matrix: Any, count: int) -> FloatArray:
     return np.asarray(basis)
 
 
-def _idle(
-    e: Any, a: Any, c: Any, plant: DescriptorSystem, rows: Indices, columns: Indices
-) -> tuple[Indices, Indices]:
+def _idle(e: Any, a: Any, c: Any, plant: DescriptorSystem, rows: Indices, columns: Indices) -> tuple[Indices, Indices]:
     """Return the rows and columns of idle blocks that cannot be solved for without differentiating."""
     pattern = csr(abs(e) + abs(a))
     coarse = coarse_structure(pattern)
@@ -156,7 +159,7 @@ def _idle(
     # What an idle block needs that is not known without differentiating makes it unknown as well.
     unknown = np.zeros(count, dtype=bool)
     unknown[block_of_row[moving.row]] = True
-    unknown |= _singular_blocks(a, block_of_row, block, ~acting & ~unknown)
+    unknown[_undetermined_blocks(plant, rows, columns, block_of_row, block, ~acting)] = True
     unknown = _spread(unknown & ~acting, from_block, to_block, within=~acting) & ~acting
     return np.flatnonzero(unknown[block_of_row]), np.flatnonzero(unknown[block])
 
@@ -174,27 +177,44 @@ def _spread(marked: Any, source: Indices, target: Indices, *, within: Any = None
         found = more
 
 
-def _singular_blocks(a: Any, block_of_row: Indices, block: Indices, candidates: Any) -> Any:
-    """Return which of the candidate blocks, whose rows of E are zero, have a singular diagonal block of A."""
-    singular = np.zeros(len(candidates), dtype=bool)
+def _undetermined_blocks(
+    plant: DescriptorSystem, rows: Indices, columns: Indices, block_of_row: Indices, block: Indices, idle: Any
+) -> list[int]:
+    """Return the idle blocks that their equations do not determine, but where these ask nothing of other variables."""
+    from scipy.sparse import hstack
+
+    found = []
     # A block of one variable is its entry of A, which is there.
-    for number in np.flatnonzero(candidates & (np.bincount(block, minlength=len(candidates)) > 1)):
-        inner = a[np.flatnonzero(block_of_row == number)][:, np.flatnonzero(block == number)]
-        singular[number] = SparseFactor(inner).singular
-    return singular
+    several = np.flatnonzero(idle & (np.bincount(block, minlength=len(idle)) > 1))
+    everything = csr(hstack([csr(getattr(plant, name)) for name in ("E", "A", "B", "Bf", "Bd", "Bw")]))
+    for number in several:
+        own, variables = rows[block_of_row == number], columns[block == number]
+        inner = csr(plant.A)[own][:, variables]
+        if SparseFactor(inner).singular:
+            left, values, _ = np.linalg.svd(inner.toarray())
+            free = left[:, values <= RANK_TOLERANCE * max(float(values[0]), np.finfo(float).tiny)]
+            terms = np.abs(everything[own].T) @ np.abs(free)
+            # Else they are a condition on the others, and leaving them out would not be exact.
+            if np.all(np.abs(everything[own].T @ free) <= RANK_TOLERANCE * np.max(terms, initial=0.0)):
+                found.append(int(number))
+    return found
 
 
 def raise_structurally_singular(plant: DescriptorSystem, equations: Indices, variables: Indices) -> None:
     """Refuse a plant whose pattern alone leaves variables free, and name them and the surplus equations."""
     names = [plant.state_names[i] for i in variables]
     raise PreconditionError(
-        "The plant is not regular, whatever its numbers are: "
-        + f"{listed(names)} {'are' if len(names) != 1 else 'is'} in too few equations, and equations "
+        "The plant is not regular, det(A - zE) is zero for every z and whatever the numbers are: "
+        + f"{listed(names)} {_are(names)} in too few equations, and equations "
         + f"{listed([equation_name(plant, i) for i in equations], quoted=False)} hold too few variables. Check for a "
         "missing or repeated equation.",
         condition="regularity",
         signals=names,
     )
+
+
+def _are(names: list[str]) -> str:
+    return "are" if len(names) != 1 else "is"
 
 
 def equation_name(plant: DescriptorSystem, row: int) -> str:

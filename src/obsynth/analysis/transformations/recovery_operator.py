@@ -51,6 +51,10 @@ class RecoveryOperator:
         """Factors of the algebraic equations."""
         return SparseFactor(self.coupling)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave the factors behind: they belong to this process."""
+        return {name: value for name, value in self.__dict__.items() if name != "factor"}
+
     def matrix(self, signal: str) -> FloatArray:
         """Return the dense map from one kind of signal, ``(nx, n)``."""
         first, last = self._columns(signal)

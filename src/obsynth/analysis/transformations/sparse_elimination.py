@@ -10,13 +10,13 @@ import numpy as np
 from obsynth.analysis.transformations.idle_variables import equation_name, listed, raise_structurally_singular
 from obsynth.analysis.transformations.recovery_operator import RecoveryOperator, without_rounding
 from obsynth.errors import PreconditionError
-from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, RANK_TOLERANCE
 from obsynth.numerics.scaling import power_of_two_below
 from obsynth.numerics.sparse import csr, dense, selection
 from obsynth.numerics.sparse_factor import NullVectors, SolutionBounds, SparseFactor
 from obsynth.numerics.sparse_structure import coarse_structure, components_of
+from obsynth.plants.descriptor import DescriptorSystem
 
 #: Points without meaning, at which a pencil has its normal rank.
 GENERIC_POINTS = (0.7391, -1.3247)
@@ -87,7 +87,7 @@ def reduced_by_sparsity(plant: DescriptorSystem) -> SparseReduction:
     signals = np.hstack([dense(matrix) for matrix in (plant.B, plant.Bf, plant.Bd, plant.Bw)])
     inner = csr(split.algebraic_rows @ a @ split.algebraic)
     factor = SparseFactor(inner)
-    _require_index_one(plant, split, inner, factor)
+    _require_index_one(plant, factor)
     right = _side_by_side(split.algebraic_rows @ a @ split.dynamic, split.algebraic_rows @ csr(signals))
     found, backward = factor.solve_with_error(right.toarray())
     found[:, count:] = without_rounding(factor, found[:, count:])
@@ -120,12 +120,14 @@ def split_by_derivatives(plant: DescriptorSystem) -> SparseCoordinates:
         for part, o in zip((row_part, column_part), order, strict=True)
     ]
     in_component = np.zeros(e.shape[0], dtype=bool), np.zeros(e.shape[0], dtype=bool)
+    # Most components are single entries: slicing each would take most of the time.
+    single = np.bincount(row_part[moving.row], weights=moving.data)[with_entries][:, None, None]
     blocks = []
     for k in range(len(with_entries)):
         rows = order[0][starts[0][k] : ends[0][k]]
         columns = order[1][starts[1][k] : ends[1][k]]
         in_component[0][rows], in_component[1][columns] = True, True
-        block = e[rows][:, columns].toarray() if len(rows) * len(columns) > 1 else e[[rows[0]], [columns[0]]].reshape(1, 1)
+        block = e[rows][:, columns].toarray() if len(rows) * len(columns) > 1 else single[k]
         blocks.append((rows, columns, row_scale[rows][:, None] * block * column_scale[columns]))
     largest = max((float(np.linalg.norm(block, 2)) for _, _, block in blocks), default=0.0)
     for rows, columns, block in blocks:
@@ -206,28 +208,44 @@ def _scales(e: Any, a: Any) -> tuple[FloatArray, FloatArray]:
     return rows, 1.0 / power_of_two_below(np.maximum(peaks(scaled[0]), peaks(scaled[1])))
 
 
-def _require_index_one(plant: DescriptorSystem, split: SparseCoordinates, inner: Any, factor: SparseFactor) -> None:
-    """Refuse a plant whose algebraic equations cannot be solved for its algebraic states; say which, and why."""
-    null = factor.null_vectors()
-    if not factor.exactly_singular and null.smallest > RANK_TOLERANCE:
-        return
-    e, a = csr(plant.E), csr(plant.A)
-    whole = coarse_structure(abs(e) + abs(a))
+def culprits(plant: DescriptorSystem) -> tuple[str, tuple[str, ...]]:
+    """Return equations, in words, and variables that keep a plant from having index 1; nothing for one that has.
+
+    Raises
+    ------
+    PreconditionError
+        The pattern alone leaves variables free: these are named.
+    """
+    whole = coarse_structure(abs(csr(plant.E)) + abs(csr(plant.A)))
     if whole.structural_rank < plant.nx:
         raise_structurally_singular(plant, whole.over_rows, whole.under_columns)
-    generic = [SparseFactor(a - point * e) for point in GENERIC_POINTS]
-    regular = any(not found.singular for found in generic)
-    if regular:
+    split = split_by_derivatives(plant)
+    inner = csr(split.algebraic_rows @ csr(plant.A) @ split.algebraic)
+    factor = SparseFactor(inner)
+    null = factor.null_vectors()
+    if not factor.exactly_singular and null.smallest > RANK_TOLERANCE:
+        return "", ()
+    generic = _generic_factors(plant)
+    if any(not found.singular for found in generic):
         equations, variables = _leading(split.algebraic_rows, split.algebraic, null, inner)
     else:
-        whole_null = generic[0].null_vectors()
-        equations, variables = _named(whole_null.rows), _named(whole_null.columns)
-    names = [plant.state_names[i] for i in variables]
-    said = (
-        f"equations {listed([equation_name(plant, i) for i in equations], quoted=False)} do not determine "
-        f"{listed(names)}"
-    )
-    if not regular:
+        null = generic[0].null_vectors()
+        equations, variables = _named(null.rows), _named(null.columns)
+    said = listed([equation_name(plant, i) for i in equations], quoted=False)
+    return said, tuple(plant.state_names[i] for i in variables)
+
+
+def _generic_factors(plant: DescriptorSystem) -> list[SparseFactor]:
+    return [SparseFactor(csr(plant.A) - point * csr(plant.E)) for point in GENERIC_POINTS]
+
+
+def _require_index_one(plant: DescriptorSystem, factor: SparseFactor) -> None:
+    """Refuse a plant whose algebraic equations cannot be solved for its algebraic states; say which, and why."""
+    if not factor.singular:
+        return
+    equations, names = culprits(plant)
+    said = f"equations {equations} do not determine {listed(list(names))}"
+    if all(found.singular for found in _generic_factors(plant)):
         raise PreconditionError(
             f"The plant is not regular: det(A - zE) is zero for every z, and {said}. Check for a missing or repeated "
             "equation.",
