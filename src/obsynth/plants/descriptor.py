@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.sparse import as_sparse_matrix, dense, is_sparse
 from obsynth.plants.names import checked_names
+from obsynth.plants.origin import carry_origin
 from obsynth.plants.validation import (
     Problems,
     any_matrix,
@@ -235,7 +236,7 @@ class DescriptorSystem:
         **changes
             Any argument of the constructor.
         """
-        return DescriptorSystem(**{**self.as_dict(), **changes})
+        return carry_origin(self, DescriptorSystem(**{**self.as_dict(), **changes}))
 
     def __repr__(self) -> str:
         time = f"dt={self.dt:g} s" if self.is_discrete else "continuous"

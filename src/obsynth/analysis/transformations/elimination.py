@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from obsynth.analysis.transformations.exact_elimination import MOST_STATES, exact_elimination, rounded_once
 from obsynth.analysis.transformations.recovery import (
     StateRecovery,
     Transformation,
@@ -22,6 +23,8 @@ from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
 from obsynth.numerics.scaling import equilibrate_pencil, power_of_two_below
 from obsynth.numerics.sparse import is_sparse
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.origin import with_origin
+from obsynth.proofs.written_numbers import computed_entries
 
 #: Arrays of plants from this size on, with at most this share of entries that are not zero, are treated as sparse.
 MANY_VARIABLES = 500
@@ -51,21 +54,18 @@ def eliminate_algebraic_states(plant: DescriptorSystem) -> Transformation:
 
     Notes
     -----
-    Results so small beside the terms they come from that they are only rounding are set to zero: the
-    flags of the recovery depend on what is exactly zero.
+    Up to 64 states the equations are solved in rational arithmetic and every entry is rounded once.  Beyond that, and
+    where data were computed, results so small beside the terms they come from that they are only rounding are set to
+    zero: the flags of the recovery depend on what is exactly zero.
     """
     if _is_identity(plant.E):
         same = plant.dense()
         return Transformation(plant, same, "", unchanged_states(plant, same, from_state=np.eye(plant.nx)))
-    if plant.is_sparse or _has_few_entries(plant):
-        return _eliminated_by_sparsity(plant)
-    try:
-        count = _dynamic_count(plant)
-    except PreconditionError as error:
-        if error.condition == "dynamic states":
-            raise
-        return _without_idle_variables(plant, error)
-    return _eliminated_densely(plant, count)
+    if plant.nx > MOST_STATES and (plant.is_sparse or _has_few_entries(plant)):
+        return eliminated_by_sparsity(plant)
+    arrays = plant.dense()
+    found = eliminated_exactly(arrays) or _eliminated_in_floating_point(arrays)
+    return found if arrays is plant else replace(found, source=plant)
 
 
 def _is_identity(e: Any) -> bool:
@@ -80,7 +80,7 @@ def _has_few_entries(plant: DescriptorSystem) -> bool:
     return bool(stored <= SPARSE_SHARE * plant.nx**2)
 
 
-def _eliminated_by_sparsity(plant: DescriptorSystem) -> Transformation:
+def eliminated_by_sparsity(plant: DescriptorSystem) -> Transformation:
     """Leave out what acts on nothing, and solve the algebraic equations by a sparse factor."""
     from obsynth.analysis.transformations.idle_variables import active_part, active_variables
     from obsynth.analysis.transformations.sparse_elimination import reduced_by_sparsity
@@ -107,20 +107,53 @@ def _without_idle_variables(plant: DescriptorSystem, refusal: PreconditionError)
         said = f" Equations {equations} do not determine {', '.join(map(repr, variables))}." if variables else ""
         raise PreconditionError(f"{refusal}{said}", condition=refusal.condition, signals=variables) from refusal
     part = active_part(plant, active)
-    count = _dynamic_count(part)
-    found = _eliminated_densely(part, count)
+    found = eliminated_exactly(part) or _eliminated_densely(part, _dynamic_count(part))
     return replace(
-        found, source=plant, description=_description(part, count, active.dropped), dropped=active.dropped,
+        found, source=plant, description=_description(part, found.plant.nx, active.dropped), dropped=active.dropped,
         notes=(active.note(),),
     )  # fmt: skip
 
 
-def _description(plant: DescriptorSystem, count: int, dropped: Sequence[str]) -> str:
+def _description(plant: DescriptorSystem, count: int, dropped: Sequence[str] = ()) -> str:
     """Return what was done to a plant of which ``count`` states are left, in words."""
     done = f"eliminated {plant.nx - count} algebraic states" if count < plant.nx else "multiplied by the inverse of E"
     if not dropped:
         return done
     return f"left out {len(dropped)} variable(s) that act on nothing ({', '.join(dropped)}); {done}"
+
+
+def eliminated_exactly(plant: DescriptorSystem, basis: FloatArray | None = None) -> Transformation | None:
+    """Return the elimination in rational arithmetic, rounded once; ``None`` where it must be left to floating point.
+
+    ``basis (nx, count)`` are the dynamic states to take, where they are combinations of those given.
+    """
+    exact = exact_elimination(plant)
+    if exact is not None and computed_entries(plant.E) and _dynamic_count(plant) != len(exact.pivots):
+        return None
+    if exact is None:
+        return None
+    count = len(exact.pivots)
+    whole = int(np.sum(plant.E.any(axis=0))) == count
+    names = tuple(plant.state_names[i] for i in exact.pivots) if whole else tuple(f"xi {i + 1}" for i in range(count))
+    if not whole and basis is None:
+        basis = _coordinates(plant, count)[1]
+    matrices, states = rounded_once(exact, plant, None if whole else basis)
+    new = with_states(plant, names, E=None, **matrices)
+    recovery = StateRecovery(
+        plant.state_names, states["A"], states["B"], states["Bf"], states["Bd"], states["Bw"], np.eye(plant.nw),
+        state_point(plant),
+    )  # fmt: skip
+    return Transformation(plant, with_origin(new, exact.origin), _description(plant, count), recovery)
+
+
+def _eliminated_in_floating_point(plant: DescriptorSystem) -> Transformation:
+    try:
+        count = _dynamic_count(plant)
+    except PreconditionError as error:
+        if error.condition == "dynamic states":
+            raise
+        return _without_idle_variables(plant, error)
+    return _eliminated_densely(plant, count)
 
 
 def _eliminated_densely(plant: DescriptorSystem, count: int) -> Transformation:
@@ -145,7 +178,7 @@ def _eliminated_densely(plant: DescriptorSystem, count: int) -> Transformation:
         plant.state_names, from_state, from_input, from_fault, from_disturbance, from_noise, np.eye(plant.nw),
         state_point(plant),
     )  # fmt: skip
-    return Transformation(plant, new, _description(plant, count, ()), recovery)
+    return Transformation(plant, new, _description(plant, count), recovery)
 
 
 def _dynamic_count(plant: DescriptorSystem) -> int:
