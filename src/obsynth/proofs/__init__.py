@@ -1,0 +1,1 @@
+"""Proofs: outward rounding, definiteness, and exact rational arithmetic."""
