@@ -17,7 +17,7 @@ from obsynth.errors import PreconditionError, SpecError
 from obsynth.importing.extras import imported
 from obsynth.importing.fmu_instance import Instance, instance_of
 from obsynth.importing.roles import plant_of
-from obsynth.models.descriptor import DescriptorSystem
+from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.numerics.arguments import is_finite_number, require_mapping
 from obsynth.numerics.arrays import FloatArray
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.importing.roles import plant_of
-from obsynth.models.descriptor import DescriptorSystem
+from obsynth.plants.descriptor import DescriptorSystem
 
 _MATRICES = ("E", "A", "B", "C", "D")
 _MORE = ("Bf", "Df", "Bd", "Dd", "Bw", "Dw")

@@ -10,7 +10,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.importing.extras import imported
-from obsynth.models.descriptor import DescriptorSystem
+from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.numerics.arguments import is_finite_number, require_mapping
 from obsynth.numerics.arrays import FloatArray
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.importing.roles import plant_of
-from obsynth.models.descriptor import DescriptorSystem
+from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray
 
 _SIZE = re.compile(r"parameter\s+Integer\s+([nmp])\s*=\s*(\d+)")

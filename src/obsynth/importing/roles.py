@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
-from obsynth.models.descriptor import DescriptorSystem
-from obsynth.models.names import checked_names, index_of
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.names import checked_names, index_of
 from obsynth.numerics.arrays import FloatArray, as_matrix
 
 

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from obsynth.errors import SpecError
 from obsynth.importing.extras import imported
 from obsynth.importing.roles import plant_of
-from obsynth.models.descriptor import DescriptorSystem
+from obsynth.plants.descriptor import DescriptorSystem
 
 
 def from_control(

@@ -27,8 +27,8 @@ from obsynth.exporting.fmu.description import (
 from obsynth.exporting.fmu.variables import Signals, finite_warm_up, signals_of_dae, signals_of_linear
 from obsynth.exporting.realisation import Realisation
 from obsynth.numerics.arguments import chosen
-from obsynth.observers.dae import DAEObserver
-from obsynth.observers.dae_library import FLAGS, compiler
+from obsynth.observers.dae.observer import DAEObserver
+from obsynth.observers.dae.compiled_library import FLAGS, compiler
 from obsynth.results.design import ObserverDesign
 from obsynth.results.files import write_atomically
 
@@ -85,7 +85,7 @@ def _contents(
     if found.observer.dt == 0.0:
         raise SpecError("The observer is continuous in time: give the sample time, in seconds, for an FMU.",
                         path="sample_time")  # fmt: skip
-    from obsynth.data.holds import transient
+    from obsynth.data.observer_holds import transient
 
     signals = signals_of_linear(found, thresholds, _warm_up(warm_up, transient(found.observer)))
     return signals, (source_text(found, _PREFIX, f"{_PREFIX}.h"), header_text(found, _PREFIX)), found.digest
