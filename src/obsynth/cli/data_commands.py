@@ -62,7 +62,10 @@ def run_export(options: argparse.Namespace) -> int:
     from obsynth.results.gain_sets import load
 
     design = load(options.gains)
-    files = export(design, options.to, sample_time=options.sample_time)
+    files = export(
+        design, options.to, sample_time=options.sample_time, fmi=options.fmi,
+        thresholds=numbers_of(options.threshold) or None, warm_up=options.warm_up,
+    )  # fmt: skip
     if options.json:
         print_json({"command": "export", "gains": str(options.gains), "files": [str(file) for file in files]})
     else:

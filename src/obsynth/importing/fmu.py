@@ -17,9 +17,9 @@ from obsynth.errors import PreconditionError, SpecError
 from obsynth.importing.extras import imported
 from obsynth.importing.fmu_instance import Instance, instance_of
 from obsynth.importing.roles import plant_of
-from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.numerics.arguments import is_finite_number, require_mapping
 from obsynth.numerics.arrays import FloatArray
+from obsynth.plants.descriptor import DescriptorSystem
 
 #: Newton steps towards an equilibrium.
 _STEPS = 50
@@ -108,13 +108,6 @@ def _instance(path: Path) -> Iterator[Instance]:
     fmpy = imported("fmpy", extra="fmu")
     _require_readable(fmpy, path)
     description = _read(lambda: fmpy.read_model_description(str(path)), path)
-    if description.modelExchange is None:
-        raise SpecError(f"{path} is for co-simulation only: its states and derivatives cannot be asked for. Export it "
-                        "for model exchange.", path=str(path))  # fmt: skip
-    interface = description.modelExchange
-    if not interface.providesDirectionalDerivative:
-        raise SpecError(f"{path} provides no directional derivatives: switch them on in the tool that exports it.",
-                        path=str(path))  # fmt: skip
     folder = _read(lambda: fmpy.extract(str(path)), path)
     try:
         instance = _read(lambda: instance_of(fmpy, description, folder), path)
@@ -140,16 +133,26 @@ def _read(make: Callable[[], Any], path: Path) -> Any:
 
 
 def _require_readable(fmpy: Any, path: Path) -> None:
-    """Raise `SpecError` unless a file is an FMU of version 2 or 3 with a binary for this machine."""
+    """Raise `SpecError` unless a file is an FMU that can be linearised on this machine."""
     if not path.is_file():
         raise SpecError(f"{path} does not exist.", path=str(path))
     try:
         with zipfile.ZipFile(path) as archive, archive.open("modelDescription.xml") as stream:
-            version = ElementTree.parse(stream).getroot().get("fmiVersion", "")
+            root = ElementTree.parse(stream).getroot()
     except (OSError, KeyError, zipfile.BadZipFile, ElementTree.ParseError) as error:
         raise SpecError(f"{path} is no FMU: {error}", path=str(path)) from error
+    version = root.get("fmiVersion", "")
     if version[:2] not in ("2.", "3."):
         raise SpecError(f"{path} is of FMI {version or '?'}: give an FMU of FMI 2 or 3.", path=str(path))
+    exchange = root.find("ModelExchange")
+    if exchange is None:
+        raise SpecError(f"{path} is for co-simulation only: its states and derivatives cannot be asked for. Export it "
+                        "for model exchange.", path=str(path))  # fmt: skip
+    # fmpy does not read the attribute of FMI 3, which is spelled differently.
+    named = "providesDirectionalDerivative" + ("" if version.startswith("2") else "s")
+    if exchange.get(named) not in ("true", "1"):
+        raise SpecError(f"{path} provides no directional derivatives: switch them on in the tool that exports it.",
+                        path=str(path))  # fmt: skip
     platforms = fmpy.supported_platforms(str(path))
     if fmpy.platform not in platforms and fmpy.platform_tuple not in platforms:
         raise SpecError(f"{path} has no binary for this machine ({fmpy.platform_tuple}); it has "
@@ -170,8 +173,8 @@ def _used(known: Sequence[str], picked: Sequence[str] | None, what: str) -> list
 def _require_known(at: Mapping[str, float], instance: Instance) -> None:
     for name in at:
         if name not in instance.settable:
-            raise SpecError(f"at: the FMU has no real variable {name!r} that can be set.{_close(name, instance.settable)}",
-                            path="at")  # fmt: skip
+            close = _close(name, instance.settable)
+            raise SpecError(f"at: the FMU has no real variable {name!r} that can be set.{close}", path="at")
 
 
 def _close(name: str, known: Sequence[str]) -> str:
@@ -206,9 +209,7 @@ def _is_rest(rates: FloatArray, a: FloatArray, states: FloatArray, known: FloatA
     return bool((np.abs(rates) <= _AT_REST * terms).all())
 
 
-def _require_rest(
-    instance: Instance, states: FloatArray, a: FloatArray, b: FloatArray, inputs: Sequence[str]
-) -> None:
+def _require_rest(instance: Instance, states: FloatArray, a: FloatArray, b: FloatArray, inputs: Sequence[str]) -> None:
     rates = instance.derivatives()
     known = np.abs(b) @ np.abs([instance.value(name) for name in inputs]) if len(inputs) else np.zeros(len(states))
     if _is_rest(rates, a, states, known):

@@ -10,9 +10,9 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.importing.extras import imported
-from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.numerics.arguments import is_finite_number, require_mapping
 from obsynth.numerics.arrays import FloatArray
+from obsynth.plants.descriptor import DescriptorSystem
 
 _MATRICES = ("E", "A", "B", "C", "D", "Bf", "Df", "Bd", "Dd", "Bw", "Dw")
 _NAMES = ("state_names", "input_names", "output_names", "fault_names", "disturbance_names", "noise_names")
@@ -37,7 +37,7 @@ def from_sympy(A: Any, B: Any = None, C: Any = None, *, parameters: Mapping[Any,
     Returns
     -------
     DescriptorSystem
-        With the numbers that the parameters give, evaluated by sympy in 30 digits and rounded once.
+        With the numbers that the parameters give: rational entries exactly, and rounded once.
 
     Raises
     ------
@@ -53,7 +53,7 @@ def from_sympy(A: Any, B: Any = None, C: Any = None, *, parameters: Mapping[Any,
     _require_values(free, values)
     arguments = {name: value for name, value in given.items() if value is not None}
     for name, matrix in symbolic.items():
-        numbers = {symbol: sympy.Float(float(values[str(symbol)]), _DIGITS) for symbol in matrix.free_symbols}
+        numbers = {symbol: _exact(values[str(symbol)], sympy) for symbol in matrix.free_symbols}
         arguments[name] = _evaluated(matrix, numbers, name)
     for name in _NAMES:
         if arguments.get(name) is not None:
@@ -61,8 +61,30 @@ def from_sympy(A: Any, B: Any = None, C: Any = None, *, parameters: Mapping[Any,
     return DescriptorSystem(**{"E": None, **arguments})
 
 
-#: Digits in which sympy evaluates an entry, so that the one rounding is that to double precision.
-_DIGITS = 30
+def from_pandas(A: Any, B: Any = None, C: Any = None, **plant: Any) -> DescriptorSystem:
+    """Return the plant of labelled frames of pandas; `DescriptorSystem` takes them as well.
+
+    Parameters
+    ----------
+    A : pandas.DataFrame
+        ``(nx, nx)``; its labels are the names of the states.
+    B, C : pandas.DataFrame, optional
+        ``(nx, nu)`` and ``(ny, nx)``: columns of B name the inputs, rows of C the outputs.
+    **plant
+        Any other argument of `DescriptorSystem`: matrices may be frames, and columns of ``Bf`` name the faults, those
+        of ``Bd`` the unknown inputs.
+
+    Returns
+    -------
+    DescriptorSystem
+        Rows and columns are put in the order of the first frame with their labels, A before C.
+
+    Raises
+    ------
+    SpecError
+        Labels differ between frames, or are repeated.
+    """
+    return DescriptorSystem(**{"E": None, "A": A, "B": B, "C": C, **plant})
 
 
 def _is_symbolic(value: Any, sympy: Any) -> bool:
@@ -87,14 +109,18 @@ def _require_values(free: set[str], values: Mapping[str, float]) -> None:
         raise SpecError(f"The parameter {wrong[0]!r} is {values[wrong[0]]!r}: give a finite number.", path="parameters")
 
 
+def _exact(value: float, sympy: Any) -> Any:
+    return sympy.Rational(*float(value).as_integer_ratio())
+
+
 def _evaluated(matrix: Any, numbers: Mapping[Any, Any], name: str) -> FloatArray:
     rows, columns = matrix.shape
     dense = np.zeros((rows, columns))
     for i in range(rows):
         for j in range(columns):
-            entry = matrix[i, j].evalf(_DIGITS, subs=numbers)
+            entry = matrix[i, j].subs(numbers)
             if not (entry.is_number and entry.is_real and entry.is_finite):
                 raise SpecError(f"{name}, row {i + 1}, column {j + 1}: {matrix[i, j]} is {entry} at these parameters; "
                                 "give a finite real number.", path=name)  # fmt: skip
-            dense[i, j] = float(entry)
+            dense[i, j] = int(entry.p) / int(entry.q) if entry.is_Rational else float(entry)
     return dense

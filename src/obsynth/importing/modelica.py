@@ -11,8 +11,8 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.importing.roles import plant_of
-from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray
+from obsynth.plants.descriptor import DescriptorSystem
 
 _SIZE = re.compile(r"parameter\s+Integer\s+([nmp])\s*=\s*(\d+)")
 _MATRIX = re.compile(r"parameter\s+Real\s+([ABCD])\s*\[[^\]]*\]\s*=\s*(\[[^\]]*\]|zeros\([^)]*\))\s*;")
@@ -75,9 +75,10 @@ def from_modelica(
     if missing:
         raise SpecError(f"{source} is no linear model as OpenModelica writes it: it has no {missing[0]}.",
                         path=str(source))  # fmt: skip
-    shapes = {"A": "nn", "B": "nm", "C": "pn", "D": "pm"}
+    shapes = {"A": ("n", "n"), "B": ("n", "m"), "C": ("p", "n"), "D": ("p", "m")}
     matrices = {
-        name: _matrix(found[name], sizes[rows], sizes[columns], name, source) for name, (rows, columns) in shapes.items()
+        name: _matrix(found[name], sizes[rows], sizes[columns], name, source)
+        for name, (rows, columns) in shapes.items()
     }
     names = {kind: [f"{kind}{i + 1}" for i in range(sizes[size])] for kind, size in zip("xuy", "nmp", strict=True)}
     for kind, name, array, number in _ALIAS.findall(text):

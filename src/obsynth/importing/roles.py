@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
+from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.names import checked_names, index_of
-from obsynth.numerics.arrays import FloatArray, as_matrix
 
 
 def plant_of(
@@ -40,8 +40,10 @@ def plant_of(
                    sensor_faults=sensor_faults)  # fmt: skip
     both = sorted(set(faults) & set(disturbances))
     if both:
-        raise SpecError(f"Input {both[0]!r} is given as a fault and as a disturbance: it can only be one.", path="faults")
-    fault, unknown = (_places(names, inputs, what) for names, what in ((faults, "faults"), (disturbances, "disturbances")))
+        raise SpecError(f"Input {both[0]!r} is given as a fault and as a disturbance: keep one.", path="faults")
+    fault, unknown = (
+        _places(names, inputs, what) for names, what in ((faults, "faults"), (disturbances, "disturbances"))
+    )
     doubled = _places(actuator_faults, inputs, "actuator_faults")
     gone = [name for name in actuator_faults if name in (*faults, *disturbances)]
     if gone:
@@ -72,7 +74,9 @@ def _full(matrix: FloatArray | None, rows: int, columns: int, name: str) -> Floa
     if matrix is None or (matrix.size == 0 and 0 in (rows, columns)):
         return np.zeros((rows, columns))
     if matrix.shape != (rows, columns):
-        raise SpecError(f"{name} is {matrix.shape[0]} by {matrix.shape[1]}, but {rows} by {columns} is needed.", path=name)
+        hint = " Is it transposed?" if matrix.shape == (columns, rows) else ""
+        raise SpecError(f"{name} is {matrix.shape[0]} by {matrix.shape[1]}, but {rows} by {columns} is needed.{hint}",
+                        path=name)  # fmt: skip
     return matrix
 
 

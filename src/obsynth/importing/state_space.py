@@ -59,7 +59,7 @@ def from_control(
     if isinstance(system, control.TransferFunction):
         system = control.ss(system)
     if not isinstance(system, control.StateSpace):
-        raise SpecError(f"system is a {type(system).__name__}: give a control.StateSpace, such as control.ss(A, B, C, D).",
+        raise SpecError(f"system is a {type(system).__name__}: give a control.StateSpace, such as control.ss(...).",
                         path="system")  # fmt: skip
     own = system.dt
     if own is True and dt is None:

@@ -16,7 +16,7 @@ from pathlib import Path
 from obsynth.errors import SpecError
 from obsynth.exporting.c_source import header_text, source_text
 from obsynth.exporting.c_words import c_identifier, comment
-from obsynth.exporting.dae_c_source import dae_c_texts
+from obsynth.exporting.dae_c_source import dae_c_texts, require_no_sample_time
 from obsynth.exporting.fmu.description import (
     Model,
     build_description,
@@ -27,8 +27,9 @@ from obsynth.exporting.fmu.description import (
 from obsynth.exporting.fmu.variables import Signals, finite_warm_up, signals_of_dae, signals_of_linear
 from obsynth.exporting.realisation import Realisation
 from obsynth.numerics.arguments import chosen
-from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.dae.compiled_library import FLAGS, compiler
+from obsynth.observers.dae.observer import DAEObserver
+from obsynth.observers.linear.warm_up import checked_warm_up, transient
 from obsynth.results.design import ObserverDesign
 from obsynth.results.files import write_atomically
 
@@ -79,22 +80,15 @@ def _contents(
 ) -> tuple[Signals, tuple[str, str], str]:
     """Return the signals, source and header, and the digest of the gain set."""
     if isinstance(design.observer, DAEObserver):
-        text, header, digest = dae_c_texts(design, _PREFIX, f"{_PREFIX}.h", sample_time)
-        return signals_of_dae(design, thresholds, _warm_up(warm_up, 0.0)), (text, header), digest
+        require_no_sample_time(design, sample_time)
+        text, header, digest = dae_c_texts(design, _PREFIX, f"{_PREFIX}.h")
+        return signals_of_dae(design, thresholds, finite_warm_up(checked_warm_up(warm_up, 0.0))), (text, header), digest
     found = Realisation.of(design, sample_time)
     if found.observer.dt == 0.0:
         raise SpecError("The observer is continuous in time: give the sample time, in seconds, for an FMU.",
                         path="sample_time")  # fmt: skip
-    from obsynth.data.observer_holds import transient
-
-    signals = signals_of_linear(found, thresholds, _warm_up(warm_up, transient(found.observer)))
+    signals = signals_of_linear(found, thresholds, finite_warm_up(checked_warm_up(warm_up, transient(found.observer))))
     return signals, (source_text(found, _PREFIX, f"{_PREFIX}.h"), header_text(found, _PREFIX)), found.digest
-
-
-def _warm_up(asked: float | None, default: float) -> float:
-    if asked is not None and not (isinstance(asked, (int, float)) and asked >= 0.0):
-        raise SpecError(f"warm_up is {asked!r}: give seconds, 0 or more.", path="warm_up")
-    return finite_warm_up(default if asked is None else float(asked))
 
 
 def _layout(design: ObserverDesign, model: Model) -> str:

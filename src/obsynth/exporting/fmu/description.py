@@ -37,8 +37,8 @@ def _variables(signals: Signals) -> Iterator[_Variable]:
     """Yield the variables in the order of their value references, which are 0, 1, 2, ..."""
     yield _Variable("time", "real", "independent", "continuous", None, None, "s", "time")
     for name, signal in zip(signals.inputs, signals.input_signals, strict=True):
-        start = signals.points.get(signal, 0.0)
-        yield _Variable(name, "real", "input", "discrete", None, start, signals.units.get(signal, ""), f"signal {signal}")
+        start, unit = signals.points.get(signal, 0.0), signals.units.get(signal, "")
+        yield _Variable(name, "real", "input", "discrete", None, start, unit, f"signal {signal}")
     for output in signals.outputs:
         yield _Variable(output.name, "real", "output", "discrete", "calculated", None, output.unit, output.description)
     for name, value in signals.points.items():

@@ -296,3 +296,39 @@ EXPORTED fmi3Status fmi3DoStep(fmi3Instance c, fmi3Float64 time, fmi3Float64 ste
     *last = time + step;
     return fmi3OK;
 }
+
+/* Clocks, model exchange and scheduled execution: this unit has none of them, but a library must have all functions. */
+#define NO_CLOCK(name, ...) \
+    EXPORTED fmi3Status name(fmi3Instance c, const fmi3ValueReference vr[], size_t n, __VA_ARGS__) \
+    { \
+        (void)c; (void)vr; \
+        return n == 0 ? fmi3OK : fmi3Error; \
+    }
+#if defined(__GNUC__)
+#pragma GCC diagnostic ignored "-Wunused-parameter"
+#endif
+NO_CLOCK(fmi3GetIntervalDecimal, fmi3Float64 intervals[], fmi3IntervalQualifier qualifiers[])
+NO_CLOCK(fmi3GetIntervalFraction, fmi3UInt64 counters[], fmi3UInt64 resolutions[], fmi3IntervalQualifier qualifiers[])
+NO_CLOCK(fmi3GetShiftDecimal, fmi3Float64 shifts[])
+NO_CLOCK(fmi3GetShiftFraction, fmi3UInt64 counters[], fmi3UInt64 resolutions[])
+NO_CLOCK(fmi3SetIntervalDecimal, const fmi3Float64 intervals[])
+NO_CLOCK(fmi3SetIntervalFraction, const fmi3UInt64 counters[], const fmi3UInt64 resolutions[])
+NO_CLOCK(fmi3SetShiftDecimal, const fmi3Float64 shifts[])
+NO_CLOCK(fmi3SetShiftFraction, const fmi3UInt64 counters[], const fmi3UInt64 resolutions[])
+
+#define REFUSED(name, ...) \
+    EXPORTED fmi3Status name(__VA_ARGS__) \
+    { \
+        return fmi3Error; \
+    }
+REFUSED(fmi3EnterContinuousTimeMode, fmi3Instance c)
+REFUSED(fmi3CompletedIntegratorStep, fmi3Instance c, fmi3Boolean no_set, fmi3Boolean *event, fmi3Boolean *terminate)
+REFUSED(fmi3SetTime, fmi3Instance c, fmi3Float64 time)
+REFUSED(fmi3SetContinuousStates, fmi3Instance c, const fmi3Float64 states[], size_t n)
+REFUSED(fmi3GetContinuousStateDerivatives, fmi3Instance c, fmi3Float64 derivatives[], size_t n)
+REFUSED(fmi3GetEventIndicators, fmi3Instance c, fmi3Float64 indicators[], size_t n)
+REFUSED(fmi3GetContinuousStates, fmi3Instance c, fmi3Float64 states[], size_t n)
+REFUSED(fmi3GetNominalsOfContinuousStates, fmi3Instance c, fmi3Float64 nominals[], size_t n)
+REFUSED(fmi3GetNumberOfEventIndicators, fmi3Instance c, size_t *n)
+REFUSED(fmi3GetNumberOfContinuousStates, fmi3Instance c, size_t *n)
+REFUSED(fmi3ActivateModelPartition, fmi3Instance c, fmi3ValueReference clock, fmi3Float64 time)

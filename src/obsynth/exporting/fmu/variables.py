@@ -14,7 +14,7 @@ from obsynth.results.design import ObserverDesign
 
 @dataclass(frozen=True)
 class Output:
-    """One estimate: its name, the signal it belongs to (for its operating point), unit, delay and whether it is watched."""
+    """One estimate: its name, the signal whose operating point it has, unit, and whether it is watched."""
 
     name: str
     signal: str | None
