@@ -11,9 +11,14 @@ from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.sparse import dense, is_sparse
+from obsynth.plants.origin import carry_origin
 from obsynth.plants.reading import plant_fields
+from obsynth.plants.validation import expected_shapes
 
 MatrixOrNames = ArrayLike | Sequence[str] | None
+#: For `expected_shapes`, where only the names of the matrices matter.
+_NO_SIGNALS = dict.fromkeys("yufdw", 0)
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -28,11 +33,12 @@ class DescriptorSystem:
 
     Parameters
     ----------
-    E : array_like or None
+    E : array_like, sparse matrix or None
         ``(nx, nx)``, may be singular; ``None`` means the identity.
-    A : array_like
-        ``(nx, nx)``.  Any matrix may be a labelled ``pandas.DataFrame``: its labels are the names, and rows and columns
-        are put in one order by them.
+    A : array_like or sparse matrix
+        ``(nx, nx)``.  Sparse matrices of scipy stay sparse, here and wherever else they are given; methods get the
+        plant without its algebraic states, which is dense (see `eliminate_algebraic_states` and `dense`).  Any matrix
+        may be a labelled ``pandas.DataFrame``: its labels are the names, and rows and columns are put in one order.
     B : array_like, optional
         Known inputs ``(nx, nu)``.
     C : array_like or list of str, optional
@@ -167,6 +173,18 @@ class DescriptorSystem:
         return int(self.Bw.shape[1])
 
     @property
+    def is_sparse(self) -> bool:
+        """Whether any matrix of the plant is a sparse one."""
+        return any(is_sparse(getattr(self, name)) for name in expected_shapes(0, _NO_SIGNALS))
+
+    def dense(self) -> DescriptorSystem:
+        """Return the same plant with arrays instead of sparse matrices; a plant without any is returned as it is."""
+        if not self.is_sparse:
+            return self
+        changes = {name: dense(getattr(self, name)) for name in expected_shapes(0, _NO_SIGNALS)}
+        return self.replace(**changes)
+
+    @property
     def is_discrete(self) -> bool:
         """Whether the plant is sampled (``dt > 0``)."""
         return self.dt > 0.0
@@ -183,7 +201,7 @@ class DescriptorSystem:
         **changes
             Any argument of the constructor.
         """
-        return DescriptorSystem(**{**self.as_dict(), **changes})
+        return carry_origin(self, DescriptorSystem(**{**self.as_dict(), **changes}))
 
     def __repr__(self) -> str:
         time = f"dt={self.dt:g} s" if self.is_discrete else "continuous"

@@ -10,10 +10,12 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, as_matrix
+from obsynth.numerics.sparse import as_sparse_matrix, dense, is_sparse
 from obsynth.plants.frames import without_frames
 from obsynth.plants.names import checked_names, is_name_list, require_known, rows_picking
 from obsynth.plants.validation import (
     Problems,
+    any_matrix,
     checked_dt,
     checked_point,
     checked_scales,
@@ -45,12 +47,12 @@ def plant_fields(
     """Return every field of a `DescriptorSystem`; raise one `SpecError` with all problems."""
     problems = Problems()
     matrices, labels = without_frames(asked, names)
-    a = problems.collect(lambda: square(as_matrix(matrices.pop("A"), "A"), "A"))
+    a = problems.collect(lambda: square(any_matrix(matrices.pop("A"), "A"), "A"))
     problems.raise_if_any()
     nx = a.shape[0]
     states = problems.collect(lambda: checked_names(labels["state_names"], nx, prefix="x", what="state_names"))
     problems.raise_if_any()
-    given: dict[str, FloatArray | None] = {"A": a, "E": np.eye(nx) if matrices["E"] is None else None}
+    given: dict[str, FloatArray | None] = {"A": a, "E": _identity_like(a) if matrices["E"] is None else None}
     for name, value in matrices.items():
         if value is not None and not (name in SENSOR_PICKS and is_name_list(value)):
             given[name] = problems.collect(partial(matrix_or_picks, value, name, states))
@@ -83,6 +85,15 @@ def plant_fields(
     return values
 
 
+def _identity_like(a: Any) -> Any:
+    """Return the identity of the size of A, sparse where A is."""
+    if not is_sparse(a):
+        return np.eye(a.shape[0])
+    from scipy.sparse import eye_array
+
+    return as_sparse_matrix(eye_array(a.shape[0], format="csr"), "E")
+
+
 def _appended(
     matrices: Mapping[str, Any],
     labels: Mapping[str, Sequence[str] | None],
@@ -109,6 +120,10 @@ def _appended(
 SENSOR_PICKS = {"Df": "Bf", "Dd": "Bd"}
 
 
+def _size(given: Mapping[str, Any]) -> int:
+    return int(given["A"].shape[0])
+
+
 def with_sensor_picks(
     asked: Mapping[str, Any], given: dict[str, FloatArray | None], outputs: Sequence[str]
 ) -> dict[str, tuple[str, ...]]:
@@ -122,8 +137,8 @@ def with_sensor_picks(
         if not is_name_list(picked):
             continue
         columns = rows_picking(picked, outputs, what=name).T
-        dynamics, nx = given.get(beside), len(given["A"]) if given["A"] is not None else 0
-        dynamics = np.zeros((nx, 0)) if dynamics is None else dynamics
+        own = given.get(beside)
+        dynamics = np.zeros((_size(given), 0)) if own is None else dense(own)
         given[beside] = np.hstack([dynamics, np.zeros((len(dynamics), len(picked)))])
         given[name] = np.hstack([np.zeros((len(outputs), dynamics.shape[1])), columns])
         found[name] = tuple(picked)
@@ -148,11 +163,11 @@ def noise_of_sensors(sensor_noise: Any, given: dict[str, FloatArray | None], out
             raise SpecError(f"sensor_noise[{name!r}] is {deviation:g}: give a standard deviation above 0.",
                             path="sensor_noise")  # fmt: skip
         columns[list(outputs).index(name), column] = deviation
-    others = [matrix for name in ("Bw", "Dw") if (matrix := given.get(name)) is not None and matrix.size]
-    nw, nx = others[0].shape[1] if others else 0, len(given["A"]) if given["A"] is not None else 0
+    others = [matrix for name in ("Bw", "Dw") if (matrix := given.get(name)) is not None and 0 not in matrix.shape]
+    nw, nx = others[0].shape[1] if others else 0, _size(given)
     for name, rows, more in (("Bw", nx, np.zeros((nx, len(sensor_noise)))), ("Dw", len(outputs), columns)):
         matrix = given.get(name)
-        matrix = np.zeros((rows, nw)) if matrix is None or not matrix.size else matrix
+        matrix = np.zeros((rows, nw)) if matrix is None or 0 in matrix.shape else dense(matrix)
         if matrix.shape != (rows, nw):
             # Its own message is enough.
             return ()
