@@ -11,10 +11,10 @@ from pathlib import Path
 
 from obsynth.errors import SpecError
 from obsynth.exporting.c_words import c_identifier, comment, included, quoted
+from obsynth.files.outputs import write_together
 from obsynth.observers.dae.c_code import observer_code
 from obsynth.plants.dae.model import DAEModel
 from obsynth.results.design import ObserverDesign
-from obsynth.results.files import write_atomically
 from obsynth.results.gain_sets import design_as_dict
 
 _STEP = r"""
@@ -58,9 +58,7 @@ def write_dae_c(design: ObserverDesign, target: Path, sample_time: float | None)
     require_no_sample_time(design, sample_time)
     prefix, header = c_identifier(target.stem), target.with_suffix(".h")
     source, declarations, _ = dae_c_texts(design, prefix, header.name)
-    # The source is refused first if it cannot be written, so that no header stays behind alone.
-    written = write_atomically(target, source)
-    return written, write_atomically(header, declarations)
+    return write_together({target: source, header: declarations})
 
 
 def require_no_sample_time(design: ObserverDesign, sample_time: float | None) -> None:

@@ -13,12 +13,21 @@ from obsynth.exporting.c_source import header_text, source_text
 from obsynth.exporting.c_words import c_identifier
 from obsynth.exporting.dae_c_source import write_dae_c
 from obsynth.exporting.realisation import Realisation
+from obsynth.files.outputs import FileKind, write_atomically, write_together
 from obsynth.numerics.arguments import require_kind
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.results.design import ObserverDesign
-from obsynth.results.files import write_atomically
 
 SUFFIXES = (".mat", ".npz", ".c", ".fmu")
+#: What an existing file has to be for another export to take its place.
+_C_FILE = FileKind("C code that obsynth has exported", rb"sha256 of the gain set")
+EXPORTED = {
+    ".mat": FileKind("an observer that obsynth has exported", rb"\AMATLAB 5.0 MAT-file(?s:.*)sha256"),
+    ".npz": FileKind("an observer that obsynth has exported", rb"\APK(?s:.*)sha256\.npy"),
+    ".c": _C_FILE,
+    ".h": _C_FILE,
+    ".fmu": FileKind("an observer that obsynth has exported", rb"\APK(?s:.*)sources/observer\.c"),
+}
 
 
 def export(
@@ -110,13 +119,17 @@ def export(
     return (write_atomically(target, buffer.getvalue()),)
 
 
+def exported_files(target: Path) -> dict[Path, FileKind | None]:
+    """Return the files that an export to ``target`` writes, with their kinds: a C source comes with its header."""
+    suffix = target.suffix.lower()
+    header = {target.with_suffix(".h"): EXPORTED[".h"]} if suffix == ".c" else {}
+    return {target: EXPORTED.get(suffix), **header}
+
+
 def _write_c(found: Realisation, target: Path) -> tuple[Path, ...]:
     if found.observer.dt == 0.0:
         raise SpecError("The observer is continuous in time: give the sample time, in seconds, for C.",
                         path="sample_time")  # fmt: skip
     prefix = c_identifier(target.stem)
     header = target.with_suffix(".h")
-    source = source_text(found, prefix, header.name)
-    # The source is refused first if it cannot be written, so that no header stays behind alone.
-    written = write_atomically(target, source)
-    return written, write_atomically(header, header_text(found, prefix))
+    return write_together({target: source_text(found, prefix, header.name), header: header_text(found, prefix)})

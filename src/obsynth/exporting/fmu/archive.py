@@ -26,12 +26,12 @@ from obsynth.exporting.fmu.description import (
 )
 from obsynth.exporting.fmu.variables import Signals, finite_warm_up, signals_of_dae, signals_of_linear
 from obsynth.exporting.realisation import Realisation
+from obsynth.files.outputs import write_atomically
 from obsynth.numerics.arguments import chosen
 from obsynth.observers.dae.compiled_library import FLAGS, compiler
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.linear.warm_up import checked_warm_up, transient
 from obsynth.results.design import ObserverDesign
-from obsynth.results.files import write_atomically
 
 VERSIONS = ("2.0", "3.0")
 #: Of every name in the C of the observer inside an FMU.
