@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from uncertain_plants import drive, wang
 
 import obsynth
 from obsynth.analysis.transformations.uncertain_plant import affine_plant
@@ -13,7 +14,6 @@ from obsynth.plants.uncertainty import UNCERTAIN_MATRICES
 from obsynth.proofs.affine import AffineMatrix, affine_exponential, affine_inverse
 from obsynth.proofs.affine_numbers import AffineNumber, affine_translation
 from obsynth.tolerances.exact_plant import drawn_points, plant_at
-from uncertain_plants import drive, wang
 
 ONE = {"E": None, "A": [["1 - 0.1 * k / m"]], "C": [[1]], "dt": 0.1}
 
