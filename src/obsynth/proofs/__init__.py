@@ -1,0 +1,1 @@
+"""Proofs about matrices of floating-point numbers: outward rounding, definiteness, contraction."""
