@@ -21,7 +21,7 @@ THREADS = (1, 2)
 
 def seconds(plant: obsynth.DescriptorSystem, threads: int) -> tuple[float, float]:
     """Return processor and wall time of one synthesis of a fault-estimation filter by its Riccati engine."""
-    method = import_module("obsynth.synthesis.methods.fault_estimation_filter")
+    method = import_module("obsynth.methods.fault_estimation_filter.synthesis")
     with threadpool_limits(limits=threads, user_api="blas"):
         began, clock = time.process_time(), time.perf_counter()
         method.synthesise(plant, progress=lambda _: None, engine="riccati")

@@ -23,9 +23,9 @@ import casadi as ca
 import numpy as np
 
 import obsynth
-from obsynth.observers.dae_building import dae_observer_from_options
+from obsynth.methods.dae_adaptive_observer.synthesis import DEFAULTS
+from obsynth.observers.dae.building import dae_observer_from_options
 from obsynth.spec import load_spec
-from obsynth.synthesis.methods.dae_adaptive_observer import DEFAULTS
 
 SPEC = Path(__file__).parents[1] / "designs" / "moussaali2013_dae" / "spec.yaml"
 SAMPLES, TRIALS, FEWER_TRIALS, REPEATS = 1001, 1000, 20, 5

@@ -23,12 +23,12 @@ from pathlib import Path
 import numpy as np
 
 import obsynth
-from obsynth.analysis.fault_filter import prepare
-from obsynth.numerics.definiteness import prove_positive_definite
+from obsynth.methods.fault_estimation_filter.injection_problem import GainProblem
+from obsynth.methods.fault_estimation_filter.prepared_plant import prepare
+from obsynth.methods.fault_estimation_filter.synthesis import gain_problem, with_weight_limit
 from obsynth.numerics.norms import hinf_norm
+from obsynth.proofs.definiteness import prove_positive_definite
 from obsynth.spec import load_spec
-from obsynth.synthesis.fault_filter.gain_problem import GainProblem
-from obsynth.synthesis.methods.fault_estimation_filter import gain_problem, with_weight_limit
 
 ROOT = Path(__file__).parents[1]
 FAMILIES = ("brief", "noise", "delay")

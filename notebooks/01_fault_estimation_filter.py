@@ -23,14 +23,14 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import obsynth
-from obsynth.analysis.fault_filter import prepare
+from obsynth.methods.conic import lmi
+from obsynth.methods.fault_estimation_filter import inequality_search, small_gains
+from obsynth.methods.fault_estimation_filter.prepared_plant import prepare
+from obsynth.methods.fault_estimation_filter.synthesis import gain_problem
 from obsynth.numerics.norms import hinf_norm, spectral_radius
 from obsynth.plotting import plot_faults, plot_poles, plot_residuals
 from obsynth.simulation import simulate_plant
 from obsynth.spec import load_spec
-from obsynth.synthesis.conic import lmi
-from obsynth.synthesis.fault_filter import gain_search, small_gains
-from obsynth.synthesis.methods.fault_estimation_filter import gain_problem
 
 np.set_printoptions(precision=4, suppress=True)
 plant = load_spec("../designs/wang2015/spec.yaml").plant
@@ -178,7 +178,7 @@ np.testing.assert_allclose(claimed, design.certificate.claims["gamma"], rtol=0, 
 np.testing.assert_allclose(L, design.gains["L"], rtol=0, atol=5e-3)
 
 problem, parts = gain_problem(prepare(plant, S), free_weight=False)
-least = gain_search.search_least_gain(problem, solver="auto")
+least = inequality_search.search_least_gain(problem, solver="auto")
 gamma = 1.05 * least.gain
 inner = gamma - min(0.2 * (gamma - least.gain), 0.005 * gamma)
 chosen, _ = small_gains.small_gain_design(problem, least, inner, solver="auto", engine="lmi")

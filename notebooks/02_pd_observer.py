@@ -28,12 +28,12 @@ import numpy as np
 from scipy.linalg import solve_continuous_are
 
 import obsynth
+from obsynth.methods.conic import lmi
 from obsynth.numerics.continuous import spectral_abscissa
 from obsynth.plotting import plot_delta_scan, plot_faults
 from obsynth.simulation import simulate_plant
 from obsynth.spec import load_spec
 from obsynth.spec.documents import read_yaml
-from obsynth.synthesis.conic import lmi
 
 np.set_printoptions(precision=4, suppress=True)
 plant = load_spec("../designs/filasova/spec.yaml").plant

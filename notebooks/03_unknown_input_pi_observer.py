@@ -24,10 +24,10 @@ import numpy as np
 from scipy.linalg import block_diag, expm
 
 import obsynth
-from obsynth.analysis.unknown_inputs import paper_decoupling
 from obsynth.analysis.zeros import invariant_zeros
+from obsynth.methods.placement.eigenstructure import place
+from obsynth.methods.ui_pi_observer.augmented_plant import paper_decoupling
 from obsynth.spec import load_spec
-from obsynth.synthesis.placement.eigenstructure import place
 
 np.set_printoptions(precision=4, suppress=True)
 spec = load_spec("../designs/sharepasand/spec.yaml")
@@ -86,8 +86,8 @@ print("five times -4: characteristic polynomial", np.poly(pair - five.K @ output
 # input can mask each other (D3).
 
 # %%
-from obsynth.analysis.unknown_input_conditions import existence
-from obsynth.models.exosystems import exosystem
+from obsynth.methods.ui_pi_observer.conditions import existence
+from obsynth.plants.exosystems import exosystem
 
 for condition in existence(plant, exosystem("ramp", plant.fault_names, 0.0)).conditions:
     print(f"{condition.name:26s} {'holds' if condition.holds else 'FAILS'}  {condition.detail}")

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from obsynth.cli.main import main
+from obsynth.methods.registry import REGISTRY
 from obsynth.simulation.failures import KINDS
-from obsynth.synthesis.methods import REGISTRY
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")

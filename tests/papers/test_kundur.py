@@ -10,8 +10,8 @@ import pytest
 from exact_runs import Together, ramp_and_sine
 
 import obsynth
-from obsynth.analysis.unknown_input_conditions import decoupling_rank, existence
-from obsynth.models.exosystems import exosystem
+from obsynth.methods.ui_pi_observer.conditions import decoupling_rank, existence
+from obsynth.plants.exosystems import exosystem
 from obsynth.simulation import simulate_plant
 from obsynth.spec import load_spec
 from obsynth.spec.documents import read_yaml

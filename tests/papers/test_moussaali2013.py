@@ -10,7 +10,7 @@ import pytest
 
 import obsynth
 from obsynth.cli.main import main
-from obsynth.observers.gain_schedule import run_batch
+from obsynth.observers.recursive.gain_schedule import run_batch
 from obsynth.simulation.time_varying import simulate_time_varying
 from obsynth.spec import load_spec
 from obsynth.spec.documents import read_yaml

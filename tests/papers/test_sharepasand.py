@@ -9,12 +9,12 @@ import pytest
 from exact_runs import ONE, RAMP, Together, ramp_and_sine, sine
 
 import obsynth
-from obsynth.analysis.unknown_inputs import paper_decoupling
 from obsynth.analysis.zeros import invariant_zeros
+from obsynth.methods.placement.eigenstructure import place
+from obsynth.methods.ui_pi_observer.augmented_plant import paper_decoupling
 from obsynth.simulation import simulate_plant
 from obsynth.spec import load_spec
 from obsynth.spec.documents import read_yaml
-from obsynth.synthesis.placement.eigenstructure import place
 
 FOLDER = Path(__file__).parents[2] / "designs" / "sharepasand"
 EXPECTED = read_yaml(FOLDER / "expected.yaml")

@@ -10,7 +10,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import obsynth
-from obsynth.observers.gain_schedule import run_batch
+from obsynth.observers.recursive.gain_schedule import run_batch
 from obsynth.spec import load_spec
 from obsynth.spec.documents import read_yaml
 

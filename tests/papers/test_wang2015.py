@@ -13,16 +13,16 @@ import numpy as np
 import pytest
 
 import obsynth
-from obsynth.analysis.fault_filter import prepare
-from obsynth.analysis.restricted_equivalent import restricted_equivalent_from
 from obsynth.analysis.zeros import fault_zeros
 from obsynth.errors import InfeasibleError
+from obsynth.methods.fault_estimation_filter import inequality_search, inequality_solutions
+from obsynth.methods.fault_estimation_filter.prepared_plant import prepare
+from obsynth.methods.fault_estimation_filter.restricted_equivalent import restricted_equivalent_from
+from obsynth.methods.fault_estimation_filter.synthesis import gain_problem
 from obsynth.numerics.norms import hinf_norm, spectral_radius
 from obsynth.simulation import simulate_plant
 from obsynth.spec import load_spec
 from obsynth.spec.documents import read_yaml
-from obsynth.synthesis.fault_filter import gain_design, gain_search
-from obsynth.synthesis.methods.fault_estimation_filter import gain_problem
 
 DESIGNS = Path(__file__).parents[2] / "designs"
 EXPECTED = read_yaml(DESIGNS / "wang2015" / "expected.yaml")
@@ -213,7 +213,7 @@ def test_the_second_stage_at_five_percent(plant, expected) -> None:
     truth = expected["truth"]
     problem, _ = gain_problem(prepare(plant, S), free_weight=False)
     level = 1.05 * truth["gamma_min"]["value"]
-    found = gain_design.small_gains(problem, level, solver="CLARABEL").injection
+    found = inequality_solutions.small_gains(problem, level, solver="CLARABEL").injection
     a, b, c, d = problem.closed_loop(found)
     stage = truth["second_stage"]
     assert np.linalg.norm(found.R) == pytest.approx(stage["norm_R"], abs=5.1e-4)
@@ -252,7 +252,7 @@ def test_a_free_residual_weight_lowers_gamma_to_one() -> None:
 def test_the_sign_printed_in_48_is_unstable() -> None:
     """TA - LC is A1 - R C1 by (60), and A1 + R C1 by (48) as printed."""
     problem, _ = gain_problem(prepare(PLANT, S), free_weight=False)
-    gain = gain_search.search_least_gain(problem, solver="CLARABEL").injection.R
+    gain = inequality_search.search_least_gain(problem, solver="CLARABEL").injection.R
     printed_sign = spectral_radius(problem.A + gain @ problem.C)
     assert printed_sign == pytest.approx(EXPECTED["truth"]["as_printed"]["spectral_radius_with_sign_of_48"], abs=5e-3)
     assert spectral_radius(problem.A - gain @ problem.C) < 0.4

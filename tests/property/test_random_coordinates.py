@@ -10,7 +10,7 @@ from plants import Recipe, build, random_recipe, well_conditioned, with_conjugat
 
 import obsynth
 from obsynth.analysis import fault_zeros
-from obsynth.pipeline.designing import check
+from obsynth.methods.designing import check
 
 SEEDS = st.integers(0, 2**32 - 1)
 METHOD = "fault-estimation-filter"

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import obsynth
-from obsynth.analysis.fault_filter import prepare
-from obsynth.synthesis.methods.fault_estimation_filter import gain_problem
+from obsynth.methods.fault_estimation_filter.prepared_plant import prepare
+from obsynth.methods.fault_estimation_filter.synthesis import gain_problem
 
 
 def random_plant(seed: int, units: list[float]) -> obsynth.DescriptorSystem:

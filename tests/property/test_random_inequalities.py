@@ -13,8 +13,8 @@ import cvxpy
 import numpy as np
 import pytest
 
-from obsynth.synthesis.fault_filter import gain_design
-from obsynth.synthesis.fault_filter.gain_problem import GainProblem, WeightLimit, normalise
+from obsynth.methods.fault_estimation_filter import inequality_solutions
+from obsynth.methods.fault_estimation_filter.injection_problem import GainProblem, WeightLimit, normalise
 
 #: What solvers leave open of the squared level, relative; the whole inequality is solved worse.
 ACCURACY = 1e-5
@@ -61,7 +61,7 @@ def whole_inequality(problem: GainProblem) -> float:
         ]
     )
     whole = cvxpy.bmat([[left, loop.T], [loop, right]])
-    constraints = [whole + whole.T >> 0, cvxpy.trace(p) <= gain_design.P_CEILING * n]
+    constraints = [whole + whole.T >> 0, cvxpy.trace(p) <= inequality_solutions.P_CEILING * n]
     limit = problem.weight_limit
     if limit is not None:
         constraints.append(cvxpy.sigma_max(limit.fixed + v @ limit.free) <= limit.bound)
@@ -78,8 +78,8 @@ CASES = list(itertools.product(("fixed", "free", "limited"), (False, True), (3, 
 def test_our_solver_agrees_with_a_general_one(weight: str, feedthrough: bool, nd: int) -> None:
     for seed in range(4):
         problem = random_problem(seed, weight=weight, feedthrough=feedthrough, nd=nd)
-        ours = gain_design.least_gain(problem, solver="SCHUR")
-        general = gain_design.least_gain(problem, solver="CLARABEL")
+        ours = inequality_solutions.least_gain(problem, solver="SCHUR")
+        general = inequality_solutions.least_gain(problem, solver="CLARABEL")
         assert ours.gain == pytest.approx(general.gain, rel=ACCURACY, abs=1e-4), seed
         reached = problem.achieved_gain(ours.injection)
         assert reached <= ours.gain * (1.0 + ACCURACY) + 1e-4, seed
@@ -88,7 +88,7 @@ def test_our_solver_agrees_with_a_general_one(weight: str, feedthrough: bool, nd
 @pytest.mark.parametrize(("weight", "feedthrough", "nd"), CASES)
 def test_elimination_loses_nothing(weight: str, feedthrough: bool, nd: int) -> None:
     problem = random_problem(9, weight=weight, feedthrough=feedthrough, nd=nd)
-    found = gain_design.least_gain(problem, solver="SCHUR")
+    found = inequality_solutions.least_gain(problem, solver="SCHUR")
     assert found.gain == pytest.approx(whole_inequality(problem), rel=ACCURACY_OF_WHOLE, abs=1e-3)
 
 
@@ -98,7 +98,7 @@ def test_a_limit_on_the_weight_holds_and_binds(feedthrough: bool) -> None:
         gains = []
         for weight in ("fixed", "limited", "free"):
             problem = random_problem(seed, weight=weight, feedthrough=feedthrough, nd=3)
-            found = gain_design.least_gain(problem, solver="SCHUR")
+            found = inequality_solutions.least_gain(problem, solver="SCHUR")
             gains.append(found.gain)
             limit = problem.weight_limit
             if limit is not None:

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 import obsynth
-from obsynth.analysis.fault_filter import prepare
-from obsynth.synthesis.fault_filter.gain_bound import proved_lower_bound
-from obsynth.synthesis.fault_filter.gain_search import search_least_gain
-from obsynth.synthesis.methods.fault_estimation_filter import gain_problem
+from obsynth.methods.fault_estimation_filter.gamma_lower_bound import proved_lower_bound
+from obsynth.methods.fault_estimation_filter.inequality_search import search_least_gain
+from obsynth.methods.fault_estimation_filter.prepared_plant import prepare
+from obsynth.methods.fault_estimation_filter.synthesis import gain_problem
 
 
 def random_plant(seed: int, units: float) -> obsynth.DescriptorSystem:

@@ -6,7 +6,7 @@ What holds by cancellation on random plants holds exactly here, and ranks fall b
 import numpy as np
 
 import obsynth
-from obsynth.pipeline.designing import check
+from obsynth.methods.designing import check
 
 
 def sparse_plant(seed: int) -> obsynth.DescriptorSystem:

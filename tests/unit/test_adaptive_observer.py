@@ -7,11 +7,11 @@ import pytest
 from time_varying_plants import maximum_likelihood, observer_for, printed, record, textbook, varying
 
 from obsynth import PreconditionError, SpecError, run_batch, simulate_time_varying
-from obsynth.analysis.recursive_conditions import residual_condition
 from obsynth.analysis.time_varying import horizon_ranks
+from obsynth.methods.recursive.conditions import residual_condition
 from obsynth.numerics.paper_filter import PaperState, paper_step
 from obsynth.numerics.recursive_least_squares import ParameterState, start_of, update
-from obsynth.observers.recursive_running import RawEstimate
+from obsynth.observers.recursive.running import RawEstimate
 
 SAMPLES = 40
 

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 import obsynth
-from obsynth.numerics import definiteness
-from obsynth.numerics.balls import Ball, Enclosed, block
-from obsynth.numerics.definiteness import prove_positive_definite
-from obsynth.numerics.extended_balls import MOST_ROWS, ExtendedBall, prove_by_ball_arithmetic
-from obsynth.observers.linear import LinearObserver
+from obsynth.methods.pd_observer.checks.inequality import prove_gain, prove_gains
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.proofs import definiteness
+from obsynth.proofs.balls import Ball, Enclosed, block
+from obsynth.proofs.definiteness import prove_positive_definite
+from obsynth.proofs.extended_balls import MOST_ROWS, ExtendedBall, prove_by_ball_arithmetic
 from obsynth.verification.bounded_real import prove_bounded_real
 from obsynth.verification.lyapunov import prove_stable
-from obsynth.verification.pd_inequality import prove_gain, prove_gains
 
 ULP = 2.0**-52
 

@@ -5,7 +5,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from obsynth.numerics.balls import UNDERFLOW, UNIT_ROUNDOFF, Ball, block, gamma, rounded_up
+from obsynth.proofs.balls import UNDERFLOW, UNIT_ROUNDOFF, Ball, block, gamma, rounded_up
 
 #: Every double is a whole multiple of 1 / UNITS.
 UNITS = 2**1074

@@ -10,8 +10,8 @@ import pytest
 from time_varying_plants import maximum_likelihood, observer_for, printed, record, textbook, varying
 
 from obsynth import PreconditionError, SpecError, TimeVaryingDescriptorSystem
-from obsynth.observers import compiled_run
-from obsynth.observers.recursive_running import RunningRecursiveObserver
+from obsynth.observers.recursive import compiled_run
+from obsynth.observers.recursive.running import RunningRecursiveObserver
 
 SAMPLES = 40
 #: Relative to the largest entry of each result: rounding of well-posed problems over a record.

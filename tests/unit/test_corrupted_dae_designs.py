@@ -22,10 +22,10 @@ from obsynth import (
     dae_adaptive_observer,
     verify,
 )
-from obsynth.models.dae_step_graph import StepGraph
-from obsynth.observers import dae_algebra
-from obsynth.observers.dae_estimates import DAERow
-from obsynth.pipeline.designing import check
+from obsynth.methods.designing import check
+from obsynth.observers.dae import step_graph as dae_algebra
+from obsynth.observers.dae.estimates import DAERow
+from obsynth.plants.dae.step_graph import StepGraph
 
 FITS, CLAIMS, RUNS, NEES, NIS = "fits the plant", "claims", "runs", "NEES", "NIS"
 CONTRACTION, DERIVATIVES, RESIDUAL, CONDITION = "contraction", "derivatives", "Newton residual", "condition of (7)"

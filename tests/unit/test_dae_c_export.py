@@ -15,7 +15,7 @@ from test_dae_observer import matrices
 import obsynth
 from obsynth import SpecError, simulate_dae
 from obsynth.cli.main import main
-from obsynth.models.dae_functions import Compiled
+from obsynth.plants.dae.functions import Compiled
 from obsynth.spec import load_spec
 
 FLAGS = ["-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-O1", "-ffp-contract=off"]

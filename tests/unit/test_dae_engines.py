@@ -13,10 +13,13 @@ from test_dae_observer import BALANCES, drive, linear_observer, observer, record
 
 import obsynth
 from obsynth import DAEModel, DAEObserver, SolverError, SpecError, run_batch, simulate_dae
-from obsynth.models.dae_functions import Compiled, DAEFunctions
-from obsynth.models.dae_step import ImplicitStep
 from obsynth.numerics.symbolic_solve import SMALL, solved
-from obsynth.observers import dae_batch, dae_library, dae_records, progress
+from obsynth.observers import progress
+from obsynth.observers.dae import batch as dae_batch
+from obsynth.observers.dae import compiled_library as dae_library
+from obsynth.observers.dae import records as dae_records
+from obsynth.plants.dae.functions import Compiled, DAEFunctions
+from obsynth.plants.dae.step import ImplicitStep
 
 SIZES = np.array([2e3, 2e3, 5.0, 5.0, 0.1, 1e3])
 
@@ -282,7 +285,7 @@ def test_a_long_run_shows_a_bar_and_a_short_one_does_not(capsys, monkeypatch) ->
 
 
 def test_truths_are_the_same_in_stretches_and_step_by_step(monkeypatch) -> None:
-    from obsynth.models import dae_stretches
+    from obsynth.plants.dae import stretches as dae_stretches
 
     model = exchanger()
     u = np.tile(model.nominal_input, (300, 1))

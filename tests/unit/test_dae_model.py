@@ -10,9 +10,9 @@ from dae_plants import ROD, diode, exchanger, pendulum
 
 from obsynth import DAEModel, SpecError, identifiability
 from obsynth.analysis.dae_index import index_report
-from obsynth.models.dae_functions import DAEFunctions
-from obsynth.models.dae_step import ImplicitStep
-from obsynth.pipeline.designing import check
+from obsynth.methods.designing import check
+from obsynth.plants.dae.functions import DAEFunctions
+from obsynth.plants.dae.step import ImplicitStep
 
 UNITS = dict.fromkeys(["a", "b", "go", "c", "seen"], "1")
 

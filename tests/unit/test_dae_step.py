@@ -7,8 +7,8 @@ import pytest
 from dae_plants import ROD, diode, exchanger, pendulum
 
 from obsynth import DAEModel, SolverError, SpecError
-from obsynth.models.dae_functions import DAEFunctions
-from obsynth.models.dae_step import ImplicitStep
+from obsynth.plants.dae.functions import DAEFunctions
+from obsynth.plants.dae.step import ImplicitStep
 
 METHODS = ("backward-euler", "radau")
 

@@ -5,9 +5,9 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from obsynth.numerics import definiteness
-from obsynth.numerics.balls import Ball
-from obsynth.numerics.definiteness import prove_positive_definite
+from obsynth.proofs import definiteness
+from obsynth.proofs.balls import Ball
+from obsynth.proofs.definiteness import prove_positive_definite
 
 
 def whole(matrix):

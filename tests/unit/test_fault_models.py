@@ -7,9 +7,9 @@ import pytest
 import scipy.linalg
 
 from obsynth import FaultModel, SpecError, fault_model
-from obsynth.models.exosystems import exosystem
-from obsynth.models.fault_model_spectra import stated_eigenvalues
-from obsynth.models.fault_models import summed
+from obsynth.plants.exosystems import exosystem
+from obsynth.plants.fault_model_spectra import stated_eigenvalues
+from obsynth.plants.fault_models import summed
 
 
 def course(data: object, start: list[float], times: np.ndarray) -> np.ndarray:

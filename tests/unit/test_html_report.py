@@ -17,12 +17,12 @@ mpl.use("Agg")
 
 import obsynth
 from obsynth.errors import SpecError
+from obsynth.methods.ui_pi_observer.checks.fault_response import fault_response
+from obsynth.methods.verifying import verify
 from obsynth.plotting import estimate_gains, plot_gains, plot_poles
 from obsynth.report.page import html_report
 from obsynth.results.report import VerificationReport
 from obsynth.spec import load_spec
-from obsynth.verification import verify
-from obsynth.verification.fault_tracking import fault_response
 
 ROOT = Path(__file__).parents[2]
 VOID = {"meta", "img", "br", "link"}

@@ -8,10 +8,10 @@ import pytest
 from scipy.optimize import linprog
 
 from obsynth.errors import SolverError
-from obsynth.synthesis.conic import interior_point, lmi
-from obsynth.synthesis.conic.interior_point import solve_cone_programme
-from obsynth.synthesis.conic.normal_equations import NormalEquations
-from obsynth.synthesis.conic.semidefinite_block import SemidefiniteBlock
+from obsynth.methods.conic import interior_point, lmi
+from obsynth.methods.conic.interior_point import solve_cone_programme
+from obsynth.methods.conic.normal_equations import NormalEquations
+from obsynth.methods.conic.semidefinite_block import SemidefiniteBlock
 
 
 def symmetric(rng: np.random.Generator, order: int) -> np.ndarray:
@@ -32,7 +32,7 @@ class TestBlock:
         self, monkeypatch: pytest.MonkeyPatch, part: int
     ) -> None:
         """Through two moves, the second given in the scaling of the first; columns in parts or at once."""
-        monkeypatch.setattr("obsynth.synthesis.conic.semidefinite_block.PART", part)
+        monkeypatch.setattr("obsynth.methods.conic.semidefinite_block.PART", part)
         rng, block = np.random.default_rng(1), SemidefiniteBlock(4, 0)
         s, z = (m @ m.T + 0.1 * np.eye(4) for m in rng.standard_normal((2, 4, 4)))
         block.move(block.vector(s), block.vector(z))
@@ -63,7 +63,7 @@ class TestBlock:
 
 class TestNormalEquations:
     def test_refinement_takes_the_shift_back(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr("obsynth.synthesis.conic.normal_equations.SHIFTS", (1e-5,))
+        monkeypatch.setattr("obsynth.methods.conic.normal_equations.SHIFTS", (1e-5,))
         rng = np.random.default_rng(3)
         columns, wanted = rng.standard_normal((6, 40)) * np.logspace(0.0, 3.0, 6)[:, None], rng.standard_normal(6)
         found = NormalEquations(columns).solution(columns @ (columns.T @ wanted))

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from obsynth.synthesis.fault_filter.gain_problem import Injection
-from obsynth.synthesis.fault_filter.level_descent import Descent
+from obsynth.methods.fault_estimation_filter.gamma_iteration import Descent
+from obsynth.methods.fault_estimation_filter.injection_problem import Injection
 
 TOLERANCE = 1e-7
 

@@ -8,7 +8,7 @@ import pytest
 
 import obsynth
 from obsynth.errors import SolverError
-from obsynth.synthesis.conic import lmi
+from obsynth.methods.conic import lmi
 
 
 class PanicException(BaseException):

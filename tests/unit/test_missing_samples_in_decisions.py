@@ -7,7 +7,7 @@ import pytest
 from time_varying_plants import observer_for, record, varying
 
 from obsynth import RecursiveObserver, TimeVaryingDescriptorSystem, decide
-from obsynth.observers.gain_schedule import gain_steps
+from obsynth.observers.recursive.gain_schedule import gain_steps
 
 SAMPLES = 40
 #: Single outputs, both at once, several in a row (so that H_k loses rank and states stay open for a while).

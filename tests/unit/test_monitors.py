@@ -15,10 +15,10 @@ from scipy.linalg import solve_discrete_lyapunov
 
 import obsynth
 from obsynth.errors import SpecError
-from obsynth.evaluation.bench import make_bench
-from obsynth.evaluation.intervals import mean, share
-from obsynth.evaluation.residual_model import residual_model
-from obsynth.evaluation.whitening import innovation_whitener, whitener_of, window_covariance
+from obsynth.experiments.batch_simulation import make_bench
+from obsynth.experiments.intervals import mean, share
+from obsynth.experiments.monitors.residual_model import residual_model
+from obsynth.experiments.monitors.whitening import innovation_whitener, whitener_of, window_covariance
 from obsynth.spec import load_spec
 
 DESIGNS = Path(__file__).parents[2] / "designs"

@@ -13,7 +13,7 @@ from scipy.linalg import expm
 
 import obsynth
 from obsynth import SpecError, run_on_data
-from obsynth.evaluation.online import share_of_look
+from obsynth.experiments.monitors.online import share_of_look
 from obsynth.spec import load_spec
 
 DESIGNS = Path(__file__).parents[2] / "designs"
@@ -206,7 +206,7 @@ def test_chi_square_of_a_sampled_continuous_design(machine):
         horizon=8, sample_time=0.02, noise=1, disturbances={"load": obsynth.Gaussian(deviation=0.5)}
     )
     watched = obsynth.monitor(machine, scenario, "chi-square", window=3)
-    from obsynth.evaluation.bench import make_bench
+    from obsynth.experiments.batch_simulation import make_bench
 
     bench = make_bench(machine, scenario)
     rows = bench.run(range(500)).rows
@@ -218,7 +218,7 @@ def test_chi_square_of_a_sampled_continuous_design(machine):
 
 def test_the_sampled_residual_is_what_the_observer_says(machine):
     """Of sensor noise, sample by sample and from rest, with a start: no straight line is wrong about that."""
-    from obsynth.evaluation.residual_model import residual_model
+    from obsynth.experiments.monitors.residual_model import residual_model
 
     plant = machine.plant.replace(A=[[0.0, 0.0], [0.0, 0.0]], B=[[0.0], [0.0]])
     still = obsynth.pd_observer(plant, decay=1.0)
@@ -272,8 +272,8 @@ def test_cumulative_sums_of_a_residual_that_a_window_does_not_whiten(machine):
 
 
 def test_the_correlation_that_is_left_is_that_of_all_lags(machine):
-    from obsynth.evaluation.residual_model import residual_model
-    from obsynth.evaluation.whitening import correlation_left, innovation_whitener, window_covariance
+    from obsynth.experiments.monitors.residual_model import residual_model
+    from obsynth.experiments.monitors.whitening import correlation_left, innovation_whitener, window_covariance
 
     model = residual_model(machine, obsynth.Scenario(horizon=4, sample_time=0.2, noise=1))
     window, lags, count = 3, 150, len(model.C)
@@ -313,7 +313,7 @@ def test_noise_of_the_worst_signs_keeps_the_bound_at_any_stamps(spacing, kind):
     response, back = np.zeros(len(times)), observer.Cz[observer.residual_rows]
     response[-1] = observer.Dy[observer.residual_rows][0, 0]
     for k in range(len(times) - 1, 0, -1):
-        transition, constant, ramp = obsynth.observers.sampling.first_order_hold(
+        transition, constant, ramp = obsynth.observers.linear.sampling.first_order_hold(
             observer.Az, observer.By, float(times[k] - times[k - 1])
         )
         response[k] += (back @ ramp).item()

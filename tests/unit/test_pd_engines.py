@@ -10,13 +10,13 @@ import pytest
 import scipy.linalg
 
 import obsynth
-from obsynth.analysis.pd_augmentation import with_faults_as_states
+from obsynth.methods.pd_observer import gain_search as pd_design
+from obsynth.methods.pd_observer import reduced_inequality as pd_reduced
+from obsynth.methods.pd_observer.augmentation import with_faults_as_states
+from obsynth.methods.pd_observer.checks.inequality import prove_gains, prove_symmetric_positive
+from obsynth.methods.pd_observer.inequalities import PdTask, solve
+from obsynth.methods.pd_observer.options import MOST_STATES_FOR_LMI, PdOptions
 from obsynth.spec import load_spec
-from obsynth.synthesis.pd import design as pd_design
-from obsynth.synthesis.pd import reduced as pd_reduced
-from obsynth.synthesis.pd.options import MOST_STATES_FOR_LMI, PdOptions
-from obsynth.synthesis.pd.problem import PdTask, solve
-from obsynth.verification.pd_inequality import prove_gains, prove_symmetric_positive
 
 PLANT = load_spec(Path(__file__).parents[2] / "designs" / "filasova" / "spec.yaml").plant
 ENGINES = ("lmi", "reduced-lmi", "riccati")

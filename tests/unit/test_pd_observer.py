@@ -9,27 +9,27 @@ import numpy as np
 import pytest
 
 import obsynth
-from obsynth.analysis.pd_augmentation import with_faults_as_states, with_sensor_noise
-from obsynth.analysis.pd_conditions import pd_observer_conditions
-from obsynth.numerics.continuous import continuous_hinf_norm
-from obsynth.simulation import simulate_plant
-from obsynth.spec import load_spec
-from obsynth.synthesis.conic import lmi
-from obsynth.synthesis.pd import design as pd_design
-from obsynth.synthesis.pd.certificate import (
+from obsynth.methods.conic import lmi
+from obsynth.methods.pd_observer import gain_search as pd_design
+from obsynth.methods.pd_observer.augmentation import with_faults_as_states, with_sensor_noise
+from obsynth.methods.pd_observer.certificate import (
     coupled_certificate,
     explicit_certificate,
     gain_certificate,
     symmetric_certificate,
 )
-from obsynth.synthesis.pd.limits import least_noise_gain
-from obsynth.verification.pd_inequality import (
+from obsynth.methods.pd_observer.checks.inequality import (
     error_inputs,
     prove_gain,
     prove_gains,
     prove_shipped_stability,
     prove_symmetric_positive,
 )
+from obsynth.methods.pd_observer.conditions import pd_observer_conditions
+from obsynth.methods.pd_observer.limits import least_noise_gain
+from obsynth.numerics.continuous import continuous_hinf_norm
+from obsynth.simulation import simulate_plant
+from obsynth.spec import load_spec
 
 FOLDER = Path(__file__).parents[2] / "designs" / "filasova"
 PLANT = load_spec(FOLDER / "spec.yaml").plant
@@ -537,7 +537,7 @@ class TestRefusals:
 
 
 def test_the_doors_options_are_those_of_the_method() -> None:
-    from obsynth.synthesis.pd.options import PdOptions
+    from obsynth.methods.pd_observer.options import PdOptions
 
     door = {
         name: parameter.default

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from obsynth import DescriptorSystem, PreconditionError, SolverError, SpecError, ui_pi_observer
+from obsynth.methods.placement.compromise import NOISE_PRICE, compromise
+from obsynth.methods.placement.eigenstructure import jordan_form, place
+from obsynth.methods.placement.kalman import KalmanProblem
+from obsynth.methods.placement.observable import observable_split
+from obsynth.methods.placement.region import Region, region_gain
 from obsynth.numerics.spectra import decay_rates, spectrum_error
-from obsynth.synthesis.placement.compromise import NOISE_PRICE, compromise
-from obsynth.synthesis.placement.eigenstructure import jordan_form, place
-from obsynth.synthesis.placement.kalman import KalmanProblem
-from obsynth.synthesis.placement.observable import observable_split
-from obsynth.synthesis.placement.region import Region, region_gain
 
 #: The paper's pair: observability indices 4 and 1.
 PAIR = np.array([[0, 0, 0, 0, 0], [-2.5, -1.5, -0.5, 1, 0], [0, -2, 0, 1, 0], [0, 0, 0, 0, 1], [0, 0, 0, 0, 0.0]])

@@ -7,9 +7,9 @@ import pytest
 
 import obsynth
 from obsynth.errors import SolverError
-from obsynth.synthesis.conic import lmi
-from obsynth.synthesis.fault_filter import gain_design, gain_search
-from obsynth.synthesis.fault_filter.gain_problem import GainProblem, WeightLimit, normalise
+from obsynth.methods.conic import lmi
+from obsynth.methods.fault_estimation_filter import inequality_search, inequality_solutions
+from obsynth.methods.fault_estimation_filter.injection_problem import GainProblem, WeightLimit, normalise
 
 
 def plant(nd: int) -> obsynth.DescriptorSystem:
@@ -82,15 +82,15 @@ def test_a_solver_that_fails_costs_the_polish_only(monkeypatch: pytest.MonkeyPat
     design = obsynth.fault_estimation_filter(plant(nd=9), engine="lmi")
     assert design.report.passed
     outcomes = [run["outcome"] for run in design.solver["runs"] if run["solver"] == "SCHUR"]
-    assert outcomes == ["broken"] * len(gain_search.CEILINGS)
+    assert outcomes == ["broken"] * len(inequality_search.CEILINGS)
 
 
 def test_gains_on_the_boundary_of_the_inequality_are_of_a_natural_size(monkeypatch: pytest.MonkeyPatch) -> None:
     """With as many disturbances as measurements P - Z'Z tends to a singular matrix: without room the gains grow."""
     problem, sizes = limited_problem(), []
     for room in (1e-6, 0.0):
-        monkeypatch.setattr(gain_design, "RECOVERY_ROOM", room)
-        found = gain_design.least_gain(problem, solver="SCHUR")
+        monkeypatch.setattr(inequality_solutions, "RECOVERY_ROOM", room)
+        found = inequality_solutions.least_gain(problem, solver="SCHUR")
         sizes.append(float(np.linalg.norm(found.injection.R)))
         if room:
             assert problem.achieved_gain(found.injection) <= found.gain * (1.0 + 1e-5)

@@ -57,7 +57,7 @@ def documented_parameters(item) -> set[str]:
     return names
 
 
-def doors():
+def public_names():
     return [(name, getattr(obsynth, name)) for name in obsynth.__all__]
 
 
@@ -68,7 +68,7 @@ def test_everything_public_has_a_docstring(name, item):
     assert (inspect.getdoc(item) or "").strip(), f"{name} has no docstring"
 
 
-@pytest.mark.parametrize(("name", "item"), doors(), ids=lambda value: value if isinstance(value, str) else "")
+@pytest.mark.parametrize(("name", "item"), public_names(), ids=lambda value: value if isinstance(value, str) else "")
 def test_doors_document_every_parameter(name, item):
     ignored = {"self", "cls", "args", "kwargs"}
     wanted = set(inspect.signature(item).parameters) - ignored
@@ -78,7 +78,7 @@ def test_doors_document_every_parameter(name, item):
 
 
 def public_methods():
-    for class_name, item in doors():
+    for class_name, item in public_names():
         if inspect.isclass(item):
             for name, method in vars(item).items():
                 plain = method.__func__ if isinstance(method, classmethod | staticmethod) else method
@@ -96,7 +96,7 @@ def test_methods_of_doors_document_every_parameter(name, item):
     )
 
 
-FUNCTIONS = [(name, item) for name, item in doors() if inspect.isfunction(item)]
+FUNCTIONS = [(name, item) for name, item in public_names() if inspect.isfunction(item)]
 
 
 @pytest.mark.parametrize(("name", "item"), FUNCTIONS, ids=lambda value: value if isinstance(value, str) else "")

@@ -8,8 +8,8 @@ from time_varying_plants import varying
 
 import obsynth
 from obsynth import DescriptorSystem, PreconditionError, TimeVaryingDescriptorSystem
-from obsynth.analysis.recursive_conditions import recursive_conditions
-from obsynth.pipeline.designing import check
+from obsynth.methods.designing import check
+from obsynth.methods.recursive.conditions import recursive_conditions
 
 NOISE = {"Q": 1.0, "R": 1.0}
 

@@ -1,4 +1,4 @@
-"""The doors of the recursive methods: from plant, options or spec to a verified design, to a file and back."""
+"""The public functions of the recursive methods: from plant, options or spec to a verified design and its file."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from time_varying_plants import observer_for, printed, record, textbook, varying
 import obsynth
 from obsynth import DescriptorSystem, PreconditionError, SpecError, TimeVaryingDescriptorSystem
 from obsynth.cli.main import main
-from obsynth.observers.gain_schedule import run_batch
-from obsynth.pipeline.designing import check
+from obsynth.methods.designing import check
+from obsynth.observers.recursive.gain_schedule import run_batch
 from obsynth.spec import load_spec
 
 NOISE = {"Q": 0.1, "R": 0.2}

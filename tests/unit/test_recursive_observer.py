@@ -1,4 +1,4 @@
-"""The recursive observer in motion: against batch solutions, with missing samples, with early constraints."""
+"""The running recursive observer: against batch solutions, with missing samples, with early constraints."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import pytest
 from time_varying_plants import maximum_likelihood, observer_for, printed, record, textbook, varying
 
 from obsynth import PreconditionError, SpecError, TimeVaryingDescriptorSystem
-from obsynth.models.sequences import MatrixSequence
-from obsynth.observers.recursive import RecursiveObserver
+from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.plants.sequences import MatrixSequence
 
 SAMPLES = 9
 

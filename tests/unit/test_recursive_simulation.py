@@ -12,8 +12,8 @@ import pytest
 import obsynth
 from obsynth.cli.main import main
 from obsynth.errors import SpecError
-from obsynth.evaluation.recursive_bench import make_recursive_bench
-from obsynth.evaluation.recursive_simulating import RecursiveSimulation
+from obsynth.experiments.parameter_batch_simulation import make_recursive_bench
+from obsynth.experiments.parameter_simulation import RecursiveSimulation
 from obsynth.spec import load_spec
 
 DESIGNS = Path(__file__).parents[2] / "designs"

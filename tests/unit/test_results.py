@@ -14,9 +14,9 @@ import pytest
 
 import obsynth
 from obsynth import Certificate, Check, DescriptorSystem, ObserverDesign, SpecError, VerificationReport, load, verify
-from obsynth.results import serialise
+from obsynth.results import gain_sets
 from obsynth.results.files import write_atomically
-from obsynth.results.serialise import design_as_dict, digest_of, plain, restored
+from obsynth.results.gain_sets import design_as_dict, digest_of, plain, restored
 
 AWKWARD = [-0.0, 5e-324, -2.2250738585072014e-308, 1.7976931348623157e308, 0.1, 1.0 / 3.0, np.nextafter(1.0, 2.0), 2e22]
 
@@ -378,7 +378,7 @@ class TestAtomicWriting:
         before = json.dumps(design_as_dict(design))
         design.save(tmp_path / "a.json")
         assert json.dumps(design_as_dict(design)) == before
-        assert serialise.SCHEMA_VERSION == 1
+        assert gain_sets.SCHEMA_VERSION == 1
 
 
 PROGRAM = """
@@ -391,7 +391,7 @@ print(report.passed, [name for name in sys.argv[2:] if name in sys.modules])
 
 HEAVY = (
     *("cvxpy", "clarabel", "scs", "control", "slycot", "matplotlib", "pydantic"),
-    *("obsynth.synthesis", "obsynth.pipeline"),
+    *("obsynth.methods.conic", "obsynth.methods.placement", "obsynth.methods.designing"),
 )
 
 
@@ -486,7 +486,7 @@ def test_trouble_inside_lapack_is_a_solver_error(monkeypatch):
     def gives_up(*_: object, **__: object) -> None:
         raise np.linalg.LinAlgError("did not converge")
 
-    monkeypatch.setattr("obsynth.synthesis.methods.fault_estimation_filter.gain_problem", gives_up)
+    monkeypatch.setattr("obsynth.methods.fault_estimation_filter.synthesis.gain_problem", gives_up)
     plant = obsynth.DescriptorSystem(None, [[0.5]], None, [[1.0]], Bf=[[1.0]], dt=0.1)
     with pytest.raises(obsynth.SolverError, match=r"LAPACK gave up \(did not converge\)"):
         obsynth.fault_estimation_filter(plant)

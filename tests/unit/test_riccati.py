@@ -6,6 +6,10 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_continuous_are, solve_discrete_are
 
+from obsynth.methods.fault_estimation_filter.central_equation import CentralEquation, central_injection
+from obsynth.methods.fault_estimation_filter.central_filter import central_filter_at, search_central_filter
+from obsynth.methods.fault_estimation_filter.injection_problem import GainProblem, Injection
+from obsynth.methods.riccati import bounded_real_matrix
 from obsynth.numerics.doubling import (
     compared_gain,
     continuous_riccati_solution,
@@ -13,10 +17,6 @@ from obsynth.numerics.doubling import (
     gain_is_below,
 )
 from obsynth.numerics.norms import hinf_norm, spectral_radius
-from obsynth.synthesis.fault_filter.central_equation import CentralEquation, central_injection
-from obsynth.synthesis.fault_filter.central_filter import central_filter_at, search_central_filter
-from obsynth.synthesis.fault_filter.gain_problem import GainProblem, Injection
-from obsynth.synthesis.riccati import bounded_real_matrix
 
 
 def random_problem(rng, n=5, m=2, q=1, nd=3, free_weight=False):

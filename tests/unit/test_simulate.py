@@ -13,10 +13,10 @@ from scipy.integrate import solve_ivp
 
 import obsynth
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.simulation.drive import resolve
+from obsynth.simulation.batch import make_stepper
 from obsynth.simulation.linear import simulate_plant
 from obsynth.simulation.profiles import sampled
-from obsynth.simulation.stepping import make_stepper
+from obsynth.simulation.scenario_signals import resolve
 from obsynth.spec import load_spec
 
 DESIGNS = Path(__file__).parents[2] / "designs"

@@ -11,7 +11,7 @@ from scipy.linalg import expm
 
 from obsynth.analysis import discretise, eliminate_algebraic_states
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.models import DescriptorSystem
+from obsynth.plants import DescriptorSystem
 from obsynth.simulation import Trajectory, simulate_plant
 from obsynth.spec import load_spec
 

@@ -9,8 +9,8 @@ import pytest
 
 import obsynth
 from obsynth import DescriptorSystem, ObserverDesign
-from obsynth.models.sequences import MatrixSequence
-from obsynth.verification.recursive import BATCH_TOLERANCE
+from obsynth.methods.recursive.checks import BATCH_TOLERANCE
+from obsynth.plants.sequences import MatrixSequence
 
 TURN = [[0.9, 0.1], [-0.2, 0.7]]
 SHIFT = [[0.5, 0.0], [0.0, 0.0]]

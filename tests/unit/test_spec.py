@@ -13,11 +13,11 @@ import scipy.io
 import scipy.sparse
 
 from obsynth.errors import SpecError
-from obsynth.pipeline.designing import door_of
+from obsynth.methods.designing import public_function
+from obsynth.methods.registry import REGISTRY
 from obsynth.spec import load_spec
 from obsynth.spec.matrices import read_matrix
 from obsynth.spec.options import METHOD_OPTIONS
-from obsynth.synthesis.methods import REGISTRY
 
 DESIGNS = Path(__file__).parents[2] / "designs"
 
@@ -356,7 +356,7 @@ class TestMethods:
 
     @pytest.mark.parametrize("method", METHOD_OPTIONS)
     def test_the_schema_has_the_options_and_defaults_of_the_function(self, method: str) -> None:
-        parameters = inspect.signature(door_of(method)).parameters
+        parameters = inspect.signature(public_function(method)).parameters
         of_function = {name: p.default for name, p in parameters.items() if name not in ("plant", "name")}
         fields = METHOD_OPTIONS[method].model_fields
         assert {name: field.default for name, field in fields.items()} == of_function

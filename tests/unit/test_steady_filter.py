@@ -8,8 +8,8 @@ from time_varying_plants import observer_for, varying
 
 import obsynth
 from obsynth import DescriptorSystem, PreconditionError, SpecError, TimeVaryingDescriptorSystem
-from obsynth.observers.gain_schedule import gain_steps
-from obsynth.synthesis.steady_filter import steady_state_filter
+from obsynth.methods.recursive.steady_filter import steady_state_filter
+from obsynth.observers.recursive.gain_schedule import gain_steps
 
 
 class TestSteadyState:

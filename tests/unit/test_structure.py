@@ -9,7 +9,7 @@ import scipy.io
 from scipy.linalg import block_diag
 
 from obsynth.analysis import analyse_structure
-from obsynth.models import DescriptorSystem
+from obsynth.plants import DescriptorSystem
 
 SMIB = Path(__file__).parents[2] / "designs" / "smib"
 

@@ -14,9 +14,9 @@ import threadpoolctl
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import obsynth
+from obsynth.methods import designing
+from obsynth.methods.pd_observer import synthesis as method
 from obsynth.numerics.threads import STATES_WORTH_THREADS, one_thread_if_small
-from obsynth.pipeline import designing
-from obsynth.synthesis.methods import pd_observer as method
 
 PLANT = obsynth.DescriptorSystem(None, [[0.5, 1.0], [0.0, -1.0]], C=[[1.0, 0.0]], Bf=[[0.0], [1.0]])
 
@@ -132,7 +132,7 @@ def test_a_design_that_fails_puts_the_number_back() -> None:
 
 
 def test_verification_alone_runs_on_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
-    from obsynth.verification import pd_observer as checker
+    from obsynth.methods.pd_observer import checks as checker
 
     made = obsynth.pd_observer(PLANT)
     seen = []
@@ -149,7 +149,7 @@ def test_verification_alone_runs_on_one_thread(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_the_method_itself_leaves_the_threads_alone() -> None:
-    """The setting is at the door, once for every method."""
+    """The setting is in `design`, once for every method."""
     method.synthesise(PLANT, progress=lambda _: None)
     assert blas_threads() == {2}
 

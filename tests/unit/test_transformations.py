@@ -19,7 +19,7 @@ from obsynth.analysis import (
     sampling_zero_warnings,
 )
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.models import DescriptorSystem
+from obsynth.plants import DescriptorSystem
 
 SMIB = Path(__file__).parents[2] / "designs" / "smib"
 

@@ -7,7 +7,7 @@ import pytest
 
 from obsynth import DescriptorSystem, ui_pi_observer
 from obsynth.errors import PreconditionError, SolverError, SpecError
-from obsynth.pipeline.designing import check
+from obsynth.methods.designing import check
 
 TWO = [[-1.0, 1.0], [0.0, -2.0]]
 PLANTS = {

@@ -5,7 +5,7 @@ import pytest
 
 import obsynth
 from obsynth.errors import InfeasibleError
-from obsynth.synthesis.fault_filter.gain_problem import WeightLimit
+from obsynth.methods.fault_estimation_filter.injection_problem import WeightLimit
 
 #: A rod of 24 cells, heated in two, with one sensor on each and one between.
 SIZE = 24

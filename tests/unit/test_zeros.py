@@ -8,9 +8,9 @@ import slycot
 from scipy.linalg import block_diag, eigvals
 
 from obsynth.analysis import are_outside, fault_zeros, invariant_zeros, is_outside
-from obsynth.analysis.fault_filter_conditions import fault_filter_conditions
-from obsynth.models import DescriptorSystem
+from obsynth.methods.fault_estimation_filter.conditions import fault_filter_conditions
 from obsynth.numerics.pencils import finite_zeros
+from obsynth.plants import DescriptorSystem
 
 PAPER_A = [[0.9, 0.005, -0.095, 0], [0.005, 0.995, 0.0997, 0], [0.095, -0.0997, 0.99, 0], [1, 0, 1, 1]]
 PAPER_C = [[0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from obsynth import TimeVaryingDescriptorSystem
-from obsynth.models.sequences import MatrixSequence
-from obsynth.observers.recursive import Adaptation, RecursiveObserver
+from obsynth.observers.recursive.observer import Adaptation, RecursiveObserver
+from obsynth.plants.sequences import MatrixSequence
 
 
 def varying(**changes) -> TimeVaryingDescriptorSystem:

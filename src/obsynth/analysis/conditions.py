@@ -13,24 +13,10 @@ from obsynth.numerics.ranks import RankDecision
 class Condition:
     """One existence condition and whether the plant meets it.
 
-    Parameters
-    ----------
-    name : str
-        Short name, as in the paper where it has one.
-    claim : str
-        What must hold, in words.
-    holds : bool
-        The verdict.
-    value, bound : float
-        The deciding number and what it is compared with.
-    source : str
-        Paper and equation, or the finding it rests on.
-    detail : str
-        The evidence (singular-value gap, the eigenvalue) and, when it fails, what to do.
-    mode : complex or None
-        The eigenvalue or zero at which it fails.
-    signals : tuple of str
-        Names of the signals involved.
+    Fields: name: Short name, as in the paper where it has one; claim: What must hold, in words; holds: The verdict;
+    value, bound: The deciding number and what it is compared with; source: Paper and equation, or the finding it rests
+    on; detail: The evidence (singular-value gap, the eigenvalue) and, when it fails, what to do; mode: The eigenvalue
+    or zero at which it fails; signals: Names of the signals involved.
     """
 
     name: str
@@ -70,21 +56,7 @@ def require_all(conditions: Iterable[Condition]) -> None:
 def rank_condition(
     name: str, decision: RankDecision, remedy: str, *, source: str, signals: tuple[str, ...] = ()
 ) -> Condition:
-    """Return the condition that a rank is full.
-
-    Parameters
-    ----------
-    name : str
-        The rank in words or symbols.
-    decision : RankDecision
-        With what was expected, and the singular-value gap behind it.
-    remedy : str
-        What to do when it fails.
-    source : str
-        Paper and equation.
-    signals : tuple of str, optional
-        Names of the signals involved when it fails.
-    """
+    """Return the condition that a rank is full."""
     return Condition(
         name,
         f"{name} = {decision.expected}",

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from obsynth.models.dae import DAEModel
-from obsynth.models.dae_functions import DAEFunctions
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.newton import ScaledMatrix
+from obsynth.plants.dae.functions import DAEFunctions
+from obsynth.plants.dae.model import DAEModel
 
 #: A matrix of (7) whose condition is above this is singular: three digits are left of sixteen.
 SINGULAR_CONDITION = 1e13
@@ -23,14 +23,9 @@ NAMED_SHARE = 0.1
 class IndexReport:
     """Index of a DAE at one point.
 
-    Parameters
-    ----------
-    index : int
-        1, 2, 3, ...; 0 where the matrix of (7) is singular for every step.
-    conditions : tuple of float
-        Equilibrated condition numbers of (7) at the shortened steps.
-    equations, states : tuple of str
-        Those that are involved where the index is not 1.
+    Fields: index: 1, 2, 3, ...; 0 where the matrix of (7) is singular for every step; conditions: Equilibrated
+    condition numbers of (7) at the shortened steps; equations, states: Those that are involved where the index is not
+    1.
     """
 
     index: int
@@ -45,19 +40,7 @@ def index_report(
 ) -> IndexReport:  # fmt: skip
     """Find the index of a model: the condition of (7) grows by ``10^(index - 1)`` when the step falls to a tenth.
 
-    Parameters
-    ----------
-    model : DAEModel
-        The model.
-    dt : float
-        Seconds: the step from which shorter ones are taken.
-    x, u, theta : FloatArray, optional
-        The point ``(nx,)``, ``(nu,)``, ``(nq,)``; nominal values by default.
-
-    Returns
-    -------
-    IndexReport
-        With the equations and states of the direction in which (7) becomes singular.
+    Shapes: ``x (nx,)``, ``u (nu,)``, ``theta (nq,)``.
     """
     x = model.nominal_state if x is None else x
     u = model.nominal_input if u is None else u
@@ -80,12 +63,7 @@ def index_report(
 def involved(model: DAEModel, matrix: FloatArray) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return equations and states of the least singular direction.
 
-    Parameters
-    ----------
-    model : DAEModel
-        The model.
-    matrix : FloatArray
-        The equilibrated matrix of (7) ``(stages * nx, stages * nx)``.
+    Shapes: ``matrix (stages * nx, stages * nx)``.
     """
     if not np.isfinite(matrix).all():
         bad = [i % model.nx for i, row in enumerate(matrix) if not np.isfinite(row).all()]

@@ -22,12 +22,7 @@ def system_zeros(E: FloatArray, A: FloatArray, *, nx: int) -> FiniteZeros:
     shows with ``z^-k``.  A candidate there counts only when the pencil is singular to rounding in units that suit
     its size.
 
-    Parameters
-    ----------
-    E, A : FloatArray
-        ``(nx + ny, nx + nu)``, the pencil ``[A - z E, B; C, D]``.
-    nx : int
-        Number of states: the leading columns.
+    Shapes: ``E (nx + ny, nx + nu)``, ``A (nx + ny, nx + nu)``.
     """
     found = finite_zeros(E, A, to_the_end=False)
     if not found.values.size:
@@ -66,14 +61,7 @@ def equilibrated_at(E: FloatArray, A: FloatArray, value: complex, *, nx: int) ->
 
     Beside a large ``z E`` the inputs and outputs would vanish: the states are measured in the units that ``z x`` has.
 
-    Parameters
-    ----------
-    E, A : FloatArray
-        ``(nx + ny, nx + nu)``.
-    value : complex
-        The point; within the unit circle this is `equilibrate_pencil`.
-    nx : int
-        Number of states: the leading columns.
+    Shapes: ``E (nx + ny, nx + nu)``, ``A (nx + ny, nx + nu)``.
     """
     size = float(power_of_two_below(np.array(max(1.0, abs(value)))))
     columns = np.where(np.arange(E.shape[1]) < nx, 1.0 / size, 1.0)

@@ -15,11 +15,11 @@ from itertools import pairwise
 
 import numpy as np
 
-from obsynth.models.descriptor import DescriptorSystem
-from obsynth.models.exosystems import Exosystem
 from obsynth.numerics.arrays import ComplexArray, FloatArray, read_only
 from obsynth.numerics.log_balance import LogBalance
 from obsynth.numerics.ranks import RANK_TOLERANCE
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.exosystems import Exosystem
 
 #: Weight of inputs and outputs beside equations and states, which they scale only where A and E leave that open.
 SIGNALS_WEIGHT = 1e-3
@@ -29,15 +29,10 @@ SIGNALS_WEIGHT = 1e-3
 class PlantUnits:
     """Factors between a plant as given and the scaled one.
 
-    Parameters
-    ----------
-    time : float, seconds
-        The unit of time: tau, or the sample time.
-    equations, states, outputs, faults, disturbances, model : FloatArray
-        ``(nx,)``, ``(nx,)``, ``(ny,)``, ``(nf,)``, ``(nd,)``, ``(nw,)``: equations and outputs are multiplied by
-        theirs; a state, fault, disturbance or state of the fault model is its factor times the scaled one.
-    discrete : bool
-        Whether the plant is sampled: its matrices have no unit of time then.
+    Fields: time: The unit of time: tau, or the sample time; equations, states, outputs, faults, disturbances, model:
+    ``(nx,)``, ``(nx,)``, ``(ny,)``, ``(nf,)``, ``(nd,)``, ``(nw,)``: equations and outputs are multiplied by theirs; a
+    state, fault, disturbance or state of the fault model is its factor times the scaled one; discrete: Whether the
+    plant is sampled: its matrices have no unit of time then.
     """
 
     time: float

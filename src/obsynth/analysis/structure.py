@@ -10,49 +10,27 @@ from types import MappingProxyType
 import numpy as np
 
 from obsynth.analysis.zeros import are_outside
-from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.pencils import FiniteZeros, finite_zeros, pencil_structure
 from obsynth.numerics.ranks import RankDecision, decide_rank
 from obsynth.numerics.scaling import equilibrate_pencil
+from obsynth.plants.descriptor import DescriptorSystem
 
 
 @dataclass(frozen=True, eq=False)
 class Structure:
     """What kind of plant this is.
 
-    Parameters
-    ----------
-    regular : bool
-        ``det (A - z E)`` is not identically zero: inputs and initial state determine the trajectory.
-    index : int or None
-        Size of the largest block at infinity, 0 for nonsingular ``E``; None when not regular.
-    finite_eigenvalues : ComplexArray
-        ``(k,)``, finite zeros of ``A - z E``.
-    infinite_block_sizes : tuple of int
-        Sizes of the blocks at infinity, largest first.
-    impulse_free : bool
-        Regular with index at most 1 (causal, for a sampled plant).
-    stable : bool
-        Regular, and every finite eigenvalue is strictly inside the stability region.
-    admissible : bool
-        Regular, impulse-free and stable.
-    observability_normal_rank : int
-        Rank of ``[A - z E; C]`` at almost every ``z``; below ``nx`` the plant hides a whole trajectory.
-    unobservable_modes : tuple of complex
-        Points where ``[A - z E; C]`` loses rank.
-    undetectable_modes : tuple of complex
-        Those of them on or outside the boundary of stability.
-    finitely_observable, detectable : bool
-        No unobservable, or no undetectable, mode (and full normal rank).
-    impulse_observable : bool
-        ``rank [E A; 0 E; 0 C] = nx + rank E``.
-    causally_observable : bool
-        ``rank [E; C] = nx``.
-    rank_of_E : RankDecision
-        The number of dynamic states.
-    decisions : mapping of str to RankDecision
-        Every rank decided on the way, by name, read-only.
+    Fields: regular: ``det (A - z E)`` is not identically zero: inputs and initial state determine the trajectory;
+    index: Size of the largest block at infinity, 0 for nonsingular ``E``; None when not regular; finite_eigenvalues:
+    ``(k,)``, finite zeros of ``A - z E``; infinite_block_sizes: Sizes of the blocks at infinity, largest first;
+    impulse_free: Regular with index at most 1 (causal, for a sampled plant); stable: Regular, and every finite
+    eigenvalue is strictly inside the stability region; admissible: Regular, impulse-free and stable;
+    observability_normal_rank: Rank of ``[A - z E; C]`` at almost every ``z``; below ``nx`` the plant hides a whole
+    trajectory; unobservable_modes: Points where ``[A - z E; C]`` loses rank; undetectable_modes: Those of them on or
+    outside the boundary of stability; finitely_observable, detectable: No unobservable, or no undetectable, mode (and
+    full normal rank); impulse_observable: ``rank [E A; 0 E; 0 C] = nx + rank E``; causally_observable: ``rank [E; C] =
+    nx``; rank_of_E: The number of dynamic states; decisions: Every rank decided on the way, by name, read-only.
     """
 
     regular: bool

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.errors import SpecError
-from obsynth.models.descriptor import DescriptorSystem
-from obsynth.models.time_varying import TimeVaryingDescriptorSystem
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import RankDecision, decide_rank
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 
 #: Steps that are looked at where the plant has no horizon.
 STEPS_WITHOUT_HORIZON = 1000
@@ -25,12 +25,8 @@ IntArray: TypeAlias = NDArray[np.intp]
 class StepBlocks(NamedTuple):
     """The matrices of one step as a filter uses them, without noise and inputs.
 
-    Parameters
-    ----------
-    E, A, Phi : FloatArray
-        ``(rows, nx)``, ``(rows, nx)`` and ``(rows, nq)``: the equations that lead to x(k + 1).
-    C, Psi : FloatArray
-        ``(outputs, nx)`` and ``(outputs, nq)``: with early constraints the algebraic equations of step k + 1 too.
+    Fields: E, A, Phi: ``(rows, nx)``, ``(rows, nx)`` and ``(rows, nq)``: the equations that lead to x(k + 1); C, Psi:
+    ``(outputs, nx)`` and ``(outputs, nq)``: with early constraints the algebraic equations of step k + 1 too.
     """
 
     E: FloatArray
@@ -41,17 +37,7 @@ class StepBlocks(NamedTuple):
 
 
 def step_blocks(plant: TimeVaryingDescriptorSystem, k: int, late: IntArray) -> StepBlocks:
-    """Return the matrices of the step from k to k + 1.
-
-    Parameters
-    ----------
-    plant : TimeVaryingDescriptorSystem
-        The plant.
-    k : int
-        Time index.
-    late : IntArray
-        Equations that are used one step early, see `algebraic_rows`; empty for none.
-    """
+    """Return the matrices of the step from k to k + 1."""
     E, A, C = plant.E.at(k + 1), plant.A.at(k), plant.C.at(k + 1)
     Phi, Psi = plant.Phi.at(k), plant.Psi.at(k)
     if not late.size:
@@ -69,22 +55,10 @@ class HorizonRanks:
 
     With early constraints H_k holds them among the outputs.
 
-    Parameters
-    ----------
-    steps : int
-        How many steps were looked at.
-    worst : RankDecision
-        Of the H_k with the lowest rank, or the smallest singular values.
-    worst_k : int
-        Where that is.
-    condition : float
-        The largest condition number of H_k, as given (the units of equations and outputs matter).
-    condition_k : int
-        Where that is.
-    directions : int
-        The least ``rank E_k + ny - nx``, early constraints being outputs.
-    directions_k : int
-        Where that is.
+    Fields: steps: How many steps were looked at; worst: Of the H_k with the lowest rank, or the smallest singular
+    values; worst_k: Where that is; condition: The largest condition number of H_k, as given (the units of equations and
+    outputs matter); condition_k: Where that is; directions: The least ``rank E_k + ny - nx``, early constraints being
+    outputs; directions_k: Where that is.
     """
 
     steps: int
@@ -97,29 +71,13 @@ class HorizonRanks:
 
 
 def early_rows(plant: TimeVaryingDescriptorSystem, *, early: bool) -> IntArray:
-    """Return the equations that are used one step early: the algebraic ones, or none where this is not asked for.
-
-    Parameters
-    ----------
-    plant : TimeVaryingDescriptorSystem
-        The plant.
-    early : bool
-        Whether it is.
-    """
+    """Return the equations that are used one step early: the algebraic ones, or none where this is not asked for."""
     steps = plant.horizon or STEPS_WITHOUT_HORIZON
     return algebraic_rows(plant, steps) if early else np.zeros(0, dtype=np.intp)
 
 
 def horizon_ranks(plant: TimeVaryingDescriptorSystem, *, early: bool = False) -> HorizonRanks:
-    """Return rank and condition of H_k along the horizon.
-
-    Parameters
-    ----------
-    plant : TimeVaryingDescriptorSystem
-        The plant.
-    early : bool, optional
-        Whether the algebraic equations are used one step early.
-    """
+    """Return rank and condition of H_k along the horizon."""
     late = early_rows(plant, early=early)
     steps = plant.horizon or STEPS_WITHOUT_HORIZON
     if plant.E.is_constant and plant.C.is_constant and (plant.A.is_constant or not late.size):
@@ -148,18 +106,7 @@ def horizon_ranks(plant: TimeVaryingDescriptorSystem, *, early: bool = False) ->
 
 
 def as_time_varying(plant: DescriptorSystem | TimeVaryingDescriptorSystem) -> TimeVaryingDescriptorSystem:
-    """Return a plant as the recursive methods take it.
-
-    Parameters
-    ----------
-    plant : DescriptorSystem or TimeVaryingDescriptorSystem
-        Any plant.
-
-    Raises
-    ------
-    SpecError
-        It is no linear plant, continuous in time, or has feedthrough or disturbances.
-    """
+    """Return a plant as the recursive methods take it."""
     if isinstance(plant, TimeVaryingDescriptorSystem):
         return plant
     if not isinstance(plant, DescriptorSystem):
@@ -169,15 +116,7 @@ def as_time_varying(plant: DescriptorSystem | TimeVaryingDescriptorSystem) -> Ti
 
 
 def algebraic_rows(plant: TimeVaryingDescriptorSystem, steps: int) -> IntArray:
-    """Return the indexes of the equations in which x(k + 1) never appears, counted from zero.
-
-    Parameters
-    ----------
-    plant : TimeVaryingDescriptorSystem
-        The plant.
-    steps : int
-        How many steps are looked at.
-    """
+    """Return the indexes of the equations in which x(k + 1) never appears, counted from zero."""
     looked_at = 1 if plant.E.is_constant else steps
     zero = np.ones(plant.ne, dtype=bool)
     for k in range(1, looked_at + 1):

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.analysis.far_zeros import equilibrated_at, system_zeros
-from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.pencils import FiniteZeros
 from obsynth.numerics.ranks import (
@@ -24,6 +23,7 @@ from obsynth.numerics.ranks import (
     RankDecision,
 )
 from obsynth.numerics.scaling import EquilibratedPencil, equilibrate_pencil
+from obsynth.plants.descriptor import DescriptorSystem
 
 #: Points without meaning, tried as generic ones; the clearest of them is used.
 _GENERIC_POINTS = (0.7391, -1.3247, 1.9561, -0.4142)
@@ -35,14 +35,9 @@ _PATH_TO_BOUNDARY = (1.0, 0.75, 0.5, 0.25)
 class Zero:
     """An invariant zero and the direction that stays invisible there.
 
-    Parameters
-    ----------
-    value : complex
-        The point where the pencil loses rank.
-    state_direction, input_direction : ComplexArray
-        ``(nx,)`` and ``(nu,)``: together of unit norm and in the null space of the pencil at ``value``.
-    input_share : float
-        Size of the input part when the pencil is equilibrated, so that units do not matter.
+    Fields: value: The point where the pencil loses rank; state_direction, input_direction: ``(nx,)`` and ``(nu,)``:
+    together of unit norm and in the null space of the pencil at ``value``; input_share: Size of the input part when the
+    pencil is equilibrated, so that units do not matter.
     """
 
     value: complex
@@ -60,21 +55,11 @@ class Zero:
 class FaultZeros:
     """What faults a plant can hide from its outputs.
 
-    Parameters
-    ----------
-    zeros : tuple of Zero
-        Invariant zeros of ``[A - z E, Bf; C, Df]``.
-    outside : tuple of Zero
-        Those on or outside the boundary of stability: such a fault grows or persists unseen.
-    normal_rank_full : bool
-        Whether the pencil has rank ``nx + nf`` at almost every ``z``; if not, some combination of
-        faults never shows at all.
-    hidden_direction : FloatArray or None
-        ``(nf,)``, the fault part of the never-visible direction at a generic point, where there is one.
-    hidden_faults : tuple of str
-        Names of the faults that take part in such directions.
-    decisions : tuple of RankDecision
-        Every rank decided on the way.
+    Fields: zeros: Invariant zeros of ``[A - z E, Bf; C, Df]``; outside: Those on or outside the boundary of stability:
+    such a fault grows or persists unseen; normal_rank_full: Whether the pencil has rank ``nx + nf`` at almost every
+    ``z``; if not, some combination of faults never shows at all; hidden_direction: ``(nf,)``, the fault part of the
+    never-visible direction at a generic point, where there is one; hidden_faults: Names of the faults that take part in
+    such directions; decisions: Every rank decided on the way.
     """
 
     zeros: tuple[Zero, ...]
@@ -103,14 +88,7 @@ def are_outside(E: FloatArray, A: FloatArray, zeros: FiniteZeros, dt: float) -> 
     zero on the boundary safely inside.  Near the boundary a zero therefore also counts as outside when
     the pencil itself is singular to working precision all the way to the nearest boundary point.
 
-    Parameters
-    ----------
-    E, A : FloatArray
-        ``(m, n)``, the pencil.
-    zeros : FiniteZeros
-        What `finite_zeros` found for it.
-    dt : float
-        Seconds between samples, 0 for continuous time.
+    Shapes: ``E (m, n)``, ``A (m, n)``.
     """
     pencil: EquilibratedPencil | None = None
     found: dict[complex, bool] = {}
@@ -131,39 +109,14 @@ def invariant_zeros(
 ) -> tuple[Zero, ...]:
     """Return the finite zeros of ``[A - z E, B; C, D]`` with multiplicity, each with its direction.
 
-    Parameters
-    ----------
-    E, A : FloatArray
-        ``(nx, nx)``.
-    B : FloatArray
-        ``(nx, nu)``.
-    C : FloatArray
-        ``(ny, nx)``.
-    D : FloatArray, optional
-        ``(ny, nu)``, zero by default.
-
-    Returns
-    -------
-    tuple of Zero
-        Where several directions share one zero, those with the smallest input part come first.
+    Shapes: ``E (nx, nx)``, ``A (nx, nx)``, ``B (nx, nu)``, ``C (ny, nx)``, ``D (ny, nu)``.
     """
     wide_e, wide_a = _system_pencil(E, A, B, C, D)
     return _with_directions(wide_e, wide_a, system_zeros(wide_e, wide_a, nx=E.shape[0]), nx=E.shape[0])
 
 
 def fault_zeros(plant: DescriptorSystem) -> FaultZeros:
-    """Return the invariant zeros from the faults of ``plant`` to its outputs.
-
-    Parameters
-    ----------
-    plant : DescriptorSystem
-        ``Bf (nx, nf)``, ``Df (ny, nf)``, either time; disturbances are left out.
-
-    Returns
-    -------
-    FaultZeros
-        The zeros, and whether every fault shows in the outputs at all.
-    """
+    """Return the invariant zeros from the faults of ``plant`` to its outputs."""
     e, a = _system_pencil(plant.E, plant.A, plant.Bf, plant.C, plant.Df)
     found = system_zeros(e, a, nx=plant.nx)
     zeros = _with_directions(e, a, found, nx=plant.nx)

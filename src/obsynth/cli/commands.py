@@ -19,24 +19,8 @@ if TYPE_CHECKING:
 
 
 def run_design(options: argparse.Namespace) -> int:
-    """Run ``design``: spec in, report and gain set out.
-
-    Parameters
-    ----------
-    options : argparse.Namespace
-        ``system``, ``output``, ``json``, ``quiet``.
-
-    Returns
-    -------
-    int
-        0; every failure is an error.
-
-    Raises
-    ------
-    ObsynthError
-        As its exit code says; nothing is written then.
-    """
-    from obsynth.results.serialise import design_as_dict
+    """Run ``design``: spec in, report and gain set out."""
+    from obsynth.results.gain_sets import design_as_dict
 
     with progress(quiet=options.quiet) as report_stage:
         report_stage(f"reading {options.system}")
@@ -60,7 +44,7 @@ def run_design(options: argparse.Namespace) -> int:
 
 def designed(spec: Spec, report_stage: Any) -> ObserverDesign:
     """Return the design that a spec asks for, proved; stages go to ``report_stage``."""
-    from obsynth.pipeline.designing import design
+    from obsynth.methods.designing import design
 
     recovery = None if spec.transformation is None else spec.transformation.recovery
     return design(
@@ -69,16 +53,10 @@ def designed(spec: Spec, report_stage: Any) -> ObserverDesign:
 
 
 def designed_or_loaded(spec: Spec, gains: Path | None, report_stage: Any) -> ObserverDesign:
-    """Return the design that a spec asks for, or a saved one of the same plant.
-
-    Raises
-    ------
-    SpecError
-        The gain set is malformed, or for a plant with other signals.
-    """
+    """Return the design that a spec asks for, or a saved one of the same plant."""
     if gains is None:
         return designed(spec, report_stage)
-    from obsynth.results.serialise import load
+    from obsynth.results.gain_sets import load
 
     design = load(gains)
     require_same_signals(design, gains, spec)
@@ -93,13 +71,7 @@ def require_same_signals(design: ObserverDesign, gains: Path, spec: Spec) -> Non
 
 
 def output_file(wanted: Path | None, spec: Spec, *, option: str = "--output") -> Path:
-    """Return where to write; refuse a hopeless place before any work is done.
-
-    Raises
-    ------
-    SpecError
-        The place is a folder, in no folder, or the spec itself.
-    """
+    """Return where to write; refuse a hopeless place before any work is done."""
     target = wanted if wanted is not None else Path(f"{spec.name}.gains.json")
     if target.is_dir():
         raise SpecError(f"{target} is a folder: give the name of a file to {option}.", path=str(target))
@@ -111,29 +83,13 @@ def output_file(wanted: Path | None, spec: Spec, *, option: str = "--output") ->
 
 
 def run_check(options: argparse.Namespace) -> int:
-    """Run ``check``: structure, and the existence conditions of every method.
-
-    Parameters
-    ----------
-    options : argparse.Namespace
-        ``system``, ``json``.
-
-    Returns
-    -------
-    int
-        0 if the conditions of the spec's own method hold, else 3.
-
-    Raises
-    ------
-    ObsynthError
-        The spec is malformed, or its plant cannot be transformed as asked.
-    """
+    """Run ``check``: structure, and the existence conditions of every method."""
     from obsynth.spec import load_spec
 
     spec = load_spec(options.system)
     from obsynth.analysis.structure import analyse_structure
-    from obsynth.models.descriptor import DescriptorSystem
-    from obsynth.pipeline.designing import check
+    from obsynth.methods.designing import check
+    from obsynth.plants.descriptor import DescriptorSystem
 
     # A pencil, its eigenvalues and its index are those of one matrix pair: a plant that changes with k has none.
     structures = {}
@@ -172,25 +128,9 @@ def _structure_as_dict(structure: Structure) -> dict[str, Any]:
 
 
 def run_verify(options: argparse.Namespace) -> int:
-    """Run ``verify``: recheck a saved gain set without a solver.
-
-    Parameters
-    ----------
-    options : argparse.Namespace
-        ``gains``, ``printed_digits``, ``json``.
-
-    Returns
-    -------
-    int
-        0 if every check holds, else 6.
-
-    Raises
-    ------
-    SpecError
-        The file is no gain set, or was changed.
-    """
-    from obsynth.results.serialise import load
-    from obsynth.verification import verify
+    """Run ``verify``: recheck a saved gain set without a solver."""
+    from obsynth.methods.verifying import verify
+    from obsynth.results.gain_sets import load
 
     design = load(options.gains)
     report = verify(design, printed_digits=options.printed_digits)

@@ -35,13 +35,7 @@ What disturbances and noise are to be expected comes from the scenario of --syst
 
 
 def add_data_verbs(verbs: Any) -> None:
-    """Add the parsers.
-
-    Parameters
-    ----------
-    verbs : object
-        The subparsers of ``obsynth``.
-    """
+    """Add the parsers."""
     run = verbs.add_parser(
         "run", help=_RUN, description=_RUN, epilog=_RUN_DETAILS, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -103,13 +97,7 @@ def add_data_verbs(verbs: Any) -> None:
 
 
 def add_monitor_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add what a monitor is made of.
-
-    Parameters
-    ----------
-    parser : argparse.ArgumentParser
-        Of ``run`` or ``evaluate``.
-    """
+    """Add what a monitor is made of."""
     group = parser.add_argument_group("monitor")
     group.add_argument("--monitor", metavar="KIND", help="watch the residual (or the parameters) by a threshold")
     group.add_argument(

@@ -15,32 +15,15 @@ from obsynth.errors import SpecError, VerificationError
 
 if TYPE_CHECKING:
     from obsynth.data.run import DataRun
-    from obsynth.evaluation.online import OnlineMonitor
+    from obsynth.experiments.monitors.online import OnlineMonitor
     from obsynth.results.design import ObserverDesign
 
 STREAM = "-"
 
 
 def run_run(options: argparse.Namespace) -> int:
-    """Run ``run``: gain set and data in, estimates out.
-
-    Parameters
-    ----------
-    options : argparse.Namespace
-        ``gains``, ``data``, ``out``, ``map``, ``scale``, ``threshold``, ``monitor`` and its options, ``system``,
-        ``gap``, ``warm_up``, ``state``, ``json``, ``quiet``.
-
-    Returns
-    -------
-    int
-        0; every failure is an error.
-
-    Raises
-    ------
-    SpecError
-        The gain set, the data or an option is malformed; no file is written then.
-    """
-    from obsynth.results.serialise import load
+    """Run ``run``: gain set and data in, estimates out."""
+    from obsynth.results.gain_sets import load
 
     out = _target(options)
     if options.json and out is sys.stdout:
@@ -74,25 +57,9 @@ def run_run(options: argparse.Namespace) -> int:
 
 
 def run_export(options: argparse.Namespace) -> int:
-    """Run ``export``: gain set in, file for another program out.
-
-    Parameters
-    ----------
-    options : argparse.Namespace
-        ``gains``, ``to``, ``sample_time``, ``json``.
-
-    Returns
-    -------
-    int
-        0; every failure is an error.
-
-    Raises
-    ------
-    SpecError
-        The gain set is malformed or recursive, or the file cannot be written.
-    """
+    """Run ``export``: gain set in, file for another program out."""
     from obsynth.exporting.files import export
-    from obsynth.results.serialise import load
+    from obsynth.results.gain_sets import load
 
     design = load(options.gains)
     files = export(design, options.to, sample_time=options.sample_time)
@@ -104,31 +71,15 @@ def run_export(options: argparse.Namespace) -> int:
 
 
 def run_report(options: argparse.Namespace) -> int:
-    """Run ``report``: gain set in, verified again, one HTML page out.
-
-    Parameters
-    ----------
-    options : argparse.Namespace
-        ``gains``, ``out``, ``system``, ``json``.
-
-    Returns
-    -------
-    int
-        0 if every check holds, else 6; the page is written in either case, and says so.
-
-    Raises
-    ------
-    SpecError
-        The gain set or the spec is malformed, the scenario does not fit the plant, or the page cannot be written.
-    """
-    from obsynth.results.serialise import load
-    from obsynth.verification import verify
+    """Run ``report``: gain set in, verified again, one HTML page out."""
+    from obsynth.methods.verifying import verify
+    from obsynth.results.gain_sets import load
 
     if options.out.resolve() == options.gains.resolve():
         raise SpecError(f"--out and --gains are the same file {options.out}: give another one.", path=str(options.out))
     design = load(options.gains)
     report = verify(design)
-    from obsynth.cli.simulating import required_scenario
+    from obsynth.cli.simulate import required_scenario
     from obsynth.report.page import html_report
     from obsynth.spec import load_spec
 
@@ -159,13 +110,7 @@ def _target(options: argparse.Namespace) -> Path | TextIO:
 
 
 def numbers_of(pairs: list[tuple[str, str]]) -> Mapping[str, float]:
-    """Return values by name, from arguments of the form NAME=VALUE.
-
-    Raises
-    ------
-    SpecError
-        A value is no number.
-    """
+    """Return values by name, from arguments of the form NAME=VALUE."""
     found = {}
     for name, text in pairs:
         try:
@@ -184,12 +129,12 @@ def _monitor(design: ObserverDesign, options: argparse.Namespace) -> OnlineMonit
             flag = f"--{asked[0].replace('_', '-')}"
             raise SpecError(f"{flag} is for a monitor: say which one by --monitor.", path=flag)
         return None
-    from obsynth.evaluation.making_online import online_monitor
+    from obsynth.experiments.monitors.online_monitor import online_monitor
 
     scenario = None
     if options.system is not None:
         from obsynth.cli.commands import require_same_signals
-        from obsynth.cli.simulating import required_scenario
+        from obsynth.cli.simulate import required_scenario
         from obsynth.spec import load_spec
 
         spec = load_spec(options.system)
@@ -239,13 +184,7 @@ def _rows_done(data: str, *, quiet: bool) -> Iterator[Callable[[int], None] | No
 
 
 def rows_in(path: Path) -> int | None:
-    """Return how many rows a file of data has, about; `None` where that cannot be told without reading it whole.
-
-    Parameters
-    ----------
-    path : Path
-        CSV or Parquet.
-    """
+    """Return how many rows a file of data has, about; `None` where that cannot be told without reading it whole."""
     try:
         if path.suffix.lower() == ".parquet":
             import pyarrow.parquet

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from obsynth import __version__
 from obsynth.cli.data_arguments import add_data_verbs
-from obsynth.cli.evaluating import add_evaluate_verb
+from obsynth.cli.evaluate import add_evaluate_verb
 from obsynth.cli.output import print_error, print_json
 from obsynth.errors import ObsynthError
 
@@ -29,34 +29,12 @@ exit codes:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run ``obsynth``.
-
-    Parameters
-    ----------
-    arguments : sequence of str, optional
-        The command line without the program's name; that of the process by default.
-
-    Returns
-    -------
-    int
-        The exit code.
-    """
+    """Run ``obsynth``."""
     return _run(_parser(), arguments)
 
 
 def design_command(arguments: Sequence[str] | None = None) -> int:
-    """Run ``design``, which is ``obsynth design``.
-
-    Parameters
-    ----------
-    arguments : sequence of str, optional
-        The command line without the program's name; that of the process by default.
-
-    Returns
-    -------
-    int
-        The exit code.
-    """
+    """Run ``design``, which is ``obsynth design``."""
     parser = argparse.ArgumentParser(
         prog="design", description=_DESIGN, epilog=_EXIT_CODES, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -139,14 +117,14 @@ def _digits(text: str) -> int:
 
 
 def _verb(name: str) -> Callable[[argparse.Namespace], int]:
-    from obsynth.cli import commands, data_commands, evaluating, simulating
+    from obsynth.cli import commands, data_commands, evaluate, simulate
 
     return {
         "design": commands.run_design,
         "check": commands.run_check,
         "verify": commands.run_verify,
-        "simulate": simulating.run_simulate,
-        "evaluate": evaluating.run_evaluate,
+        "simulate": simulate.run_simulate,
+        "evaluate": evaluate.run_evaluate,
         "run": data_commands.run_run,
         "export": data_commands.run_export,
         "report": data_commands.run_report,

@@ -28,7 +28,7 @@ _TITLES = {
 
 def print_json(data: Any, *, is_plain: bool = False) -> None:
     """Print ``data`` as one JSON document on stdout; arrays and special floats as in gain sets."""
-    from obsynth.results.serialise import plain
+    from obsynth.results.gain_sets import plain
 
     print(json.dumps(data if is_plain else plain(data), indent=1, allow_nan=False))
 
@@ -61,18 +61,7 @@ def stdout_console() -> Console:
 
 @contextmanager
 def progress(*, quiet: bool) -> Iterator[Callable[[str], None]]:
-    """Show the stages of a long run on stderr.
-
-    Parameters
-    ----------
-    quiet : bool
-        Show nothing.
-
-    Yields
-    ------
-    callable
-        Takes the text of a stage.  On a terminal a line that disappears at the end; else one line each.
-    """
+    """Show the stages of a long run on stderr."""
     if quiet:
         yield lambda text: None
         return

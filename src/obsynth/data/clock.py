@@ -15,12 +15,8 @@ GAP_FACTOR = 10.0
 class Clock:
     """Checks one time stamp after the other.
 
-    Parameters
-    ----------
-    dt : float
-        Seconds between samples of the design; 0 for continuous time.
-    gap : float or None
-        Continuous time: intervals longer than this are gaps, in seconds.
+    Fields: dt: Seconds between samples of the design; 0 for continuous time; gap: Continuous time: intervals longer
+    than this are gaps, in seconds.
     """
 
     def __init__(self, dt: float, gap: float | None) -> None:
@@ -29,25 +25,7 @@ class Clock:
         self.longest = 0.0
 
     def advance(self, time: float, row: int) -> tuple[float, int]:
-        """Take the stamp of the next row.
-
-        Parameters
-        ----------
-        time : float
-            Seconds.
-        row : int
-            Number of the row, for errors; the first row of data is 1.
-
-        Returns
-        -------
-        tuple
-            Seconds since the row before, and how many rows are missing in between (0 where there is no gap).
-
-        Raises
-        ------
-        SpecError
-            The stamp is not finite, repeats or decreases, or does not fit dt.
-        """
+        """Take the stamp of the next row."""
         if not math.isfinite(time):
             raise SpecError(f"Row {row} has no time: each row needs a finite number of seconds.", path=f"row {row}")
         last = self.last
@@ -88,13 +66,7 @@ class Clock:
 
 
 def interval(before: float, after: float) -> float:
-    """Return ``after - before``, rounded to what the two stamps can resolve, so that equal intervals are equal.
-
-    Parameters
-    ----------
-    before, after : float
-        Stamps in seconds.
-    """
+    """Return ``after - before``, rounded to what the two stamps can resolve, so that equal intervals are equal."""
     resolution = 2.0 * max(math.ulp(before), math.ulp(after))
     digits = -math.ceil(math.log10(resolution))
     rounded = round(after - before, digits)

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.transformations import StateRecovery
-from obsynth.data.engine import DECIDING, Engine, Row, delayed
-from obsynth.data.operating import FirstSecond
+from obsynth.data.log_estimator import DECIDING, Engine, Row, delayed
+from obsynth.data.operating_point import OperatingPointCheck
 from obsynth.data.recovered import LATE, RecoveredStates
 from obsynth.data.signals import TIME, Signals
 from obsynth.errors import SpecError
-from obsynth.evaluation.online import OnlineMonitor
+from obsynth.experiments.monitors.online import OnlineMonitor
 from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray
 
@@ -22,23 +22,8 @@ from obsynth.numerics.arrays import FloatArray
 class Job:
     """Rows of data to rows of output.
 
-    Parameters
-    ----------
-    engine : Engine
-        What is run.
-    signals : Signals
-        Which columns it reads.
-    recovery : StateRecovery or None
-        The way back to the states of the plant as written.
-    thresholds : mapping
-        Level by column.
-    monitor : OnlineMonitor or None
-        What watches residuals or parameters.
-
-    Raises
-    ------
-    SpecError
-        A threshold is for no column, or not positive; or the monitor is for another design.
+    Fields: engine: What is run; signals: Which columns it reads; recovery: The way back to the states of the plant as
+    written; thresholds: Level by column; monitor: What watches residuals or parameters.
     """
 
     def __init__(
@@ -74,16 +59,13 @@ class Job:
             *(("statistic", "threshold") if monitor is not None else ()),
             *(("alarm",) if thresholds or monitor is not None else ()),
         )  # fmt: skip
-        self.first, self.rows = FirstSecond(signals), 0
+        self.first, self.rows = OperatingPointCheck(signals), 0
         self.statuses, self.alarms, self.isolated = Counter[str](), dict[str, float](), ""
 
     def take(self, chunk: FloatArray) -> list[list[Any]]:
         """Take rows ``[time, u, y]`` as read; return rows of output.
 
-        Parameters
-        ----------
-        chunk : FloatArray
-            ``(rows, 1 + nu + ny)``.
+        Shapes: ``chunk (rows, 1 + nu + ny)``.
         """
         times: list[float] = chunk[:, 0].tolist()
         nu = len(self.engine.input_names)
@@ -128,7 +110,7 @@ class Job:
         return [*cells, "; ".join(names)]
 
     def as_dict(self) -> dict[str, Any]:
-        """Return what is carried from row to row, as data."""
+        """Return the state that goes from row to row, as data."""
         return {
             "observer": self.engine.as_dict(),
             "recovered": None if self.recovered is None else self.recovered.as_dict(),
@@ -136,18 +118,7 @@ class Job:
         }
 
     def resume(self, data: dict[str, Any]) -> None:
-        """Go on from what `as_dict` returned.
-
-        Parameters
-        ----------
-        data : dict
-            From a run with the same gain set and options.
-
-        Raises
-        ------
-        SpecError
-            The options differ.
-        """
+        """Go on from what `as_dict` returned."""
         if (data["monitor"] is None) != (self.monitor is None):
             raise SpecError("The saved state is of a run with another monitor: use the same options.", path="state")
         self.engine.resume(data["observer"])

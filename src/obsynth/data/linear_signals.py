@@ -7,18 +7,10 @@ from collections.abc import Mapping
 from obsynth.results.design import ObserverDesign
 
 
-class LinearSignals:
+class LinearSignalNames:
     """Names, delays, operating point and scales of a linear design.
 
-    Parameters
-    ----------
-    design : ObserverDesign
-        Linear.
-
-    Raises
-    ------
-    SpecError
-        It is not.
+    Fields: design: Linear.
     """
 
     def __init__(self, design: ObserverDesign) -> None:

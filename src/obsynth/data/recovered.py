@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.transformations import StateRecovery
-from obsynth.data.engine import Engine, Row
+from obsynth.data.log_estimator import Engine, Row
 from obsynth.numerics.arrays import FloatArray
 
 #: Its column says of which time the recovered states are.
@@ -19,12 +19,7 @@ LATE = "recovered states"
 class RecoveredStates:
     """Estimates of the states that a transformation took away, all of one moment.
 
-    Parameters
-    ----------
-    recovery : StateRecovery
-        Of the design.
-    engine : Engine
-        Whose estimates are used.
+    Fields: recovery: Of the design; engine: Whose estimates are used.
 
     Notes
     -----
@@ -56,15 +51,7 @@ class RecoveredStates:
 
     @classmethod
     def of(cls, recovery: StateRecovery | None, engine: Engine) -> RecoveredStates | None:
-        """Return the recovery of a design; `None` where there is nothing to recover.
-
-        Parameters
-        ----------
-        recovery : StateRecovery or None
-            Of the design.
-        engine : Engine
-            Whose estimates are used.
-        """
+        """Return the recovery of a design; `None` where there is nothing to recover."""
         if recovery is None or recovery.from_state.shape[1] != len(engine.state_names):
             return None
         found = cls(recovery, engine)
@@ -73,12 +60,7 @@ class RecoveredStates:
     def take(self, row: Row, inputs: FloatArray) -> FloatArray:
         """Return the recovered states, deviations; NaN where they are not known.
 
-        Parameters
-        ----------
-        row : Row
-            Estimates.
-        inputs : FloatArray
-            ``(nu,)``, deviations; the last known ones stand for those that are missing.
+        Shapes: ``inputs (nu,)``.
         """
         if row.skipped:
             self._rows.clear()
@@ -92,17 +74,11 @@ class RecoveredStates:
             return np.asarray(self._map @ estimates + self._inputs @ rows[self.delay, len(self._columns) :])
 
     def as_dict(self) -> dict[str, Any]:
-        """Return what is carried from row to row, as data."""
+        """Return the state that goes from row to row, as data."""
         return {"rows": list(self._rows), "known": self._known}
 
     def resume(self, data: Mapping[str, Any]) -> None:
-        """Go on from what `as_dict` returned.
-
-        Parameters
-        ----------
-        data : mapping
-            From a run with the same gain set.
-        """
+        """Go on from what `as_dict` returned."""
         self._rows.clear()
         self._rows.extend(data["rows"])
         self._known = data["known"]

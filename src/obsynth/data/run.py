@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 from obsynth.data.job import Job
+from obsynth.data.saved_state import digest_of_gains, resume_state, save_state
 from obsynth.data.signals import Signals
 from obsynth.data.sinks import FrameSink, Sink, TextSink, file_sink
 from obsynth.data.sources import Data, chunks
-from obsynth.data.starting import engine_of
-from obsynth.data.states import digest_of_gains, resume_state, save_state
+from obsynth.data.start import engine_of
 from obsynth.errors import SpecError
-from obsynth.evaluation.online import OnlineMonitor
+from obsynth.experiments.monitors.online import OnlineMonitor
 from obsynth.numerics.arguments import require_kind, require_mapping
 from obsynth.results.design import ObserverDesign
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from obsynth.data.engine import Engine
+from obsynth.data.log_estimator import Engine
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray, read_only
@@ -20,16 +20,9 @@ TIME = "time"
 class Signals:
     """Which column holds which measured signal, and how its values become deviations.
 
-    Parameters
-    ----------
-    names : tuple of str
-        Signals: known inputs, then outputs.
-    columns : tuple of str
-        The columns that are read: time, then one for each signal.
-    scale, offset : FloatArray
-        ``(nu + ny,)``: deviation = scale times the value in the column, minus offset.
-    point : Mapping of str to float
-        The operating point.
+    Fields: names: Signals: known inputs, then outputs; columns: The columns that are read: time, then one for each
+    signal; scale, offset: ``(nu + ny,)``: deviation = scale times the value in the column, minus offset; point: The
+    operating point.
     """
 
     names: tuple[str, ...]
@@ -45,22 +38,7 @@ class Signals:
         columns: Mapping[str, str] | None,
         scales: Mapping[str, float] | None,
     ) -> Signals:
-        """Return the signals that a design in motion reads.
-
-        Parameters
-        ----------
-        engine : Engine
-            What is run, with its operating point.
-        columns : mapping or None
-            Column of a signal, or of ``time``, where the two names differ.
-        scales : mapping or None
-            Factor of a signal: the column's value times the factor is in the signal's unit; the plant's by default.
-
-        Raises
-        ------
-        SpecError
-            A key is no signal that is read, or a factor is not finite or zero.
-        """
+        """Return the signals that a running design reads."""
         names = engine.input_names + engine.output_names
         renamed, factors = dict(columns or {}), dict(scales or {})
         unknown = [name for name in renamed if name not in (TIME, *names)]
@@ -81,18 +59,7 @@ class Signals:
         )
 
     def positions(self, header: tuple[str, ...]) -> list[int]:
-        """Return where in a header each column is that is read.
-
-        Parameters
-        ----------
-        header : tuple of str
-            Names of the columns of the data.
-
-        Raises
-        ------
-        SpecError
-            Columns are missing, or stand there twice.
-        """
+        """Return where in a header each column is that is read."""
         missing = sorted({name for name in self.columns if name not in header})
         if missing:
             raise SpecError(

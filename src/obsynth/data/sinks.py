@@ -24,12 +24,7 @@ class Sink(Protocol):
 class TextSink:
     """CSV to a text stream, flushed after each call.
 
-    Parameters
-    ----------
-    stream : TextIO
-        Where to.
-    header : sequence of str
-        Names of the columns.
+    Fields: stream: Where to; header: Names of the columns.
     """
 
     def __init__(self, stream: TextIO, header: Sequence[str]) -> None:
@@ -46,10 +41,7 @@ class TextSink:
 class FrameSink:
     """Rows to a data frame.
 
-    Parameters
-    ----------
-    header : sequence of str
-        Names of the columns.
+    Fields: header: Names of the columns.
     """
 
     def __init__(self, header: Sequence[str]) -> None:
@@ -69,14 +61,7 @@ class FrameSink:
 class ParquetSink:
     """Rows to a Parquet file, one row group for each call.
 
-    Parameters
-    ----------
-    path : str
-        The file.
-    header : sequence of str
-        Names of the columns.
-    texts : set of str
-        The columns that hold text.
+    Fields: path: The file; header: Names of the columns; texts: The columns that hold text.
     """
 
     def __init__(self, path: str, header: Sequence[str], texts: set[str]) -> None:
@@ -101,22 +86,7 @@ class ParquetSink:
 
 @contextmanager
 def file_sink(path: Path, header: Sequence[str], texts: set[str]) -> Iterator[Sink]:
-    """Give a sink for a file that replaces ``path`` when all went well, and leaves nothing behind otherwise.
-
-    Parameters
-    ----------
-    path : Path
-        ``.csv`` or ``.parquet``.
-    header : sequence of str
-        Names of the columns.
-    texts : set of str
-        The columns that hold text.
-
-    Raises
-    ------
-    SpecError
-        The suffix is unknown, the folder does not exist, the path is a folder, or the system refuses.
-    """
+    """Give a sink for a file that replaces ``path`` when all went well, and leaves nothing behind otherwise."""
     check_suffix(path)
     with replacement_of(path) as (handle, temporary):
         if path.suffix.lower() == ".parquet":

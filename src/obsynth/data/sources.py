@@ -28,22 +28,7 @@ Data: TypeAlias = "str | Path | TextIO | pd.DataFrame"
 
 
 def chunks(data: Data, signals: Signals, rows: int) -> Iterator[FloatArray]:
-    """Yield ``(rows, 1 + nu + ny)``: time and signals, in order; NaN where a sample is missing.
-
-    Parameters
-    ----------
-    data : path, text stream or DataFrame
-        The data; a stream is CSV with a header, and comes one row at a time.
-    signals : Signals
-        Which columns to take.
-    rows : int
-        Rows that are read at a time from a file.
-
-    Raises
-    ------
-    SpecError
-        The file cannot be read, columns are missing, or a cell is no number.
-    """
+    """Yield ``(rows, 1 + nu + ny)``: time and signals, in order; NaN where a sample is missing."""
     if isinstance(data, str | Path):
         path = Path(data)
         check_suffix(path)

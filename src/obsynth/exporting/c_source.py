@@ -12,15 +12,7 @@ _NUMBERS_PER_LINE = 4
 
 
 def header_text(found: Realisation, prefix: str) -> str:
-    """Return the header.
-
-    Parameters
-    ----------
-    found : Realisation
-        Sampled.
-    prefix : str
-        Of every name.
-    """
+    """Return the header."""
     observer = found.observer
     guard = f"{prefix.upper()}_H"
     before, after = found.operating_point
@@ -46,17 +38,7 @@ def header_text(found: Realisation, prefix: str) -> str:
 
 
 def source_text(found: Realisation, prefix: str, header: str) -> str:
-    """Return the source.
-
-    Parameters
-    ----------
-    found : Realisation
-        Sampled.
-    prefix : str
-        Of every name.
-    header : str
-        Name of the header's file.
-    """
+    """Return the source."""
     observer = found.observer
     sizes = {"z": observer.order, "u": len(observer.input_names), "y": len(observer.output_names)}
     groups = (

@@ -15,13 +15,7 @@ _KEYWORDS = frozenset(
 
 
 def c_identifier(text: str) -> str:
-    """Return a C identifier made of ``text``; one that C reserves, or that begins with a digit, gets a prefix.
-
-    Parameters
-    ----------
-    text : str
-        Such as the stem of a file.
-    """
+    """Return a C identifier made of ``text``; one that C reserves, or that begins with a digit, gets a prefix."""
     name = re.sub(r"\W", "_", text, flags=re.ASCII)
     return name if re.match(r"[A-Za-z]", name) and name not in _KEYWORDS else f"obs_{name}"
 

@@ -1,7 +1,7 @@
 """The observer of a nonlinear DAE as C99: one header, one source, no allocation, no library but that of C.
 
 CasADi writes the equations; the loop of Newton around them, its damping and its homotopy are those of
-`obsynth.observers.dae_c_code`.
+`obsynth.observers.dae.c_code`.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ from pathlib import Path
 
 from obsynth.errors import SpecError
 from obsynth.exporting.c_words import c_identifier, comment, included, quoted
-from obsynth.models.dae import DAEModel
-from obsynth.observers.dae_c_code import observer_code
+from obsynth.observers.dae.c_code import observer_code
+from obsynth.plants.dae.model import DAEModel
 from obsynth.results.design import ObserverDesign
 from obsynth.results.files import write_atomically
-from obsynth.results.serialise import design_as_dict
+from obsynth.results.gain_sets import design_as_dict
 
 _STEP = r"""
 void PREFIX_reset(PREFIX_state *state)
@@ -51,23 +51,7 @@ NOTHING    failed = advance(state, INPUT, y, after, said);
 
 
 def write_dae_c(design: ObserverDesign, target: Path, sample_time: float | None) -> tuple[Path, ...]:
-    """Write source and header.
-
-    Parameters
-    ----------
-    design : ObserverDesign
-        Of a nonlinear plant.
-    target : Path
-        The source; the header stands beside it.
-    sample_time : float or None
-        Must be left out: the observer is sampled.
-
-    Raises
-    ------
-    SpecError
-        The model is made of Python functions, which have no digest; the suffix is not ``.c``; a sample time is given;
-        or a file cannot be written.
-    """
+    """Write source and header."""
     if target.suffix.lower() != ".c":
         raise SpecError(f"{target}: the observer of a nonlinear plant is no matrices; it is exported as C (.c).",
                         path=str(target))  # fmt: skip

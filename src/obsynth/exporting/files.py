@@ -13,7 +13,7 @@ from obsynth.exporting.c_words import c_identifier
 from obsynth.exporting.dae_c_source import write_dae_c
 from obsynth.exporting.realisation import Realisation
 from obsynth.numerics.arguments import require_kind
-from obsynth.observers.dae import DAEObserver
+from obsynth.observers.dae.observer import DAEObserver
 from obsynth.results.design import ObserverDesign
 from obsynth.results.files import write_atomically
 

@@ -8,16 +8,16 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.models.dae import DAEModel
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray
-from obsynth.observers.dae import DAEObserver
-from obsynth.observers.linear import LinearObserver
-from obsynth.observers.recursive import RecursiveObserver
-from obsynth.observers.sampling import sample_observer
-from obsynth.observers.steady import steady_observer
+from obsynth.observers.dae.observer import DAEObserver
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.linear.sampling import sample_observer
+from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.recursive.steady_state import steady_observer
+from obsynth.plants.dae.model import DAEModel
 from obsynth.results.design import ObserverDesign
-from obsynth.results.serialise import design_as_dict
+from obsynth.results.gain_sets import design_as_dict
 
 #: What a file says about the steady state of a recursion.
 STEADY = (
@@ -30,18 +30,9 @@ STEADY = (
 class Realisation:
     """The observer of a design, ready to be handed on.
 
-    Parameters
-    ----------
-    design : ObserverDesign
-        Linear, or recursive for a time-invariant plant.
-    observer : LinearObserver
-        Its observer, sampled if that was asked for, or the steady state of its recursion.
-    digest : str
-        sha256 of the gain set.
-    start : FloatArray
-        ``z(0)``.
-    note : str
-        What a reader must know; may be empty.
+    Fields: design: Linear, or recursive for a time-invariant plant; observer: Its observer, sampled if that was asked
+    for, or the steady state of its recursion; digest: sha256 of the gain set; start: ``z(0)``; note: What a reader must
+    know; may be empty.
     """
 
     design: ObserverDesign
@@ -52,23 +43,7 @@ class Realisation:
 
     @classmethod
     def of(cls, design: ObserverDesign, sample_time: float | None) -> Realisation:
-        """Return the realisation of a design.
-
-        Parameters
-        ----------
-        design : ObserverDesign
-            Linear, or recursive.
-        sample_time : float or None
-            Seconds; samples a continuous-time observer by a first-order hold.
-
-        Raises
-        ------
-        SpecError
-            The plant or its noise changes with k, the design is nonlinear, or the sample time is not positive or does
-            not fit a sampled design.
-        PreconditionError, SolverError
-            A recursive design has no stable steady state.
-        """
+        """Return the realisation of a design."""
         require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
         digest = str(design_as_dict(design)["sha256"])
         if isinstance(design.observer, RecursiveObserver):

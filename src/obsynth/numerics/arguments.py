@@ -71,43 +71,13 @@ def is_number(value: Any) -> bool:
 
 
 def require_kind(value: Any, kinds: type | tuple[type, ...], name: str, wanted: str) -> None:
-    """Raise `SpecError` unless an argument is of some kind.
-
-    Parameters
-    ----------
-    value : object
-        The argument.
-    kinds : type or tuple of type
-        What it may be.
-    name : str
-        Of the argument.
-    wanted : str
-        What to give, in words.
-
-    Raises
-    ------
-    SpecError
-        It is something else.
-    """
+    """Raise `SpecError` unless an argument is of some kind."""
     if not isinstance(value, kinds):
         raise SpecError(f"{name} is a {type(value).__name__}: give {wanted}.", path=name)
 
 
 def require_mapping(value: Any, name: str) -> None:
-    """Raise `SpecError` unless an optional argument is a mapping from names.
-
-    Parameters
-    ----------
-    value : object
-        The argument.
-    name : str
-        Of the argument.
-
-    Raises
-    ------
-    SpecError
-        It is something else.
-    """
+    """Raise `SpecError` unless an optional argument is a mapping from names."""
     if value is not None:
         require_kind(value, Mapping, name, "a mapping from names, such as {'speed': 1.0}")
 

@@ -26,15 +26,7 @@ SIGNATURE = f"int64({', '.join([VECTOR, MATRIX, *[STACK] * 3, *[MATRIX] * 4, STA
 
 
 def compiled(function: Function, signature: str | None = None) -> Function:
-    """Return a function compiled by numba, at its first call or, with a signature, at once.
-
-    Parameters
-    ----------
-    function : callable
-        Of numbers and arrays.
-    signature : str, optional
-        Its types.
-    """
+    """Return a function compiled by numba, at its first call or, with a signature, at once."""
     arguments = () if signature is None else (signature,)
     njit: Any = numba.njit
     try:
@@ -184,25 +176,8 @@ def square_root_steps(
     All arrays are of double precision, in C order, and writeable.  What does not change with k has one entry along its
     first axis.
 
-    Parameters
-    ----------
-    x, factor : FloatArray
-        ``(n,)`` and ``(n, n)``: estimate and square root of its covariance; overwritten by those after the last step.
-    moved : FloatArray
-        ``(1 or steps, n, rows)``: the transpose of ``rotation [A; 0]``, parity first.
-    known : FloatArray
-        ``(1 or steps, any, rows)``: the transpose of the rotated noise.
-    head : FloatArray
-        ``(1 or steps, n, n)``: R_H, upper triangular.
-    data : FloatArray
-        ``(steps, rows)``: rotated data, without what the state adds.
-    states, innovations : FloatArray
-        ``(steps, n)`` and ``(steps, rows - n)``: filled.
-    deviations : FloatArray
-        ``(steps, nx)``: filled; standard deviations of the first nx entries of the state.
-    covariances : FloatArray
-        ``(steps, n - nx, n - nx)``: filled; of the others.
-    share : float
-        `SUSPECT_PARITY`, an argument because numba's cache does not see it change.
+    Shapes: ``x (n,)``, ``factor (n, n)``, ``moved (1 or steps, n, rows)``, ``known (1 or steps, any, rows)``, ``head (1
+    or steps, n, n)``, ``data (steps, rows)``, ``states (steps, n)``, ``innovations (steps, rows - n)``, ``deviations
+    (steps, nx)``, ``covariances (steps, n - nx, n - nx)``.
     """
     return _compiled_steps(x, factor, moved, known, head, data, states, innovations, deviations, covariances, share)

@@ -14,14 +14,9 @@ from obsynth.numerics.norms import hinf_norm
 class ContinuousHinfNorm:
     """The H-infinity norm of a stable continuous-time system.
 
-    Parameters
-    ----------
-    value : float
-        Largest singular value found on the imaginary axis: a lower bound that is attained.
-    upper : float
-        Level that no singular value exceeds, as far as double precision can tell (computed, not proved).
-    frequency : float
-        Where the peak is, rad/s; infinite when it is the feedthrough.
+    Fields: value: Largest singular value found on the imaginary axis: a lower bound that is attained; upper: Level that
+    no singular value exceeds, as far as double precision can tell (computed, not proved); frequency: Where the peak is,
+    rad/s; infinite when it is the feedthrough.
     """
 
     value: float
@@ -44,15 +39,7 @@ def continuous_hinf_norm(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatAr
     The substitution ``s = w (z - 1) / (z + 1)`` takes the imaginary axis to the unit circle and keeps every gain, so
     the norm is that of a discrete-time system; w is the geometric mean of the moduli of the eigenvalues.
 
-    Parameters
-    ----------
-    a, b, c, d : FloatArray
-        ``(n, n)``, ``(n, m)``, ``(p, n)``, ``(p, m)``.
-
-    Returns
-    -------
-    ContinuousHinfNorm
-        Infinite when an eigenvalue of ``a`` does not have a negative real part, or when a number is not finite.
+    Shapes: ``a (n, n)``, ``b (n, m)``, ``c (p, n)``, ``d (p, m)``.
     """
     if b.shape[1] == 0 or c.shape[0] == 0:
         return ContinuousHinfNorm(0.0, 0.0, 0.0)

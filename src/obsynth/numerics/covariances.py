@@ -17,23 +17,6 @@ def covariance_factor(covariance: FloatArray, name: str) -> FloatArray:
     """Return ``F (n, n)`` with ``F F' = covariance``; zero variances and singular matrices are allowed.
 
     The factor is taken of the correlation matrix, so that variances of 1e-30 beside 1 keep all their digits.
-
-    Parameters
-    ----------
-    covariance : FloatArray
-        ``(n, n)``, symmetric and positive semidefinite.
-    name : str
-        For messages.
-
-    Returns
-    -------
-    FloatArray
-        Lower triangular where the correlation matrix is definite.
-
-    Raises
-    ------
-    SpecError
-        It is not square, not symmetric, or not positive semidefinite.
     """
     if covariance.ndim != 2 or covariance.shape[0] != covariance.shape[1]:
         raise SpecError(f"{name} has shape {covariance.shape}: a covariance must be square.", path=name)
@@ -72,12 +55,7 @@ def covariance_factor(covariance: FloatArray, name: str) -> FloatArray:
 def is_definite(covariance: FloatArray, factor: FloatArray) -> bool:
     """Return whether a covariance is positive definite, judged by its correlations so that units do not matter.
 
-    Parameters
-    ----------
-    covariance : FloatArray
-        ``(n, n)``.
-    factor : FloatArray
-        From `covariance_factor`.
+    Shapes: ``covariance (n, n)``.
     """
     variances = np.diag(covariance)
     if not np.all(variances > 0.0):

@@ -43,19 +43,7 @@ def doubled_riccati_solution(
 
     ``Y = A Y A' - (A Y H' + S) (W + H Y H')^-1 (A Y H' + S)' + Q``.
 
-    Parameters
-    ----------
-    a, h : FloatArray
-        ``(n, n)`` and ``(p, n)``.
-    process, weight, cross : FloatArray
-        Q ``(n, n)``, W ``(p, p)`` nonsingular, S ``(n, p)``.
-    possible : callable, optional
-        Called with the solutions over 2, 4, 8, ... steps from zero, which grow; false ends the attempt.
-
-    Returns
-    -------
-    FloatArray or None
-        Symmetric ``(n, n)``; ``None`` when the doubling breaks down, does not settle, or was ended.
+    Shapes: ``a (n, n)``, ``h (p, n)``, ``process (n, n)``, ``weight (p, p)``, ``cross (n, p)``.
 
     Notes
     -----
@@ -76,17 +64,7 @@ def continuous_riccati_solution(
 
     ``A Y + Y A' - Y C' R^-1 C Y + Q = 0``.
 
-    Parameters
-    ----------
-    a, c : FloatArray
-        ``(n, n)`` and ``(p, n)``.
-    process, measured : FloatArray
-        Q ``(n, n)`` semidefinite, R ``(p, p)`` definite.
-
-    Returns
-    -------
-    FloatArray or None
-        Symmetric ``(n, n)``; ``None`` when the doubling breaks down or does not settle.
+    Shapes: ``a (n, n)``, ``c (p, n)``, ``process (n, n)``, ``measured (p, p)``.
 
     Notes
     -----
@@ -175,12 +153,7 @@ def compared_gain(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, le
     residual is judged against what it is made of.  Over finitely many steps the gain is no larger, so that W > 0 fails
     there only if the norm is above the level.
 
-    Parameters
-    ----------
-    a, b, c, d : FloatArray
-        ``(n, n)``, ``(n, m)``, ``(p, n)``, ``(p, m)``, ``a`` Schur stable.
-    level : float
-        Positive.
+    Shapes: ``a (n, n)``, ``b (n, m)``, ``c (p, n)``, ``d (p, m)``.
     """
     process, cross = c.T @ c, c.T @ d
     gap = d.T @ d - level**2 * np.eye(b.shape[1])

@@ -57,14 +57,8 @@ def _as_it_is(operation: Callable[..., Any]) -> Callable[..., Any]:
 class Expression:
     """An expression that was parsed and can be evaluated.
 
-    Parameters
-    ----------
-    text : str
-        As written.
-    names : frozenset of str
-        The names whose values are needed.
-    rates : mapping of str to Expression, optional
-        What ``der(...)`` is taken of, by the name under which the value of the derivative is looked up.
+    Fields: text: As written; names: The names whose values are needed; rates: What ``der(...)`` is taken of, by the
+    name under which the value of the derivative is looked up.
     """
 
     text: str
@@ -83,15 +77,7 @@ class Expression:
             return self._evaluator(values, _as_it_is)
 
     def translated(self, values: Mapping[str, Any], translation: Translation) -> Any:
-        """Return the value on other things than numbers.
-
-        Parameters
-        ----------
-        values : mapping
-            By name, rates included.
-        translation : callable
-            From numpy's operation to the one for these values.
-        """
+        """Return the value on other things than numbers."""
         return self._evaluator(values, translation)
 
 
@@ -100,25 +86,7 @@ def _parsed(text: str, rates: bool) -> Expression:
 
 
 def parse_expression(text: str, *, rates: bool = False) -> Expression:
-    """Parse a text into an expression.
-
-    Parameters
-    ----------
-    text : str
-        For example ``"(k + 1) / (k + 0.5)"``.
-    rates : bool, optional
-        Whether ``der(...)`` is allowed.
-
-    Returns
-    -------
-    Expression
-        Ready to be evaluated for values of its names, numbers or arrays.
-
-    Raises
-    ------
-    SpecError
-        The text does not belong to the language; the message says where.
-    """
+    """Parse a text into an expression."""
     if len(text) > MAXIMUM_LENGTH:
         raise SpecError(f"An expression has {len(text)} characters: at most {MAXIMUM_LENGTH} are read.")
     parser = _Parser(text, rates=rates)

@@ -13,17 +13,7 @@ def first_order_hold(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:  # fmt: skip
     """Return Phi, Gamma0 and Gamma1 of ``x(h) = Phi x(0) + Gamma0 s(0) + Gamma1 (s(h) - s(0))``.
 
-    Parameters
-    ----------
-    a, inputs : FloatArray
-        ``(n, n)`` and ``(n, m)``.
-    step : float, seconds
-        ``h``.
-
-    Returns
-    -------
-    tuple of FloatArray
-        ``(n, n)``, ``(n, m)``, ``(n, m)``, from one balanced block exponential.
+    Shapes: ``a (n, n)``, ``inputs (n, m)``.
     """
     from scipy.linalg import expm, matrix_balance
 

@@ -30,16 +30,9 @@ CONSISTENCY = 1e-9
 class LeastSquaresStep(NamedTuple):
     """What one step gives.
 
-    Parameters
-    ----------
-    estimate : FloatArray
-        ``(n, columns of Y)``: the linear map applied to each column of Y.
-    factor : FloatArray
-        ``(n, n)`` with ``P = factor factor'``.
-    innovation : FloatArray
-        ``(m, columns of Y)``, the whitened parity: for the column that holds the data it is N(0, I).
-    diffuse : FloatArray
-        ``(n, r)``: directions of x about which nothing is known; r = 0 unless samples are missing.
+    Fields: estimate: ``(n, columns of Y)``: the linear map applied to each column of Y; factor: ``(n, n)`` with ``P =
+    factor factor'``; innovation: ``(m, columns of Y)``, the whitened parity: for the column that holds the data it is
+    N(0, I); diffuse: ``(n, r)``: directions of x about which nothing is known; r = 0 unless samples are missing.
     """
 
     estimate: FloatArray
@@ -51,14 +44,8 @@ class LeastSquaresStep(NamedTuple):
 class Projection(NamedTuple):
     """The orthogonal factorisation of H, which may serve many steps.
 
-    Parameters
-    ----------
-    rotation : FloatArray
-        ``(rows, rows)``: ``[Q_2'; Q_1']``, parity first.
-    head : FloatArray
-        ``(n, n)``: R_H, upper triangular.
-    lower : FloatArray
-        ``(n, n)``: ones on and below the diagonal.
+    Fields: rotation: ``(rows, rows)``: ``[Q_2'; Q_1']``, parity first; head: ``(n, n)``: R_H, upper triangular; lower:
+    ``(n, n)``: ones on and below the diagonal.
     """
 
     rotation: FloatArray
@@ -69,10 +56,7 @@ class Projection(NamedTuple):
 def projection_of(H: FloatArray) -> Projection | None:
     """Return the factorisation of H, or ``None`` where its rank has to be decided.
 
-    Parameters
-    ----------
-    H : FloatArray
-        ``(rows, n)``.
+    Shapes: ``H (rows, n)``.
     """
     from scipy.linalg.lapack import dgeqrf, dormqr
 
@@ -93,14 +77,7 @@ def projected_step(projection: Projection, noise: FloatArray, data: FloatArray) 
 
     Noise that outgrows double precision is left to the caller too.
 
-    Parameters
-    ----------
-    projection : Projection
-        Of H.
-    noise : FloatArray
-        ``(s, rows)``, in Fortran order, overwritten: the transpose of ``rotation S``.
-    data : FloatArray
-        ``(rows, columns)``: ``rotation Y``.
+    Shapes: ``noise (s, rows)``, ``data (rows, columns)``.
     """
     from scipy.linalg.lapack import dgeqrf, dtrtrs
 
@@ -135,14 +112,7 @@ def least_squares_step(H: FloatArray, S: FloatArray, Y: FloatArray) -> LeastSqua
         \begin{bmatrix} Q_2^T S \\ Q_1^T S \end{bmatrix} = \begin{bmatrix} L & 0 \\ X & T \end{bmatrix} Z^T, \quad
         v = L^{-1} Q_2^T Y, \quad x = R_H^{-1} (Q_1^T Y - X v), \quad P = R_H^{-1} T T^T R_H^{-T}
 
-    Parameters
-    ----------
-    H : FloatArray
-        ``(rows, n)``, of full column rank.
-    S : FloatArray
-        ``(rows, s)`` with ``s >= rows``: square root of the covariance of ``Y - H x``.
-    Y : FloatArray
-        ``(rows, columns)``: data, regressors, or the identity.
+    Shapes: ``H (rows, n)``, ``S (rows, s)``, ``Y (rows, columns)``.
     """
     projection = projection_of(H)
     if projection is None:
@@ -155,25 +125,7 @@ def rank_revealing_step(
 ) -> LeastSquaresStep:
     """Solve one step in which x may be undetermined, noise may be missing, and earlier directions are unknown.
 
-    Parameters
-    ----------
-    H, S, Y : FloatArray
-        As for `least_squares_step`; here H may have any rank.
-    unknown : FloatArray
-        ``(rows, r)``: columns of further unknowns without prior, eliminated together with x.
-    mapped : int, optional
-        How many columns of Y, the first, make a map of the data instead of data: nothing need be consistent in them.
-
-    Returns
-    -------
-    LeastSquaresStep
-        Undetermined directions are in ``diffuse``, where the estimate is the one of least norm; perfect and redundant
-        rows of the innovation are left out.
-
-    Raises
-    ------
-    PreconditionError
-        Constraints without noise contradict each other, or determine what only noise may: the regressors.
+    Shapes: ``unknown (rows, r)``.
     """
     from scipy.linalg import qr, solve_triangular
 

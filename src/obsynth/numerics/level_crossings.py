@@ -22,12 +22,7 @@ def level_crossings(
     ``z [I 0; C'C + C'D R^-1 D'C, A' + C'D R^-1 B'] - [A + B R^-1 D'C, B R^-1 B'; 0 I]``, with
     ``R = g^2 I - D'D``, is singular at z = e^{jw}.
 
-    Parameters
-    ----------
-    a, b, c, d : FloatArray
-        ``(n, n)``, ``(n, m)``, ``(p, n)``, ``(p, m)``, ``a`` Schur stable.
-    level : float
-        Above the norm of D.
+    Shapes: ``a (n, n)``, ``b (n, m)``, ``c (p, n)``, ``d (p, m)``.
     """
     root = np.sqrt(level)
     b, c, d = b / root, c / root, d / level

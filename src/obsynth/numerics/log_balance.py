@@ -29,10 +29,7 @@ PASSES = 3
 class LogBalance:
     """Minimise ``log2 abs(M[i, j]) + row[i] + column[j] + common`` over all nonzero entries of matrices.
 
-    Parameters
-    ----------
-    count : int
-        Number of unknowns: binary logarithms of factors.
+    Fields: count: Number of unknowns: binary logarithms of factors.
     """
 
     count: int
@@ -51,18 +48,7 @@ class LogBalance:
     ) -> None:
         """Ask for entries near one.
 
-        Parameters
-        ----------
-        matrix : FloatArray
-            ``(m, n)``.
-        rows, columns : sequence of int
-            Which unknowns multiply (or divide) its rows and columns.
-        signs : tuple of int, optional
-            1 to multiply, -1 to divide.
-        common : int, optional
-            An unknown that multiplies the whole matrix.
-        weight : float, optional
-            Of the squares, beside those of other matrices.
+        Shapes: ``matrix (m, n)``.
         """
         i, j = np.nonzero(matrix)
         unknowns = [np.array(rows, dtype=np.int64)[i], np.array(columns, dtype=np.int64)[j]]

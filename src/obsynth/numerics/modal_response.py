@@ -25,12 +25,7 @@ POWER_STEPS, ROUGH_STEPS = 8, 4
 class Modes(NamedTuple):
     """Eigenvalues and eigenvectors of a matrix.
 
-    Parameters
-    ----------
-    values : ComplexArray
-        ``(n,)``.
-    vectors : ComplexArray
-        ``(n, n)``, as columns.
+    Fields: values: ``(n,)``; vectors: ``(n, n)``, as columns.
     """
 
     values: ComplexArray
@@ -52,14 +47,7 @@ class Modes(NamedTuple):
 class ModalResponse:
     """``C (z I - A)^-1 B + D`` with ``A = V diag(poles) V^-1``: cheap at many points, exact as far as V is regular.
 
-    Parameters
-    ----------
-    poles : ComplexArray
-        ``(n,)``.
-    shown, driven : ComplexArray
-        ``C V (p, n)`` and ``V^-1 B (n, m)``.
-    direct : FloatArray
-        D ``(p, m)``.
+    Fields: poles: ``(n,)``; shown, driven: ``C V (p, n)`` and ``V^-1 B (n, m)``; direct: D ``(p, m)``.
     """
 
     poles: ComplexArray

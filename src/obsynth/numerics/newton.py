@@ -23,12 +23,7 @@ MOST_HALVINGS = 12
 class ScaledMatrix:
     """A square matrix with columns scaled by given sizes and rows scaled to a largest entry of one.
 
-    Parameters
-    ----------
-    matrix : FloatArray
-        ``diag(rows) J diag(columns)``.
-    rows, columns : FloatArray
-        ``(n,)``.
+    Fields: matrix: ``diag(rows) J diag(columns)``; rows, columns: ``(n,)``.
     """
 
     matrix: FloatArray
@@ -39,12 +34,7 @@ class ScaledMatrix:
     def of(cls, jacobian: FloatArray, columns: FloatArray) -> ScaledMatrix:
         """Scale a matrix.
 
-        Parameters
-        ----------
-        jacobian : FloatArray
-            ``(n, n)``.
-        columns : FloatArray
-            ``(n,)``: sizes of the unknowns.
+        Shapes: ``jacobian (n, n)``, ``columns (n,)``.
         """
         scaled = jacobian * columns
         peaks = np.abs(scaled).max(axis=1)
@@ -52,18 +42,7 @@ class ScaledMatrix:
         return cls(rows[:, None] * scaled, rows, columns)
 
     def solve(self, right: FloatArray) -> FloatArray:
-        """Return ``J^-1 right`` by pivoted elimination.
-
-        Parameters
-        ----------
-        right : FloatArray
-            ``(n,)`` or ``(n, m)``.
-
-        Raises
-        ------
-        numpy.linalg.LinAlgError
-            The matrix is singular.
-        """
+        """Return ``J^-1 right`` by pivoted elimination."""
         rows, columns = (self.rows, self.columns) if right.ndim == 1 else (self.rows[:, None], self.columns[:, None])
         return np.asarray(columns * np.linalg.solve(self.matrix, rows * right))
 
@@ -76,10 +55,7 @@ class ScaledMatrix:
 def condition_number(matrix: FloatArray) -> float:
     """Return the condition number of a matrix; infinite where it is singular or not finite.
 
-    Parameters
-    ----------
-    matrix : FloatArray
-        ``(n, n)``.
+    Shapes: ``matrix (n, n)``.
     """
     if not np.isfinite(matrix).all():
         return float("inf")
@@ -91,16 +67,8 @@ def condition_number(matrix: FloatArray) -> float:
 class NewtonResult:
     """Where an iteration ended.
 
-    Parameters
-    ----------
-    x : FloatArray
-        ``(n,)``.
-    converged : bool
-        The verdict.
-    iterations : int
-        Steps taken.
-    residuals : FloatArray
-        ``(n,)``: the last residuals in units of the unknowns' sizes.
+    Fields: x: ``(n,)``; converged: The verdict; iterations: Steps taken; residuals: ``(n,)``: the last residuals in
+    units of the unknowns' sizes.
     """
 
     x: FloatArray
@@ -124,17 +92,7 @@ def newton(
 ) -> NewtonResult:
     """Solve ``f(x) = 0``.
 
-    Parameters
-    ----------
-    evaluate : callable
-        x -> residual ``(n,)`` and Jacobian ``(n, n)``; may hold what is not finite.
-    start, sizes : FloatArray
-        ``(n,)``: first guess, and sizes of the unknowns.
-
-    Returns
-    -------
-    NewtonResult
-        Not converged where the iteration stalls, leaves the domain, or meets a singular Jacobian.
+    Shapes: ``start (n,)``, ``sizes (n,)``.
     """
     x = start.copy()
     value, jacobian = evaluate(x)

@@ -34,17 +34,11 @@ MAXIMUM_DOUBLINGS = 64
 class HinfNorm:
     """The H-infinity norm of a stable discrete-time system.
 
-    Parameters
-    ----------
-    value : float
-        Largest singular value found on the unit circle: a lower bound that is attained.
-    upper : float
-        Level at which the symplectic pencil has no eigenvalue on the unit circle or, for many states, a Riccati
-        equation has a solution: the norm is below it, as far as double precision can tell (computed, not proved).
-    angle : float
-        Where the peak is, radians per sample.
-    distance : float
-        Distance of the closest eigenvalue of that pencil from the unit circle; NaN where there was none.
+    Fields: value: Largest singular value found on the unit circle: a lower bound that is attained; upper: Level at
+    which the symplectic pencil has no eigenvalue on the unit circle or, for many states, a Riccati equation has a
+    solution: the norm is below it, as far as double precision can tell (computed, not proved); angle: Where the peak
+    is, radians per sample; distance: Distance of the closest eigenvalue of that pencil from the unit circle; NaN where
+    there was none.
     """
 
     value: float
@@ -74,17 +68,7 @@ def hinf_norm(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, *, mod
     Bruinsma and Steinbuch's iteration: raise the level to the largest gain found, ask the symplectic pencil
     where the gain crosses that level, look between the crossings, until there are none.
 
-    Parameters
-    ----------
-    a, b, c, d : FloatArray
-        ``(n, n)``, ``(n, m)``, ``(p, n)``, ``(p, m)``.
-    modes : Modes, optional
-        Of ``a``, where they are known.
-
-    Returns
-    -------
-    HinfNorm
-        Infinite when ``a`` is not Schur stable, or when the data or the response are not finite.
+    Shapes: ``a (n, n)``, ``b (n, m)``, ``c (p, n)``, ``d (p, m)``.
     """
     if b.shape[1] == 0 or c.shape[0] == 0:
         return HinfNorm(0.0, 0.0, 0.0, np.inf)
@@ -122,12 +106,7 @@ def norm_is_at_most(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, 
 
     By a Riccati equation or, where that leaves it open, by the norm.
 
-    Parameters
-    ----------
-    a, b, c, d : FloatArray
-        ``(n, n)``, ``(n, m)``, ``(p, n)``, ``(p, m)``.
-    level : float
-        Positive.
+    Shapes: ``a (n, n)``, ``b (n, m)``, ``c (p, n)``, ``d (p, m)``.
     """
     if a.shape[0] == 0 or b.shape[1] == 0 or c.shape[0] == 0:
         return hinf_norm(a, b, c, d).upper <= level
@@ -151,12 +130,7 @@ def highest_gain_found(
 ) -> float:
     """Return the H-infinity norm or, for many states, the largest gain that a modal response shows: it is attained.
 
-    Parameters
-    ----------
-    a, b, c, d : FloatArray
-        ``(n, n)``, ``(n, m)``, ``(p, n)``, ``(p, m)``; infinite when ``a`` is not Schur stable.
-    modes : Modes, optional
-        Of ``a``, where they are known.
+    Shapes: ``a (n, n)``, ``b (n, m)``, ``c (p, n)``, ``d (p, m)``.
     """
     if a.shape[0] <= STATES_OF_PENCIL or b.shape[1] == 0 or c.shape[0] == 0 or not np.all(np.isfinite(a)):
         return hinf_norm(a, b, c, d, modes=modes).upper

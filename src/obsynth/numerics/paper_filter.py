@@ -15,14 +15,7 @@ from obsynth.numerics.arrays import FloatArray
 class PaperGains(NamedTuple):
     """Gains and covariance of one step.
 
-    Parameters
-    ----------
-    L : FloatArray
-        ``(nx, ne)``.
-    K : FloatArray
-        ``(nx, ny)``.
-    P : FloatArray
-        ``(nx, nx)``: covariance of the estimate at k + 1.
+    Fields: L: ``(nx, ne)``; K: ``(nx, ny)``; P: ``(nx, nx)``: covariance of the estimate at k + 1.
     """
 
     L: FloatArray
@@ -50,18 +43,8 @@ def paper_gains(E: FloatArray, A: FloatArray, C: FloatArray, Q: FloatArray, R: F
 class PaperState(NamedTuple):
     """What (18) carries from step to step.
 
-    Parameters
-    ----------
-    x : FloatArray
-        ``(nx,)``.
-    theta, theta_before : FloatArray
-        ``(nq,)``: the estimates at k and at k - 1.
-    Upsilon : FloatArray
-        ``(nx, nq)``.
-    S : FloatArray
-        ``(nq, nq)``.
-    P : FloatArray
-        ``(nx, nx)``.
+    Fields: x: ``(nx,)``; theta, theta_before: ``(nq,)``: the estimates at k and at k - 1; Upsilon: ``(nx, nq)``; S:
+    ``(nq, nq)``; P: ``(nx, nx)``.
     """
 
     x: FloatArray
@@ -83,19 +66,6 @@ def paper_step(
     forgetting: float,
 ) -> PaperState:
     """Return the state of (18) one step later, in the only order in which (22) and (23) hold.
-
-    Parameters
-    ----------
-    state : PaperState
-        At k; start with ``Upsilon = 0`` and ``theta_before = theta``.
-    matrices : dict
-        ``E`` and ``C`` at k + 1, ``A``, ``B``, ``Phi`` and ``Psi`` at k.
-    Q, R : FloatArray
-        Covariances at k, positive definite.
-    y, u : FloatArray
-        ``y(k + 1)`` and ``u(k)``.
-    forgetting : float
-        lambda, dimensionless.
 
     References
     ----------

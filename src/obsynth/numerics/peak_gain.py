@@ -20,31 +20,14 @@ INTERVALS_PER_LENGTH = 64
 FIRST_LENGTH = 0.02
 #: The intervals end when no more than this share of the response can be left.
 LEFT_SHARE = 1e-4
-#: Doublings of the length before the response is held to be endless.
+#: Doublings of the length before the response is held to have ended.
 MOST_LENGTHS = 60
 
 
 def peak_gain(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
     r"""Return an upper bound on the integral of the Euclidean norm of the response to each input.
 
-    Parameters
-    ----------
-    a : FloatArray
-        ``(n, n)``, stable.
-    b : FloatArray
-        ``(n, m)``.
-    c : FloatArray
-        ``(p, n)``.
-
-    Returns
-    -------
-    FloatArray
-        ``(m,)``: an output driven by ``|d_i(t)| <= 1`` never has a larger norm than their sum.
-
-    Raises
-    ------
-    SpecError
-        ``a`` is not stable, or so close to it that the response has no end.
+    Shapes: ``a (n, n)``, ``b (n, m)``, ``c (p, n)``.
     """
     if not a.size or not b.shape[1]:
         return np.zeros(b.shape[1])

@@ -38,22 +38,11 @@ SAFE_CONDITION = 1e5
 class PencilStructure:
     """What a pencil ``A - z E`` looks like.
 
-    Parameters
-    ----------
-    rows, columns : int
-        Its shape.
-    regular : bool
-        Square with a determinant that is not identically zero.
-    normal_rank : int
-        Rank of ``A - z E`` at almost every ``z``.
-    index : int or None
-        Size of the largest infinite block, 0 for nonsingular ``E``; None when not regular.
-    finite_eigenvalues : ComplexArray
-        ``(k,)``, finite zeros with multiplicity, read-only; conjugate pairs are exact.
-    infinite_block_sizes : tuple of int
-        Sizes of the Jordan blocks at infinity, largest first.
-    decisions : tuple of RankDecision
-        Every rank decided on the way, in order, relative to the norm of the equilibrated pencil.
+    Fields: rows, columns: Its shape; regular: Square with a determinant that is not identically zero; normal_rank: Rank
+    of ``A - z E`` at almost every ``z``; index: Size of the largest infinite block, 0 for nonsingular ``E``; None when
+    not regular; finite_eigenvalues: ``(k,)``, finite zeros with multiplicity, read-only; conjugate pairs are exact;
+    infinite_block_sizes: Sizes of the Jordan blocks at infinity, largest first; decisions: Every rank decided on the
+    way, in order, relative to the norm of the equilibrated pencil.
     """
 
     rows: int
@@ -70,14 +59,8 @@ class PencilStructure:
 class FiniteZeros:
     """The points where a pencil loses rank.
 
-    Parameters
-    ----------
-    values : ComplexArray
-        ``(k,)``, with multiplicity, read-only; conjugate pairs are exact.
-    normal_rank : int
-        Rank of the pencil at almost every point.
-    decisions : tuple of RankDecision
-        Every rank decided on the way.
+    Fields: values: ``(k,)``, with multiplicity, read-only; conjugate pairs are exact; normal_rank: Rank of the pencil
+    at almost every point; decisions: Every rank decided on the way.
     """
 
     values: ComplexArray
@@ -87,16 +70,6 @@ class FiniteZeros:
 
 def pencil_structure(E: FloatArray, A: FloatArray) -> PencilStructure:
     """Return the structure of ``A - z E`` for matrices ``(m, n)`` of any size, including zero.
-
-    Parameters
-    ----------
-    E, A : FloatArray
-        ``(m, n)`` real matrices; they are not modified.
-
-    Returns
-    -------
-    PencilStructure
-        For non-square and singular pencils too: ``regular`` is then False and ``index`` None.
 
     References
     ----------
@@ -123,17 +96,7 @@ def pencil_structure(E: FloatArray, A: FloatArray) -> PencilStructure:
 def finite_zeros(E: FloatArray, A: FloatArray, *, to_the_end: bool = True) -> FiniteZeros:
     """Return the points where ``rank (A - z E)`` drops below the normal rank, with multiplicity.
 
-    Parameters
-    ----------
-    E, A : FloatArray
-        ``(m, n)`` real matrices of any size, including zero; they are not modified.
-    to_the_end : bool, optional
-        Whether every rank of the staircase is decided; otherwise it ends where there clearly are no zeros.
-
-    Returns
-    -------
-    FiniteZeros
-        Zeros, normal rank, and the rank decisions behind them.
+    Shapes: ``E (m, n)``, ``A (m, n)``.
 
     References
     ----------
@@ -221,10 +184,7 @@ def _clearly_without_zeros(parts: _SquarePart, scales: tuple[float, float]) -> b
 def regularity(E: FloatArray, A: FloatArray) -> tuple[bool, int]:
     """Return whether ``A - z E`` is regular, and its normal rank; what `pencil_structure` says without eigenvalues.
 
-    Parameters
-    ----------
-    E, A : FloatArray
-        ``(m, n)`` real matrices; they are not modified.
+    Shapes: ``E (m, n)``, ``A (m, n)``.
     """
     right, left = reduce_pencil(equilibrate_pencil(E, A))
     return _is_regular(E, right), normal_rank_of(right, left)

@@ -48,19 +48,11 @@ SLOW_ZERO_RADIUS = 0.98
 class RankDecision:
     """A numerical rank, with the evidence for it.
 
-    Parameters
-    ----------
-    rank : int
-        The decided rank.
-    expected : int
-        Full rank for the purpose at hand (usually the smaller dimension).
-    singular_values : FloatArray
-        All singular values, largest first, of the matrix as decided upon (rows and columns scaled).
-    smallest_kept, largest_dropped : float
-        The singular values on both sides of the cut, relative to the largest (0 where there is none).
-    gap : float
-        ``smallest_kept / largest_dropped``; infinite when nothing, or only an exact zero, was dropped;
-        when the rank is full, the distance to the tolerance instead.
+    Fields: rank: The decided rank; expected: Full rank for the purpose at hand (usually the smaller dimension);
+    singular_values: All singular values, largest first, of the matrix as decided upon (rows and columns scaled);
+    smallest_kept, largest_dropped: The singular values on both sides of the cut, relative to the largest (0 where there
+    is none); gap: ``smallest_kept / largest_dropped``; infinite when nothing, or only an exact zero, was dropped; when
+    the rank is full, the distance to the tolerance instead.
     """
 
     rank: int
@@ -106,21 +98,7 @@ def decide_rank(
     scale: float | None = None,
     equilibrated: bool = True,
 ) -> RankDecision:
-    """Decide the rank of ``matrix (rows, cols)`` by its singular values.
-
-    Parameters
-    ----------
-    matrix : FloatArray
-        Any real or complex matrix.
-    expected : int, optional
-        What full rank means here; the smaller dimension by default.
-    tolerance : float, optional
-        Relative to ``scale``.
-    scale : float, optional
-        Reference size; the largest singular value by default.
-    equilibrated : bool, optional
-        Scale rows and columns by powers of two first, so that units do not decide the rank.
-    """
+    """Decide the rank of ``matrix (rows, cols)`` by its singular values."""
     work = equilibrate(matrix) if equilibrated and not np.iscomplexobj(matrix) else np.asarray(matrix)
     values = np.asarray(np.linalg.svd(work, compute_uv=False)) if work.size else np.zeros(0)
     return rank_from(
@@ -131,19 +109,7 @@ def decide_rank(
 def rank_from(
     values: FloatArray, *, expected: int, tolerance: float = RANK_TOLERANCE, scale: float | None = None
 ) -> RankDecision:
-    """Decide a rank by the singular values of a matrix.
-
-    Parameters
-    ----------
-    values : FloatArray
-        All of them, largest first.
-    expected : int
-        What full rank means.
-    tolerance : float, optional
-        Relative to ``scale``.
-    scale : float, optional
-        Reference size; the largest singular value by default.
-    """
+    """Decide a rank by the singular values of a matrix."""
     reference = scale if scale is not None else (float(values[0]) if values.size else 0.0)
     rank = int(np.count_nonzero(values > tolerance * reference)) if reference > 0.0 else 0
     relative = values / reference if reference > 0.0 else values

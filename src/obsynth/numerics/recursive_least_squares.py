@@ -15,14 +15,8 @@ WORTH_FORGETTING = 0.1
 class ParameterState(NamedTuple):
     """The estimate of constant parameters and two different spreads.
 
-    Parameters
-    ----------
-    theta : FloatArray
-        ``(nq,)``.
-    triangle : FloatArray
-        ``(nq, nq)``, upper: ``S = (triangle' triangle)^-1`` sets the gain; it is no covariance of theta.
-    spread : FloatArray
-        ``(nq, nq)``: ``spread spread'`` is the covariance of theta.
+    Fields: theta: ``(nq,)``; triangle: ``(nq, nq)``, upper: ``S = (triangle' triangle)^-1`` sets the gain; it is no
+    covariance of theta; spread: ``(nq, nq)``: ``spread spread'`` is the covariance of theta.
     """
 
     theta: FloatArray
@@ -33,12 +27,7 @@ class ParameterState(NamedTuple):
 def start_of(theta: FloatArray, factor: FloatArray) -> ParameterState:
     """Return the state before any data.
 
-    Parameters
-    ----------
-    theta : FloatArray
-        ``(nq,)``.
-    factor : FloatArray
-        ``(nq, nq)``, nonsingular: ``S_0 = factor factor'`` is also the covariance of theta.
+    Shapes: ``theta (nq,)``, ``factor (nq, nq)``.
     """
     triangle = np.linalg.qr(np.linalg.inv(factor), mode="r") if factor.size else factor
     return ParameterState(theta.copy(), np.asarray(triangle), factor.copy())
@@ -63,27 +52,7 @@ def update(
 
     with ``M = S^-1``.  The second term is a guard against wind-up: it bounds S by the inverse of M_reg.
 
-    Parameters
-    ----------
-    state : ParameterState
-        At k.
-    v, G : FloatArray
-        ``(m,)`` and ``(m, nq)``.
-    forgetting : float
-        lambda in (0, 1], dimensionless.
-    regular : FloatArray, optional
-        ``(nq, nq)``, with ``M_reg = regular' regular``.
-    directional : bool, optional
-        Forget only in directions that G excites: ``M - (1 - lambda) G' (G S G')^-1 G`` takes the place of ``lambda M``.
-    noise : FloatArray, optional
-        ``W (m, any)``: square root of the covariance of the noise in v; the identity by default.
-
-    Returns
-    -------
-    state : ParameterState
-        At k + 1.
-    gain : FloatArray
-        ``Theta (nq, m)``.
+    Shapes: ``v (m,)``, ``G (m, nq)``, ``regular (nq, nq)``, ``noise (m, any)``.
     """
     from scipy.linalg.lapack import dgeqrf, dtrtrs
 

@@ -24,14 +24,9 @@ class Scaling:
     The scaled plant is ``diag(equations) E diag(states)``, ``diag(outputs) C diag(states)`` and so
     on; its state ``z`` is ``x = diag(states) z``, its output ``diag(outputs) y``.
 
-    Parameters
-    ----------
-    equations : FloatArray
-        ``(nx,)``, multiplies the rows of ``E``, ``A`` and every input-like matrix.
-    states : FloatArray
-        ``(nx,)``, multiplies the columns of ``E``, ``A`` and every output-like matrix.
-    outputs : FloatArray
-        ``(ny,)``, multiplies the rows of the stacked output-like matrices.
+    Fields: equations: ``(nx,)``, multiplies the rows of ``E``, ``A`` and every input-like matrix; states: ``(nx,)``,
+    multiplies the columns of ``E``, ``A`` and every output-like matrix; outputs: ``(ny,)``, multiplies the rows of the
+    stacked output-like matrices.
     """
 
     equations: FloatArray
@@ -64,12 +59,8 @@ class Scaling:
 class EquilibratedPencil:
     """A pencil ``A - z E`` with rows and columns scaled to largest entries near one.
 
-    Parameters
-    ----------
-    E, A : FloatArray
-        ``(m, n)``, the scaled pencil ``diag(rows) (A - z E) diag(columns)``.
-    rows, columns : FloatArray
-        ``(m,)`` and ``(n,)``, powers of two.
+    Fields: E, A: ``(m, n)``, the scaled pencil ``diag(rows) (A - z E) diag(columns)``; rows, columns: ``(m,)`` and
+    ``(n,)``, powers of two.
     """
 
     E: FloatArray
@@ -91,15 +82,7 @@ def equilibrate_pencil(E: FloatArray, A: FloatArray) -> EquilibratedPencil:
     Zeros and Kronecker structure do not change.  One pass is enough: scaling a column up to its
     largest entry cannot lift an entry above those that already rule their rows.
 
-    Parameters
-    ----------
-    E, A : FloatArray
-        ``(m, n)``, any sizes including zero.
-
-    Returns
-    -------
-    EquilibratedPencil
-        The scaled pencil and its factors.
+    Shapes: ``E (m, n)``, ``A (m, n)``.
     """
     size = np.maximum(np.abs(E), np.abs(A))
     rows = 1.0 / power_of_two_below(_row_peaks(size))
@@ -121,19 +104,7 @@ def balance_system(
     that is zero), outputs by their own rows, and states by the column of ``[E; C]``, or of ``A`` where
     that is zero.  A plant whose rows and columns have largest entries in [1, 2) is left unchanged.
 
-    Parameters
-    ----------
-    E, A : FloatArray
-        ``(nx, nx)``.
-    inputs : sequence of FloatArray, optional
-        Input-like matrices ``(nx, *)``.
-    outputs : sequence of FloatArray, optional
-        Output-like matrices ``(*, nx)``; ``Scaling.outputs`` follows their stacked rows.
-
-    Returns
-    -------
-    Scaling
-        The factors.
+    Shapes: ``E (nx, nx)``, ``A (nx, nx)``, ``inputs (nx, *)``, ``outputs (*, nx)``.
 
     Notes
     -----
@@ -165,16 +136,6 @@ def balance_by_least_squares(
     The sum of the squared logarithms of all nonzero entries of the scaled ``E``, ``A``, input-like (their columns
     are free as well) and output-like matrices is least.  The result does not depend on the units of the plant, up
     to one rounding of each exponent: changing them only shifts the unknowns.
-
-    Parameters
-    ----------
-    E, A, inputs, outputs
-        As for `balance_system`.
-
-    Returns
-    -------
-    Scaling
-        The factors.
 
     References
     ----------

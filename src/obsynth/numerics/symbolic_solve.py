@@ -23,12 +23,7 @@ def equilibrated(matrix: Any, columns: FloatArray) -> tuple[Any, Any]:
 
     The same scaling as `obsynth.numerics.newton.ScaledMatrix`.
 
-    Parameters
-    ----------
-    matrix : casadi.SX or casadi.MX
-        ``(n, n)``.
-    columns : FloatArray
-        ``(n,)``: sizes of the unknowns.
+    Shapes: ``matrix (n, n)``, ``columns (n,)``.
     """
     import casadi as ca
 
@@ -39,13 +34,7 @@ def equilibrated(matrix: Any, columns: FloatArray) -> tuple[Any, Any]:
 
 
 def largest_entries(matrix: Any) -> Any:
-    """Return the largest absolute value of each row ``(rows,)``, which is not NaN where others are not.
-
-    Parameters
-    ----------
-    matrix : casadi.SX or casadi.MX
-        At least one column.
-    """
+    """Return the largest absolute value of each row ``(rows,)``, which is not NaN where others are not."""
     import casadi as ca
 
     sizes = ca.fabs(matrix)
@@ -58,10 +47,7 @@ def largest_entries(matrix: Any) -> Any:
 def solved(matrix: Any, right: Any) -> Any:
     """Return ``A^-1 B`` with row pivots; not finite where A is singular.
 
-    Parameters
-    ----------
-    matrix, right : casadi.MX
-        ``(n, n)``, equilibrated, and ``(n, m)``.
+    Shapes: ``matrix (n, n)``, ``right (n, m)``.
     """
     return _solution(matrix, right, pivots=True)
 
@@ -69,10 +55,7 @@ def solved(matrix: Any, right: Any) -> Any:
 def definite_solved(matrix: Any, right: Any) -> Any:
     """Return ``A^-1 B`` for a positive definite A, scaled to a unit diagonal first.
 
-    Parameters
-    ----------
-    matrix, right : casadi.MX
-        ``(n, n)`` and ``(n, m)``.
+    Shapes: ``matrix (n, n)``, ``right (n, m)``.
     """
     import casadi as ca
 

@@ -41,11 +41,6 @@ def one_thread_if_small(states: int) -> Iterator[None]:
     """Run a block on one BLAS thread if the problem has fewer than `STATES_WORTH_THREADS` states.
 
     While another such block runs, inside this one or beside it, nothing is set: the number is that one's business.
-
-    Parameters
-    ----------
-    states : int
-        Number of states of the plant.
     """
     if states >= STATES_WORTH_THREADS or not _SETTING.acquire(blocking=False):
         yield

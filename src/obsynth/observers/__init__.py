@@ -1,5 +1,5 @@
 """Observers that run: a realisation from measured signals to estimates."""
 
-from obsynth.observers.linear import Estimates, LinearObserver, RunningObserver
+from obsynth.observers.linear.observer import Estimates, LinearObserver, RunningObserver
 
 __all__ = ["Estimates", "LinearObserver", "RunningObserver"]

@@ -58,28 +58,14 @@ class Decision:
 
 
 def tail(degrees: FloatArray, value: FloatArray) -> FloatArray:
-    """Return the probability that chi-square passes a value.
-
-    Parameters
-    ----------
-    degrees, value : FloatArray
-        Degrees of freedom, and the value.
-    """
+    """Return the probability that chi-square passes a value."""
     from scipy.special import chdtrc
 
     return np.asarray(chdtrc(degrees, value))
 
 
 def quantile(degrees: FloatArray, probability: float) -> FloatArray:
-    """Return what chi-square passes with a probability; infinite where there are no degrees of freedom.
-
-    Parameters
-    ----------
-    degrees : FloatArray
-        Degrees of freedom.
-    probability : float
-        Of passing it.
-    """
+    """Return what chi-square passes with a probability; infinite where there are no degrees of freedom."""
     from scipy.special import chdtri
 
     return np.where(degrees > 0.0, chdtri(np.maximum(degrees, 1.0), probability), np.inf)
@@ -88,9 +74,6 @@ def quantile(degrees: FloatArray, probability: float) -> FloatArray:
 def alone(scores: FloatArray, information: FloatArray) -> int:
     """Return the parameter whose change alone explains most.
 
-    Parameters
-    ----------
-    scores, information : FloatArray
-        ``(nq,)``: of each parameter alone.
+    Shapes: ``scores (nq,)``, ``information (nq,)``.
     """
     return int(np.argmax(scores**2 / np.maximum(information, np.finfo(np.float64).tiny)))

@@ -7,11 +7,11 @@ from typing import Any, overload
 
 from numpy.typing import ArrayLike
 
-from obsynth.observers import gain_schedule
-from obsynth.observers.dae import DAEObserver
-from obsynth.observers.dae_batch import DAEBatchEstimates, run_dae_batch
-from obsynth.observers.gain_schedule import BatchEstimates
-from obsynth.observers.recursive import RecursiveObserver
+from obsynth.observers.dae.batch import DAEBatchEstimates, run_dae_batch
+from obsynth.observers.dae.observer import DAEObserver
+from obsynth.observers.recursive import gain_schedule
+from obsynth.observers.recursive.gain_schedule import BatchEstimates
+from obsynth.observers.recursive.observer import RecursiveObserver
 
 
 @overload

@@ -13,9 +13,9 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arguments import chosen, real_array, real_number, real_vector
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.alarms import Alarm, Decision, alone, quantile, tail
-from obsynth.observers.likelihood_ratio import likelihood_ratio, pull_of_the_start
-from obsynth.observers.recursive import RecursiveObserver
-from obsynth.observers.recursive_estimates import RecursiveEstimates
+from obsynth.observers.recursive.estimates import RecursiveEstimates
+from obsynth.observers.recursive.likelihood_ratio import likelihood_ratio, pull_of_the_start
+from obsynth.observers.recursive.observer import RecursiveObserver
 
 STATISTICS = ("chi-square", "cusum", "glr", "nis")
 #: Samples that the NIS sums up: the choice that its threshold was tried with.

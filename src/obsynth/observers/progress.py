@@ -21,28 +21,7 @@ PATIENCE = 2.0
 def shown_progress(
     progress: bool | Callable[[int], None] | None, total: int, what: str
 ) -> Iterator[Callable[[int], None]]:
-    """Show how much of a long run is done.
-
-    Parameters
-    ----------
-    progress : bool, callable or None
-        ``None`` shows a bar on stderr after `PATIENCE` seconds if that is a terminal, ``True`` wherever it is,
-        ``False`` never; a callable is called with the number of what is done.
-    total : int
-        How many there are.
-    what : str
-        Of what, for the bar.
-
-    Yields
-    ------
-    callable
-        To be called with the number of what is done.
-
-    Raises
-    ------
-    SpecError
-        ``progress`` is something else.
-    """
+    """Show how much of a long run is done."""
     if callable(progress):
         yield progress
         return

@@ -7,17 +7,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from obsynth.analysis.unknown_input_pencils import equilibrated
 from obsynth.errors import SpecError
-from obsynth.models.descriptor import DescriptorSystem
+from obsynth.methods.ui_pi_observer.checks.decoupling import frequency_grid
+from obsynth.methods.ui_pi_observer.pencils import equilibrated
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.numerics.spectra import boundary_points, response
-from obsynth.observers.linear import LinearObserver
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plotting.panels import WIDTH, new_panels, plain_decades, tidy
 from obsynth.results.design import ObserverDesign
-from obsynth.verification.decoupling import frequency_grid
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -40,15 +40,8 @@ _BOUND: dict[str, Any] = {"color": "tab:green", "linewidth": 1.2, "linestyle": "
 class EstimateGains:
     """Singular values from what acts on a plant to what an observer says.
 
-    Parameters
-    ----------
-    frequencies : FloatArray
-        ``(k,)``, rad/s.
-    gains : dict of str to FloatArray
-        Largest ones from ``faults``, ``disturbances``, ``noise`` as far as the plant has them: ``(k,)``, zero where
-        only rounding is left.
-    least : FloatArray
-        ``(k,)``: the least ones from the faults.
+    Fields: frequencies: ``(k,)``, rad/s; gains: Largest ones from ``faults``, ``disturbances``, ``noise`` as far as the
+    plant has them: ``(k,)``, zero where only rounding is left; least: ``(k,)``: the least ones from the faults.
     """
 
     frequencies: FloatArray

@@ -99,13 +99,7 @@ def with_unit(name: str, units: Mapping[str, str] | None) -> str:
 
 
 def plain_decades(panel: Axes) -> None:
-    """Give the vertical axis a logarithmic scale whose numbers stand plain at 1, 2 and 5 where it is short.
-
-    Parameters
-    ----------
-    panel : Axes
-        With its lines drawn.
-    """
+    """Give the vertical axis a logarithmic scale whose numbers stand plain at 1, 2 and 5 where it is short."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
     panel.set_yscale("log")

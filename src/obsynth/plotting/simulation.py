@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from obsynth.evaluation.monitors import Detection
-from obsynth.evaluation.recursive_simulating import RecursiveSimulation
-from obsynth.evaluation.simulating import Simulation
+from obsynth.experiments.monitors.monitor import Detection
+from obsynth.experiments.parameter_simulation import RecursiveSimulation
+from obsynth.experiments.simulation import Simulation
 from obsynth.observers.alarms import Decision
 from obsynth.plotting.faults import plot_faults
 from obsynth.plotting.panels import MARK_STYLE, RESIDUAL_STYLE, THRESHOLD_STYLES, legend_above, new_panels, tidy

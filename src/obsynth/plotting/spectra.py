@@ -107,13 +107,7 @@ def _continuous_plane(axes: Axes, poles: ComplexArray, zeros: ComplexArray) -> N
 
 
 def region_asked_for(design: ObserverDesign) -> list[Excess]:
-    """Return the parts of the region that was asked for (or proved, of a PD observer); none where none was.
-
-    Parameters
-    ----------
-    design : ObserverDesign
-        Of a linear method.
-    """
+    """Return the parts of the region that was asked for (or proved, of a PD observer); none where none was."""
     claims, options, dt = design.certificate.claims, design.options, design.linear[1].dt
     asked = options.get("region") or {}
     asked = dict(asked) if isinstance(asked, Mapping) else {}

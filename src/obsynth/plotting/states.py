@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
-from obsynth.models.names import index_of
 from obsynth.numerics.arrays import FloatArray, as_matrix
-from obsynth.observers.dae_estimates import DAEEstimates
-from obsynth.observers.linear import Estimates
-from obsynth.observers.recursive_estimates import RecursiveEstimates
+from obsynth.observers.dae.estimates import DAEEstimates
+from obsynth.observers.linear.observer import Estimates
+from obsynth.observers.recursive.estimates import RecursiveEstimates
+from obsynth.plants.names import index_of
 from obsynth.plotting.panels import (
     BAND_STYLE,
     BAND_WIDTH,

@@ -1,1 +1,1 @@
-"""Proofs about matrices of floating-point numbers: outward rounding, definiteness, contraction."""
+"""Proofs: outward rounding, definiteness, and exact rational arithmetic."""

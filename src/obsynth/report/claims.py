@@ -62,24 +62,10 @@ _SOURCES = {
 
 
 def source_of(method: str) -> str:
-    """Return the paper that a method comes from; empty for an unknown one.
-
-    Parameters
-    ----------
-    method : str
-        Method id.
-    """
+    """Return the paper that a method comes from; empty for an unknown one."""
     return _SOURCES.get(method, "")
 
 
 def meaning_of(method: str, claim: str) -> str:
-    """Return what a claim means; empty when the method has no such claim.
-
-    Parameters
-    ----------
-    method : str
-        Method id.
-    claim : str
-        Name of the claim.
-    """
+    """Return what a claim means; empty when the method has no such claim."""
     return _MEANINGS.get(method, {}).get(claim, "")

@@ -10,11 +10,11 @@ from rich.table import Table
 from rich.text import Text
 
 from obsynth.analysis.transformations import StateRecovery
-from obsynth.models.dae import DAEModel
-from obsynth.models.descriptor import DescriptorSystem
-from obsynth.models.time_varying import TimeVaryingDescriptorSystem
-from obsynth.observers.linear import LinearObserver
-from obsynth.observers.recursive import RecursiveObserver
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.plants.dae.model import DAEModel
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.report.claims import meaning_of
 from obsynth.report.layout import facts_table, headed_table, name_list, number, print_section
 from obsynth.report.verification import verification_report
@@ -23,18 +23,7 @@ from obsynth.results.design import ObserverDesign
 
 
 def plant_facts(plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel) -> Iterator[tuple[str, str]]:
-    """Yield label and value of what is known about a plant.
-
-    Parameters
-    ----------
-    plant : DescriptorSystem, TimeVaryingDescriptorSystem or DAEModel
-        The plant.
-
-    Yields
-    ------
-    tuple of str
-        Label and value.
-    """
+    """Yield label and value of what is known about a plant."""
     if isinstance(plant, TimeVaryingDescriptorSystem):
         yield from _varying_facts(plant)
         return
@@ -105,13 +94,7 @@ def design_report(design: ObserverDesign, *, console: Console, file: Path | None
 
 
 def delta_scan_table(scan: DeltaScan) -> Table:
-    """Return the table of a scan of delta: decay against gains against noise.
-
-    Parameters
-    ----------
-    scan : DeltaScan
-        One row per delta.
-    """
+    """Return the table of a scan of delta: decay against gains against noise."""
     table = headed_table("delta (s)", "decay (1/s)", "norm of gains", "f' to fault (s)", "noise to fault", "fast noise")
     for row in scan.rows():
         names = ("delta", "decay", "gain", "rate_gain", "noise_gain", "fast_noise_gain")
@@ -120,18 +103,7 @@ def delta_scan_table(scan: DeltaScan) -> Table:
 
 
 def recovered_states(recovery: StateRecovery) -> Iterator[tuple[str, str]]:
-    """Yield how good an estimate of each original state is, with the names, best first.
-
-    Parameters
-    ----------
-    recovery : StateRecovery
-        Of a design.
-
-    Yields
-    ------
-    tuple of str
-        How good, and which.
-    """
+    """Yield how good an estimate of each original state is, with the names, best first."""
     names_by_flag: dict[str, list[str]] = {}
     for name, flag in zip(recovery.names, recovery.flags(), strict=True):
         names_by_flag.setdefault(flag, []).append(name)
@@ -140,18 +112,7 @@ def recovered_states(recovery: StateRecovery) -> Iterator[tuple[str, str]]:
 
 
 def promises(design: ObserverDesign) -> Iterator[tuple[str, str, str]]:
-    """Yield name, value and meaning of what a design claims.
-
-    Parameters
-    ----------
-    design : ObserverDesign
-        A finished design.
-
-    Yields
-    ------
-    tuple of str
-        Name, value, meaning.
-    """
+    """Yield name, value and meaning of what a design claims."""
     for name, value in design.certificate.claims.items():
         yield name, number(value, digits=7), meaning_of(design.method, name)
     for check in design.report.checks:
@@ -161,13 +122,7 @@ def promises(design: ObserverDesign) -> Iterator[tuple[str, str, str]]:
 
 
 def fault_estimates_table(design: ObserverDesign) -> tuple[str, Table]:
-    """Return heading and table of delays and deviations of the estimates of faults or parameters.
-
-    Parameters
-    ----------
-    design : ObserverDesign
-        With faults or parameters.
-    """
+    """Return heading and table of delays and deviations of the estimates of faults or parameters."""
     observer, units = design.observer, design.plant.units
     deviations = {check.name: check.value for check in design.report.checks}
     if not isinstance(observer, LinearObserver):

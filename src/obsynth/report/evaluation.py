@@ -9,10 +9,10 @@ import numpy as np
 from rich.console import Console
 from rich.text import Text
 
-from obsynth.evaluation.intervals import Interval
-from obsynth.evaluation.monitors import Monitor
-from obsynth.evaluation.monte_carlo import Evaluation
-from obsynth.evaluation.recursive_monte_carlo import ParameterMonitor
+from obsynth.experiments.intervals import Interval
+from obsynth.experiments.monitors.monitor import Monitor
+from obsynth.experiments.monte_carlo import Evaluation
+from obsynth.experiments.parameter_monte_carlo import ParameterMonitor
 from obsynth.report.layout import headed_table, number, print_section
 
 #: Rows of a table; of a large plant the worst estimates are shown.
@@ -33,21 +33,7 @@ def evaluation_report(
     console: Console,
     units: Mapping[str, str],
 ) -> None:
-    """Print rates, delays and errors over many runs.
-
-    Parameters
-    ----------
-    name : str
-        Of the design.
-    found : Evaluation
-        The evaluation.
-    monitor : Monitor, ParameterMonitor or None
-        What decided.
-    console : Console
-        Where to.
-    units : mapping
-        Unit of signals by name.
-    """
+    """Print rates, delays and errors over many runs."""
     share = f"{100.0 * found.confidence:g} % interval"
     console.print(Text(f"{name}: {found.runs} runs", style="bold"))
     console.print()

@@ -14,8 +14,8 @@ from obsynth.report.pictures import pictures_of
 from obsynth.report.verification import verdict_line
 from obsynth.results.design import ObserverDesign
 from obsynth.results.files import write_atomically
+from obsynth.results.gain_sets import design_as_dict
 from obsynth.results.report import VerificationReport
-from obsynth.results.serialise import design_as_dict
 from obsynth.simulation.scenario import Scenario
 
 #: The check without which observer and plant cannot be run together.

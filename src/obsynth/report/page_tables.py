@@ -31,13 +31,7 @@ KINDS: dict[CheckKind, str] = {
 
 
 def fact_rows(rows: Iterable[Sequence[str]]) -> Iterator[str]:
-    """Yield a table of labels with one or more values each.
-
-    Parameters
-    ----------
-    rows : iterable of sequence of str
-        Label and values.
-    """
+    """Yield a table of labels with one or more values each."""
     yield '<div class="scroll"><table class="facts"><tbody>'
     for label, *values in rows:
         cells = "".join(f"<td>{escape(value)}</td>" for value in values)
@@ -46,13 +40,7 @@ def fact_rows(rows: Iterable[Sequence[str]]) -> Iterator[str]:
 
 
 def copied_table(table: Table) -> Iterator[str]:
-    """Yield a terminal's table as one of the page.
-
-    Parameters
-    ----------
-    table : rich.table.Table
-        With headings; cells that align right are numbers.
-    """
+    """Yield a terminal's table as one of the page."""
     kinds = ["number" if column.justify == "right" else "" for column in table.columns]
     yield '<div class="scroll"><table class="copied"><thead><tr>'
     yield "".join(
@@ -67,13 +55,7 @@ def copied_table(table: Table) -> Iterator[str]:
 
 
 def check_rows(checks: Sequence[Check]) -> Iterator[str]:
-    """Yield the table of the checks, those that fail in a group of their own at the top, and what the kinds mean.
-
-    Parameters
-    ----------
-    checks : sequence of Check
-        Of a report, in its order.
-    """
+    """Yield the table of the checks, those that fail in a group of their own at the top, and what the kinds mean."""
     yield '<div class="scroll"><table class="checks"><thead><tr>'
     yield "".join(
         f'<th class="{"number" if heading in ("value", "bound", "margin") else ""}">{heading}</th>'
@@ -119,10 +101,7 @@ def _row(check: Check) -> str:
 def matrix_rows(matrix: FloatArray) -> Iterator[str]:
     """Yield a matrix; zeros are faint.
 
-    Parameters
-    ----------
-    matrix : FloatArray
-        ``(rows, cols)``.
+    Shapes: ``matrix (rows, cols)``.
     """
     if not matrix.size:
         yield '<p class="soft">empty</p>'
@@ -138,13 +117,7 @@ def matrix_rows(matrix: FloatArray) -> Iterator[str]:
 
 
 def value_text(value: Any) -> str:
-    """Return an option or a solver's setting as one line: matrices by rows, diagonal ones as such; long ones are cut.
-
-    Parameters
-    ----------
-    value : object
-        Plain data or an array.
-    """
+    """Return an option or a solver's setting as one line: matrices by rows, diagonal ones as such; long ones cut."""
     text = _text(value)
     return text if len(text) <= LONGEST_VALUE else f"{text[:LONGEST_VALUE]} ... (the gain set has all of it)"
 

@@ -8,16 +8,16 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 from obsynth.errors import ObsynthError, SpecError
-from obsynth.evaluation.demonstration import demonstration_scenario
-from obsynth.evaluation.monitors import Detection
-from obsynth.evaluation.recursive_simulating import RecursiveSimulation
-from obsynth.evaluation.simulating import Simulation, simulate
-from obsynth.evaluation.watching import monitor
+from obsynth.experiments.demonstration import demonstration_scenario
+from obsynth.experiments.monitors.monitor import Detection
+from obsynth.experiments.monitors.residual_monitor import monitor
+from obsynth.experiments.parameter_simulation import RecursiveSimulation
+from obsynth.experiments.simulation import Simulation, simulate
 from obsynth.observers.alarms import Decision
 from obsynth.observers.decisions import decide
-from obsynth.observers.linear import LinearObserver
-from obsynth.observers.recursive import RecursiveObserver
-from obsynth.observers.recursive_estimates import RecursiveEstimates
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.recursive.estimates import RecursiveEstimates
+from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.plotting.frequency import plot_gains
 from obsynth.plotting.simulation import plot_simulation
 from obsynth.plotting.spectra import plot_poles
@@ -41,16 +41,8 @@ MOST_STATES = 6
 class Picture(NamedTuple):
     """A picture in a page.
 
-    Parameters
-    ----------
-    title : str
-        What it shows.
-    text : str
-        The same for who cannot see it, and as a caption.
-    source : str
-        A data URL.
-    wide : bool, optional
-        Whether it takes a row of its own.
+    Fields: title: What it shows; text: The same for who cannot see it, and as a caption; source: A data URL; wide:
+    Whether it takes a row of its own.
     """
 
     title: str
@@ -60,25 +52,7 @@ class Picture(NamedTuple):
 
 
 def pictures_of(design: ObserverDesign, *, scenario: Scenario | None = None) -> Iterator[Picture]:
-    """Yield the pictures of a design.
-
-    Parameters
-    ----------
-    design : ObserverDesign
-        Any design.
-    scenario : Scenario, optional
-        What the design is shown on, with what a monitor sees where there is one; by default each fault in turn.
-
-    Yields
-    ------
-    Picture
-        The design at work; of a linear one its poles, and singular values over the frequency.
-
-    Raises
-    ------
-    ObsynthError
-        A given scenario cannot be simulated.
-    """
+    """Yield the pictures of a design."""
     yield from _at_work(design, scenario)
     if not isinstance(design.observer, LinearObserver):
         return

@@ -8,9 +8,9 @@ from rich.console import Console
 from rich.text import Text
 
 from obsynth.analysis.structure import Structure
-from obsynth.models.dae import DAEModel
-from obsynth.models.descriptor import DescriptorSystem
-from obsynth.models.time_varying import TimeVaryingDescriptorSystem
+from obsynth.plants.dae.model import DAEModel
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.report.designs import plant_facts
 from obsynth.report.layout import complex_numbers, facts_table, name_list, print_section
 from obsynth.report.verification import checks_table
@@ -63,18 +63,7 @@ def _existence_line(method: str, report: VerificationReport) -> Text:
 
 
 def structure_facts(structure: Structure) -> dict[str, str]:
-    """Return the facts about a plant's structure.
-
-    Parameters
-    ----------
-    structure : Structure
-        The structure.
-
-    Returns
-    -------
-    dict
-        Value by label, both texts; every structure has the same labels.
-    """
+    """Return the facts about a plant's structure."""
     blocks = [f"{size}" for size in structure.infinite_block_sizes]
     return {
         "pencil A - zE": "regular" if structure.regular else "NOT regular",

@@ -7,8 +7,8 @@ from collections.abc import Iterator, Mapping
 from rich.console import Console
 from rich.text import Text
 
-from obsynth.evaluation.recursive_simulating import RecursiveSimulation
-from obsynth.evaluation.simulating import Simulation
+from obsynth.experiments.parameter_simulation import RecursiveSimulation
+from obsynth.experiments.simulation import Simulation
 from obsynth.report.layout import headed_table, number, print_section
 
 #: Rows of a table; of a large plant the worst estimates are shown.
@@ -23,21 +23,7 @@ def simulation_report(
     units: Mapping[str, str],
     file: str | None = None,
 ) -> None:
-    """Print errors of all estimates: after warm-up for linear designs, with the coverage of their bands for others.
-
-    Parameters
-    ----------
-    name : str
-        Of the design.
-    found : Simulation or RecursiveSimulation
-        The simulation.
-    console : Console
-        Where to.
-    units : mapping
-        Unit of signals by name.
-    file : str, optional
-        Where every signal was written.
-    """
+    """Print errors of all estimates: after warm-up for linear designs, with the coverage of their bands for others."""
     summary = found.summary()
     console.print(Text(f"{name}: {summary['samples']} samples, {found.time[-1]:g} s", style="bold"))
     console.print()

@@ -21,20 +21,7 @@ _NUMBER_WIDTH = 10
 
 
 def checks_table(checks: Sequence[Check], *, width: int) -> RenderableType:
-    """Return checks as a table.
-
-    Parameters
-    ----------
-    checks : sequence of Check
-        Its rows.
-    width : int
-        Columns of the terminal; below `WIDE_ENOUGH` the claim stands below the numbers.
-
-    Returns
-    -------
-    RenderableType
-        With the columns check, claim, value, bound, margin, verdict and kind.
-    """
+    """Return checks as a table."""
     if width >= WIDE_ENOUGH:
         table = _grid(width, with_claim=True)
         table.add_row(*(Text(heading, style="bold") for heading in _HEADINGS))
@@ -83,13 +70,7 @@ def _numbers_and_verdict(check: Check) -> list[Text]:
 
 
 def verdict_line(report: VerificationReport) -> Text:
-    """Return one line that says whether the whole report holds, and what fails.
-
-    Parameters
-    ----------
-    report : VerificationReport
-        The report.
-    """
+    """Return one line that says whether the whole report holds, and what fails."""
     real = [check for check in report.checks if check.kind != "information"]
     if report.passed:
         return Text(f"Verified: all {len(real)} checks hold.", style="green")

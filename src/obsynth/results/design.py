@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any
 
 from obsynth.analysis.transformations import StateRecovery
 from obsynth.errors import SpecError
-from obsynth.models.dae import DAEModel
-from obsynth.models.descriptor import DescriptorSystem
-from obsynth.models.time_varying import TimeVaryingDescriptorSystem
 from obsynth.numerics.arrays import FloatArray, read_only
-from obsynth.observers.dae import DAEObserver
-from obsynth.observers.linear import LinearObserver
-from obsynth.observers.recursive import RecursiveObserver
+from obsynth.observers.dae.observer import DAEObserver
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.plants.dae.model import DAEModel
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.results.report import VerificationReport
 
 if TYPE_CHECKING:
@@ -159,7 +159,7 @@ class ObserverDesign:
         SpecError
             The file cannot be written.
         """
-        from obsynth.results.serialise import save
+        from obsynth.results.gain_sets import save
 
         return save(self, path)
 
@@ -178,7 +178,7 @@ class ObserverDesign:
         import control
         import numpy as np
 
-        from obsynth.observers.steady import steady_observer
+        from obsynth.observers.recursive.steady_state import steady_observer
 
         observer = (
             steady_observer(self.observer).observer if isinstance(self.observer, RecursiveObserver) else self.linear[1]

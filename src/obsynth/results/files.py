@@ -13,18 +13,7 @@ from obsynth.errors import SpecError
 
 @contextmanager
 def replacement_of(target: Path) -> Iterator[tuple[int, str]]:
-    """Give an open file, and its path, that takes the place of ``target`` when all went well; it is removed otherwise.
-
-    Parameters
-    ----------
-    target : Path
-        An existing file is replaced.  The descriptor that is given has to be closed by who takes it.
-
-    Raises
-    ------
-    SpecError
-        The folder does not exist, the path is a folder, or the system refuses.
-    """
+    """Give an open file, and its path, that takes the place of ``target`` when all went well, else is removed."""
     if target.is_dir():
         raise SpecError(f"{target} is a folder: give the name of a file.", path=str(target))
     temporary = None
@@ -44,13 +33,7 @@ def replacement_of(target: Path) -> Iterator[tuple[int, str]]:
 
 
 def write_atomically(path: str | Path, content: str | bytes) -> Path:
-    """Write ``content`` (text as UTF-8) to ``path`` so that the file is there whole or not at all.
-
-    Raises
-    ------
-    SpecError
-        The folder does not exist, the path is a folder, or the system refuses.
-    """
+    """Write ``content`` (text as UTF-8) to ``path`` so that the file is there whole or not at all."""
     if not isinstance(path, (str, os.PathLike)):
         raise SpecError(f"path is {path!r}: give the name of a file.", path="path")
     target = Path(path)

@@ -1,4 +1,4 @@
-"""Plants in motion: exact recursions of discrete descriptor systems."""
+"""Simulated plants: exact recursions of discrete descriptor systems."""
 
 from obsynth.simulation.linear import Trajectory, simulate_plant
 

@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
-from obsynth.models.dae import DAEModel
-from obsynth.models.dae_checks import checked_inputs, finite_vector, step_length
-from obsynth.models.dae_functions import Compiled, DAEFunctions
-from obsynth.models.dae_step import ImplicitStep
-from obsynth.models.dae_stretches import take_samples
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.covariances import covariance_factor
+from obsynth.plants.dae.checks import checked_inputs, finite_vector, step_length
+from obsynth.plants.dae.functions import Compiled, DAEFunctions
+from obsynth.plants.dae.model import DAEModel
+from obsynth.plants.dae.step import ImplicitStep
+from obsynth.plants.dae.stretches import take_samples
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,25 +14,18 @@ from numpy.typing import ArrayLike
 
 from obsynth.analysis.transformations import StateRecovery, eliminate_algebraic_states
 from obsynth.errors import SpecError
-from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
+from obsynth.plants.descriptor import DescriptorSystem
 
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
     """What a plant did, one row per sample; arrays are read-only.
 
-    Parameters
-    ----------
-    states, outputs : FloatArray
-        ``(steps, nx)`` and ``(steps, ny)``.
-    inputs, faults, disturbances, noise : FloatArray
-        ``(steps, nu)``, ``(steps, nf)``, ``(steps, nd)``, ``(steps, nw)``: what drove it.
-    time : FloatArray
-        ``(steps,)``, seconds; starts at zero.
-    inconsistency : float
-        Norm of the change that the given initial state needed to satisfy the algebraic equations at k = 0; only
-        rounding for a consistent one.
+    Fields: states, outputs: ``(steps, nx)`` and ``(steps, ny)``; inputs, faults, disturbances, noise: ``(steps, nu)``,
+    ``(steps, nf)``, ``(steps, nd)``, ``(steps, nw)``: what drove it; time: ``(steps,)``, seconds; starts at zero;
+    inconsistency: Norm of the change that the given initial state needed to satisfy the algebraic equations at k = 0;
+    only rounding for a consistent one.
     """
 
     states: FloatArray
@@ -62,32 +55,7 @@ def simulate_plant(
 ) -> Trajectory:
     """Simulate a discrete plant; every row satisfies its equations up to rounding.
 
-    Parameters
-    ----------
-    plant : DescriptorSystem
-        ``dt > 0``, regular, index 0 or 1; ``E`` may be singular.
-    steps : int
-        Number of samples, k = 0 to ``steps - 1``.
-    u, f, d, w : array_like, optional
-        Known inputs ``(steps, nu)``, faults ``(steps, nf)``, disturbances ``(steps, nd)`` and noise
-        ``(steps, nw)`` (unit covariance: its sizes are in ``Bw, Dw``); zero by default.  A single signal may be
-        given as ``(steps,)``.
-    initial_state : array_like, optional
-        ``x(0)``, ``(nx,)``; zero by default.  ``E x(0)`` is kept; the algebraic part is replaced by what the
-        algebraic equations ask for at k = 0, with the signals of that sample.
-
-    Returns
-    -------
-    Trajectory
-        States, outputs and signals, and by how much the initial state was inconsistent.
-
-    Raises
-    ------
-    SpecError
-        A continuous plant, ``steps`` below one, a signal of the wrong shape or with a value that is not finite,
-        or states that outgrow double precision.
-    PreconditionError
-        The plant is not regular, has index 2 or more, or has no dynamic state.
+    Shapes: ``initial_state (nx,)``.
     """
     if not plant.is_discrete:
         raise SpecError(

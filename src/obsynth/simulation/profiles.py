@@ -23,10 +23,7 @@ SAMPLE_SLACK = 1e-6
 class Profile:
     """What all profiles have.
 
-    Parameters
-    ----------
-    start, end : float, optional, seconds
-        When it acts; without end by default.
+    Fields: start, end: When it acts; without end by default.
     """
 
     #: Whether the signal is held between samples; else it is linear there.
@@ -46,15 +43,7 @@ class Profile:
             raise SpecError(f"end ({self.end:g} s) is not after start ({self.start:g} s).", path="end")
 
     def active(self, steps: int, dt: float) -> np.ndarray:
-        """Return which of the samples 0 to ``steps - 1`` it acts on.
-
-        Parameters
-        ----------
-        steps : int
-            Samples.
-        dt : float, seconds
-            Between samples.
-        """
+        """Return which of the samples 0 to ``steps - 1`` it acts on."""
         place = np.arange(steps) + SAMPLE_SLACK
         return np.asarray((place >= self.start / dt) & (place < self.end / dt))
 
@@ -224,17 +213,7 @@ ADDITIVE = (Step, Ramp, Sine, Drift, Intermittent)
 
 
 def sampled(profile: Additive, steps: int, dt: float) -> tuple[FloatArray, FloatArray]:
-    """Return its values at the left and right end of each interval between samples, ``(steps,)`` each.
-
-    Parameters
-    ----------
-    profile : Additive
-        What adds to a signal.
-    steps : int
-        Samples.
-    dt : float, seconds
-        Between samples.
-    """
+    """Return its values at the left and right end of each interval between samples, ``(steps,)`` each."""
     acts, time = profile.active(steps, dt), dt * np.arange(steps + 1, dtype=np.float64)
     values = profile.at(time)
     left = np.where(acts, values[:-1], 0.0)

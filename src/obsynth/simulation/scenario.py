@@ -9,8 +9,8 @@ from types import MappingProxyType
 from typing import Any
 
 from obsynth.errors import SpecError
-from obsynth.models.descriptor import DescriptorSystem
-from obsynth.models.names import index_of
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.names import index_of
 from obsynth.simulation.failures import RANDOM, LostEffectiveness, Stuck
 from obsynth.simulation.profiles import ADDITIVE, Profile
 

@@ -9,22 +9,17 @@ from numpy.typing import ArrayLike
 
 from obsynth.analysis.time_varying import algebraic_rows
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.models.time_varying import TimeVaryingDescriptorSystem
 from obsynth.numerics.arguments import real_array, real_vector, whole_number
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.ranks import decide_rank
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 
 
 @dataclass(frozen=True, eq=False)
 class VaryingTrajectory:
     """A simulated record.
 
-    Parameters
-    ----------
-    states : FloatArray
-        ``(samples, nx)``.
-    outputs : FloatArray
-        ``(samples, ny)``; the first row is NaN: the model begins with y(1).
+    Fields: states: ``(samples, nx)``; outputs: ``(samples, ny)``; the first row is NaN: the model begins with y(1).
     """
 
     states: FloatArray
@@ -97,28 +92,8 @@ def varying_runs(
 ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
     """Simulate many runs at once, which differ in their noise: one factorisation a step serves all of them.
 
-    Parameters
-    ----------
-    plant : TimeVaryingDescriptorSystem
-        As for `simulate_time_varying`.
-    parameters, inputs : FloatArray
-        ``(samples, nq)`` and ``(samples, nu)``, of all runs.
-    initial_state : FloatArray
-        ``(nx,)``, of all runs, taken to the nearest state that satisfies the algebraic equations.
-    equation_noise, output_noise : FloatArray
-        ``(samples, runs, ne)`` and ``(samples - 1, runs, ny)``.
-
-    Returns
-    -------
-    tuple of FloatArray
-        States ``(samples, runs, nx)`` and outputs ``(samples, runs, ny)``, of which the first are NaN.
-
-    Raises
-    ------
-    SpecError
-        The equations do not determine the states.
-    PreconditionError
-        As for `simulate_time_varying`.
+    Shapes: ``parameters (samples, nq)``, ``inputs (samples, nu)``, ``initial_state (nx,)``, ``equation_noise (samples,
+    runs, ne)``, ``output_noise (samples - 1, runs, ny)``.
     """
     if plant.ne != plant.nx:
         raise SpecError(f"{plant.ne} equations do not determine {plant.nx} states.", path="E")

@@ -27,14 +27,8 @@ MAXIMUM_PROBLEMS = 25
 class DocumentProblems:
     """Collects the problems of one document, to raise them together.
 
-    Parameters
-    ----------
-    source : Path
-        The document.
-    what : str
-        What the document should be, for the message, such as ``spec``.
-    found : list
-        Path and text of each problem so far.
+    Fields: source: The document; what: What the document should be, for the message, such as ``spec``; found: Path and
+    text of each problem so far.
     """
 
     source: Path
@@ -47,13 +41,7 @@ class DocumentProblems:
             self.found.append((path, text))
 
     def raise_if_any(self) -> None:
-        """Raise one `SpecError` with everything noted, if anything was.
-
-        Raises
-        ------
-        SpecError
-            At least one problem was noted; its ``path`` is that of the first.
-        """
+        """Raise one `SpecError` with everything noted, if anything was."""
         if not self.found:
             return
         lines = [f"{path}: {text}" if path else text for path, text in self.found]
@@ -64,27 +52,7 @@ class DocumentProblems:
 
 
 def checked_spec(document: Mapping[str, Any], source: Path) -> tuple[SpecDocument, dict[str, Any]]:
-    """Check a whole spec, and the options of its method.
-
-    Parameters
-    ----------
-    document : mapping
-        Raw data.
-    source : Path
-        Where it comes from, for messages.
-
-    Returns
-    -------
-    checked : SpecDocument
-        The spec.
-    options : dict
-        The options that were given, checked; matrices still as written.
-
-    Raises
-    ------
-    SpecError
-        The document does not fit the schema; all problems at once.
-    """
+    """Check a whole spec, and the options of its method."""
     from obsynth.spec.options import METHOD_OPTIONS
     from obsynth.spec.schema import SpecDocument
 
@@ -110,25 +78,7 @@ def checked_spec(document: Mapping[str, Any], source: Path) -> tuple[SpecDocumen
 
 
 def checked_plant(document: Mapping[str, Any], source: Path) -> PlantDocument | TimeVaryingDocument | DAEDocument:
-    """Check a plant in a file of its own.
-
-    Parameters
-    ----------
-    document : mapping
-        Raw data.
-    source : Path
-        Where it comes from, for messages.
-
-    Returns
-    -------
-    PlantDocument, TimeVaryingDocument or DAEDocument
-        The plant's section.
-
-    Raises
-    ------
-    SpecError
-        The document does not fit the schema; all problems at once.
-    """
+    """Check a plant in a file of its own."""
     from obsynth.spec.schema import DAEDocument, PlantDocument, TimeVaryingDocument
 
     problems = DocumentProblems(source, what="plant")

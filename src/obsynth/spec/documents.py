@@ -15,25 +15,7 @@ MAXIMUM_CHARACTERS = 32_000_000
 
 
 def existing_file(path: Path, *, where: str) -> Path:
-    """Return ``path`` if it is a file.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    where : str
-        What refers to it: a path inside a document, or the file itself.
-
-    Returns
-    -------
-    Path
-        The same path.
-
-    Raises
-    ------
-    SpecError
-        There is no such file, or it is a folder.
-    """
+    """Return ``path`` if it is a file."""
     try:
         if path.is_dir():
             raise SpecError(f"{path} is a folder: give the name of a file.", path=where)
@@ -45,25 +27,7 @@ def existing_file(path: Path, *, where: str) -> Path:
 
 
 def read_text(path: Path, *, where: str | None = None) -> str:
-    """Return the text of a UTF-8 file.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    where : str, optional
-        What refers to it, for the error; the file itself by default.
-
-    Returns
-    -------
-    str
-        The whole text.
-
-    Raises
-    ------
-    SpecError
-        The file is missing, a folder, unreadable, too large or not UTF-8.
-    """
+    """Return the text of a UTF-8 file."""
     place = where or str(path)
     existing_file(path, where=place)
     try:
@@ -79,25 +43,7 @@ def read_text(path: Path, *, where: str | None = None) -> str:
 
 
 def read_yaml(path: Path, *, where: str | None = None) -> dict[str, Any]:
-    """Return the mapping in a YAML 1.2 document; duplicate keys, tags and anchors used twice are refused.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    where : str, optional
-        What refers to it, for the error; the file itself by default.
-
-    Returns
-    -------
-    dict
-        Plain data; nothing in the document is executed.
-
-    Raises
-    ------
-    SpecError
-        The file cannot be read, is no YAML 1.2 document, is empty, or is no mapping at its top level.
-    """
+    """Return the mapping in a YAML 1.2 document; duplicate keys, tags and anchors used twice are refused."""
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError, YAMLWarning
 
@@ -125,25 +71,7 @@ def read_yaml(path: Path, *, where: str | None = None) -> dict[str, Any]:
 
 
 def read_names(path: Path, *, where: str) -> list[str]:
-    """Return the names in a JSON file: a list, or a mapping of lists that are concatenated in order.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    where : str
-        The path inside the document that refers to it.
-
-    Returns
-    -------
-    list of str
-        The names.
-
-    Raises
-    ------
-    SpecError
-        The file cannot be read, or holds anything else.
-    """
+    """Return the names in a JSON file: a list, or a mapping of lists that are concatenated in order."""
     if path.suffix.lower() != ".json":
         raise SpecError(f"{path.name} has an unknown suffix: names are read from .json files.", path=where)
     try:

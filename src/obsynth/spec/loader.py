@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from obsynth.errors import SpecError
-from obsynth.models.dae import DAEModel
-from obsynth.models.descriptor import DescriptorSystem
-from obsynth.models.time_varying import TimeVaryingDescriptorSystem
+from obsynth.plants.dae.model import DAEModel
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.spec.checking import DocumentProblems, checked_plant, checked_spec
 from obsynth.spec.documents import read_yaml
 from obsynth.spec.plants import built_plant, read_value, transformed

@@ -28,28 +28,7 @@ _READING_ERRORS = (
 
 
 def read_matrix(path: Path, *, variable: str | None = None, where: str) -> FloatArray:
-    """Return the matrix in a file.
-
-    Parameters
-    ----------
-    path : Path
-        ``.mtx`` (Matrix Market, dense or sparse), ``.npz``, ``.mat`` (up to version 7.2) or ``.csv``
-        (numbers, separated by commas, no header; ``#`` starts a comment).
-    variable : str, optional
-        Which array of an ``.npz`` or ``.mat`` file; needed if it holds more than one.
-    where : str
-        The path inside the document that refers to the file, such as ``plant.A``.
-
-    Returns
-    -------
-    FloatArray
-        Dense and read-only.
-
-    Raises
-    ------
-    SpecError
-        The file is missing, damaged, of an unknown kind, or holds no finite real matrix.
-    """
+    """Return the matrix in a file."""
     return _checked(_read_array(path, variable=variable, where=where), path.name, where)
 
 
@@ -64,25 +43,7 @@ def _checked(dense: Any, name: str, where: str) -> FloatArray:
 
 
 def read_matrices(path: Path, *, variable: str | None = None, count: int | None = None, where: str) -> FloatArray:
-    """Return the matrix in a file, or a stack of matrices ``(entries, rows, columns)``.
-
-    Parameters
-    ----------
-    path : Path
-        As for `read_matrix`; an array of three dimensions is a stack: k counts along the first axis in an ``.npz``
-        file, and along the last in a ``.mat`` file, as each of them is used.
-    variable : str, optional
-        As for `read_matrix`.
-    count : int, optional
-        How many matrices stand one below the other, in a file that holds two dimensions.
-    where : str
-        The path inside the document that refers to the file.
-
-    Raises
-    ------
-    SpecError
-        As for `read_matrix`; or the rows cannot be shared out among that many matrices.
-    """
+    """Return the matrix in a file, or a stack of matrices ``(entries, rows, columns)``."""
     array = _read_array(path, variable=variable, where=where)
     if np.ndim(array) != 3:
         matrix = _checked(array, path.name, where)

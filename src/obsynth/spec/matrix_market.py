@@ -13,28 +13,7 @@ from obsynth.numerics.arrays import FloatArray
 
 
 def read_matrix_market(path: Path, *, maximum_entries: int) -> FloatArray:
-    """Return the matrix in a Matrix Market file, dense.
-
-    Parameters
-    ----------
-    path : Path
-        ``coordinate`` or ``array``; ``real``, ``double``, ``integer`` or ``pattern``; ``general``,
-        ``symmetric`` or ``skew-symmetric``.
-    maximum_entries : int
-        Larger matrices are refused before anything is allocated.
-
-    Returns
-    -------
-    FloatArray
-        ``(rows, columns)``.
-
-    Raises
-    ------
-    ValueError
-        Anything else, in words.
-    OSError
-        The file cannot be read.
-    """
+    """Return the matrix in a Matrix Market file, dense."""
     with path.open(encoding="utf-8") as stream:
         layout, field, symmetry = _checked_header(stream.readline(200))
         lines = (line for line in stream if line.strip() and not line.startswith("%"))

@@ -63,7 +63,7 @@ class NoiseSection(Section):
 
 
 class UiPiObserverOptions(Section):
-    """Options of the method ``ui-pi-observer``; the fault model is checked by `obsynth.models.fault_models`."""
+    """Options of the method ``ui-pi-observer``; the fault model is checked by `obsynth.plants.fault_models`."""
 
     fault_model: Text | dict[Text, Any] = "step"
     poles: list[float | Annotated[list[float], Field(min_length=2, max_length=2)]] | None = None

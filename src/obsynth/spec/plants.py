@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.models.dae import DAEModel
-from obsynth.models.descriptor import DescriptorSystem
-from obsynth.models.names import index_of
-from obsynth.models.time_varying import TimeVaryingDescriptorSystem
+from obsynth.plants.dae.model import DAEModel
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.names import index_of
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.spec.checking import DocumentProblems
 from obsynth.spec.documents import read_names
 from obsynth.spec.matrices import read_matrices, read_matrix
@@ -33,22 +33,7 @@ _LABELS = ("operating_point", "scales", "units")
 def built_plant(
     section: PlantSection | TimeVaryingSection | DAESection, source: Path, prefix: str
 ) -> DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel:
-    """Return the plant of a section, as written.
-
-    Parameters
-    ----------
-    section : PlantSection, TimeVaryingSection or DAESection
-        Checked.
-    source : Path
-        The document: files are looked up beside it.
-    prefix : str
-        Path of the section in it; empty for a document that is a plant.
-
-    Raises
-    ------
-    SpecError
-        A file cannot be read, or the plant is not well formed.
-    """
+    """Return the plant of a section, as written."""
     kind = getattr(section, "kind", None)
     make: Any = _invariant_plant if kind is None else _nonlinear_plant if kind == "dae" else _varying_plant
     plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel = make(section, source, prefix)
@@ -72,19 +57,7 @@ def _joined(prefix: str, name: str) -> str:
 
 
 def read_value(value: Any, folder: Path, where: str, problems: DocumentProblems) -> Any:
-    """Return rows as an array, files read, picks as lists of names, sections as mappings, all else as it is.
-
-    Parameters
-    ----------
-    value : object
-        An entry of a checked document.
-    folder : Path
-        In which files are looked up.
-    where : str
-        Path of the entry, for problems.
-    problems : DocumentProblems
-        To which what cannot be read is added; the value is ``None`` then.
-    """
+    """Return rows as an array, files read, picks as lists of names, sections as mappings, all else as it is."""
     if isinstance(value, list) and any(isinstance(entry, str) for row in value for entry in _listed(row)):
         return value
     if isinstance(value, list):
@@ -172,26 +145,7 @@ def _noise_arguments(plant: DescriptorSystem, sensor_noise: Mapping[str, float] 
 def transformed(
     wanted: TransformSection | None, plant: DescriptorSystem, source: Path, prefix: str
 ) -> Transformation | None:
-    """Return a plant without its algebraic states, sampled, or both, as asked; ``None`` where nothing is.
-
-    Parameters
-    ----------
-    wanted : TransformSection or None
-        The section ``transform``.
-    plant : DescriptorSystem
-        As written.
-    source : Path
-        The document, for errors.
-    prefix : str
-        Path of what holds the section.
-
-    Raises
-    ------
-    SpecError
-        The plant is sampled already.
-    PreconditionError
-        The plant cannot be transformed, for example because its index is not one.
-    """
+    """Return a plant without its algebraic states, sampled, or both, as asked; ``None`` where nothing is."""
     if wanted is None or not (wanted.eliminate_algebraic_states or wanted.sample_time is not None):
         return None
     where = _joined(prefix, "transform")

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from obsynth.errors import SpecError
-from obsynth.models.dae import DAEModel
-from obsynth.models.descriptor import DescriptorSystem
-from obsynth.models.time_varying import TimeVaryingDescriptorSystem
+from obsynth.plants.dae.model import DAEModel
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.simulation.failures import KINDS
+from obsynth.simulation.parameter_scenario_signals import check_recursive
 from obsynth.simulation.profiles import Profile
-from obsynth.simulation.recursive_drive import check_recursive
 from obsynth.simulation.scenario import Scenario
 from obsynth.spec.checking import DocumentProblems
 
@@ -25,22 +25,7 @@ _GROUPS = ("inputs", "faults", "disturbances", "sensors")
 def built_scenario(
     section: ScenarioSection | None, plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel, source: Path
 ) -> Scenario | None:
-    """Return the scenario of a spec; `None` if it has none.
-
-    Parameters
-    ----------
-    section : ScenarioSection or None
-        As checked by the schema.
-    plant : DescriptorSystem, TimeVaryingDescriptorSystem or DAEModel
-        Whose signals it names, after the transformation.
-    source : Path
-        The spec, for messages.
-
-    Raises
-    ------
-    SpecError
-        A profile lacks a key or has one of another kind, a number is out of range, or a name is unknown.
-    """
+    """Return the scenario of a spec; `None` if it has none."""
     if section is None:
         return None
     problems = DocumentProblems(source, what="spec")

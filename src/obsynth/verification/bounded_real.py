@@ -16,11 +16,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.balls import Enclosed, block
-from obsynth.numerics.definiteness import DefinitenessProof, prove_positive_definite, unproved
-from obsynth.observers.linear import LinearObserver
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.proofs.balls import Enclosed, block
+from obsynth.proofs.definiteness import DefinitenessProof, prove_positive_definite, unproved
 from obsynth.verification.error_system import LaggedPlant
 
 
@@ -35,25 +35,7 @@ def prove_bounded_real(
 ) -> DefinitenessProof:
     """Try to prove the bounded real inequality for the shipped observer.
 
-    Parameters
-    ----------
-    plant : DescriptorSystem
-        The plant.
-    observer : LinearObserver
-        What is shipped; its leading states, as many as Q has rows, carry the fault estimate.
-    tracking : FloatArray
-        ``(nz, nx (lag + 1))``.
-    factor : FloatArray
-        Certificate Q ``(core, core)``, upper triangular.
-    gain : float
-        Claimed bound g; without disturbances only stability is proved.
-    lag : int
-        Samples of past states appended to the plant.
-
-    Returns
-    -------
-    DefinitenessProof
-        ``proved`` also requires that the other observer states neither act on the core nor on the fault estimate.
+    Shapes: ``factor (core, core)``.
     """
     core = factor.shape[0]
     outside = (observer.Az[:core, core:], observer.Cz[observer.fault_rows, core:])

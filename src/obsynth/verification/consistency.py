@@ -13,10 +13,10 @@ from typing import NamedTuple
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
-from obsynth.observers.gain_schedule import GainStep, gain_steps
-from obsynth.observers.recursive import RecursiveObserver
-from obsynth.observers.recursive_running import RunningRecursiveObserver
-from obsynth.observers.step_model import EarlySteps, StepMatrices
+from obsynth.observers.recursive.gain_schedule import GainStep, gain_steps
+from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.recursive.running import RunningRecursiveObserver
+from obsynth.observers.recursive.step_model import EarlyConstraintSteps, StepMatrices
 from obsynth.results.report import Check, upper_bound_check
 
 #: Trials and steps: a wrong variance of 10 % is 20 standard deviations away.
@@ -33,30 +33,20 @@ _SOURCE = "recomputed, Monte Carlo with a fixed seed"
 
 
 def consistency(stated: RecursiveObserver, shipped: RecursiveObserver, steps: int) -> Iterator[Check]:
-    """Yield NEES, NIS and whiteness of a shipped observer on noise as it is stated.
-
-    Parameters
-    ----------
-    stated : RecursiveObserver
-        Built from plant and options: it makes the noise.
-    shipped : RecursiveObserver
-        Which is run.
-    steps : int
-        How many the model has; the first `STEPS` of them are run.
-    """
+    """Yield NEES, NIS and whiteness of a shipped observer on noise as it is stated."""
     rng = np.random.default_rng(SEED)
     truth = RunningRecursiveObserver(stated)
     nq = len(truth.parameters.theta)
     x = rng.standard_normal((TRIALS, truth.factor.shape[1])) @ truth.factor.T
     theta = rng.standard_normal((TRIALS, nq)) @ truth.parameters.spread.T
-    model, early = truth.model, isinstance(truth.model, EarlySteps)
+    model, early = truth.model, isinstance(truth.model, EarlyConstraintSteps)
     nis, pairs = [], []
     scores: dict[int, Scores] = {}
     before = np.zeros((TRIALS, 0))
     count, factor = min(steps, STEPS), truth.factor
     for position, gains in enumerate(gain_steps(shipped, count)):
         k = position - 1 if early else position
-        true = model.first() if isinstance(model, EarlySteps) and position == 0 else model.at(k)
+        true = model.first() if isinstance(model, EarlyConstraintSteps) and position == 0 else model.at(k)
         noise = rng.standard_normal((TRIALS, true.noise.shape[1])) @ true.noise.T
         known = np.zeros_like(noise)
         known[:, : len(true.A)] = x @ gains.step.A.T
@@ -106,12 +96,7 @@ def _terms(gains: GainStep, factor: FloatArray) -> FloatArray:
 def data_deviations(step: StepMatrices, factor: FloatArray) -> FloatArray:
     """Return the standard deviations of the data of one step, ``(rows,)``.
 
-    Parameters
-    ----------
-    step : StepMatrices
-        The step.
-    factor : FloatArray
-        ``(nx, any)``: square root of the covariance before it.
+    Shapes: ``factor (nx, any)``.
     """
     deviations = np.linalg.norm(step.noise, axis=1)
     deviations[: len(step.A)] = np.hypot(deviations[: len(step.A)], np.linalg.norm(step.A @ factor, axis=1))
@@ -119,27 +104,15 @@ def data_deviations(step: StepMatrices, factor: FloatArray) -> FloatArray:
 
 
 def state_terms(step: StepMatrices, sizes: FloatArray) -> FloatArray:
-    """Return how large the terms are that make up the state after a step, for data of these sizes.
-
-    Parameters
-    ----------
-    step : StepMatrices
-        The step.
-    sizes : FloatArray
-        ``(rows,)`` or ``(rows, columns)``, not negative.
-    """
+    """Return how large the terms are that make up the state after a step, for data of these sizes."""
     return np.asarray(np.abs(np.linalg.pinv(step.H)) @ sizes)
 
 
 class Scores(NamedTuple):
     """Errors at one sample.
 
-    Parameters
-    ----------
-    normalised : FloatArray
-        ``(trials, rank)``: in units of their deviations, where these are not zero.
-    known : FloatArray
-        ``(trials, n - rank)``: in units of the terms, in the directions that are claimed to be known exactly.
+    Fields: normalised: ``(trials, rank)``: in units of their deviations, where these are not zero; known: ``(trials, n
+    - rank)``: in units of the terms, in the directions that are claimed to be known exactly.
     """
 
     normalised: FloatArray
@@ -149,14 +122,7 @@ class Scores(NamedTuple):
 def normalised(errors: FloatArray, root: FloatArray, terms: FloatArray) -> Scores:
     """Return errors in units of their covariance ``root root'``; its rank is that beside rounding of its terms.
 
-    Parameters
-    ----------
-    errors : FloatArray
-        ``(trials, n)``.
-    root : FloatArray
-        ``(n, any)``.
-    terms : FloatArray
-        ``(n,)``: the deviations that ``root`` was computed from.
+    Shapes: ``errors (trials, n)``, ``root (n, any)``, ``terms (n,)``.
     """
     sizes = np.where(terms > 0.0, terms, 1.0)
     left, values, _ = np.linalg.svd(root / sizes[:, None])

@@ -16,9 +16,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray
-from obsynth.observers.linear import LinearObserver
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.plants.descriptor import DescriptorSystem
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,16 +59,9 @@ class LaggedPlant:
 class ErrorSystem:
     """The observer's error ``e = V E x - z`` and what it does to the estimates.
 
-    Parameters
-    ----------
-    Az : FloatArray
-        ``(nz, nz)``.
-    fault, disturbance, noise : FloatArray
-        Inputs of the error ``V b - By d``: ``(nz, nf)``, ``(nz, nd)``, ``(nz, nw)``.
-    fault_output, residual_output : tuple of FloatArray
-        ``(Cf, Df, Dd, Dw)``: fault estimate (residual) = ``-Cf e + Df f + Dd d + Dw w``.
-    state_output : tuple of FloatArray
-        ``(Cx, Df, Dd, Dw)``: state error = ``Cx e - Df f - Dd d - Dw w``.
+    Fields: Az: ``(nz, nz)``; fault, disturbance, noise: Inputs of the error ``V b - By d``: ``(nz, nf)``, ``(nz, nd)``,
+    ``(nz, nw)``; fault_output, residual_output: ``(Cf, Df, Dd, Dw)``: fault estimate (residual) = ``-Cf e + Df f + Dd d
+    + Dw w``; state_output: ``(Cx, Df, Dd, Dw)``: state error = ``Cx e - Df f - Dd d - Dw w``.
     """
 
     Az: FloatArray

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.scaling import balance_by_least_squares
-from obsynth.observers.linear import LinearObserver
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.report import Check, upper_bound_check
 from obsynth.verification.error_system import LaggedPlant
 
@@ -25,14 +25,8 @@ EQUALITY_TOLERANCE = 1e-9
 class Residual:
     """How far an identity is from holding, at its worst entry.
 
-    Parameters
-    ----------
-    error : float
-        Absolute value of the sum there.
-    scale : float
-        Size of the terms it is made of.
-    allowance : float, optional
-        What the rounding of printed gains may add to the error.
+    Fields: error: Absolute value of the sum there; scale: Size of the terms it is made of; allowance: What the rounding
+    of printed gains may add to the error.
     """
 
     error: float
@@ -62,16 +56,9 @@ class Residual:
 class Identity:
     """A sum of terms that must vanish: ``terms[0] + terms[1] + ... = 0``.
 
-    Parameters
-    ----------
-    terms : tuple of FloatArray
-        All of one shape.
-    factors : tuple of tuple of FloatArray, optional
-        The products inside the terms, which also say what rounding can do.
-    units : FloatArray, optional
-        Sizes of the columns' signals: multiplied by them, entries of one row compare.
-    entrywise : bool, optional
-        Whether each entry is judged by its own terms; by default it is by the largest ones of its row.
+    Fields: terms: All of one shape; factors: The products inside the terms, which also say what rounding can do; units:
+    Sizes of the columns' signals: multiplied by them, entries of one row compare; entrywise: Whether each entry is
+    judged by its own terms; by default it is by the largest ones of its row.
     """
 
     terms: tuple[FloatArray, ...]
@@ -85,13 +72,7 @@ class Identity:
         return np.asarray(sum(self.terms[1:], start=self.terms[0].copy()))
 
     def residual(self, allowance: FloatArray | None = None) -> Residual:
-        """Return the residual at the entry that is worst beside what is allowed there.
-
-        Parameters
-        ----------
-        allowance : FloatArray, optional
-            What printed gains may add to each entry; nothing by default.
-        """
+        """Return the residual at the entry that is worst beside what is allowed there."""
         total = self.total
         if total.size == 0:
             return Residual(0.0, 1.0)
@@ -137,15 +118,7 @@ def worst(found: list[Residual]) -> Residual:
 
 
 def relative_tolerance(printed_digits: int | None, products: int) -> float:
-    """Return what an equality may miss by, relative to its terms.
-
-    Parameters
-    ----------
-    printed_digits : int or None
-        Decimals to which the gains were printed; ``None`` for double precision.
-    products : int
-        How many products an entry sums up, each with half a unit in the last printed place.
-    """
+    """Return what an equality may miss by, relative to its terms."""
     return EQUALITY_TOLERANCE if printed_digits is None else 0.5 * 10.0 ** (-printed_digits) * products
 
 
@@ -166,19 +139,7 @@ def equality(name: str, claim: str, found: Residual, source: str, *, bound: floa
 def tracking_identities(
     plant: DescriptorSystem, observer: LinearObserver, tracking: FloatArray, lag: int
 ) -> dict[str, Identity]:
-    """Return the identities that make the observer unbiased without faults and disturbances.
-
-    Parameters
-    ----------
-    plant : DescriptorSystem
-        The plant.
-    observer : LinearObserver
-        What is shipped.
-    tracking : FloatArray
-        ``(nz, nx (lag + 1))``.
-    lag : int
-        Samples of past states appended to the plant.
-    """
+    """Return the identities that make the observer unbiased without faults and disturbances."""
     lagged = LaggedPlant.of(plant, lag)
     ve = tracking @ lagged.E
     states, cz, dy, du = observer.state_rows, observer.Cz, observer.Dy, observer.Du

@@ -13,26 +13,14 @@ from __future__ import annotations
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.balls import Enclosed, block
-from obsynth.numerics.definiteness import DefinitenessProof, prove_positive_definite, unproved
+from obsynth.proofs.balls import Enclosed, block
+from obsynth.proofs.definiteness import DefinitenessProof, prove_positive_definite, unproved
 
 
 def prove_stable(a: FloatArray, factor: FloatArray, dt: float) -> DefinitenessProof:
     """Try to prove that every mode of ``a`` dies out.
 
-    Parameters
-    ----------
-    a : FloatArray
-        ``(n, n)``.
-    factor : FloatArray
-        Q ``(n, n)``, upper triangular with a nonzero diagonal.
-    dt : float
-        Seconds between samples, 0 for continuous time.
-
-    Returns
-    -------
-    DefinitenessProof
-        ``proved`` is never true for a matrix that is not stable.
+    Shapes: ``a (n, n)``, ``factor (n, n)``.
     """
     if factor.shape != a.shape or not np.all(np.isfinite(factor)) or not np.all(np.isfinite(a)):
         return unproved("the certificate does not fit, or a number is not finite")

@@ -6,21 +6,13 @@ from collections.abc import Iterable, Iterator
 
 from obsynth.analysis.conditions import Condition
 from obsynth.analysis.zeros import are_outside
-from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.pencils import FiniteZeros, PencilStructure, pencil_structure
+from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.report import Check, information
 
 
 def plant_information(plant: DescriptorSystem, structure: PencilStructure | None = None) -> Iterator[Check]:
-    """Yield rows on regularity, index, eigenvalues and stability of the plant; they inform and never fail.
-
-    Parameters
-    ----------
-    plant : DescriptorSystem
-        The plant.
-    structure : PencilStructure, optional
-        Of its E and A, where it is known.
-    """
+    """Yield rows on regularity, index, eigenvalues and stability of the plant; they inform and never fail."""
     structure = pencil_structure(plant.E, plant.A) if structure is None else structure
     source = "the plant"
     yield information("plant: regular", "det(A - zE) is not identically zero", float(structure.regular), source=source)

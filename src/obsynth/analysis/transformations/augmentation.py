@@ -9,34 +9,17 @@ import numpy as np
 from obsynth.analysis.transformations.recovery import Transformation, unchanged_states, with_states
 from obsynth.analysis.zeros import leading_names
 from obsynth.errors import PreconditionError
-from obsynth.models.descriptor import DescriptorSystem
-from obsynth.models.names import index_of
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import NEGLIGIBLE_INPUT, decide_rank
 from obsynth.numerics.scaling import equilibrate_pencil
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.names import index_of
 
 
 def augment_faults(plant: DescriptorSystem, faults: Sequence[str]) -> Transformation:
     """Append the chosen faults that act on the outputs as algebraic states ``phi = f``.
 
-    Parameters
-    ----------
-    plant : DescriptorSystem
-        ``Df (ny, nf)``, either time.
-    faults : sequence of str
-        Names; those whose column of ``Df`` is zero need no state and are left alone.
-
-    Returns
-    -------
-    Transformation
-        With states ``fault:<name>`` appended and the columns of these faults in ``Df`` zero.
-
-    Raises
-    ------
-    SpecError
-        An unknown fault.
-    PreconditionError
-        ``rank [E 0; 0 0; C Df] < nx + n``: a combination of sensor faults looks like a state.
+    Shapes: ``plant (ny, nf)``.
     """
     columns = [index_of(name, plant.fault_names, what="The plant") for name in faults]
     chosen = sorted({column for column in columns if plant.Df[:, column].any()})

@@ -14,11 +14,11 @@ from obsynth.analysis.transformations.recovery import (
     with_states,
 )
 from obsynth.errors import PreconditionError
-from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
 from obsynth.numerics.scaling import equilibrate_pencil, power_of_two_below
+from obsynth.plants.descriptor import DescriptorSystem
 
 
 def eliminate_algebraic_states(plant: DescriptorSystem) -> Transformation:

@@ -8,8 +8,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.plants.descriptor import DescriptorSystem
 
 _Value = TypeVar("_Value")
 
@@ -20,16 +20,10 @@ class StateRecovery:
 
     ``x_source = from_state x + from_input u + from_fault f + from_disturbance d + from_noise w``
 
-    Parameters
-    ----------
-    names : tuple of str
-        Names of the source states.
-    from_state, from_input, from_fault, from_disturbance, from_noise : FloatArray
-        ``(nx_source, nx)``, ``(nx_source, nu)`` and so on, read-only.
-    noise_kept : FloatArray
-        ``(nw_source, nw)``: the noise of the source as far as the transformed plant still has it.
-    operating_point : mapping, optional
-        Of the source states: the transformed plant forgets that of states which are gone.
+    Fields: names: Names of the source states; from_state, from_input, from_fault, from_disturbance, from_noise:
+    ``(nx_source, nx)``, ``(nx_source, nu)`` and so on, read-only; noise_kept: ``(nw_source, nw)``: the noise of the
+    source as far as the transformed plant still has it; operating_point: Of the source states: the transformed plant
+    forgets that of states which are gone.
     """
 
     names: tuple[str, ...]
@@ -76,14 +70,8 @@ class StateRecovery:
 class Transformation:
     """A plant made from another one.
 
-    Parameters
-    ----------
-    source, plant : DescriptorSystem
-        The plant before and after.
-    description : str
-        What was done, in words.
-    recovery : StateRecovery
-        The states of ``source`` from the signals of ``plant``.
+    Fields: source, plant: The plant before and after; description: What was done, in words; recovery: The states of
+    ``source`` from the signals of ``plant``.
     """
 
     source: DescriptorSystem

@@ -10,10 +10,10 @@ from obsynth.analysis.transformations.elimination import columns_of, eliminate_a
 from obsynth.analysis.transformations.recovery import Transformation, unchanged_states
 from obsynth.analysis.zeros import fault_zeros
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.models.descriptor import DescriptorSystem
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, SLOW_ZERO_RADIUS
 from obsynth.numerics.scaling import power_of_two_below
+from obsynth.plants.descriptor import DescriptorSystem
 
 
 def discretise(plant: DescriptorSystem, sample_time: float) -> Transformation:
@@ -88,11 +88,6 @@ def sampling_zero_warnings(plant: DescriptorSystem) -> tuple[str, ...]:
     """Return a text for every fault zero strictly inside, but near, the unit circle of a sampled plant.
 
     The fault estimate rings for ``dt / -ln abs(z)`` seconds there.
-
-    Parameters
-    ----------
-    plant : DescriptorSystem
-        ``dt > 0``; a continuous plant gets no warnings.
     """
     if not plant.is_discrete:
         return ()

@@ -1,0 +1,128 @@
+"""What runs on rows of data: the same questions and answers for every kind of design."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple, Protocol
+
+from obsynth.experiments.monitors.online import Evidence
+from obsynth.numerics.arrays import FloatArray
+
+#: What a row of estimates is.
+OK, WARM_UP, PARTIAL, GAP, RECOVERING = "ok", "warm-up", "partial", "gap", "recovering"
+#: Rows in which a decision may be taken.
+DECIDING = (OK, PARTIAL)
+#: Gaps longer than this many samples are not bridged: the observer starts again.
+LONGEST_BRIDGE = 10_000
+
+
+class Row(NamedTuple):
+    """Estimates at one row of data.
+
+    Fields: status: ``ok``, ``warm-up``, ``partial``, ``gap`` or ``recovering``; values: One for each column of the
+    engine, state estimates first, then fault estimates; deviations; NaN where nothing is known; skipped: How many rows
+    were missing before this one; evidence: What a recursive observer learnt from this row, for decisions; `None` for
+    others.
+    """
+
+    status: str
+    values: FloatArray
+    skipped: int = 0
+    evidence: Evidence | None = None
+
+
+class Engine(Protocol):
+    """A running design on measured data.
+
+    Fields: input_names, output_names: What is read from each row, in order; state_names, fault_names: What is
+    estimated: the first columns; columns: Names of the columns of estimates; state_delays, fault_delays: Samples by
+    which each estimate lags; dt: Seconds between samples; 0 for continuous time; point: Operating point by name of the
+    signal; scales: Factor of inputs and outputs by name, where the plant states one; notes: What a user should know
+    before anything is run.
+    """
+
+    @property
+    def input_names(self) -> tuple[str, ...]:
+        """Known inputs."""
+        ...
+
+    @property
+    def output_names(self) -> tuple[str, ...]:
+        """Outputs of the plant."""
+        ...
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """States that are estimated."""
+        ...
+
+    @property
+    def fault_names(self) -> tuple[str, ...]:
+        """Faults or parameters that are estimated."""
+        ...
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names of the columns of estimates."""
+        ...
+
+    @property
+    def state_delays(self) -> tuple[int, ...]:
+        """Samples by which each state estimate lags."""
+        ...
+
+    @property
+    def fault_delays(self) -> tuple[int, ...]:
+        """Samples by which each fault estimate lags."""
+        ...
+
+    @property
+    def dt(self) -> float:
+        """Seconds between samples; 0 for continuous time."""
+        ...
+
+    @property
+    def point(self) -> Mapping[str, float]:
+        """Operating point by name of the signal."""
+        ...
+
+    @property
+    def scales(self) -> Mapping[str, float]:
+        """Factor of inputs and outputs by name, where the plant states one."""
+        ...
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a user should know before anything is run."""
+        ...
+
+    def step(self, time: float, values: FloatArray, row: int) -> Row:
+        """Take one row of data; see `obsynth.data.linear_log.DataObserver.step`."""
+        ...
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the state that goes from row to row, as data."""
+        ...
+
+    def resume(self, data: dict[str, Any]) -> None:
+        """Go on from what `as_dict` returned."""
+        ...
+
+
+def estimate_columns(
+    states: tuple[str, ...], faults: tuple[str, ...], residuals: tuple[str, ...], *, deviations: bool = False
+) -> tuple[str, ...]:
+    """Return the names of columns."""
+    estimated = (*(f"xhat[{name}]" for name in states), *(f"fhat[{name}]" for name in faults))
+    spread = tuple(f"sd {name}" for name in estimated) if deviations else ()
+    return (*estimated, *spread, *(f"r[{name}]" for name in residuals))
+
+
+def delayed(engine: Engine) -> tuple[tuple[str, int], ...]:
+    """Return name and delay in samples of what lags: the states (together where they lag alike), and each fault."""
+    states = set(engine.state_delays)
+    found = [(f"xhat[{name}]", delay) for name, delay in zip(engine.state_names, engine.state_delays, strict=True)]
+    if len(states) == 1:
+        found = [("xhat", engine.state_delays[0])]
+    found += [(f"fhat[{name}]", delay) for name, delay in zip(engine.fault_names, engine.fault_delays, strict=True)]
+    return tuple((name, delay) for name, delay in found if delay)

@@ -1,0 +1,66 @@
+"""What simulations of every kind have in common: signals as named columns of a table, and what is said of the start."""
+
+from __future__ import annotations
+
+import csv
+import io
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+
+from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.results.files import write_atomically
+
+
+def named_columns(time: FloatArray, groups: Iterable[tuple[str, Sequence[str], FloatArray]]) -> dict[str, FloatArray]:
+    """Return every column by name; inputs and outputs go by their own names, unless those are taken.
+
+    Shapes: ``time (steps,)``.
+    """
+    found = {"time": time}
+    for form, names, values in groups:
+        for i, name in enumerate(names):
+            plain = form[0] in "uy" and name not in found
+            found[name if plain else form.format(name)] = values[:, i]
+    return found
+
+
+def write_columns(table: Mapping[str, FloatArray], path: str | Path) -> Path:
+    """Write columns as comma-separated text, atomically, floats with all their digits; NaN is an empty cell.
+
+    Shapes: ``table (steps,)``.
+    """
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(table)
+    for row in zip(*(column.tolist() for column in table.values()), strict=True):
+        writer.writerow(["" if value != value else value for value in row])
+    return write_atomically(path, text.getvalue())
+
+
+@dataclass(frozen=True, eq=False)
+class SignalTable(ABC):
+    """Signals of a simulation, one row per sample; arrays are read-only."""
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            if isinstance(getattr(self, field.name), np.ndarray):
+                object.__setattr__(self, field.name, read_only(getattr(self, field.name)))
+
+    @abstractmethod
+    def columns(self) -> dict[str, FloatArray]:
+        """Return every column by name, ``(steps,)`` each."""
+
+    def write_csv(self, path: str | Path) -> Path:
+        """Write `columns` as comma-separated text, atomically, floats with all their digits."""
+        return write_columns(self.columns(), path)
+
+
+def projected_note(change: float) -> str:
+    """Return what to say of an initial state that was moved by ``change`` (norm)."""
+    return (
+        f"The initial state did not satisfy the algebraic equations: it was projected, a change of {change:.3g} (norm)."
+    )

@@ -1,0 +1,1 @@
+"""Monitors of residuals and parameters: statistics, thresholds, and what they promise."""

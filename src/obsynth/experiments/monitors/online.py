@@ -1,0 +1,171 @@
+"""Monitors for runs of any length: thresholds that hold from the first row to the last, whenever that comes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.numerics.arrays import FloatArray
+
+
+class Seen(NamedTuple):
+    """What a monitor says of one row.
+
+    Fields: statistic, threshold: NaN where nothing is decided; alarm: Whether the threshold is passed; fault: The fault
+    that stands out; empty without an alarm, or without faults.
+    """
+
+    statistic: float
+    threshold: float
+    alarm: bool
+    fault: str
+
+
+class Evidence(NamedTuple):
+    """What a recursive observer learnt from a sample.
+
+    Fields: theta, covariance: Parameters ``(nq,)`` and their covariance ``(nq, nq)``; innovation, regressor: ``(m,)``
+    and ``(m, nq)``: innovation less regressor times the true parameters is white, N(0, I).
+    """
+
+    theta: FloatArray
+    covariance: FloatArray
+    innovation: FloatArray
+    regressor: FloatArray
+
+
+UNDECIDED = Seen(math.nan, math.nan, False, "")
+
+
+class Rule(Protocol):
+    """A statistic and its threshold, row by row."""
+
+    def take(
+        self, time: float, residuals: FloatArray, evidence: Any, *, deciding: bool
+    ) -> tuple[float, float, int | None]:
+        """Return statistic, threshold, and the number of the fault if the rule knows it."""
+        ...
+
+    def restart(self) -> None:
+        """Forget windows and sums: rows are missing."""
+        ...
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the state that goes from row to row, as data."""
+        ...
+
+    def resume(self, data: Mapping[str, Any]) -> None:
+        """Go on from what `as_dict` returned."""
+        ...
+
+
+class OnlineMonitor:
+    """A monitor for data of any length; made by `obsynth.online_monitor`.  Each run begins with a copy.
+
+    Parameters
+    ----------
+    kind, statement : str
+        Which one, and what its threshold means.
+    rule : Rule
+        Statistic and threshold.
+    residuals : int
+        Columns of the residual that it watches.
+    fault_names : tuple of str
+        What an alarm may name.
+    fault_scales : FloatArray
+        ``(nf,)``: what fault estimates are compared in.
+    """
+
+    def __init__(
+        self, kind: str, statement: str, rule: Rule, *, residuals: int, fault_names: tuple[str, ...],
+        fault_scales: FloatArray,
+    ) -> None:  # fmt: skip
+        self.kind, self.statement, self._rule = kind, statement, rule
+        self._residuals, self._names, self._scales = residuals, fault_names, fault_scales
+        self._decided = False
+
+    def require_fit(self, residuals: int, fault_names: tuple[str, ...]) -> None:
+        """Refuse a design that this monitor was not made for.
+
+        Parameters
+        ----------
+        residuals : int
+            Columns of its residual.
+        fault_names : tuple of str
+            What it estimates.
+
+        Raises
+        ------
+        SpecError
+            They differ from those that are watched.
+        """
+        if residuals != self._residuals or fault_names != self._names:
+            raise SpecError("The monitor was made for another design.", path="monitor")
+
+    def see(
+        self, time: float, *, deciding: bool, skipped: int, residuals: FloatArray, faults: FloatArray, evidence: Any
+    ) -> Seen:
+        """Take one row of estimates.
+
+        Parameters
+        ----------
+        time : float, seconds
+            Of the row.
+        deciding : bool
+            Whether a decision may be taken: not in gaps, and not while a start is being forgotten.
+        skipped : int
+            Rows that were missing before this one.
+        residuals, faults : FloatArray
+            ``(nr,)`` and ``(nf,)``, deviations.
+        evidence : object
+            What a recursive observer learnt.
+        """
+        if skipped or (self._decided and not deciding):
+            self._rule.restart()
+        self._decided = deciding
+        statistic, threshold, which = self._rule.take(time, residuals, evidence, deciding=deciding)
+        # A statistic that has overflowed has passed any threshold.
+        if math.isnan(statistic) or not math.isfinite(threshold):
+            return UNDECIDED
+        if statistic <= threshold:
+            return Seen(statistic, threshold, False, "")
+        if which is None and self._names and np.isfinite(faults).all():
+            which = int(np.argmax(np.abs(faults) / self._scales))
+        return Seen(statistic, threshold, True, "" if which is None else self._names[which])
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the state that goes from row to row, as data."""
+        return {"kind": self.kind, "decided": self._decided, "rule": self._rule.as_dict()}
+
+    def resume(self, data: Mapping[str, Any]) -> None:
+        """Go on from what `as_dict` returned.
+
+        Parameters
+        ----------
+        data : mapping
+            From a run with the same gain set and options.
+
+        Raises
+        ------
+        SpecError
+            The state is of another kind of monitor, or one with other options.
+        """
+        if data["kind"] != self.kind:
+            raise SpecError(f"The saved state is of a run with the monitor {data['kind']!r}: use the same options.",
+                            path="state")  # fmt: skip
+        self._decided = data["decided"]
+        self._rule.resume(data["rule"])
+
+
+def share_of_look(look: int) -> float:
+    """Return the share of the probability of a false alarm that look number ``look`` (from 1) may take.
+
+    The shares of all looks sum up to at most one, however long a run is: looks ``2^j`` to ``2^(j+1) - 1`` share
+    ``6 / (pi (j + 1))^2`` evenly.
+    """
+    epoch = look.bit_length() - 1
+    return 6.0 / (math.pi * (epoch + 1.0)) ** 2 / 2.0**epoch

@@ -1,0 +1,141 @@
+"""What reaches the residual of a design when nothing is wrong: disturbances, noise, an error at the start."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.experiments.monitors.sampled_residual import sampled_errors, tracked_errors
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.norms import output_covariance
+from obsynth.results.design import ObserverDesign
+from obsynth.simulation.failures import Random, Uniform
+from obsynth.simulation.profiles import Additive, sampled
+from obsynth.simulation.scenario import Scenario
+from obsynth.simulation.scenario_signals import resolve
+
+
+@dataclass(frozen=True, eq=False)
+class ResidualModel:
+    """``e+ = A e + Bd d + Bw w``, ``r = C e + Dd d + Dw w`` at the samples, without faults, w of unit covariance.
+
+    Fields: A, C, Bd, Dd, Bw, Dw: Of the residual; fault_C, fault_Dd, fault_Dw: Of the fault estimates; steps: Samples
+    of the scenario; start: ``(n,)``: e at the start of the scenario; bounds, means, deviations: ``(nd,)``: largest
+    absolute value of each disturbance in the scenario (infinite if there is none), mean and standard deviation of what
+    is random in it; steady: Whether each disturbance has no part but random ones over the whole record; flow: Of a
+    continuous design: A and Bd in continuous time; start_noise: Of a continuous design, ``(n, any)``: what the noise w
+    of the first sample (its first signals) adds to e there; sensor_noise: Of a continuous design: what the noise of the
+    sensors (the first signals of w), drawn as straight lines between samples, does to e' and r.
+    """
+
+    A: FloatArray
+    C: FloatArray
+    Bd: FloatArray
+    Dd: FloatArray
+    Bw: FloatArray
+    Dw: FloatArray
+    fault_C: FloatArray
+    fault_Dd: FloatArray
+    fault_Dw: FloatArray
+    steps: int
+    start: FloatArray
+    bounds: FloatArray
+    means: FloatArray
+    deviations: FloatArray
+    steady: tuple[bool, ...]
+    flow: tuple[FloatArray, FloatArray] | None = None
+    start_noise: FloatArray | None = None
+    sensor_noise: tuple[FloatArray, FloatArray] | None = None
+
+    @property
+    def initial_error(self) -> float:
+        """Norm of e at the start of the scenario."""
+        return float(np.linalg.norm(self.start))
+
+    def powers(self) -> list[FloatArray]:
+        """Return ``A^k`` for every sample."""
+        found = [np.eye(len(self.A))]
+        while len(found) < self.steps:
+            found.append(np.asarray(found[-1] @ self.A))
+        return found
+
+    @property
+    def noisy(self) -> bool:
+        """Whether white noise reaches the residual."""
+        return bool(self.Bw.any() or self.Dw.any())
+
+    def fault_scales(self) -> FloatArray:
+        """Return ``(nf,)``: standard deviations of the fault estimates, by which they are compared.
+
+        Disturbances count as white, of their deviation in the scenario or else of half their bound.
+        """
+        known = np.where(np.isfinite(self.bounds), self.bounds, 0.0) / 2.0
+        sizes = np.where(self.deviations > 0.0, self.deviations, known)
+        covariance = output_covariance(
+            self.A,
+            np.hstack([self.Bd * sizes, self.Bw]),
+            self.fault_C,
+            np.hstack([self.fault_Dd * sizes, self.fault_Dw]),
+        )
+        scales = np.sqrt(np.abs(np.diag(covariance)))
+        largest = float(np.max(scales, initial=0.0))
+        # What nothing disturbs is compared as it is, in the units of what is disturbed most.
+        return np.where(scales > 0.0, scales, largest if largest > 0.0 else 1.0)
+
+
+def residual_model(design: ObserverDesign, scenario: Scenario) -> ResidualModel:
+    """Return the model of a design's residual on a scenario."""
+    plant, observer = design.linear
+    drive = resolve(plant, scenario)
+    noisy = plant.replace(
+        Bw=np.hstack([scenario.noise * plant.Bw, np.zeros((plant.nx, plant.ny))]),
+        Dw=np.hstack([scenario.noise * plant.Dw, np.diag(drive.deviations)]),
+        noise_names=None,
+    )
+    found = tracked_errors(design, noisy)
+    errors = found.errors
+    start = np.array([scenario.initial_state.get(name, 0.0) for name in plant.state_names])
+    begin = np.zeros(observer.order) if scenario.observer_state is None else np.array(scenario.observer_state)
+    if len(begin) != observer.order:
+        raise SpecError(f"observer_state needs {observer.order} numbers, not {len(begin)}.", path="observer_state")
+    initial = found.tracking @ (plant.E @ start) - begin
+    shown, _, direct_d, direct_w = errors.residual_output
+    faults, _, faults_d, faults_w = errors.fault_output
+    bounds, means, deviations, steady = _disturbances(scenario, plant.disturbance_names, drive.steps, drive.dt)
+    a, driven, noise, flow, start_noise, heard = errors.Az, errors.disturbance, errors.noise, None, None, None
+    if not plant.is_discrete:
+        held, flow = sampled_errors(noisy, observer, found, drive.dt), (errors.Az, errors.disturbance)
+        a, driven, noise, start_noise = held.A, held.Bd, held.Bw, held.start
+        sensors = noisy.Dw.any(axis=0)
+        heard = errors.noise[:, sensors], direct_w[:, sensors]
+        direct_w, faults_w = held.direct(observer.residual_rows), held.direct(observer.fault_rows)
+    return ResidualModel(
+        a, -shown, driven, direct_d, noise, direct_w, -faults, faults_d, faults_w,
+        drive.steps, initial, bounds, means, deviations, steady, flow, start_noise, heard,
+    )  # fmt: skip
+
+
+def _disturbances(
+    scenario: Scenario, names: tuple[str, ...], steps: int, dt: float
+) -> tuple[FloatArray, FloatArray, FloatArray, tuple[bool, ...]]:
+    bounds, means, variances = np.zeros(len(names)), np.zeros(len(names)), np.zeros(len(names))
+    steady = []
+    for i, name in enumerate(names):
+        fixed, calm = np.zeros(steps), True
+        for profile in scenario.disturbances.get(name, ()):  # type: ignore[union-attr]
+            if isinstance(profile, Random):
+                calm &= bool(profile.active(steps, dt).all())
+                means[i] += (profile.low + profile.high) / 2 if isinstance(profile, Uniform) else profile.mean
+                bounds[i] += max(abs(profile.low), abs(profile.high)) if isinstance(profile, Uniform) else np.inf
+                spread = (
+                    (profile.high - profile.low) ** 2 / 12 if isinstance(profile, Uniform) else profile.deviation**2
+                )
+                variances[i] += spread
+            else:
+                fixed, calm = fixed + sampled(cast(Additive, profile), steps, dt)[0], False
+        bounds[i] += np.max(np.abs(fixed))
+        steady.append(calm)
+    return bounds, means, np.sqrt(variances), tuple(steady)

@@ -1,0 +1,208 @@
+"""From a design and a scenario to a monitor of the residual."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.experiments.batch_simulation import Bench, make_bench
+from obsynth.experiments.monitors.monitor import KINDS, Monitor, statement_of
+from obsynth.experiments.monitors.residual_model import ResidualModel, residual_model
+from obsynth.experiments.monitors.thresholds import (
+    paper_threshold,
+    pointwise_threshold,
+    scaled_inputs,
+    window_threshold,
+)
+from obsynth.experiments.monitors.whitening import cusum_whitener, settled, steady_mean, whitener_of, window_covariance
+from obsynth.numerics.arguments import is_finite_number, require_kind, require_mapping
+from obsynth.numerics.arrays import FloatArray
+from obsynth.plants.names import index_of
+from obsynth.results.design import ObserverDesign
+from obsynth.simulation.scenario import Scenario
+
+#: What rounding may add to a residual, relative to the terms it is made of.
+ROUNDING_SHARE = 1e-10
+
+
+def monitor(
+    design: ObserverDesign,
+    scenario: Scenario,
+    kind: str = "pointwise",
+    *,
+    disturbance_bounds: Mapping[str, float] | None = None,
+    noise_bound: float | None = None,
+    initial_error: float | None = None,
+    gamma: float | None = None,
+    window: int = 20,
+    false_alarms: float = 0.01,
+    change: float = 1.0,
+    isolation_delay: int = 0,
+) -> Monitor:
+    """Return a threshold for the residual of a linear design, and the statistic it belongs to.
+
+    Parameters
+    ----------
+    design : ObserverDesign
+        Of a linear method, with residuals.
+    scenario : Scenario
+        Its length, sampling, inputs, start, disturbances and noise count; its faults do not.
+    kind : {"pointwise", "paper", "window", "chi-square", "cusum"}, optional
+        ``pointwise``: norm of the residual against its l1 (peak) bound, never passed without a fault.  ``paper``: the
+        same norm against (66) with the norm of the power, which is not a pointwise bound.  ``window``: l2 norm over a
+        window against the l2 gain and the energy of the error at its start.  ``chi-square``: a window of residuals in
+        the metric of its covariance.  ``cusum``: cumulative sums of the whitened residual, for small changes.
+    disturbance_bounds : mapping, optional
+        Largest absolute value of disturbances by name; those of the scenario by default.
+    noise_bound : float, optional
+        Standard deviations that no component of the noise exceeds; needed by ``pointwise`` and ``window`` where the
+        scenario has noise.
+    initial_error : float, optional
+        Bound on the norm of the observer's error at the start (``V E x - z``, with the tracking map V of the
+        certificate); that of the scenario by default.
+    gamma : float, optional
+        For ``paper``: l2 gain from the disturbances to the residual; computed by default.
+    window : int, optional
+        Samples that ``window``, ``chi-square`` and ``cusum`` look back.
+    false_alarms : float, optional
+        For ``chi-square`` and ``cusum``: probability of a false alarm in a whole run, at most.
+    change : float, optional
+        For ``cusum``: shift it is tuned for, in standard deviations of the whitened residual.
+    isolation_delay : int, optional
+        Samples from an alarm to the comparison of the fault estimates, where these answer later than the residual.
+
+    Returns
+    -------
+    Monitor
+        With a sentence that says what its threshold means.
+
+    Raises
+    ------
+    SpecError
+        A recursive design, an option out of range, a signal without a bound (or without a covariance), or a record that
+        is too short; the paper's threshold for a continuous design.
+
+    Notes
+    -----
+    Of a continuous design, the pointwise bound is that of the observer in continuous time, for disturbances of any
+    shape within their bounds: a rigorous bound on its peak gain, with what the known inputs and the plant's start alone
+    do to the sampled observer (which takes them as straight lines between samples) computed and added.  What the
+    curvature of the response to disturbances does between samples is not in it: sample fast enough, as the statement
+    says.  The statistical kinds use disturbances that are held between samples, and exact covariances of the noise.
+    """
+    require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
+    require_kind(scenario, Scenario, "scenario", "an obsynth.Scenario")
+    require_mapping(disturbance_bounds, "disturbance_bounds")
+    if kind not in KINDS:
+        raise SpecError(f"kind is {kind!r}: use one of {', '.join(KINDS)}.", path="kind")
+    require_options(noise_bound, initial_error, gamma, window, false_alarms, change, isolation_delay)
+    model = residual_model(design, scenario)
+    start = model.initial_error if initial_error is None else float(initial_error)
+    bounds = bounds_of(design, model, disturbance_bounds)
+    whitener, mean = np.zeros((0, 0)), np.zeros(len(model.C))
+    if kind == "paper":
+        threshold = paper_threshold(model, bounds, start, gamma)
+    elif kind in ("pointwise", "window"):
+        inputs = scaled_inputs(model, bounds, noise_bound)
+        threshold = (
+            pointwise_threshold(model, inputs, start)
+            if kind == "pointwise"
+            else window_threshold(model, inputs, start, window)
+        )
+    else:
+        white = True
+        if kind == "chi-square":
+            whitener = whitener_of(window_covariance(model, window))
+        else:
+            whitener, white = cusum_whitener(model, window)
+        mean = steady_mean(model)
+        threshold = _statistical(kind, model, len(whitener), start, window, false_alarms, white=white)
+    bench = make_bench(design, scenario)
+    if model.flow is not None:
+        threshold = threshold + _straight_lines(design, scenario, model, kind, window)
+    return Monitor(
+        kind, statement_of(kind, continuous=model.flow is not None), threshold, _floor(bench, scenario), bench.drive.dt,
+        window,
+        mean, whitener, float(change), model.fault_scales(), design.linear[1].fault_names, isolation_delay,
+    )  # fmt: skip
+
+
+def require_options(
+    noise_bound: float | None, initial_error: float | None, gamma: float | None, window: int, false_alarms: float,
+    change: float, isolation_delay: int,
+) -> None:  # fmt: skip
+    """Raise `SpecError` where an option of a monitor is out of range."""
+    for name, value in (("noise_bound", noise_bound), ("initial_error", initial_error), ("gamma", gamma)):
+        if value is not None and not (is_finite_number(value) and value >= 0.0):
+            raise SpecError(f"{name} is {value!r}: give a number, 0 or more.", path=name)
+    for name, count, least in (("window", window, 1), ("isolation_delay", isolation_delay, 0)):
+        if isinstance(count, bool) or not isinstance(count, int) or count < least:
+            raise SpecError(f"{name} is {count!r}: give a whole number of samples, {least} or more.", path=name)
+    if not (is_finite_number(false_alarms) and 0.0 < false_alarms < 1.0):
+        raise SpecError(f"false_alarms is {false_alarms!r}: give a probability between 0 and 1.", path="false_alarms")
+    if not (is_finite_number(change) and change > 0.0):
+        raise SpecError(f"change is {change!r}: give a positive number of deviations.", path="change")
+
+
+def bounds_of(design: ObserverDesign, model: ResidualModel, given: Mapping[str, float] | None) -> FloatArray:
+    """Return the largest absolute value of each disturbance ``(nd,)``: the scenario's, or what is given."""
+    bounds = model.bounds.copy()
+    for name, value in (given or {}).items():
+        place = index_of(name, design.linear[0].disturbance_names, what="disturbance_bounds")
+        if not (is_finite_number(value) and value >= 0.0):
+            raise SpecError(f"The bound of {name!r} is {value!r}: give a number, 0 or more.", path="disturbance_bounds")
+        bounds[place] = float(value)
+    return bounds
+
+
+def _statistical(
+    kind: str, model: ResidualModel, degrees: int, start: float, window: int, false_alarms: float,
+    *, white: bool,
+) -> FloatArray:  # fmt: skip
+    """Return thresholds by Bonferroni's inequality over all looks (chi-square), or Ville's over all sums (cusum).
+
+    Ville's is for white residuals; sums of others are counted one by one, from each start to each end.
+    """
+    from scipy.special import chdtri
+
+    threshold = np.full(model.steps, np.inf)
+    first = settled(model, start, window)
+    looks = model.steps - first
+    if kind == "chi-square":
+        threshold[first:] = float(chdtri(degrees, false_alarms / looks))
+    else:
+        # Two signs for each component; a sum may start at every look.
+        sums = looks if white else looks * (looks + 1) / 2
+        threshold[first:] = math.log(2 * degrees * sums / false_alarms)
+    return threshold
+
+
+def _floor(bench: Bench, scenario: Scenario) -> float:
+    """Return what rounding may add to the norm of the residual, from the size of what it is made of."""
+    runs, rows = bench.run([scenario.seed]), bench.observer.residual_rows
+    size = (
+        np.abs(runs.outputs) @ np.abs(bench.observer.Dy[rows]).T
+        + np.abs(runs.inputs) @ np.abs(bench.observer.Du[rows]).T
+    )
+    return ROUNDING_SHARE * float(np.max(np.linalg.norm(size, axis=2)))
+
+
+def _straight_lines(
+    design: ObserverDesign, scenario: Scenario, model: ResidualModel, kind: str, window: int
+) -> FloatArray:
+    """Return what straight lines between samples add to a norm of the residual: known inputs and start alone."""
+    if kind not in ("pointwise", "window"):
+        return np.zeros(model.steps)
+    calm = scenario.replace(faults={}, sensors={}, disturbances={}, noise=0.0, sensor_noise={})
+    bench = make_bench(design, calm)
+    residuals = bench.run([scenario.seed]).rows[:, 0, bench.observer.residual_rows]
+    sizes = np.array([
+        np.linalg.norm(residual - model.C @ power @ model.start)
+        for residual, power in zip(residuals, model.powers(), strict=True)
+    ])  # fmt: skip
+    if kind == "pointwise":
+        return sizes
+    return np.array([np.linalg.norm(sizes[max(k - window + 1, 0) : k + 1]) for k in range(model.steps)])

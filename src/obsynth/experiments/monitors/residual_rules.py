@@ -1,0 +1,162 @@
+"""Rules for the residual of a linear design, row by row."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.experiments.monitors.online import share_of_look
+from obsynth.experiments.monitors.unlimited_horizon import UnlimitedHorizonBound
+from obsynth.numerics.arrays import FloatArray
+
+#: Share of an interval by which the data's sampling may differ from the one that a threshold is for.
+FITTING_SHARE = 0.01
+#: Share of an interval within which two of them are the same: stamps are rounded.
+SAME_SHARE = 1e-6
+#: What rounding may take from a number of samples, as a share of it.
+ROUNDING = 1e-9
+
+
+class NormRule:
+    """The norm of the residual, or of a window of it, against a bound by the number of samples since the start.
+
+    Fields: table: The bound at each sample; limit: The bound after the table; window: Samples of which squares are
+    summed up; 1 for the norm itself; dt: Between samples; irregular: Continuous designs: table and limit that hold
+    where samples are not all ``dt`` apart.
+    """
+
+    def __init__(
+        self, table: FloatArray, limit: float, *, window: int, dt: float, irregular: UnlimitedHorizonBound | None = None
+    ) -> None:
+        self._table, self._limit, self._dt = table, limit, dt
+        self._other, self._regular = irregular, True
+        self._norms: deque[float] = deque(maxlen=window)
+        self._begin: float | None = None
+        self._last: float | None = None
+
+    def take(
+        self, time: float, residuals: FloatArray, evidence: Any, *, deciding: bool
+    ) -> tuple[float, float, int | None]:
+        """Return statistic and threshold; see `obsynth.experiments.monitors.online.Rule`."""
+        del evidence
+        away = 0.0 if self._last is None else abs(time - self._last - self._dt) / self._dt
+        fits = away <= FITTING_SHARE
+        self._regular &= away <= SAME_SHARE
+        if self._norms.maxlen != 1 and not fits:
+            # A window is a number of samples at the sampling that its bound is for.
+            self._norms.clear()
+        self._begin, self._last = (time if self._begin is None else self._begin), time
+        k = math.floor((time - self._begin) / self._dt * (1.0 + ROUNDING))
+        table, limit = (self._table, self._limit) if self._regular or self._other is None else self._other
+        threshold = float(table[k]) if k < len(table) else limit
+        if not deciding:
+            return math.nan, threshold, None
+        # Not squared: the square of a number of any size may be none.
+        self._norms.append(math.hypot(*residuals))
+        # The bound counts samples before the window as well: a window that is not full is bounded all the more.
+        return math.hypot(*self._norms), threshold, None
+
+    def restart(self) -> None:
+        """Begin again: the error at a new start is taken to be no larger than that at the first."""
+        self._norms.clear()
+        self._begin = self._last = None
+        self._regular = True
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the state that goes from row to row, as data."""
+        return {
+            "norms": list(self._norms), "begin": self._begin, "last": self._last, "limit": self._limit,
+            "regular": self._regular,
+        }  # fmt: skip
+
+    def resume(self, data: Mapping[str, Any]) -> None:
+        """Go on from what `as_dict` returned."""
+        require_same(data["limit"], self._limit)
+        self._norms.clear()
+        self._norms.extend(data["norms"])
+        self._begin, self._last, self._regular = data["begin"], data["last"], data["regular"]
+
+
+class WhitenedRule:
+    """A window of residuals in the metric of its covariance: chi-square, or cumulative sums for small changes.
+
+    Fields: whitener: ``(m, window nr)``, oldest sample first; mean: ``(nr,)``; window: Samples; change: Shift of the
+    whitened residual that the sums are tuned for; `None` for chi-square; false_alarms: Probability of a false alarm in
+    a run, however long; dt: Between samples; white: Whether what is summed up is white, see
+    `obsynth.experiments.monitors.whitening.cusum_whitener`.
+    """
+
+    def __init__(
+        self, whitener: FloatArray, mean: FloatArray, *, window: int, change: float | None, false_alarms: float,
+        dt: float, white: bool = True,
+    ) -> None:  # fmt: skip
+        self._whitener, self._mean, self._change = whitener, mean, change
+        self._probability, self._dt, self._white = false_alarms, dt, white
+        self._window: deque[FloatArray] = deque(maxlen=window)
+        self._levels = np.zeros(2 * len(whitener))
+        self._looks = 0
+        self._last: float | None = None
+
+    def take(
+        self, time: float, residuals: FloatArray, evidence: Any, *, deciding: bool
+    ) -> tuple[float, float, int | None]:
+        """Return statistic and threshold; see `obsynth.experiments.monitors.online.Rule`."""
+        del evidence
+        if self._last is not None and abs(time - self._last - self._dt) > FITTING_SHARE * self._dt:
+            self.restart()
+        self._last = time
+        if not deciding:
+            return math.nan, math.nan, None
+        self._window.append(residuals - self._mean)
+        if len(self._window) < (self._window.maxlen or 1):
+            return math.nan, math.nan, None
+        self._looks += 1
+        probability = self._probability * share_of_look(self._looks)
+        with np.errstate(over="ignore", invalid="ignore"):
+            white = _finite(self._whitener @ np.concatenate(self._window))
+            if self._change is None:
+                from scipy.special import chdtri
+
+                return float(white @ white), float(chdtri(len(white), probability)), None
+            rise = self._change * np.concatenate([white, -white]) - 0.5 * self._change**2
+            self._levels = _finite(np.maximum(self._levels + _finite(rise), 0.0))
+        # Sums of what is not white are counted one by one: as many end here as there were looks.
+        ending = 1 if self._white else self._looks
+        return float(self._levels.max()), math.log(len(self._levels) * ending / probability), None
+
+    def restart(self) -> None:
+        """Forget window and sums; looks that were taken stay taken."""
+        self._window.clear()
+        self._levels = np.zeros_like(self._levels)
+        self._last = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the state that goes from row to row, as data."""
+        return {
+            "window": list(self._window), "levels": self._levels, "looks": self._looks, "last": self._last,
+            "options": [self._probability, float(self._window.maxlen or 0), self._change or 0.0],
+        }  # fmt: skip
+
+    def resume(self, data: Mapping[str, Any]) -> None:
+        """Go on from what `as_dict` returned."""
+        require_same(data["options"], [self._probability, float(self._window.maxlen or 0), self._change or 0.0])
+        self._window.clear()
+        self._window.extend(data["window"])
+        self._levels, self._looks, self._last = data["levels"], data["looks"], data["last"]
+
+
+def _finite(values: FloatArray) -> FloatArray:
+    """Return numbers that have overflowed as the largest there is: one of them must not silence all that follow."""
+    largest = np.finfo(np.float64).max
+    return np.nan_to_num(values, nan=largest, posinf=largest, neginf=-largest)
+
+
+def require_same(saved: Any, own: Any) -> None:
+    """Raise `SpecError` unless a saved state has the options of the monitor that it is for."""
+    if saved != own:
+        raise SpecError("The saved state is of a run whose monitor had other options: use the same.", path="state")

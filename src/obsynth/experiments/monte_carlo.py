@@ -1,0 +1,246 @@
+"""Many runs of a scenario, each with its own seed: how often alarms are false, late, missing or blame another fault."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor, as_completed
+from dataclasses import asdict, dataclass
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.experiments.batch_simulation import Bench, Runs, make_bench
+from obsynth.experiments.intervals import Interval, mean, share
+from obsynth.experiments.monitors.monitor import Monitor
+from obsynth.experiments.parameter_batch_simulation import make_recursive_bench
+from obsynth.experiments.parameter_monte_carlo import ParameterMonitor, RecursiveTask, recursive_tasks
+from obsynth.experiments.progress import Progress, shown_progress
+from obsynth.experiments.simulation import aligned_errors, warm_up_ends
+from obsynth.numerics.arguments import is_finite_number, require_kind
+from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.results.design import ObserverDesign
+from obsynth.simulation.scenario import Scenario
+
+#: Numbers that a batch of runs may hold at once, per signal: what keeps memory small and one task worth sending.
+BATCH_SAMPLES = 100_000
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """What many runs of a scenario say, each number with its confidence interval.
+
+    Parameters
+    ----------
+    runs : int
+        Run i has the scenario's seed plus i.
+    confidence : float
+        Of the intervals.
+    false_alarm_rate : Interval
+        Share of the runs with an alarm before the first fault; of all runs where the scenario has none.
+    missed_detection_rate : Interval
+        Share of the runs without an alarm from the first fault on; of no runs without a fault.
+    detection_delay : Interval
+        Seconds from the first fault to the first alarm after it, mean over the runs that have one.
+    isolation_error_rate : Interval
+        Share of the detections that name a fault which did not act until then; of no runs where no fault of the plant
+        acts.
+    fault_rmse, state_rmse : mapping of str to Interval
+        Root mean square error after warm-up of each estimate, mean over runs; of recursive designs, which state how
+        uncertain they are from the start, over the whole record but its first row.
+    """
+
+    runs: int
+    confidence: float
+    false_alarm_rate: Interval
+    missed_detection_rate: Interval
+    detection_delay: Interval
+    isolation_error_rate: Interval
+    fault_rmse: Mapping[str, Interval]
+    state_rmse: Mapping[str, Interval]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return everything as plain data."""
+        found: dict[str, Any] = {}
+        for name, value in vars(self).items():
+            if isinstance(value, Mapping):
+                found[name] = {signal: asdict(item) for signal, item in value.items()}
+            else:
+                found[name] = asdict(value) if isinstance(value, Interval) else value
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Task:
+    """What a worker needs; plain data and arrays."""
+
+    bench: Bench
+    watched: Monitor | None
+    onset: int | None
+    warm_ups: tuple[int, int]
+    seeds: tuple[int, ...]
+
+    def __call__(self) -> dict[str, FloatArray]:
+        return _trial(self)
+
+
+def evaluate(
+    design: ObserverDesign,
+    scenario: Scenario,
+    *,
+    runs: int = 100,
+    monitor: Monitor | ParameterMonitor | None = None,
+    executor: Executor | None = None,
+    progress: Progress | bool | None = None,
+    confidence: float = 0.95,
+) -> Evaluation:
+    """Run a scenario many times, with the seeds ``scenario.seed``, ``scenario.seed + 1``, ...
+
+    Parameters
+    ----------
+    design : ObserverDesign
+        Of any method.
+    scenario : Scenario
+        With random disturbances or noise; as `simulate` takes it.
+    runs : int, optional
+        How many.
+    monitor : Monitor or ParameterMonitor, optional
+        From `obsynth.monitor`, or how a recursive design decides on its parameters; without one only errors of the
+        estimates are counted.
+    executor : concurrent.futures.Executor, optional
+        Where batches of runs go; by default they run here.  The result does not depend on it.
+    progress : callable or bool, optional
+        Called with the number of runs done and their total after each batch; `True` shows a bar on standard error.
+    confidence : float, optional
+        Of every interval: Clopper-Pearson for shares, Student for means.
+
+    Returns
+    -------
+    Evaluation
+        Rates, delays and errors.
+
+    Raises
+    ------
+    SpecError
+        An option is out of range, or as for `simulate`.
+    PreconditionError
+        As for `simulate`.
+    """
+    require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
+    require_kind(scenario, Scenario, "scenario", "an obsynth.Scenario")
+    if isinstance(runs, bool) or not isinstance(runs, int) or runs < 1:
+        raise SpecError(f"runs is {runs!r}: give a whole number, 1 or more.", path="runs")
+    if not (is_finite_number(confidence) and 0.0 < confidence < 1.0):
+        raise SpecError(f"confidence is {confidence!r}: give a number between 0 and 1.", path="confidence")
+    seeds = range(scenario.seed, scenario.seed + runs)
+    tasks: Sequence[_Task] | Sequence[RecursiveTask]
+    if isinstance(design.observer, LinearObserver):
+        tasks, onset, dt = _linear_tasks(design, scenario, monitor, seeds)
+    else:
+        bench = make_recursive_bench(design, scenario)
+        onset, dt = bench.onset, bench.drive.dt
+        tasks = recursive_tasks(bench, monitor, seeds, max(1, BATCH_SAMPLES // bench.drive.steps))
+    with shown_progress(progress) as told:
+        parts = _done(tasks, executor, told, runs)
+    return _summed(parts, design, onset, dt, watched=monitor is not None, level=confidence)
+
+
+def _linear_tasks(
+    design: ObserverDesign, scenario: Scenario, monitor: Monitor | ParameterMonitor | None, seeds: Sequence[int]
+) -> tuple[list[_Task], int | None, float]:
+    """Return batches of runs, the first sample at which something is wrong, and the seconds between samples."""
+    if isinstance(monitor, ParameterMonitor):
+        raise SpecError("This design is linear: give monitor=obsynth.monitor(design, scenario).", path="monitor")
+    bench = make_bench(design, scenario)
+    nu, nf, _ = bench.sizes
+    onset = bench.drive.first_fault(slice(nu, nu + nf))
+    states, faults = (end or 0 for end in warm_up_ends(bench))
+    size = max(1, BATCH_SAMPLES // bench.drive.steps)
+    tasks = [
+        _Task(bench, monitor, onset, (states, faults), tuple(seeds[i : i + size])) for i in range(0, len(seeds), size)
+    ]
+    return tasks, onset, bench.drive.dt
+
+
+def _done(
+    tasks: Sequence[Callable[[], dict[str, FloatArray]]],
+    executor: Executor | None,
+    progress: Progress | None,
+    runs: int,
+) -> dict[str, FloatArray]:
+    """Return the numbers of all runs in the order of their seeds."""
+    results: list[dict[str, FloatArray]] = [{} for _ in tasks]
+    waiting = {} if executor is None else {executor.submit(task): i for i, task in enumerate(tasks)}
+    finished = 0
+    order = as_completed(waiting) if executor is not None else iter(range(len(tasks)))
+    for item in order:
+        i = item if isinstance(item, int) else waiting[item]
+        results[i] = tasks[i]() if isinstance(item, int) else item.result()
+        finished += len(results[i]["false"])
+        if progress is not None:
+            progress(finished, runs)
+    return {name: np.concatenate([part[name] for part in results]) for name in results[0]}
+
+
+def _trial(task: _Task) -> dict[str, FloatArray]:
+    """Return what counts of a batch of runs, one row per run; NaN for what did not happen."""
+    runs, observer = task.bench.run(task.seeds), task.bench.observer
+    found = {}
+    for name, rows, truth, delays, warm_up in (
+        ("states", observer.state_rows, runs.states, observer.state_delays, task.warm_ups[0]),
+        ("faults", observer.fault_rows, runs.faults, observer.fault_delays, task.warm_ups[1]),
+    ):
+        errors = aligned_errors(runs.rows[:, :, rows], truth, delays)[max(warm_up, *delays, 0) :]
+        # A record no longer than the delays has no error to speak of.
+        found[name] = np.sqrt(np.mean(errors**2, axis=0)) if len(errors) else np.full(errors.shape[1:], np.nan)
+    count = len(task.seeds)
+    false, found_at, wrong = np.full(count, np.nan), np.full(count, np.nan), np.full(count, np.nan)
+    if task.watched is not None:
+        passed = task.watched.passed(runs.rows[:, :, observer.residual_rows])
+        begin = len(passed) if task.onset is None else task.onset
+        false[:] = passed[:begin].any(axis=0)
+        for run in np.flatnonzero(passed[begin:].any(axis=0)):
+            k = begin + int(np.argmax(passed[begin:, run]))
+            found_at[run], wrong[run] = k, _blames_another(task.watched, runs, observer.fault_rows, int(run), k)
+    return {**found, "false": false, "found": found_at, "wrong": wrong}
+
+
+def _blames_another(watched: Monitor, runs: Runs, rows: slice, run: int, k: int) -> float:
+    """Return 1 if the isolated fault has not acted until its comparison, else 0; NaN if none has."""
+    end = min(k + watched.isolation_delay, len(runs.faults) - 1)
+    acted = np.any(runs.faults[: end + 1, run] != 0.0, axis=0)
+    if not acted.any():
+        return float("nan")
+    return float(not acted[watched.isolated(runs.rows[:, run, rows], k)])
+
+
+def _summed(
+    parts: Mapping[str, FloatArray],
+    design: ObserverDesign,
+    onset: int | None,
+    dt: float,
+    *,
+    watched: bool,
+    level: float,
+) -> Evaluation:
+    runs, observer = len(parts["false"]), design.observer
+    detected, judged = ~np.isnan(parts["found"]), ~np.isnan(parts["wrong"])
+    counted = runs if watched else 0
+    faulty = counted if onset is not None else 0
+    delays = np.array([]) if not watched or onset is None else (parts["found"] - onset) * dt
+
+    def errors(name: str, signals: tuple[str, ...]) -> Mapping[str, Interval]:
+        return MappingProxyType({signal: mean(parts[name][:, i], level) for i, signal in enumerate(signals)})
+
+    return Evaluation(
+        runs=runs,
+        confidence=level,
+        false_alarm_rate=share(int(np.nansum(parts["false"])), counted, level),
+        missed_detection_rate=share(faulty - int(np.sum(detected)) if faulty else 0, faulty, level),
+        detection_delay=mean(delays, level),
+        isolation_error_rate=share(int(np.nansum(parts["wrong"])), int(np.sum(judged)), level),
+        fault_rmse=errors("faults", observer.fault_names),
+        state_rmse=errors("states", observer.state_names),
+    )

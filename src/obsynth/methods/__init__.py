@@ -1,0 +1,1 @@
+"""The methods: analyse, synthesise, verify, and hand over an `ObserverDesign`."""

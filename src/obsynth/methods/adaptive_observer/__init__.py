@@ -1,0 +1,1 @@
+"""The adaptive observer of time-varying descriptor plants."""

@@ -1,0 +1,99 @@
+"""Public function of the method ``adaptive-observer``."""
+
+from __future__ import annotations
+
+from numpy.typing import ArrayLike
+
+from obsynth.methods.designing import design
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.sequences import MatrixLike
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.results.design import ObserverDesign
+
+
+def adaptive_observer(
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem,
+    *,
+    Q: MatrixLike = None,
+    R: MatrixLike = None,
+    forgetting: float = 0.98,
+    form: str = "innovation",
+    guard: str | None = None,
+    random_walk: ArrayLike | None = None,
+    initial_parameters: ArrayLike | None = None,
+    initial_parameter_covariance: ArrayLike | None = None,
+    initial_state: ArrayLike | None = None,
+    initial_covariance: ArrayLike | None = None,
+    early_constraints: bool = False,
+    window: int = 50,
+    reset: float = 0.0,
+    name: str = "design",
+) -> ObserverDesign:
+    r"""Design an observer of states and parameters of a descriptor plant, time-varying or not.
+
+    While the parameters are constant and excited, their estimates are unbiased and forget their start at the rate of
+    the forgetting factor; a change is followed with a lag of about ``lambda / (1 - lambda)`` samples.
+
+    Parameters
+    ----------
+    plant : TimeVaryingDescriptorSystem or DescriptorSystem
+        ``E (ne, nx)``, ``C (ny, nx)``, ``Phi (ne, nq)``, ``Psi (ny, nq)``; the faults of a DescriptorSystem are taken
+        as parameters (it must be discrete in time, without feedthrough and without disturbances).
+    Q, R : MatrixLike, optional
+        As for `descriptor_kalman`.
+    forgetting : float, optional, dimensionless
+        lambda in (0, 1].
+    form : {"innovation", "literal", "random-walk"}, optional
+        Least squares on the whitened parity innovation (default); (18) as printed; or the parameters as states that
+        walk randomly (the augmented Kalman filter), which ``forgetting`` and ``guard`` do not concern.
+    guard : {"regularise", "directional", "none"}, optional
+        Against wind-up: ``(1 - lambda) S_0^-1`` added to the information, so that S never exceeds S_0 (default);
+        forgetting only in directions that are excited; or nothing, as printed (default of form ``literal``).
+    random_walk : array_like, optional
+        Covariance of one step of the walk: ``(nq, nq)``, or a variance for all, in parameter units squared.
+    initial_parameters : array_like, optional
+        ``(nq,)``; zeros by default.
+    initial_parameter_covariance : array_like, optional
+        ``S_0 (nq, nq)``, or a variance for all; the identity by default.
+    initial_state, initial_covariance, early_constraints
+        As for `descriptor_kalman`.
+    window : int, optional
+        Samples over which excitation is watched.
+    reset : float, optional, dimensionless
+        Detect and reset: when the innovations of 20 samples pass a threshold (with this probability per sample where
+        nothing has changed, such as 1e-6), S and the covariance of theta start again from S_0.  0, the default, never.
+    name : str, optional
+        Name of the design.
+
+    Returns
+    -------
+    ObserverDesign
+        ``observer`` is a `RecursiveObserver`; ``gains``: ``L (nx, ne)``, ``K (nx, ny)`` of the last step.
+        ``certificate.claims``: ``condition``, ``contraction``, ``residual_directions``, ``excitation`` (least in any
+        window, parameter units to the power -2) and the sample at which it is least.
+
+    Raises
+    ------
+    SpecError
+        lambda outside (0, 1], a covariance that is not symmetric or indefinite, or an option of the wrong shape.
+    PreconditionError
+        As for `descriptor_kalman`; no parameters; parameters that the outputs cannot tell from each other or from the
+        state (of a time-invariant plant: ``rank [A - E, Phi; C, Psi] < nx + nq``), which are named with the ratio in
+        which they leave no trace; or form ``literal`` where ``rank E + ny - nx`` is zero, so that it would never learn.
+    VerificationError
+        The observer fails a check.
+
+    Notes
+    -----
+    Differs from the paper: see the module `obsynth.methods.adaptive_observer.synthesis`.
+
+    References
+    ----------
+    .. [MoussaAli2013] Fault diagnosis for linear time-varying descriptor systems, IFAC ALCOSP 2013, eqs. (17)-(26).
+    """
+    return design(
+        plant, "adaptive-observer", name=name, Q=Q, R=R, forgetting=forgetting, form=form, guard=guard,
+        random_walk=random_walk, initial_parameters=initial_parameters,
+        initial_parameter_covariance=initial_parameter_covariance, initial_state=initial_state,
+        initial_covariance=initial_covariance, early_constraints=early_constraints, window=window, reset=reset,
+    )  # fmt: skip

@@ -1,0 +1,222 @@
+r"""A primal-dual interior-point method for programmes with a few dense semidefinite blocks and few unknowns.
+
+.. math:: \min_x c^T x, \quad s = b - A x \in K, \qquad \max_z -b^T z, \quad A^T z + c = 0, \quad z \in K
+
+with K a product of cones of semidefinite matrices, stored as in `SemidefiniteBlock`; a number that is not negative is
+a matrix of order one.
+
+General solvers factor a matrix as large as the cones, n(n + 1)/2 for a block of order n, which for the dense blocks of
+our inequalities costs n^6.  Here only the unknowns are left (the Schur complement).  A Nesterov-Todd scaling R of a
+block has ``R^-1 S R^-T = R'ZR = diag(l)``; with a tilde for ``R^-1 U R^-T`` (for z: ``R'UR``), ``G`` the columns of A
+after it, ``r_x = A'z + c``, ``r_s = A x + s - b`` and ``q`` from the linearised ``s z = sigma mu``, Newton's equations
+
+.. math:: A^T dz = -r_x, \qquad A\,dx + ds = -r_s, \qquad \tilde{ds} + \tilde{dz} = q
+
+become ``G'G dx = -r_x - G'(q + r_s~)``, ``dz~ = G dx + q + r_s~``, ``ds~ = q - dz~``: one product and one Cholesky
+factorisation of the order of x, shared by Mehrotra's predictor and corrector.
+
+Sources: Todd, Toh and Tutuncu, SIAM J. Optim. 8 (1998) 769-796; Andersen, Dahl, Liu and Vandenberghe, "Interior-point
+methods for large-scale cone programming", in Optimization for Machine Learning (2011), whose start we take.  Primal and
+dual steps have lengths of their own.  Nobody believes the numbers that come out: callers judge what is made of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from obsynth.methods.conic.normal_equations import NormalEquations
+from obsynth.methods.conic.semidefinite_block import SemidefiniteBlock
+from obsynth.numerics.arrays import FloatArray
+
+#: Relative gap, and relative residuals of both equations, at which the search ends.
+TOLERANCE = 1e-6
+#: The gap is relative to the objective, or to this where that is smaller.
+SMALLEST_OBJECTIVE = 1e-2
+#: What a search that cannot go on must have reached to count as an inaccurate answer.
+INACCURATE_GAP = 1e-2
+INACCURATE_RESIDUAL = 1e-4
+#: Multipliers whose equation is met to this accuracy, relative to the objective, show that there is no solution.
+INFEASIBLE_RAY = 1e-8
+MOST_ITERATIONS = 80
+#: Steps without coming closer than ever before, after which rounding has the upper hand; only close to the end.
+PATIENCE = 5
+#: Share of the way to the boundary; the step below which a plain one towards the middle is tried, and this share of the
+#: mean of s z as its target; and the step below which nothing moves any more.
+STEP_SHARE = 0.98
+SHORT_STEP = 0.1
+CENTRING = 0.5
+SHORTEST_STEP = 1e-4
+#: Distance to the boundary, relative to the size, below which a starting point is moved inside.
+START_MARGIN = 1e-8
+
+
+@dataclass(frozen=True, eq=False)
+class ConeSolution:
+    """Where a search ended.
+
+    Fields: x, z: Unknowns ``(n,)`` and multipliers ``(m,)``; status: Whether the gap and the residuals are as small as
+    asked, nearly, because there is no x (as far as numbers can tell), or not; iterations: Number of factorisations.
+    """
+
+    x: FloatArray
+    z: FloatArray
+    status: str
+    iterations: int
+
+
+def _joined(parts: Iterable[FloatArray]) -> FloatArray:
+    return np.concatenate(list(parts))
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """A point, the residuals of both equations, the relative gap, and the larger relative residual.
+
+    ``ray`` is ``|A'z| / -b'z``: zero for z in the cone shows that there is no x.
+    """
+
+    x: FloatArray
+    z: FloatArray
+    dual: FloatArray
+    primal: FloatArray
+    gap: float
+    residual: float
+    ray: float
+
+    @property
+    def distance(self) -> float:
+        return max(self.gap, self.residual)
+
+    @property
+    def is_final(self) -> bool:
+        return self.distance <= TOLERANCE or self.ray <= INFEASIBLE_RAY
+
+    @property
+    def status(self) -> str:
+        if self.distance <= TOLERANCE:
+            return "optimal"
+        if self.gap <= INACCURATE_GAP and self.residual <= INACCURATE_RESIDUAL:
+            return "optimal_inaccurate"
+        return "infeasible" if self.ray <= INFEASIBLE_RAY else "failed"
+
+
+@dataclass(frozen=True, eq=False)
+class _Programme:
+    """The data, with the columns of A as rows: ``(n, m)``."""
+
+    c: FloatArray
+    columns: FloatArray
+    b: FloatArray
+    blocks: tuple[SemidefiniteBlock, ...]
+
+    def start(self) -> FloatArray:
+        """Set the blocks to the least s and z of the equations, moved inside the cone, and return x."""
+        normal = NormalEquations(self.columns)
+        x = normal.solution(self.columns @ self.b)
+        s, z = self.b - self.columns.T @ x, -self.columns.T @ normal.solution(self.c)
+        for block in self.blocks:
+            block.move(*(self._inside(point)[block.part] for point in (s, z)))
+        return x
+
+    def _inside(self, point: FloatArray) -> FloatArray:
+        least = min(block.least(point[block.part]) for block in self.blocks)
+        if least > START_MARGIN * max(1.0, float(np.linalg.norm(point))):
+            return point
+        identity = _joined(block.vector(np.eye(block.order)) for block in self.blocks)
+        return np.asarray(point + (1.0 - min(least, 0.0)) * identity)
+
+    def state(self, x: FloatArray) -> _State:
+        """Return how far the equations and the gap are from zero."""
+        s, z = (_joined(points) for points in zip(*(block.points() for block in self.blocks), strict=True))
+        dual, primal = self.columns @ z + self.c, self.columns.T @ x + s - self.b
+        size = max(abs(float(self.c @ x)), abs(float(self.b @ z)), SMALLEST_OBJECTIVE)
+        pairs = ((dual, self.c), (primal, self.b))
+        worst = max(float(np.linalg.norm(r)) / max(1.0, float(np.linalg.norm(data))) for r, data in pairs)
+        below = -float(self.b @ z)
+        ray = float(np.linalg.norm(dual - self.c)) / below if below > 0.0 else np.inf
+        return _State(x, z, dual, primal, float(s @ z) / size, worst, ray)
+
+    def step(self, now: _State) -> tuple[FloatArray, float]:
+        """Take Mehrotra's step, or where that is short a plain one; return the next x and the shorter length."""
+        newton = _Newton(self, now)
+        predicted = newton.direction(0.0)
+        target = min(1.0, max(0.0, newton.left_after(predicted))) ** 3
+        found = newton.direction(target, predicted)
+        if found.length < SHORT_STEP:
+            found = max(found, newton.direction(CENTRING), key=lambda move: move.length)
+        s, z = newton.centre + found.forward * found.s, newton.centre + found.back * found.z
+        for block in self.blocks:
+            block.move(s[block.part], z[block.part])
+        return now.x + found.forward * found.x, found.length
+
+
+@dataclass(frozen=True, eq=False)
+class _Direction:
+    """A direction, s and z in the scaling, and the lengths of its primal and dual steps."""
+
+    x: FloatArray
+    s: FloatArray
+    z: FloatArray
+    forward: float
+    back: float
+
+    @property
+    def length(self) -> float:
+        return min(self.forward, self.back)
+
+
+class _Newton:
+    """Newton's equations at one point: a factorisation for several right-hand sides."""
+
+    def __init__(self, programme: _Programme, now: _State) -> None:
+        self._blocks, self._dual = programme.blocks, now.dual
+        self._columns = np.hstack([block.scaled(programme.columns[:, block.part]) for block in self._blocks])
+        self._normal = NormalEquations(self._columns)
+        self._offset = _joined(block.scaled(now.primal[None, block.part])[0] for block in self._blocks)
+        self.centre = _joined(block.centre() for block in self._blocks)
+        self._mean = float(self.centre @ self.centre) / sum(block.order for block in self._blocks)
+
+    def direction(self, target: float, before: _Direction | None = None) -> _Direction:
+        """Return the direction to ``target`` times the present mean of s z, with the second order of another one."""
+        ds, dz = (np.zeros_like(self.centre),) * 2 if before is None else (before.s, before.z)
+        wanted = (block.corrected(ds[block.part], dz[block.part], target * self._mean) for block in self._blocks)
+        q = _joined(wanted) - self.centre
+        dx = self._normal.solution(-self._dual - self._columns @ (self._offset + q))
+        dz = self._columns.T @ dx + self._offset + q
+        lengths = (min(1.0, STEP_SHARE * self._longest(move)) for move in (q - dz, dz))
+        return _Direction(dx, q - dz, dz, *lengths)
+
+    def left_after(self, move: _Direction) -> float:
+        """Return the share of the gap that is left after a step."""
+        s, z = self.centre + move.forward * move.s, self.centre + move.back * move.z
+        return float(s @ z) / float(self.centre @ self.centre)
+
+    def _longest(self, move: FloatArray) -> float:
+        return min(block.longest_step(move[block.part]) for block in self._blocks)
+
+
+def solve_cone_programme(c: FloatArray, a: FloatArray, b: FloatArray, orders: Sequence[int]) -> ConeSolution:
+    """Return the solution of a cone programme.
+
+    Shapes: ``c (n,)``, ``a (m, n)``, ``b (m,)``.
+    """
+    ends = np.cumsum([0, *(order * (order + 1) // 2 for order in orders)])
+    blocks = tuple(SemidefiniteBlock(order, int(first)) for order, first in zip(orders, ends[:-1], strict=True))
+    programme = _Programme(c, np.ascontiguousarray(a.T), b, blocks)
+    with np.errstate(all="ignore"):  # what overflows is not finite, and ends the search
+        best = now = programme.state(programme.start())
+        length, count, closest = 1.0, 0, 0
+        while not now.is_final and length >= SHORTEST_STEP and count < MOST_ITERATIONS:
+            if best.status != "failed" and count >= closest + PATIENCE:
+                break
+            try:
+                x, length = programme.step(now)
+            except np.linalg.LinAlgError:
+                break  # rounding has the last word: what was reached is judged by itself
+            now, count = programme.state(x), count + 1
+            if now.is_final or now.distance < best.distance:
+                best, closest = now, count
+    return ConeSolution(best.x, best.z, best.status, count)

@@ -1,0 +1,206 @@
+"""The LMI layer: the only place that writes matrix inequalities and calls a solver.
+
+Three traps are closed here.  ``X >> scalar`` in cvxpy promotes the scalar to a full matrix, so margins are
+always ``margin * I``.  A block matrix that is symmetric only in exact arithmetic gives a different cone, so
+every block is symmetrised.  A solver may end in a panic that is no ``Exception``: whatever it does becomes
+a `SolverError` with a record.
+"""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from obsynth.errors import SolverError
+from obsynth.methods.conic.interior_point import solve_cone_programme
+from obsynth.numerics.arrays import FloatArray
+
+if TYPE_CHECKING:
+    import cvxpy
+
+#: Statuses that come with numbers; whether they count is decided by verification, not here.
+USABLE_STATUSES = ("optimal", "optimal_inaccurate")
+#: Our own solver, see `obsynth.methods.conic.interior_point`, and what "auto" tries in turn.
+SCHUR = "SCHUR"
+AUTO_SOLVERS = (SCHUR, "CLARABEL")
+FIRST_ORDER_SOLVERS = ("SCS",)
+#: Solvers of cvxpy that take semidefinite constraints, and the settings we use.
+SOLVER_SETTINGS: dict[str, dict[str, Any]] = {
+    "CLARABEL": {},
+    "SCS": {"eps_abs": 1e-9, "eps_rel": 1e-9, "max_iters": 20_000},
+}
+#: Problems with more unknowns are made into cones faster by SciPy than by the usual way of cvxpy.
+MANY_UNKNOWNS = 500
+#: Solvers of filters: their inequalities have dense blocks of orders like those of the plant.
+FILTER_SOLVERS = ("auto", SCHUR, *SOLVER_SETTINGS)
+
+
+def symmetric_variable(size: int) -> Any:
+    """Return a symmetric matrix variable ``(size, size)``."""
+    import cvxpy
+
+    return cvxpy.Variable((size, size), symmetric=True)
+
+
+def matrix_variable(rows: int, columns: int) -> Any:
+    """Return a matrix variable ``(rows, columns)``; a constant zero block where a dimension is 0."""
+    import cvxpy
+
+    return cvxpy.Variable((rows, columns)) if rows and columns else np.zeros((rows, columns))
+
+
+def scalar_variable() -> Any:
+    """Return a scalar variable that is not negative."""
+    import cvxpy
+
+    return cvxpy.Variable(nonneg=True)
+
+
+def symmetric_blocks(lower: Sequence[Sequence[Any]]) -> Any:
+    """Return the symmetric block matrix whose lower triangle of blocks is ``lower``; empty blocks are dropped."""
+    import cvxpy
+
+    kept = [i for i, row in enumerate(lower) if row[i].shape[0] > 0]
+    rows = [[lower[i][j] if j <= i else lower[j][i].T for j in kept] for i in kept]
+    full = cvxpy.bmat(rows)
+    return 0.5 * (full + full.T)
+
+
+def at_least(expression: Any, margin: float = 0.0) -> Any:
+    """Return the constraint ``expression >= margin * I`` for a square matrix expression."""
+    symmetric = 0.5 * (expression + expression.T)
+    return symmetric >> margin * np.eye(expression.shape[0])
+
+
+def at_most(expression: Any, level: float) -> Any:
+    """Return the constraint ``expression <= level * I`` for a square matrix expression."""
+    symmetric = 0.5 * (expression + expression.T)
+    return symmetric << level * np.eye(expression.shape[0])
+
+
+def trace(expression: Any) -> Any:
+    """Return the trace of a square matrix expression."""
+    import cvxpy
+
+    return cvxpy.trace(expression)
+
+
+def frobenius_norm(*blocks: Any) -> Any:
+    """Return the Frobenius norm of blocks side by side, as a convex expression."""
+    import cvxpy
+
+    return cvxpy.norm(cvxpy.hstack(blocks), "fro")
+
+
+def stacked(*blocks: Any) -> Any:
+    """Return blocks with the same number of columns, one above the other."""
+    import cvxpy
+
+    return cvxpy.vstack(blocks)
+
+
+def scalar_block(expression: Any) -> Any:
+    """Return a scalar expression as a matrix ``(1, 1)``."""
+    import cvxpy
+
+    return cvxpy.reshape(expression, (1, 1), order="C")
+
+
+def value_of(variable: Any) -> FloatArray:
+    """Return the value of a variable or constant block as an array; raise `SolverError` when there is none."""
+    value = variable if isinstance(variable, np.ndarray) else variable.value
+    if value is None or not np.all(np.isfinite(value)):
+        raise SolverError("The solver returned no finite numbers: nothing is known.")
+    return np.asarray(value, dtype=np.float64)
+
+
+def minimise(objective: Any, constraints: Sequence[Any], *, what: str, solver: str = "CLARABEL") -> dict[str, Any]:
+    """Minimise a linear or convex objective under the constraints and return the record of the run."""
+    import cvxpy
+
+    problem: cvxpy.Problem = cvxpy.Problem(cvxpy.Minimize(0 if objective is None else objective), list(constraints))
+    if solver != "auto":
+        return _solved(problem, what, solver)
+    first, second = AUTO_SOLVERS
+    try:
+        return _solved(problem, what, first)
+    except SolverError as error:
+        if error.record["status"] == "infeasible":
+            raise
+        before = {key: error.record[key] for key in ("solver", "status")}
+    return _solved(problem, what, second) | {"tried_before": before}
+
+
+def _solved(problem: cvxpy.Problem, what: str, solver: str) -> dict[str, Any]:
+    """Solve a problem by one solver and return the record."""
+    settings = SOLVER_SETTINGS.get(solver, {})
+    record: dict[str, Any] = {"what": what, "solver": solver, "version": _version(solver), "settings": dict(settings)}
+    began = time.perf_counter()
+    try:
+        with warnings.catch_warnings():
+            # "Solution may be inaccurate": every solution is verified, so the warning tells nobody anything.
+            warnings.simplefilter("ignore")
+            if solver == SCHUR:
+                record |= _solved_by_schur_complement(problem)
+            else:
+                problem.solve(solver=solver, **settings)
+                stats = problem.solver_stats
+                iterations = None if stats is None or stats.num_iters is None else int(stats.num_iters)
+                record |= {"status": str(problem.status), "iterations": iterations}
+    except (KeyboardInterrupt, SystemExit):
+        raise
+    except BaseException as error:  # Rust panics, and memory that ran out inside the solver
+        reason = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+        record |= {"status": "crashed", "reason": reason, "seconds": time.perf_counter() - began}
+        raise SolverError(
+            f"{solver} failed while solving for {what} ({reason}): nothing is known.", record=record
+        ) from error
+    record["seconds"] = time.perf_counter() - began
+    if record["status"] not in USABLE_STATUSES:
+        raise SolverError(
+            f"{solver} ended with status {record['status']!r} while solving for {what}: nothing is known.",
+            record=record,
+        )
+    return record
+
+
+def _solved_by_schur_complement(problem: cvxpy.Problem) -> dict[str, Any]:
+    """Solve a problem by our own method, from the cones that cvxpy makes of it, and give its variables their values."""
+    # As for CLARABEL: lower triangles, row by row, times sqrt(2) off the diagonal.
+    size = sum(variable.size for variable in problem.variables())
+    backend = "SCIPY" if size > MANY_UNKNOWNS else None
+    data, chain, inverse = problem.get_problem_data("CLARABEL", canon_backend=backend, solver_opts={})
+    cones = data["dims"]
+    if cones.zero or cones.soc or cones.exp or cones.p3d or "P" in data:
+        raise ValueError("only semidefinite blocks, numbers that are not negative and linear objectives are taken")
+    orders = [1] * int(cones.nonneg) + [int(order) for order in cones.psd]
+    found = solve_cone_programme(data["c"], data["A"].toarray(), data["b"], orders)
+    if found.status in USABLE_STATUSES:
+        solution = SimpleNamespace(
+            status="Solved",
+            x=found.x,
+            z=found.z,
+            obj_val=float(data["c"] @ found.x),
+            solve_time=0.0,
+            iterations=found.iterations,
+        )
+        problem.unpack_results(solution, chain, inverse)
+    return {"status": found.status, "iterations": found.iterations}
+
+
+def _version(solver: str) -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
+    if solver == SCHUR:
+        from obsynth import __version__
+
+        return __version__
+    try:
+        return version(solver.lower())
+    except PackageNotFoundError:
+        return "unknown"

@@ -1,0 +1,1 @@
+"""The adaptive observer of nonlinear differential-algebraic plants."""

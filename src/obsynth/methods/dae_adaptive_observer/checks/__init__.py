@@ -1,0 +1,201 @@
+"""Checks of the observer of a DAE: fit, derivatives, solvability along a run, contraction, consistency by Monte Carlo.
+
+Source of the claims: Moussa Ali, Zhang 2013 (DAE), (7)-(9), (26); the bands are ours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from obsynth.analysis.dae_index import SINGULAR_CONDITION
+from obsynth.errors import ObsynthError
+from obsynth.methods.dae_adaptive_observer.conditions import dae_conditions
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.covariances import covariance_factor
+from obsynth.numerics.newton import LARGEST_RESIDUAL
+from obsynth.observers.dae.batch import run_dae_batch
+from obsynth.observers.dae.building import OPTIONS, dae_observer_from_options, resolved_options
+from obsynth.observers.dae.nominal_run import NOMINAL_STEPS, DAEFacts, dae_facts
+from obsynth.observers.dae.observer import DAEObserver
+from obsynth.results.design import ObserverDesign
+from obsynth.results.report import Check, information, upper_bound_check
+from obsynth.simulation.dae import simulate_dae
+from obsynth.verification.plant import condition_rows
+
+#: Claims may differ from what is recomputed by this much: they are the same numbers from another run.
+CLAIM_TOLERANCE = 1e-6
+#: Central differences over this share of a size leave about its square, and rounding over it.
+DIFFERENCE = 1e-5
+#: So much may be left between differences and derivatives, in sizes of the signals.
+DERIVATIVE_TOLERANCE = 1e-6
+#: Runs and steps of the Monte Carlo: with one parameter the mean of 48 squares is wrong by the factor below one time in
+#: several hundred.
+TRIALS = 48
+STEPS = 40
+SEED = 20130206
+#: A mean of normalised squares may be off by this factor: covariances of a nonlinear plant are first-order ones.  Less
+#: than this is left to the information in the row.
+CONSISTENCY_FACTOR = 2.0
+
+_SOURCE = "Moussa Ali, Zhang 2013 (DAE)"
+
+
+def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
+    """Yield every check of ``design``; see `obsynth.verification.verify`."""
+    plant, observer = design.nonlinear
+    conditions = tuple(dae_conditions(plant, observer.dt))
+    yield from condition_rows(conditions)
+    if not all(condition.holds for condition in conditions):
+        return
+    problem = misfit(design)
+    yield upper_bound_check(
+        "fits the plant", "observer, options and plant hold the same model and numbers", float(bool(problem)), 0.0,
+        source="shipped observer", kind="equality", detail=problem,
+    )  # fmt: skip
+    try:
+        facts = dae_facts(observer)
+        yield from _model_rows(observer, facts)
+        yield _claims_row(design, facts)
+        yield from _consistency_rows(design, observer)
+    except (ObsynthError, np.linalg.LinAlgError, ValueError, KeyError, TypeError) as error:
+        yield upper_bound_check("runs", "the observer runs on its own model", 1.0, 0.0, source="shipped observer",
+                                detail=str(error))  # fmt: skip
+
+
+def misfit(design: ObserverDesign) -> str:
+    """Return what does not fit between a design's plant, options and shipped observer; empty when all does."""
+    plant, observer = design.nonlinear
+    try:
+        stated = resolved_options(dae_observer_from_options(plant, design.options))
+    except (ObsynthError, KeyError, TypeError, ValueError):
+        return "the options stand for no observer of this plant"
+    shipped = resolved_options(observer)
+    for name in OPTIONS:
+        if not np.array_equal(np.asarray(stated[name], dtype=object), np.asarray(shipped[name], dtype=object)):
+            return name
+    if plant is observer.model:
+        return ""
+    if not (plant.is_data and observer.model.is_data):
+        return "model"
+    first, second = plant.as_dict(), observer.model.as_dict()
+    return next((name for name in first if list(first[name].items()) != list(second[name].items())), "")
+
+
+def _model_rows(observer: DAEObserver, facts: DAEFacts) -> Iterator[Check]:
+    names, priors = observer.fault_names, np.sqrt(np.diag(observer.initial_parameter_covariance))
+    yield upper_bound_check(
+        "condition of (7)", "dF/dx' / dt + dF/dx is far from singular along the nominal run", facts.condition,
+        SINGULAR_CONDITION, source=f"{_SOURCE}, (7)", detail=f"worst at k = {facts.condition_k}",
+    )  # fmt: skip
+    yield upper_bound_check(
+        "Newton residual", "every step of the nominal run solves its equations", facts.residual, LARGEST_RESIDUAL,
+        source="recomputed", kind="equality",
+    )  # fmt: skip
+    yield upper_bound_check(
+        "derivatives", "F, G, H and L equal central differences of converged steps", _derivative_gap(observer),
+        DERIVATIVE_TOLERANCE, source=f"{_SOURCE}, (8), (9)", kind="equality",
+    )  # fmt: skip
+    yield upper_bound_check(
+        "contraction", "spectral radius of F (I - K H) at the end of the nominal run", facts.contraction,
+        np.nextafter(1.0, 0.0), source=f"{_SOURCE}, convergence", detail=f"decay in {facts.decay_time:.3g} steps",
+    )  # fmt: skip
+    deviations = facts.identifiable.deviations[observer.model.nx :]
+    for name, prior, bound, deviation in zip(names, priors, deviations, facts.deviations, strict=True):
+        unit = observer.model.units.get(name, "")
+        told = "the outputs alone do not tell it" if not np.isfinite(bound) else f"Cramer-Rao {bound:.3g} {unit}"
+        yield information(
+            f"excitation: {name}", "what nominal constant inputs say, in prior deviations to the power -2",
+            float((prior / bound) ** 2), source=f"{_SOURCE}, (26)", detail=told,
+        )  # fmt: skip
+        yield information(f"noise in fhat[{name}]", "standard deviation after the nominal run", float(deviation),
+                          source="recomputed", detail=unit)  # fmt: skip
+    if len(names) > 1:
+        off = np.abs(facts.correlations - np.diag(np.diag(facts.correlations)))
+        i, j = np.unravel_index(int(np.argmax(off)), off.shape)
+        yield information("crosstalk", "largest correlation between errors of parameters", float(off[i, j]),
+                          source="recomputed", detail=f"{names[int(i)]}, {names[int(j)]}")  # fmt: skip
+
+
+def _derivative_gap(observer: DAEObserver) -> float:
+    """Return the largest gap between derivatives and differences, in sizes of the signals."""
+    model, running = observer.model, observer.start()
+    u, nothing = np.array(model.nominal_input), np.full(model.ny, np.nan)
+    x, theta = running.raw_step(nothing, u).part("posterior"), np.array(observer.initial_parameters)
+    found = running.raw_step(nothing, u)
+    H, L = found.part("H"), found.part("L")
+    exact = np.vstack([np.hstack([found.part("F"), found.part("G")]), np.hstack([H, L])])
+    priors = np.sqrt(np.diag(observer.initial_parameter_covariance))
+    sizes = np.concatenate([model.state_scales, priors])
+    seen = np.abs(H) @ model.state_scales + np.abs(L) @ priors
+    rows = np.concatenate([model.state_scales, np.where(seen > 0.0, seen, 1.0)])
+    step, end = running.implicit, found.part("posterior") - x
+
+    def both(point: FloatArray) -> FloatArray:
+        """Return the end of a step from a point, and the outputs of the point moved to where the step ends."""
+        x_moved, theta_moved = point[: model.nx], point[model.nx :]
+        reached = step.solve_carefully(x_moved, u, theta_moved).x
+        return np.concatenate([reached, step.functions.outputs(x_moved + end, theta_moved)[0]])
+
+    centre, worst = np.concatenate([x, theta]), 0.0
+    for j, size in enumerate(sizes):
+        moved = np.zeros(len(sizes))
+        moved[j] = DIFFERENCE * size
+        slope = (both(centre + moved) - both(centre - moved)) / (2.0 * DIFFERENCE)
+        gap = np.abs(slope - exact[:, j] * size) / rows
+        worst = max(worst, float(gap.max()) / max(1.0, float(np.abs(exact[:, j] * size / rows).max())))
+    return worst
+
+
+def _claims_row(design: ObserverDesign, facts: DAEFacts) -> Check:
+    found = {"index": float(facts.index.index), "condition": facts.condition, "contraction": facts.contraction,
+             "steps": float(NOMINAL_STEPS)}  # fmt: skip
+    claims = design.certificate.claims
+    gaps = [abs(claims.get(name, np.nan) - value) / max(abs(value), CLAIM_TOLERANCE) for name, value in found.items()]
+    return upper_bound_check(
+        "claims", "every claimed number is found again", float(np.max(gaps)), CLAIM_TOLERANCE, source="certificate"
+    )
+
+
+def _consistency_rows(design: ObserverDesign, shipped: DAEObserver) -> Iterator[Check]:
+    """Run the shipped observer on noise, starts and parameters as they are stated in the options."""
+    stated = dae_observer_from_options(design.nonlinear[0], design.options)
+    rng = np.random.default_rng(SEED)
+    roots = [covariance_factor(stated.initial_parameter_covariance, "initial_parameter_covariance"),
+             covariance_factor(stated.initial_covariance, "initial_covariance")]  # fmt: skip
+    u = np.tile(stated.model.nominal_input, (STEPS + 1, 1))
+    parameters, outputs = [], []
+    for trial in range(TRIALS):
+        theta = stated.initial_parameters + roots[0] @ rng.standard_normal(stated.model.nq)
+        parameters.append(np.clip(theta, stated.lower, stated.upper))
+        start = stated.initial_state + roots[1] @ rng.standard_normal(stated.model.nx)
+        truth = simulate_dae(stated.model, u, dt=stated.dt, parameters=parameters[-1], initial_state=start, Q=stated.Q,
+                             R=stated.R, integration=stated.integration, seed=SEED + trial)  # fmt: skip
+        outputs.append(truth.outputs)
+    # As C it would be faster, but the compiler takes longer than all of this.
+    found = run_dae_batch(shipped, np.array(outputs), u, compiled=False, progress=False)
+    gaps = found.parameters[:, -1] - np.array(parameters)
+    weighted = np.linalg.solve(found.parameter_covariances[:, -1], gaps[:, :, None])[:, :, 0]
+    errors = np.sum(gaps * weighted, axis=1) / gaps.shape[1]
+    squares, degrees = float(found.nis[:, 1:].sum()), float(found.nis_degrees[:, 1:].sum())
+    for name, claim, mean, count in (
+        ("NEES", "squared errors of the parameters per degree of freedom are one, within a factor", np.mean(errors),
+         float(gaps.size)),
+        ("NIS", "squared innovations per degree of freedom are one, within a factor", squares / degrees, degrees),
+    ):  # fmt: skip
+        ratio = float(np.exp(abs(np.log(mean))))
+        low, high = _band(count)
+        yield upper_bound_check(
+            name, claim, ratio, CONSISTENCY_FACTOR, source="recomputed, Monte Carlo with a fixed seed",
+            detail=f"mean {mean:.3f} of {TRIALS} runs of {STEPS} steps at nominal inputs; 95 % band of exact "
+            f"covariances {low:.3f} to {high:.3f}",
+        )  # fmt: skip
+
+
+def _band(count: float) -> tuple[float, float]:
+    """Return where the mean of so many squares of standard normal numbers lies with 95 % (chi squared)."""
+    from scipy.special import gammaincinv
+
+    low, high = (2.0 * float(gammaincinv(count / 2.0, share)) / count for share in (0.025, 0.975))
+    return low, high

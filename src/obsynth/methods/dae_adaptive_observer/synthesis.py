@@ -1,0 +1,92 @@
+"""Method ``dae-adaptive-observer``: states and parameters of a nonlinear differential-algebraic plant.
+
+Source: A. Moussa Ali, Q. Zhang, Adaptive observer based fault diagnosis applied to differential-algebraic systems, IFAC
+SSSC 2013, (5)-(23).
+
+Deviations:
+
+1. (12a)-(12c), (22) and (23) are circular as printed: they need theta(k) to compute theta(k).  The innovation is taken
+   before any update, the state is corrected by ``Upsilon (theta(k) - theta(k-1))``, and H, L, K follow at the result.
+2. ``N_k = G_k - F_k K_{k-1} L_{k-1}``; (24) prints ``L_k``, and (15) leaves N undefined.
+3. (18) uses the covariance of the innovation where R is printed (option ``weight``): with lambda = 1 the observer then
+   equals the extended Kalman filter with constant parameters.
+4. What is reported is the state after the measurement of k; the paper's is a prediction.
+5. S is kept below S_0 where excitation is missing (option ``guard``), parameters have bounds, missing samples are
+   skipped without forgetting, and the covariance of theta is carried besides S.
+6. Radau IIA beside backward Euler; derivatives of stored quantities are discretised in conservative form.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+
+from obsynth.analysis.conditions import Condition, require_all
+from obsynth.errors import SpecError
+from obsynth.methods.dae_adaptive_observer.conditions import dae_conditions
+from obsynth.methods.synthesis_result import Synthesis
+from obsynth.observers.dae.building import dae_observer_from_options, resolved_options
+from obsynth.observers.dae.nominal_run import NOMINAL_STEPS, DAEFacts, dae_facts
+from obsynth.observers.dae.observer import DAEObserver
+from obsynth.observers.dae.running import PROJECTION_NOTICE
+from obsynth.plants.dae.model import DAEModel
+from obsynth.results.design import Certificate
+
+
+def conditions(plant: object, *, dt: float = 1.0) -> tuple[Condition, ...]:
+    """Return the existence conditions; the list ends at the first failure."""
+    return tuple(dae_conditions(plant, dt))
+
+
+def synthesise(plant: DAEModel, *, progress: Callable[[str], None], **options: Any) -> Synthesis:
+    """Put the observer together; see `obsynth.dae_adaptive_observer` for the options, results and errors."""
+    given = {**DEFAULTS, **options}
+    if given["dt"] is None:
+        raise SpecError("dt is missing: give the seconds between samples.", path="method.options.dt")
+    if given["form"] == "forgetting" and given["random_walk"] is not None:
+        raise SpecError("random_walk belongs to the forms 'random-walk' and 'augmented-kalman': form 'forgetting' "
+                        "forgets instead.", path="method.options.random_walk")  # fmt: skip
+    observer = dae_observer_from_options(plant, given)
+    progress("checking index and parameters")
+    require_all(conditions(plant, dt=observer.dt))
+    progress("running the observer on its own model")
+    facts = dae_facts(observer)
+    claims = {
+        "index": float(facts.index.index), "condition": facts.condition, "contraction": facts.contraction,
+        "steps": float(NOMINAL_STEPS),
+    }  # fmt: skip
+    return Synthesis(
+        resolved_options(observer), {"K": facts.K, "Upsilon": facts.Upsilon}, observer, Certificate({}, claims),
+        notes=tuple(_notes(observer, facts)),
+    )  # fmt: skip
+
+
+#: Defaults of all options; Q, R and dt must be given.
+DEFAULTS: dict[str, Any] = {
+    "dt": None, "Q": None, "R": None, "form": "forgetting", "forgetting": 0.98, "guard": "regularise",
+    "weight": "innovation", "integration": "backward-euler", "random_walk": None, "initial_state": None,
+    "initial_covariance": None, "initial_parameters": None, "initial_parameter_covariance": None, "bounds": None,
+    "largest_move": None, "window": 50,
+}  # fmt: skip
+
+
+def _notes(observer: DAEObserver, facts: DAEFacts) -> Iterator[str]:
+    if np.any(facts.projection):
+        sizes = PROJECTION_NOTICE * observer.model.state_scales
+        moved = [f"{name} by {move:.4g}" for name, move, size in
+                 zip(observer.state_names, facts.projection, sizes, strict=True) if abs(move) > size]  # fmt: skip
+        yield f"The initial state does not meet the algebraic equations; it is moved onto them: {', '.join(moved)}."
+    for direction in facts.identifiable.faint:
+        shares = ", ".join(f"{name} ({share:+.3g})" for name, share in direction.items())
+        yield (
+            "At nominal constant inputs the outputs do not tell this direction from noise, in prior deviations "
+            f"and nominal sizes: {shares}. Excite the plant, or add a sensor."
+        )
+    window = 1.0 / (1.0 - observer.forgetting) if observer.forgetting < 1.0 else np.inf
+    if observer.form == "forgetting" and facts.decay_time > window:
+        yield (
+            f"The state filter forgets in {facts.decay_time:.0f} steps, the parameters in {window:.0f}: after a jump "
+            "of a parameter the estimates will be biased for the longer of the two. Raise Q, or lambda."
+        )

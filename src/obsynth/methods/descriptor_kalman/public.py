@@ -1,0 +1,80 @@
+"""Public function of the method ``descriptor-kalman``."""
+
+from __future__ import annotations
+
+from numpy.typing import ArrayLike
+
+from obsynth.methods.designing import design
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.sequences import MatrixLike
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.results.design import ObserverDesign
+
+
+def descriptor_kalman(
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem,
+    *,
+    Q: MatrixLike = None,
+    R: MatrixLike = None,
+    initial_state: ArrayLike | None = None,
+    initial_covariance: ArrayLike | None = None,
+    early_constraints: bool = False,
+    name: str = "design",
+) -> ObserverDesign:
+    r"""Design the Kalman filter of a descriptor plant, time-varying or not.
+
+    The estimate at k is the maximum-likelihood estimate of x(k) from y(1) ... y(k) and u(0) ... u(k - 1), computed by
+    orthogonal factorisations alone, so that covariances may be singular and rows may hold exactly.
+
+    Parameters
+    ----------
+    plant : TimeVaryingDescriptorSystem or DescriptorSystem
+        ``E (ne, nx)``, ``C (ny, nx)``; a DescriptorSystem must be discrete in time, without feedthrough and without
+        disturbances.  Its parameters are taken as zero.
+    Q : MatrixLike, optional
+        Covariance ``(ne, ne)`` of mu(k): constant, stack, callable, or rows of expressions in ``k``; a number stands
+        for that multiple of the identity.  By default ``Bw Bw'`` of a DescriptorSystem with noise, else the identity.
+    R : MatrixLike, optional
+        Covariance ``(ny, ny)`` of nu(k), likewise from ``Dw``.
+    initial_state : array_like, optional
+        Mean of x(0), ``(nx,)``; zeros by default.
+    initial_covariance : array_like, optional
+        ``P_0 (nx, nx)``; the identity by default.
+    early_constraints : bool, optional
+        Use the equations of step k + 1 in which x(k + 2) does not appear already for x(k + 1).  They need u(k + 1),
+        which `step` has; Q must not couple them with the others.
+    name : str, optional
+        Name of the design.
+
+    Returns
+    -------
+    ObserverDesign
+        ``observer`` is a `RecursiveObserver`; ``gains``: ``L (nx, ne)``, ``K (nx, ny)`` of the last step.
+        ``certificate.claims``: ``condition`` (dimensionless; largest of H_k), ``contraction`` (per step),
+        ``residual_directions``.
+
+    Raises
+    ------
+    SpecError
+        A covariance is not symmetric or indefinite, or an option has the wrong shape.
+    PreconditionError
+        ``rank [E_k; C_k] < nx`` at some k, which is named (with early constraints their rows count); where E, A and C
+        are constant, a mode with ``|z| >= 1`` that shows in no output; where they change, errors that do not die out
+        along the horizon, or outgrow double precision at some k.
+    VerificationError
+        The observer fails a check.
+
+    Notes
+    -----
+    Differs from the paper: square roots instead of (9)-(11); (14) and (15), which have misprints, are not needed; y(0)
+    is not used, as the model begins with y(1).
+
+    References
+    ----------
+    .. [Nikoukhah1992] Kalman filtering and Riccati equations for descriptor systems, IEEE TAC 37 (9), Lemmas 2.3, 2.4.
+    .. [MoussaAli2013] Fault diagnosis for linear time-varying descriptor systems, IFAC ALCOSP 2013, eqs. (5)-(13).
+    """
+    return design(
+        plant, "descriptor-kalman", name=name, Q=Q, R=R, initial_state=initial_state,
+        initial_covariance=initial_covariance, early_constraints=early_constraints,
+    )  # fmt: skip

@@ -1,0 +1,152 @@
+"""Central H-infinity filters: the least gain of a `GainProblem`, and filters that weigh noise at a given gain.
+
+See `central_equation` for the equation behind them.  The true gain of the true problem decides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from obsynth.methods.fault_estimation_filter.central_equation import CentralEquation, central_injection
+from obsynth.methods.fault_estimation_filter.gamma_iteration import NEXT_TO, Descent
+from obsynth.methods.fault_estimation_filter.injection_problem import GainProblem, Injection
+
+#: Artificial noise relative to the disturbance, in turn: the first is bisected, and each of the others only where it
+#: reaches a level below.
+NOISES = (1e-6, 1e-8, 1e-7, 1e-5, 1e-4, 1e-2)
+#: Relative width of the bracket at which the search ends, for few and for many states.
+FEW_STATES = 80
+LEVEL_TOLERANCE = 1e-7
+COARSE_LEVEL_TOLERANCE = 1e-5
+COARSE_NOISES = (1e-6, 1e-4)
+#: Distance below the best gain, in tolerances, at which another noise is tried.
+PROBE = 10.0
+#: The first level tried, relative to the start.
+START_SHARE = 0.5
+#: Weights of the noise beside the disturbance, relative to their sizes, and levels of both together, relative to the
+#: gain of the disturbance alone.
+NOISE_WEIGHTS = np.logspace(-6.0, 3.0, 31)
+LEVEL_FACTORS = (1.0, 1.5)
+#: Above so many states the higher level, which makes gains up to a quarter smaller, would cost up to half of the time.
+MOST_STATES_FOR_LEVELS = 200
+WEIGHT_STEPS = 4
+#: A level this far above anything a disturbance could do is no limit.
+WITHOUT_LIMIT = 1e4
+
+
+def central_filter_at(problem: GainProblem, level: float) -> Injection | None:
+    """Return a filter whose true gain is below ``level``, from the first noise that gives one, or ``None``."""
+    if problem.order == 0 or problem.measured == 0:
+        return None
+    work = with_least_weight(problem)
+    for noise in NOISES:
+        found = central_injection(work, level, noise=noise)
+        if found is not None and problem.reaches(found, level):
+            return found
+    return None
+
+
+def with_least_weight(problem: GainProblem) -> GainProblem:
+    """Return the problem with V = 0 where the weight has a limit: the least weight there is meets every limit."""
+    return problem if problem.weight_limit is None else replace(problem, free_weight=False, weight_limit=None)
+
+
+def search_central_filter(
+    problem: GainProblem,
+    start: Injection,
+    gain: float | None = None,
+    *,
+    tolerance: float | None = None,
+    start_is_good: bool = False,
+) -> tuple[Injection, float]:
+    """Return the best central filter found, and (a bound on) its true gain.
+
+    The least level of the equation with little noise is found.  Less of it may cost less, and with more of it the
+    equation is less sensitive to rounding: a level just below is tried, and if that is reached, the least from there.
+    """
+    if tolerance is None:
+        tolerance = LEVEL_TOLERANCE if problem.order <= FEW_STATES else COARSE_LEVEL_TOLERANCE
+    best, gain = start, problem.achieved_gain(start) if gain is None else gain
+    low, most_noise = least_level(problem), np.inf
+    for noise in NOISES if problem.order <= FEW_STATES else COARSE_NOISES:
+        if gain <= low * (1.0 + 2.0 * tolerance):
+            break
+        if noise > most_noise:
+            continue
+        close = start_is_good or best is not start
+        equation = CentralEquation.of(problem, noise=noise)
+        descent = Descent(equation, low, gain, tolerance, wary=close)
+        descent.run(max(low, gain * (1.0 - PROBE * tolerance if close else START_SHARE)))
+        found = descent.best()
+        if found is None and descent.reached and descent.reached[0].level < gain * (1.0 - NEXT_TO):
+            descent = descent.judged_again(gain)
+            found = descent.best()
+        if found is None:
+            continue
+        injection, reached = found
+        if descent.settled and reached <= descent.high * (1.0 + PROBE * tolerance):
+            most_noise = noise  # more of it cannot cost less
+        if reached < gain:
+            best, gain = injection, reached
+    return best, gain
+
+
+def least_level(problem: GainProblem) -> float:
+    """Return what a disturbance does to xi before any measurement can help: no gain is below."""
+    if problem.weight_is_free:
+        return 0.0
+    direct = problem.Zd if np.any(problem.D) else np.hstack([problem.Zd, problem.Z @ problem.B])
+    return float(np.linalg.norm(direct, 2)) if direct.size else 0.0
+
+
+def least_noise_filter(problem: GainProblem) -> Injection | None:
+    """Return the filter with the least variance of xi under the noise of the problem: a level without limit."""
+    noise = replace(with_least_weight(problem), B=problem.Bn, D=problem.Dn, Zd=problem.Zn)
+    if noise.order == 0 or noise.measured == 0:
+        return None
+    found = central_injection(noise, WITHOUT_LIMIT * max(noise.disturbance_size, 1.0), noise=NOISES[0])
+    return found if found is not None and np.isfinite(problem.noise_variance(found)) else None
+
+
+def noise_weighted_filters(
+    problem: GainProblem, gain: float, *, reaches: Callable[[Injection], bool]
+) -> Iterator[Injection]:
+    """Yield central filters that promise a gain of at most ``gain``, for which the noise counts as much as it can.
+
+    The noise of the problem, times a weight, is one more disturbance.  At the level ``gain`` for both together the gain
+    of the true disturbance alone is lower; at a higher level the weight may be larger, and must then be searched with
+    the true gain.
+    """
+    work = with_least_weight(problem)
+    sizes = [float(np.linalg.norm(np.vstack(pair))) for pair in ((work.B, work.D), (work.Bn, work.Dn))]
+    if work.order == 0 or work.measured == 0 or not min(sizes) > 0.0:
+        return
+    weights, last = NOISE_WEIGHTS * sizes[0] / sizes[1], 0
+    for factor in LEVEL_FACTORS if work.order <= MOST_STATES_FOR_LEVELS else LEVEL_FACTORS[:1]:
+        # More weight than at a lower level, and not more than can be hoped for.
+        low, high = last, len(weights) if factor == 1.0 else min(last + WEIGHT_STEPS, len(weights))
+        best = None
+        while low < high:
+            middle = (low + high) // 2
+            equation = CentralEquation.of(_with_noise(work, weights[middle]), noise=NOISES[0])
+            found = equation.filter_at(factor * gain)
+            if found is not None and (factor == 1.0 or reaches(found)):
+                best, low = found, middle + 1
+            else:
+                high = middle
+        if best is not None:
+            yield best
+            last = low - 1
+
+
+def _with_noise(problem: GainProblem, weight: float) -> GainProblem:
+    """Return the problem with its noise, times a weight, as further disturbances."""
+    return replace(
+        problem,
+        B=np.hstack([problem.B, weight * problem.Bn]),
+        D=np.hstack([problem.D, weight * problem.Dn]),
+        Zd=np.hstack([problem.Zd, weight * problem.Zn]),
+    )

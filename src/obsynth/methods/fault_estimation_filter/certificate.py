@@ -1,0 +1,124 @@
+"""Finding a certificate for gains in hand: a Lyapunov matrix with which the shipped inequality can be proved."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import product
+
+import numpy as np
+
+from obsynth.methods.riccati import bounded_real_matrix, normalising_change
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.norms import balancing_factors, output_covariance
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.verification.bounded_real import prove_bounded_real
+from obsynth.verification.error_system import ErrorSystem
+
+#: Levels, relative to the claimed one, at which coordinates are improved on the way to it.
+APPROACHES = ((1.05,), (1.5, 1.05, 1.001))
+#: Weights of what the output does not show, relative to the output's, tried in turn.
+TAILS = (1e-2, 1e-4, 1e-6, 1e-9, 1e-12, 1e-16, 1e-20)
+#: Slack of the Riccati equation relative to the output weight, largest first: the first that proves is taken.
+SLACKS = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10)
+#: Steps towards coordinates in which the norm of the error dynamics is near one: how many, and down to which power.
+MOST_STEPS = 60
+STEP_POWER = 0.75
+NEAR_ONE = 1.05
+
+
+def bounded_real_certificate(
+    plant: DescriptorSystem, observer: LinearObserver, tracking: FloatArray, gain: float, *, core: int, lag: int
+) -> FloatArray:
+    """Return Q ``(core, core)``, upper triangular with P = Q'Q, for the shipped observer at level ``gain``.
+
+    The Riccati solution with the largest slack that gives a proof; the last try when none does, for the report.
+    """
+    errors = ErrorSystem.of(plant, observer, tracking, lag)
+    a, b = observer.Az[:core, :core], errors.disturbance[:core] / gain
+    c, d = -errors.fault_output[0][:, :core], errors.fault_output[2] / gain
+    best, spare = np.eye(core), None
+    for change in _changes(a, b, c, d):
+        inverse = np.asarray(np.linalg.inv(change))
+        moved_a, moved_b, moved_c = inverse @ a @ change, inverse @ b, c @ change
+        weight = max(1.0, float(np.linalg.norm(moved_c, 2)) ** 2)
+        for slack in SLACKS:
+            p = bounded_real_matrix(moved_a, moved_b, moved_c, d, 1.0, slack=slack * weight)
+            if p is None:
+                continue
+            best = _triangular(np.asarray(np.linalg.cholesky(p)).T @ inverse)
+            proof = prove_bounded_real(plant, observer, tracking, best, gain, lag=lag)
+            if proof.in_double_precision:
+                return best
+            spare = best if proof.proved and spare is None else spare
+    return best if spare is None else spare
+
+
+def _changes(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> Iterator[FloatArray]:
+    """Yield state changes in which a Riccati solution may prove something, the cheapest first."""
+    for begin in (_balanced, _contracted, _unchanged):
+        start = begin(a, b, c)
+        inverse = np.asarray(np.linalg.inv(start))
+        moved = (inverse @ a @ start, inverse @ b, c @ start)
+        for path, tail in product(APPROACHES, TAILS):
+            change = _coordinates(*moved, d, path=path, tail=tail)
+            if change is not None:
+                yield start @ change
+
+
+def _balanced(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
+    """Return a diagonal state change, powers of two, in which units cost no digits."""
+    n, inputs, outputs = a.shape[0], b.shape[1], c.shape[0]
+    system = np.zeros((n + inputs + outputs,) * 2)
+    system[:n, :n], system[:n, n : n + inputs], system[n + inputs :, :n] = a, b, c
+    return np.diag(balancing_factors(system)[:n])
+
+
+def _unchanged(a: FloatArray, _b: FloatArray, _c: FloatArray) -> FloatArray:
+    """Return no change: at the edge of what can be proved in double precision, other rounding errors may do."""
+    return np.eye(a.shape[0])
+
+
+def _contracted(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
+    """Return a state change in which the norm of ``a``, far above its spectral radius, is at most about one.
+
+    In coordinates where the Lyapunov matrix of ``a / s`` is the identity the norm of ``a`` is below s.  From the norm
+    down to one s shrinks in steps, smaller ones close to one, so that each Lyapunov equation is well conditioned.
+    """
+    change, identity = _balanced(a, b, c), np.eye(a.shape[0])
+    moved = np.linalg.solve(change, a @ change)
+    norm = float(np.linalg.norm(moved, 2))
+    for _ in range(MOST_STEPS):
+        level = max(min(0.5 * norm, norm**STEP_POWER), 1.0)
+        p = output_covariance(moved.T / level, identity, identity, np.zeros_like(a))  # the sum of A'^k A^k
+        if norm <= NEAR_ONE or not np.all(np.isfinite(p)):
+            break
+        change = change @ normalising_change(p)
+        moved = np.linalg.solve(change, a @ change)
+        norm = float(np.linalg.norm(moved, 2))
+    return change
+
+
+def _coordinates(
+    a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, *, path: tuple[float, ...], tail: float
+) -> FloatArray | None:
+    """Return a state change in which a rough Riccati solution is the identity, approached over the levels of ``path``.
+
+    ``tail`` weighs states that the output does not show: little enough that the disturbance on them does not count,
+    and otherwise as much as possible, for the sake of the condition number.  ``None`` when there is no solution.
+    """
+    change = np.eye(a.shape[0])
+    for level in path:
+        inverse = np.asarray(np.linalg.inv(change))
+        shown = c @ change
+        size = max(float(np.linalg.norm(shown, 2)) ** 2, np.finfo(np.float64).tiny)
+        p = bounded_real_matrix(inverse @ a @ change, inverse @ b, shown, d, level, slack=tail * size)
+        if p is None:
+            return None
+        change = change @ normalising_change(p)
+    return change
+
+
+def _triangular(factor: FloatArray) -> FloatArray:
+    """Return the upper triangular factor of the same Gram matrix."""
+    return np.asarray(np.triu(np.linalg.qr(factor, mode="r")))

@@ -1,0 +1,210 @@
+"""Checks of a fault-estimation filter, from the plant and the shipped realisation alone.
+
+Source of the claims: Wang 2015, eqs. (7), (26), (32), (44), (45), (49); the corrected state estimate is ours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterator
+
+import numpy as np
+
+from obsynth.errors import PreconditionError
+from obsynth.methods.fault_estimation_filter.checks.faults import fault_rows
+from obsynth.methods.fault_estimation_filter.checks.gains import gain_rows, gains_fit
+from obsynth.methods.fault_estimation_filter.checks.printed_gains import printed_allowances
+from obsynth.methods.fault_estimation_filter.checks.realisation import Equations
+from obsynth.methods.fault_estimation_filter.conditions import fault_filter_conditions
+from obsynth.methods.fault_estimation_filter.prepared_plant import with_sensor_faults_as_states
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.modal_response import Modes
+from obsynth.numerics.norms import highest_gain_found, hinf_norm
+from obsynth.numerics.pencils import pencil_structure
+from obsynth.numerics.scaling import Scaling, balance_by_least_squares
+from obsynth.numerics.spectra import certain_noise_covariance
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.results.design import ObserverDesign
+from obsynth.results.report import Check, information, upper_bound_check
+from obsynth.verification.bounded_real import prove_bounded_real
+from obsynth.verification.claims import UNCERTAIN, claim_rows, claimed, recovery_rows
+from obsynth.verification.error_system import ErrorSystem
+from obsynth.verification.identities import equality, tracking_identities
+from obsynth.verification.plant import condition_rows, plant_information
+
+_IDENTITIES = {
+    "dynamics": ("unbiased: dynamics", "Az V E + By C = V A", "Wang 2015, eqs. (7), (26)"),
+    "inputs": ("unbiased: inputs", "Bu + By D = V B", "Wang 2015, eq. (23)"),
+    "state estimate": (
+        "unbiased: state",
+        "the state estimate equals the state when the error is zero",
+        "Wang 2015, eq. (7)",
+    ),
+    "fault estimate": ("unbiased: fault", "the fault estimate does not see the state", "Wang 2015, eq. (25)"),
+    "residual": ("unbiased: residual", "the residual does not see the state", "Wang 2015, eq. (25)"),
+    "input feedthrough": (
+        "unbiased: feedthrough",
+        "no estimate sees the input directly (Du + Dy D = 0)",
+        "our extension",
+    ),
+}
+
+
+def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
+    """Yield every check of ``design``; see `obsynth.verification.verify`."""
+    (plant, observer), claims = design.linear, design.certificate.claims
+    structure = pencil_structure(plant.E, plant.A)
+    yield from plant_information(plant, structure)
+    yield from condition_rows(fault_filter_conditions(plant, structure=structure))
+    yield from claim_rows(plant, claims)
+    yield from recovery_rows(plant, design.recovery)
+    tracking, factor = design.certificate.matrices.get("tracking"), design.certificate.matrices.get("P_factor")
+    lag = _whole(claimed(claims, "state_lag"))
+    fitting = _fits(plant, observer, tracking, factor, lag)
+    yield upper_bound_check(
+        "fits the plant",
+        "observer, certificate and plant have matching signals and shapes",
+        0.0 if fitting else 1.0,
+        0.0,
+        source="shipped realisation",
+    )
+    if not fitting or tracking is None or factor is None:
+        return
+    work = _with_sensor_faults(plant)
+    scaling = balance_by_least_squares(work.E, work.A, inputs=[work.Bf], outputs=[work.C]) if work is not None else None
+    allowances = yield from _gain_set_rows(design, work, scaling, tracking, printed_digits)
+    for key, identity in tracking_identities(plant, observer, tracking, lag).items():
+        name, claim, source = _IDENTITIES[key]
+        yield equality(name, claim, identity.residual(allowances.get(key)), source)
+    errors = ErrorSystem.of(plant, observer, tracking, lag)
+    yield from fault_rows(plant, observer, tracking, errors, scaling, allowances)
+    modes = Modes.of(observer.Az)
+    radius = modes.radius
+    yield upper_bound_check(
+        "spectral radius",
+        "the observer is stable",
+        radius,
+        np.nextafter(1.0, 0.0),
+        source="Wang 2015, Theorem 2",
+        detail=f"eigenvalues computed; proved by the row 'LMI'; {_time_constant(radius, plant.dt)}",
+    )
+    yield from _norm_rows(design, errors, modes, tracking, factor, lag)
+    yield from _noise_rows(plant, errors)
+
+
+def _gain_set_rows(
+    design: ObserverDesign,
+    work: DescriptorSystem | None,
+    scaling: Scaling | None,
+    tracking: FloatArray,
+    printed_digits: int | None,
+) -> Generator[Check, None, dict[str, FloatArray]]:
+    """Yield the rows on the gain set, and return what its printed digits allow the identities to miss."""
+    (plant, observer), gains = design.linear, design.gains
+    if not gains:
+        return {}  # nothing is said about gains: the realisation stands for itself
+    if work is None or scaling is None:
+        return {}  # a failed existence condition says so already
+    fitting = gains_fit(work, gains, observer)
+    yield fitting
+    if not fitting.passed:
+        return {}
+    allowances: dict[str, FloatArray] = {}
+    if printed_digits is not None:
+        allowances = printed_allowances(plant, work, observer, gains, scaling, printed_digits)
+    equations = Equations.of(plant, work, observer.fault_delays)
+    yield from gain_rows(work, gains, observer, tracking, equations, scaling, allowances)
+    return allowances
+
+
+def _with_sensor_faults(plant: DescriptorSystem) -> DescriptorSystem | None:
+    """Return the plant with its sensor faults as states; ``None`` where these cannot be told from the others."""
+    try:
+        return with_sensor_faults_as_states(plant)
+    except PreconditionError:
+        return None
+
+
+def _whole(lag: float) -> int:
+    """Return a lag as a number of samples, -1 when it is none."""
+    return int(lag) if np.isfinite(lag) and lag == int(lag) else -1
+
+
+def _fits(
+    plant: DescriptorSystem, observer: LinearObserver, tracking: FloatArray | None, factor: FloatArray | None, lag: int
+) -> bool:
+    if tracking is None or factor is None or tracking.ndim != 2 or factor.ndim != 2:
+        return False
+    return bool(
+        lag >= 0
+        and tracking.shape == (observer.order, plant.nx * (lag + 1))
+        and factor.shape[0] == factor.shape[1] <= observer.order
+        and np.all(np.isfinite(tracking))
+        and np.all(np.isfinite(factor))
+        and observer.input_names == plant.input_names
+        and observer.output_names == plant.output_names
+        and observer.state_names == plant.state_names
+        and observer.fault_names == observer.residual_names == plant.fault_names
+        and observer.dt == plant.dt
+        and all(delay == lag for delay in observer.state_delays)
+        and all(delay >= 1 for delay in observer.fault_delays)
+    )
+
+
+def _norm_rows(
+    design: ObserverDesign, errors: ErrorSystem, modes: Modes, tracking: FloatArray, factor: FloatArray, lag: int
+) -> Iterator[Check]:
+    (plant, observer), claims = design.linear, design.certificate.claims
+    gamma = claimed(claims, "gamma")
+    proof = prove_bounded_real(plant, observer, tracking, factor, gamma if plant.nd else 1.0, lag=lag)
+    what = f"stable, and l2 gain d -> fault error < {gamma:.6g}" if plant.nd else "stable (Lyapunov)"
+    yield Check(
+        "LMI",
+        f"the matrix inequality is positive definite: {what}",
+        proof.lower_bound,
+        0.0,
+        proof.lower_bound,
+        proof.proved,
+        "Wang 2015, eq. (45)",
+        "proved",
+        proof.text,
+    )
+    if not plant.nd:
+        return
+    fault, states = errors.fault_output, errors.state_output
+    norm = hinf_norm(errors.Az, errors.disturbance, fault[0], -fault[2], modes=modes)
+    reported = max(gamma, norm.upper)
+    yield upper_bound_check(
+        "H-infinity norm",
+        "the exact norm d -> fault error is at most the claimed gamma",
+        norm.upper,
+        gamma,
+        source="Wang 2015, eq. (49)",
+        detail=f"peak at {norm.angle:.4g} rad/sample; the gain to quote is {reported:.6g}",
+    )
+    state = highest_gain_found(errors.Az, errors.disturbance, states[0], -states[2], modes=modes)
+    yield information(
+        "disturbance in the state estimate", "H-infinity norm d -> state error", state, source="recomputed"
+    )
+
+
+def _noise_rows(plant: DescriptorSystem, errors: ErrorSystem) -> Iterator[Check]:
+    if not plant.nw:
+        return
+    covariance = certain_noise_covariance(
+        errors.Az, errors.noise, -errors.fault_output[0], errors.fault_output[3], plant.dt
+    )
+    for name, variance in zip(plant.fault_names, np.diag(covariance), strict=True):
+        yield information(
+            f"noise in fhat[{name}]",
+            "standard deviation of the fault estimate under the stated noise",
+            float(np.sqrt(variance)),
+            source="recomputed, Lyapunov equation",
+            detail=UNCERTAIN if np.isnan(variance) else plant.units.get(name, ""),
+        )
+
+
+def _time_constant(radius: float, dt: float) -> str:
+    if not 0.0 < radius < 1.0:
+        return "no time constant"
+    return f"slowest time constant {-dt / np.log(radius):.3g} s"

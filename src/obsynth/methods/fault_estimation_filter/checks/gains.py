@@ -1,0 +1,145 @@
+"""The gain set beside the realisation: letters that are not those of what is shipped would mislead a reader.
+
+Source: Wang 2015, eqs. (8) and (17) for T and N, (20) for Psi and Upsilon, (23) for the filter, (60) for L.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from obsynth.methods.fault_estimation_filter.checks.realisation import MATRICES, Equations
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.scaling import Scaling
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.results.report import Check, upper_bound_check
+from obsynth.verification.identities import Identity, equality, worst
+
+#: Letters that every gain set has, and that it may have.
+NEEDED, OPTIONAL = ("T", "N", "L", "W", "Psi", "Upsilon"), ("R",)
+RESTRICTED, WEIGHT = "gains: T and N", "gains: W"
+
+
+def gains_fit(work: DescriptorSystem, gains: Mapping[str, FloatArray], observer: LinearObserver) -> Check:
+    """Return the row on letters and shapes of the gain set."""
+    na, ny, nf = work.nx, work.ny, work.nf
+    shapes = {
+        "T": (na, na), "N": (na, ny), "L": (na, ny), "W": (nf, ny), "Psi": (na, nf), "Upsilon": (ny, nf), "R": (na, ny),
+    }  # fmt: skip
+    wrong = [letter for letter in NEEDED if letter not in gains]
+    wrong += [letter for letter in gains if letter not in shapes]
+    wrong += [
+        letter
+        for letter, shape in shapes.items()
+        if letter in gains and (gains[letter].shape != shape or not np.all(np.isfinite(gains[letter])))
+    ]
+    order = na + len(observer.state_names) * (max(observer.fault_delays, default=1) - 1)
+    wrong += ["the order of the observer"] if observer.order != order else []
+    return upper_bound_check(
+        "gains fit",
+        "the gain set has the letters and shapes of the plant, the observer the order that follows",
+        float(len(wrong)),
+        0.0,
+        source="gain set",
+        detail=f"wrong: {', '.join(wrong)}" if wrong else "",
+    )
+
+
+def gain_identities(
+    work: DescriptorSystem, gains: Mapping[str, FloatArray], equations: Equations, scaling: Scaling
+) -> dict[str, Identity]:
+    """Return the identities that T, N and W satisfy, and that the rounding of printed gains disturbs."""
+    t, n, w = gains["T"], gains["N"], gains["W"]
+    upsilon = work.C @ equations.detectability_matrix(gains)
+    # The columns are in the units of the faults, which differ: each is compared with its own largest products.
+    peaks = np.max(np.abs(w) @ np.abs(upsilon), axis=0, initial=0.0)
+    return {
+        RESTRICTED: Identity((t @ work.E, n @ work.C, -np.eye(work.nx)), ((t, work.E), (n, work.C)), scaling.states),
+        WEIGHT: Identity(
+            (w @ upsilon, -np.eye(work.nf)), ((w, upsilon),), 1.0 / np.where(peaks > 0.0, peaks, 1.0)
+        ),
+    }  # fmt: skip
+
+
+def gain_rows(
+    work: DescriptorSystem,
+    gains: Mapping[str, FloatArray],
+    observer: LinearObserver,
+    tracking: FloatArray,
+    equations: Equations,
+    scaling: Scaling,
+    allowances: Mapping[str, FloatArray],
+) -> Iterator[Check]:
+    """Yield the rows on the gain set, which must fit."""
+    identities = gain_identities(work, gains, equations, scaling)
+    claims = {
+        RESTRICTED: ("T E + N C = I", "Wang 2015, eq. (8)"),
+        WEIGHT: ("W Upsilon = I", "Wang 2015, eq. (44)"),
+    }
+    for name, (claim, source) in claims.items():
+        yield equality(name, claim, identities[name].residual(allowances.get(name)), source)
+    yield equality(
+        "gains: Psi and Upsilon",
+        "Psi holds the columns (TA)^(rho_i - 1) T f_i, and Upsilon = C Psi",
+        worst([identity.residual() for identity in _detectability_identities(work, gains, equations)]),
+        "Wang 2015, eq. (20)",
+    )
+    if "R" in gains:
+        yield equality(
+            "gains: R",
+            "R is the free part of L: R Upsilon = 0, and L - R = T A Psi G with G Upsilon = I",
+            worst([identity.residual() for identity in _free_part_identities(work, gains, scaling)]),
+            "Wang 2015, eq. (60)",
+        )
+    yield equality(
+        "gains: realisation",
+        "the realisation is that of T, N, L and W, and the certificate tracks T x",
+        worst([identity.residual() for identity in _realisation_identities(gains, observer, tracking, equations)]),
+        "Wang 2015, eq. (23); our state estimate",
+    )
+
+
+def _detectability_identities(
+    work: DescriptorSystem, gains: Mapping[str, FloatArray], equations: Equations
+) -> list[Identity]:
+    psi, upsilon = equations.detectability_matrix(gains), gains["Upsilon"]
+    sizes = equations.absolute.detectability_matrix({"T": np.abs(gains["T"])})
+    return [
+        Identity((gains["Psi"], -psi), ((sizes,),), entrywise=True),
+        Identity((upsilon, -work.C @ gains["Psi"]), ((work.C, sizes),), entrywise=True),
+    ]
+
+
+def _free_part_identities(work: DescriptorSystem, gains: Mapping[str, FloatArray], scaling: Scaling) -> list[Identity]:
+    # Which left inverse G of Upsilon is taken depends on the units of the outputs: any one is right.
+    outputs, fixed, free = 1.0 / scaling.outputs, gains["L"] - gains["R"], gains["R"]
+    moved = gains["T"] @ work.A @ gains["Psi"]
+    # The columns of L - R are combinations of those of T A Psi: nothing is left beside their span.
+    basis, sizes, _ = np.linalg.svd(moved / scaling.states[:, None], full_matrices=False)
+    span = scaling.states[:, None] * basis[:, sizes > 0.0]
+    shares = (basis[:, sizes > 0.0] / scaling.states[:, None]).T
+    upsilon = gains["Upsilon"]
+    # R is the difference of L and the fixed part: it is judged against these, however small it is itself.
+    parts = np.abs(gains["L"]) + np.abs(fixed) + np.abs(free)
+    rows = np.max(parts * outputs, axis=1, keepdims=True)
+    columns = np.max(np.abs(upsilon) / outputs[:, None], axis=0, keepdims=True)
+    products = ((rows, columns), (gains["T"], work.A, gains["Psi"]))
+    formed = parts + np.abs(gains["T"]) @ np.abs(work.A) @ np.abs(gains["Psi"]) @ np.abs(gains["W"])
+    # The projection mixes the rows in balanced units.
+    mixed = scaling.states[:, None] * np.max(formed / scaling.states[:, None], axis=0, initial=0.0)
+    return [
+        Identity((free @ upsilon,), products),
+        Identity((fixed @ upsilon, -moved), products),
+        Identity((fixed, -span @ (shares @ fixed)), ((mixed,),), outputs),
+    ]
+
+
+def _realisation_identities(
+    gains: Mapping[str, FloatArray], observer: LinearObserver, tracking: FloatArray, equations: Equations
+) -> list[Identity]:
+    formed = equations.realised(gains)
+    sizes = equations.absolute.realised({letter: np.abs(gains[letter]) for letter in "TNLW"}, minus=1.0)
+    found = [Identity((getattr(observer, name), -formed[name]), ((sizes[name],),), entrywise=True) for name in MATRICES]
+    return [*found, Identity((tracking, -equations.tracking(gains["T"])), entrywise=True)]

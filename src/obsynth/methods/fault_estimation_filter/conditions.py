@@ -1,0 +1,207 @@
+"""When a fault-estimation filter exists, decided before any solver runs.
+
+Source: Wang, Rodrigues, Theilliol, Shen 2015, section 2 and Theorem 2 (i), and the condition that the paper never
+states: detectability of (A1, C1), which holds when every invariant zero from the faults to the outputs lies strictly
+inside the unit circle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from obsynth.analysis.conditions import Condition, rank_condition
+from obsynth.analysis.zeros import Zero, fault_zeros, leading_names
+from obsynth.errors import PreconditionError
+from obsynth.methods.fault_estimation_filter.detectability_indexes import detectability_conditions
+from obsynth.methods.fault_estimation_filter.prepared_plant import PreparedPlant, prepare, with_sensor_faults_as_states
+from obsynth.numerics.pencils import PencilStructure, regularity
+from obsynth.numerics.ranks import decide_rank
+from obsynth.plants.descriptor import DescriptorSystem
+
+#: At most this many signals are named in a failed condition.
+MOST_NAMES = 4
+
+
+def fault_filter_conditions(
+    plant: DescriptorSystem, *, structure: PencilStructure | None = None
+) -> tuple[Condition, ...]:
+    """Return the existence conditions of the fault-estimation filter, in order; the list ends at the first failure."""
+    return examine_fault_filter(plant, structure=structure)[0]
+
+
+def examine_fault_filter(
+    plant: DescriptorSystem, *, structure: PencilStructure | None = None
+) -> tuple[tuple[Condition, ...], PreparedPlant | None]:
+    """Return the existence conditions, and the prepared plant on which the last of them were decided."""
+    prepared: PreparedPlant | None = None
+
+    def visibility_conditions() -> list[Condition]:
+        nonlocal prepared
+        prepared = prepare(plant)
+        return list(detectability_conditions(prepared.detectability, plant.fault_names, prepared.scaling.outputs))
+
+    groups: tuple[Callable[[], list[Condition]], ...] = (
+        lambda: _form_conditions(plant, structure),
+        lambda: _rank_conditions(plant),
+        visibility_conditions,
+        lambda: _zero_conditions(plant),
+    )
+    found: list[Condition] = []
+    for group in groups:
+        for condition in group():
+            found.append(condition)
+            if not condition.holds:
+                return tuple(found), prepared
+    return tuple(found), prepared
+
+
+def _form_conditions(plant: DescriptorSystem, structure: PencilStructure | None) -> list[Condition]:
+    if structure is None:
+        regular, normal_rank = regularity(plant.E, plant.A)
+    else:
+        regular, normal_rank = structure.regular, structure.normal_rank
+    return [
+        Condition(
+            "discrete time",
+            "a discrete-time plant (dt > 0)",
+            plant.is_discrete,
+            plant.dt,
+            0.0,
+            "Wang 2015, eq. (1)",
+            ""
+            if plant.is_discrete
+            else "a continuous plant. Sample it first (transform: {sample_time: ...} in "
+            "a spec, obsynth.discretise in Python).",
+        ),
+        Condition(
+            "faults",
+            "at least one fault",
+            plant.nf > 0,
+            float(plant.nf),
+            1.0,
+            "Wang 2015, eq. (1)",
+            "" if plant.nf else "none. Name the fault to estimate in Bf or Df.",
+        ),
+        Condition(
+            "regularity",
+            "a regular pencil (det(A - zE) not identically zero)",
+            regular,
+            float(normal_rank),
+            float(plant.nx),
+            "definition of a descriptor plant",
+            f"normal rank {normal_rank} of {plant.nx}"
+            + ("" if regular else ": the equations do not determine the states. Add what is missing."),
+        ),
+    ]
+
+
+def _rank_conditions(plant: DescriptorSystem) -> list[Condition]:
+    enough = Condition(
+        "nf <= ny",
+        "no more faults than outputs (nf <= ny)",
+        plant.nf <= plant.ny,
+        float(plant.nf),
+        float(plant.ny),
+        "Wang 2015, below eq. (1)",
+        ""
+        if plant.nf <= plant.ny
+        else f"{plant.nf} faults and {plant.ny} output(s). Measure more, or leave a fault out.",
+        signals=() if plant.nf <= plant.ny else plant.fault_names,
+    )
+    faults = decide_rank(np.vstack([plant.Bf, plant.Df]), expected=plant.nf)
+    ranks = [
+        enough,
+        rank_condition(
+            "rank F",
+            faults,
+            "some faults act nowhere, or in the same direction as others, and cannot be told apart.",
+            source="Wang 2015, below eq. (1)",
+            signals=_dependent_columns(plant),
+        ),
+    ]
+    if not all(condition.holds for condition in ranks):
+        return ranks
+    try:
+        work = with_sensor_faults_as_states(plant)
+    except PreconditionError as error:
+        return [
+            *ranks,
+            Condition(
+                error.condition,
+                "sensor faults can be told from the states",
+                False,
+                np.nan,
+                np.nan,
+                "Wang 2015, eq. (2), with the fault as a state",
+                str(error),
+                signals=error.signals,
+            ),
+        ]
+    outputs = decide_rank(work.C, expected=work.ny)
+    stacked = np.vstack([work.E, work.C])
+    states = decide_rank(stacked, expected=work.nx)
+    ranks += [
+        rank_condition(
+            "rank C",
+            outputs,
+            "some outputs repeat others: leave them out.",
+            source="Wang 2015, below eq. (1)",
+            signals=()
+            if outputs.full
+            else leading_names(np.linalg.svd(work.C)[0][:, -1], plant.output_names, most=MOST_NAMES),
+        ),
+        rank_condition(
+            "rank [E; C]",
+            states,
+            "not every state is either dynamic or measured. Measure more, or eliminate the algebraic states first "
+            "(transform: {eliminate_algebraic_states: true} in a spec).",
+            source="Wang 2015, eq. (2)",
+            signals=()
+            if states.full
+            else leading_names(np.linalg.svd(stacked)[2][-1], work.state_names, most=MOST_NAMES),
+        ),
+    ]
+    return ranks
+
+
+def _zero_conditions(plant: DescriptorSystem) -> list[Condition]:
+    zeros = fault_zeros(plant)
+    largest = max((abs(zero.value) for zero in zeros.zeros), default=0.0)
+    claim = "every invariant zero from the faults to the outputs strictly inside the unit circle"
+    source = "never stated in Wang 2015: detectability of (A1, C1)"
+    if not zeros.normal_rank_full:
+        detail = f"faults {', '.join(map(repr, zeros.hidden_faults))} can act together without showing in any output."
+        return [Condition("fault zeros", claim, False, np.inf, 1.0, source, detail, signals=zeros.hidden_faults)]
+    if zeros.outside:
+        return [_zero_failure(plant, max(zeros.outside, key=lambda zero: abs(zero.value)), claim, source)]
+    detail = f"{len(zeros.zeros)} zero(s)" + (f", largest modulus {largest:.6g}" if zeros.zeros else "")
+    return [Condition("fault zeros", claim, True, float(largest), 1.0, source, detail)]
+
+
+def _zero_failure(plant: DescriptorSystem, zero: Zero, claim: str, source: str) -> Condition:
+    value = f"{zero.value.real:.6g}" if zero.value.imag == 0.0 else f"{zero.value:.6g}"
+    if zero.is_unobservable_mode:
+        signals = leading_names(np.abs(zero.state_direction), plant.state_names, most=MOST_NAMES)
+        detail = (
+            f"the mode z = {value} (states {', '.join(map(repr, signals))}) never shows in the outputs and does "
+            "not decay: measure something it moves."
+        )
+    else:
+        signals = leading_names(np.abs(zero.input_direction), plant.fault_names, most=MOST_NAMES)
+        detail = (
+            f"at the zero z = {value} the fault {', '.join(map(repr, signals))} can follow z^k without showing "
+            "in any output, so no filter can estimate it. Measure another signal."
+        )
+    return Condition(
+        "fault zeros", claim, False, abs(zero.value), 1.0, source, detail, mode=zero.value, signals=signals
+    )
+
+
+def _dependent_columns(plant: DescriptorSystem) -> tuple[str, ...]:
+    columns = np.vstack([plant.Bf, plant.Df])
+    lengths = np.linalg.norm(columns, axis=0)
+    if np.any(lengths == 0.0):
+        return tuple(name for name, length in zip(plant.fault_names, lengths, strict=True) if length == 0.0)
+    return leading_names(np.linalg.svd(columns / lengths)[2][-1], plant.fault_names, most=MOST_NAMES)

@@ -1,0 +1,136 @@
+"""Fault detectability indexes and matrix, and when a fault-estimation filter exists.
+
+Source: Wang, Rodrigues, Theilliol, Shen 2015, Definitions 2 and 3, assumptions around eq. (2), Theorem 2 (i).
+Differences: the search for the indexes is bounded and relative; the condition that the paper never states (every
+invariant zero from the faults to the outputs strictly inside the unit circle) is tested before any solver.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from obsynth.analysis.conditions import Condition
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.ranks import DEAD_CHAIN_TOLERANCE, MARKOV_TOLERANCE, RankDecision, decide_rank
+
+#: A fault detectability matrix with a larger condition number is usable but noisy: a note says so.
+WARN_CONDITION = 1e4
+#: Above this its inverse means nothing in double precision.
+REFUSE_CONDITION = 1e8
+
+
+@dataclass(frozen=True, eq=False)
+class FaultDetectability:
+    """Detectability indexes and matrices of the pair ``(TA, C)`` for the fault directions ``TF``.
+
+    Fields: indexes: ``rho_i``: steps from fault i to the outputs; ``None`` when it never reaches them; Psi: ``(nx,
+    nf)``, columns ``(TA)^(rho_i - 1) T f_i``; zero for infinite indexes; Upsilon: ``C Psi (ny, nf)``; rank: Rank of
+    Upsilon; condition_number: Of Upsilon, columns scaled to unit length.
+    """
+
+    indexes: tuple[int | None, ...]
+    Psi: FloatArray
+    Upsilon: FloatArray
+    rank: RankDecision
+    condition_number: float
+
+    @property
+    def finite(self) -> bool:
+        """Whether every fault reaches the outputs."""
+        return all(index is not None for index in self.indexes)
+
+    def chain(self, ta: FloatArray, tf: FloatArray) -> list[FloatArray]:
+        """Return the powers ``[TF, TA TF, ...]`` up to the largest index, one matrix ``(nx, nf)`` each."""
+        powers = [tf]
+        for _ in range(max((index or 1) for index in self.indexes) - 1):
+            powers.append(ta @ powers[-1])
+        return powers
+
+
+def fault_detectability(ta: FloatArray, c: FloatArray, tf: FloatArray) -> FaultDetectability:
+    """Return the detectability indexes (19) and matrices (20).
+
+    Shapes: ``ta (nx, nx)``, ``c (ny, nx)``, ``tf (nx, nf)``.
+    """
+    size = float(np.linalg.norm(c, 2))
+    results = [_first_visible(ta, c, tf[:, i], size) for i in range(tf.shape[1])]
+    psi = np.column_stack([vector for _, vector in results]) if results else np.zeros((ta.shape[0], 0))
+    upsilon = c @ psi
+    lengths = np.linalg.norm(upsilon, axis=0)
+    unit = upsilon / np.where(lengths == 0.0, 1.0, lengths)
+    values = np.linalg.svd(unit, compute_uv=False) if unit.size else np.ones(1)
+    invertible = unit.shape[0] >= unit.shape[1] and values[-1] > 0.0
+    condition = float(values[0] / values[-1]) if invertible else np.inf
+    rank = decide_rank(unit, expected=tf.shape[1])
+    return FaultDetectability(tuple(index for index, _ in results), psi, upsilon, rank, condition)
+
+
+def _first_visible(ta: FloatArray, c: FloatArray, direction: FloatArray, size: float) -> tuple[int | None, FloatArray]:
+    """Return the index of one fault and the vector that becomes visible; by Cayley-Hamilton nx steps suffice.
+
+    ``size`` is the norm of ``c``.
+    """
+    growth: float | None = None
+    vector, bound = direction, float(np.linalg.norm(direction))
+    for step in range(1, ta.shape[0] + 1):
+        length = float(np.linalg.norm(vector))
+        if length <= DEAD_CHAIN_TOLERANCE * bound or length == 0.0:
+            break
+        if float(np.linalg.norm(c @ vector)) > MARKOV_TOLERANCE * size * length:
+            return step, vector
+        growth = max(float(np.linalg.norm(ta, 2)), 1.0) if growth is None else growth
+        vector, bound = ta @ vector, bound * growth
+    return None, np.zeros_like(direction)
+
+
+def detectability_conditions(
+    detectability: FaultDetectability, fault_names: tuple[str, ...], output_scales: FloatArray
+) -> tuple[Condition, ...]:
+    """Return the conditions on indexes and matrix: finite indexes, ``rank Upsilon = nf`` with its condition number.
+
+    ``output_scales (ny,)`` are the factors by which the outputs were balanced, to give norms in the user's units.
+    """
+    hidden = tuple(name for name, index in zip(fault_names, detectability.indexes, strict=True) if index is None)
+    largest = max((index for index in detectability.indexes if index is not None), default=0)
+    finite = Condition(
+        "finite detectability indexes",
+        "every fault reaches the outputs",
+        not hidden,
+        float(largest),
+        float(detectability.Psi.shape[0]),
+        "Wang 2015, eq. (19)",
+        f"fault {', '.join(map(repr, hidden))} never shows in any output: measure something it acts on."
+        if hidden
+        else f"indexes {', '.join(map(str, detectability.indexes))}",
+        signals=hidden,
+    )
+    if hidden:
+        return (finite,)
+    rank, user_units = detectability.rank, detectability.Upsilon / output_scales[:, None]
+    usable = rank.full and detectability.condition_number <= REFUSE_CONDITION
+    mixed = () if usable else _dependent_faults(detectability.Upsilon, fault_names)
+    independent = Condition(
+        "rank Upsilon",
+        "the faults first reach the outputs in independent directions (rank Upsilon = nf)",
+        usable,
+        detectability.condition_number,
+        REFUSE_CONDITION,
+        "Wang 2015, Theorem 2 (i)",
+        f"{rank.describe()}, condition number {detectability.condition_number:.3g}, "
+        f"||Upsilon|| = {float(np.linalg.norm(user_units, 2)):.3g}"
+        + (f"; {_names(mixed)} cannot be told apart at first sight. Leave one out, or measure more." if mixed else "."),
+        signals=mixed,
+    )
+    return finite, independent
+
+
+def _names(faults: tuple[str, ...]) -> str:
+    return f"the faults {', '.join(map(repr, faults))}"
+
+
+def _dependent_faults(upsilon: FloatArray, names: tuple[str, ...]) -> tuple[str, ...]:
+    lengths = np.linalg.norm(upsilon, axis=0)
+    direction = np.abs(np.linalg.svd(upsilon / lengths)[2][-1])
+    return tuple(name for name, size in zip(names, direction, strict=True) if size > 0.1 * np.max(direction))

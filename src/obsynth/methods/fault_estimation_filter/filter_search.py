@@ -1,0 +1,125 @@
+"""The search for the gains of a fault-estimation filter: the least gain, the one to ship, and small gains for it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from obsynth.errors import SolverError
+from obsynth.methods.fault_estimation_filter import inequality_search
+from obsynth.methods.fault_estimation_filter.gamma_bisection import search_by_bisection
+from obsynth.methods.fault_estimation_filter.gamma_lower_bound import require_reachable
+from obsynth.methods.fault_estimation_filter.injection_problem import GainProblem, Injection, WeightLimit
+from obsynth.methods.fault_estimation_filter.options import FilterOptions
+from obsynth.methods.fault_estimation_filter.small_gains import small_gain_design
+
+#: Asking for a gain above this multiple of the starting filter's adds nothing but bad scaling.
+LARGEST_USEFUL_GAIN = 1e3
+#: The gains are designed for a slightly smaller gamma than claimed, so that the claim has a well-conditioned proof.
+CERTIFICATE_MARGIN = 5e-3
+CERTIFICATE_SHARE = 0.2
+#: Gains below this, relative to the disturbance and the output it could reach, are rounding errors.
+ROUNDING_GAIN = 1e-11
+#: Level of the certificate, relative to the same, when no disturbance reaches the fault estimate at all.
+NOMINAL_GAIN = 1e-3
+
+#: A gamma between these multiples of the least gain found by the equations calls the inequality by default, up to so
+#: many states: far below the least no polish helps, and far above none is needed.
+BELOW_LEAST, ABOVE_LEAST = 0.95, 1.0 + 1e-4
+MOST_STATES_TO_POLISH = 64
+
+
+@dataclass(frozen=True, eq=False)
+class FoundGains:
+    """What the search for gains found.
+
+    Fields: problem: What it was about in the end; least: The least gain found; gamma: The gain that is claimed; chosen:
+    The gains that are shipped; records: Solver runs of the choice of small gains.
+    """
+
+    problem: GainProblem
+    least: inequality_search.LeastGain
+    gamma: float
+    chosen: Injection
+    records: list[dict[str, Any]]
+
+    def within(self, limit: WeightLimit) -> bool:
+        """Whether the weights of both, the least gain and what is shipped, keep a limit."""
+        weights = (limit.fixed + found.V @ limit.free for found in (self.least.injection, self.chosen))
+        return all(float(np.linalg.norm(weight, 2)) <= limit.bound for weight in weights)
+
+
+def found_gains(
+    problem: GainProblem, asked: FilterOptions, engine: str, *, noisy: bool, progress: Callable[[str], None]
+) -> FoundGains:
+    """Search the least gain, and small gains for a slightly larger one."""
+    size = max(problem.disturbance_size, NOMINAL_GAIN)
+    progress("searching the least gain")
+    least = _least_gain(problem, asked, engine)
+    unfelt = problem.disturbances and least.starting_gain <= ROUNDING_GAIN * problem.disturbance_size
+    if unfelt and noisy and problem.weight_limit is None:
+        # Against the noise, gains may take up measurements that feel the disturbance: it stays in the problem.
+        least = replace(least, starting_gain=NOMINAL_GAIN * size)
+    elif unfelt:
+        # What is left of the disturbance in the estimates is rounding: nothing to minimise.
+        problem = problem.without_disturbance()
+        least = replace(_least_gain(problem, asked, engine), gain=least.starting_gain)
+    elif engine == "auto" and asked.gamma is not None and _leaves_little(asked.gamma, least.gain, problem):
+        progress("polishing the least gain")
+        polished = _least_gain(problem, asked, "lmi")
+        records = [*least.records, *polished.records]
+        least = replace(min(least, polished, key=lambda found: found.gain), records=records)
+    gamma = _gain_to_ship(asked, problem, least, noisy=noisy)
+    progress("choosing small gains")
+    inner = gamma - min(CERTIFICATE_SHARE * (gamma - least.gain), CERTIFICATE_MARGIN * gamma)
+    chosen, records = small_gain_design(problem, least, inner, solver=asked.solver, engine=engine)
+    return FoundGains(problem, least, gamma, chosen, records)
+
+
+def found_within(
+    problem: GainProblem, limited: GainProblem, asked: FilterOptions, *, noisy: bool, progress: Callable[[str], None]
+) -> FoundGains:
+    """Search gains with a limit on the weight, which Riccati equations do not cover."""
+    if asked.engine == "auto" and limited.weight_limit is not None:
+        # They do where the limit costs nothing: what is found without it keeps it.
+        try:
+            free = found_gains(problem, asked, "auto", noisy=noisy, progress=progress)
+        except SolverError:
+            free = None
+        if free is not None and free.within(limited.weight_limit):
+            return free
+    engine = "lmi" if asked.engine == "auto" else asked.engine
+    return found_gains(limited, asked, engine, noisy=noisy, progress=progress)
+
+
+def _least_gain(problem: GainProblem, asked: FilterOptions, engine: str) -> inequality_search.LeastGain:
+    polish = engine == "lmi"
+    if asked.gamma_search == "direct":
+        return inequality_search.search_least_gain(problem, solver=asked.solver, polish=polish)
+    return search_by_bisection(problem, tolerance=asked.tolerance, solver=asked.solver, polish=polish)
+
+
+def _leaves_little(gamma: float, least: float, problem: GainProblem) -> bool:
+    """Whether a gamma leaves less room above the least gain found than the inequality may still find."""
+    near = BELOW_LEAST * least <= gamma <= ABOVE_LEAST * least
+    return near and problem.disturbances > 0 and problem.order <= MOST_STATES_TO_POLISH
+
+
+def _gain_to_ship(
+    asked: FilterOptions, problem: GainProblem, least: inequality_search.LeastGain, *, noisy: bool
+) -> float:
+    floor = inequality_search.SMALLEST_USEFUL_GAIN * least.starting_gain
+    if problem.disturbances == 0:
+        return NOMINAL_GAIN
+    if asked.gamma is None and noisy:
+        # Where noise is stated, the least gain may cost any amount of it (a decoupled disturbance).  The Kalman filter
+        # that takes the disturbance as unit white noise is a fair compromise, and its gain is known to be reachable.
+        return max((1.0 + asked.gamma_margin) * least.gain, least.starting_gain)
+    if asked.gamma is None:
+        return max((1.0 + asked.gamma_margin) * least.gain, floor)
+    require_reachable(problem, least, asked.gamma, solver=asked.solver)
+    ceiling = LARGEST_USEFUL_GAIN * least.starting_gain
+    return min(asked.gamma, ceiling) if ceiling > 0.0 else asked.gamma

@@ -1,0 +1,186 @@
+"""What no filter can reach: a lower bound on the gain from a dual point that passes our own check."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+
+from obsynth.errors import InfeasibleError, SolverError
+from obsynth.methods.conic import lmi
+from obsynth.methods.fault_estimation_filter.inequality_search import LeastGain
+from obsynth.methods.fault_estimation_filter.injection_problem import (
+    GainProblem,
+    Injection,
+    NormalisedProblem,
+    normalise,
+)
+from obsynth.methods.fault_estimation_filter.output_nulling import (
+    invisible_pairs,
+    null_space,
+    output_nulling_part,
+    strict_point,
+)
+from obsynth.numerics.arrays import FloatArray
+
+#: A dual point must be positive definite by this margin, where the point of `strict_point` is the identity, and beat
+#: the level by this relative one.
+DUAL_MARGIN = 1e-8
+BOUND_MARGIN = 1e-6
+#: Disturbances smaller than these, relative to the largest, may be left out of the proof.
+NEGLIGIBLE_DISTURBANCES = (1e-3, 3e-2)
+
+
+def proved_lower_bound(
+    problem: GainProblem, *, solver: str, best: Injection | None = None, enough: float = np.inf
+) -> float:
+    """Return a lower bound on the gain of every filter, from a dual point that passes our own check; 0 without one.
+
+    The dual is solved in the coordinates of the starting filter, then in those of the best one; and in turn without the
+    disturbances that are negligible beside the largest, which only make the bound lower.
+
+    Notes
+    -----
+    For ``Z1 >= 0`` in the null basis N of [C D] with ``Q = G N Z1 N'G' - Nx Z1 Nx' >= 0`` and, for a fixed weight,
+    ``Z2 = [Q, *; *, *] >= 0``: multiplying the two eliminated inequalities by Z1 and Z2 cancels P, and leaves
+    ``g^2 (tr Nd Z1 Nd' + tr Z2_22) > tr H N Z1 N'H' + tr H Z2 H'`` (for a free weight without Z2).  The check is in
+    floating point with margins, on data in which a strictly feasible dual point is the identity.
+    """
+    bound = 0.0
+    for work, start in product(_with_fewer_disturbances(problem), (None,) if best is None else (None, best)):
+        bound = max(
+            bound, _bound_in(normalise(work, start=start, rotate=solver not in lmi.FIRST_ORDER_SOLVERS), solver)
+        )
+        if bound > enough:
+            break
+    return bound
+
+
+def _with_fewer_disturbances(problem: GainProblem) -> Iterator[GainProblem]:
+    """Yield the problem, and the problem without small disturbances: a gain for fewer of them is not larger."""
+    yield problem
+    sizes = np.linalg.norm(np.vstack([problem.B, problem.D, problem.Zd]), axis=0)
+    count = len(sizes)
+    for share in NEGLIGIBLE_DISTURBANCES:
+        kept = sizes > share * np.max(sizes, initial=0.0)
+        if 0 < np.sum(kept) < count:
+            count = int(np.sum(kept))
+            yield replace(problem, B=problem.B[:, kept], D=problem.D[:, kept], Zd=problem.Zd[:, kept])
+
+
+def _bound_in(normalised: NormalisedProblem, solver: str) -> float:
+    work = output_nulling_part(normalised.problem)
+    if work.disturbances == 0:
+        return 0.0
+    if work.order == 0:
+        return normalised.gain * _direct_bound(work) * (1.0 - BOUND_MARGIN)
+    try:
+        dual = _DualProblem.of(work)
+        point = _best_dual_point(dual, solver=solver)
+    except (SolverError, np.linalg.LinAlgError):
+        return 0.0
+    return normalised.gain * _checked_bound(dual, *point)
+
+
+def _direct_bound(work: GainProblem) -> float:
+    """Return the gain of what no measurement sees and no state keeps: the disturbance in xi at once."""
+    direct = work.Zd @ null_space(work.D) if work.weight_is_free else work.Zd
+    return float(np.linalg.norm(direct, 2)) if direct.size else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class _DualProblem:
+    """Data of the dual inequalities, in coordinates in which a strictly feasible point is about the identity.
+
+    ``Q = image Z1 image' - top Z1 top'``; ``shown`` and ``bottom`` are xi and d on the output-nulling directions,
+    ``outputs`` is xi on states and disturbance.
+    """
+
+    top: FloatArray
+    bottom: FloatArray
+    image: FloatArray
+    shown: FloatArray
+    outputs: FloatArray
+    free_weight: bool
+
+    @classmethod
+    def of(cls, work: GainProblem) -> _DualProblem:
+        top, bottom, image = invisible_pairs(work)
+        point = strict_point(top, image)
+        slack = image @ point @ image.T - top @ point @ top.T
+        invisible, states = np.linalg.cholesky(point), np.linalg.cholesky(0.5 * (slack + slack.T))
+        back, outputs = np.linalg.inv(states), np.hstack([work.Z @ states, work.Zd])
+        shown = (work.Z @ top + work.Zd @ bottom) @ invisible
+        moved = (back @ top @ invisible, bottom @ invisible, back @ image @ invisible)
+        return cls(*moved, shown, outputs, work.weight_is_free)
+
+
+def _best_dual_point(dual: _DualProblem, *, solver: str) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return ``Z1``, and corner and last block of ``Z2``, that maximise what is shown at disturbance energy one."""
+    (n, size), nd = dual.top.shape, dual.bottom.shape[0]
+    z1 = lmi.symmetric_variable(size)
+    q = dual.image @ z1 @ dual.image.T - dual.top @ z1 @ dual.top.T
+    shown = lmi.trace(dual.shown @ z1 @ dual.shown.T)
+    energy = lmi.trace(dual.bottom @ z1 @ dual.bottom.T)
+    second, corner, last = q, np.zeros((nd, n)), np.zeros((nd, nd))
+    if not dual.free_weight:
+        corner, last = lmi.matrix_variable(nd, n), lmi.symmetric_variable(nd)
+        second = lmi.symmetric_blocks([[q], [corner, last]])
+        shown, energy = shown + lmi.trace(dual.outputs @ second @ dual.outputs.T), energy + lmi.trace(last)
+    constraints = [
+        lmi.at_least(z1, DUAL_MARGIN * 2),
+        lmi.at_least(second, DUAL_MARGIN * 2),
+        lmi.at_most(lmi.scalar_block(energy), 1.0),
+    ]
+    lmi.minimise(-shown, constraints, what="lower bound on the gain", solver=solver)
+    return lmi.value_of(z1), lmi.value_of(corner), lmi.value_of(last)
+
+
+def _checked_bound(dual: _DualProblem, z1: FloatArray, corner: FloatArray, last: FloatArray) -> float:
+    """Recompute the bound of a dual point from the data; 0 unless it is strictly feasible.
+
+    What the solver left short of feasibility is made up for by a little of the strict point, which is the identity.
+    """
+    z1, last = 0.5 * (z1 + z1.T), 0.5 * (last + last.T)
+    short = 0.0
+    for _ in range(2):
+        z1, last = z1 + short * np.eye(len(z1)), last + short * np.eye(len(last))
+        q = dual.image @ z1 @ dual.image.T - dual.top @ z1 @ dual.top.T
+        second = q if dual.free_weight else np.block([[q, corner.T], [corner, last]])
+        second = 0.5 * (second + second.T)
+        least = min(float(np.linalg.eigvalsh(matrix)[0]) for matrix in (z1, second) if matrix.size)
+        short = max(0.0, 2.0 * DUAL_MARGIN - least)
+    if least < DUAL_MARGIN:
+        return 0.0
+    shown = float(np.trace(dual.shown @ z1 @ dual.shown.T))
+    energy = float(np.trace(dual.bottom @ z1 @ dual.bottom.T))
+    if not dual.free_weight:
+        shown += float(np.trace(dual.outputs @ second @ dual.outputs.T))
+        energy += float(np.trace(last))
+    return float(np.sqrt(max(shown, 0.0) / energy)) * (1.0 - BOUND_MARGIN) if energy > 0.0 else 0.0
+
+
+def require_reachable(problem: GainProblem, least: LeastGain, gain: float, *, solver: str) -> None:
+    """Raise unless ``gain`` is within reach of the best filter found."""
+    best = least.gain
+    if problem.disturbances == 0 or best <= gain:
+        return
+    # Without free measurements there is one filter, and its norm is attained at a frequency.
+    bound = best * (1.0 - BOUND_MARGIN)
+    if problem.measured:
+        bound = proved_lower_bound(problem, solver=solver, best=least.injection, enough=gain)
+    choice = "for this T and N" if problem.free_weight else "for this T, N and W"
+    if bound > gain:
+        remedy = "" if problem.free_weight else ", or set free_residual_weight: true"
+        raise InfeasibleError(
+            f"No filter reaches gamma = {gain:.6g} {choice}: a checked certificate proves gamma >= {bound:.6g}, and "
+            f"the best filter found has {best:.6g}. Ask for a larger gamma, leave it out for the least{remedy}.",
+            necessary=False,
+            lower_bound=bound,
+        )
+    raise SolverError(
+        f"gamma = {gain:.6g} was not reached (best found {best:.6g}), and the proved lower bound {bound:.6g} does not "
+        f"rule it out: nothing is known {choice}. Ask for a slightly larger gamma."
+    )

@@ -1,0 +1,238 @@
+r"""The convex core: bound the gain from a disturbance to an output by output injection.
+
+The error system of every filter of this kind is
+
+.. math::
+    e^+ = (A - R C) e + (B - R D) d + (B_n - R D_n) w, \qquad
+    \xi = (Z + V C) e + (Z_d + V D) d + (Z_n + V D_n) w
+
+with the injection gain R free, and the weight V free or fixed at zero.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from obsynth.errors import SolverError
+from obsynth.methods.riccati import bounded_real_matrix, normalising_change, stabilising_gain
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.norms import highest_gain_found, hinf_norm, norm_is_at_most, output_covariance, spectral_radius
+
+#: The normalising Riccati solution is taken at this multiple of the starting filter's norm.
+NORMALISING_LEVEL = 1.3
+#: A share that norms are certain to, and no one misses.
+ROUNDING = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class WeightLimit:
+    """A bound on the spectral norm of the weight ``fixed + V free``.
+
+    Fields: fixed, free: ``(q, ny)`` and ``(m, ny)``; bound: Positive.
+    """
+
+    fixed: FloatArray
+    free: FloatArray
+    bound: float
+
+    def kept(self, v: FloatArray) -> FloatArray:
+        """Return V, drawn towards zero by as much as a solver's rounding has let the weight out of the bound."""
+        least, found = (float(np.linalg.norm(self.fixed + part, 2)) for part in (0.0, v @ self.free))
+        if found <= self.bound or least >= self.bound:
+            return v
+        return np.asarray((1.0 - ROUNDING) * (self.bound - least) / (found - least) * v)
+
+
+@dataclass(frozen=True, eq=False)
+class GainProblem:
+    """Data of the problem: find R (and V) so that the gain d -> xi is small.
+
+    Fields: A, C, Z: ``(n, n)``, ``(m, n)``, ``(q, n)``; B, D, Zd: Disturbance: ``(n, nd)``, ``(m, nd)``, ``(q, nd)``;
+    Bn, Dn, Zn: Noise of unit covariance: ``(n, nw)``, ``(m, nw)``, ``(q, nw)``; free_weight: Whether V ``(q, m)`` is
+    free; weight_limit: Bound on the weight that V is a part of.
+    """
+
+    A: FloatArray
+    C: FloatArray
+    Z: FloatArray
+    B: FloatArray
+    D: FloatArray
+    Zd: FloatArray
+    Bn: FloatArray
+    Dn: FloatArray
+    Zn: FloatArray
+    free_weight: bool
+    weight_limit: WeightLimit | None = None
+
+    @property
+    def order(self) -> int:
+        """Number of states n."""
+        return int(self.A.shape[0])
+
+    @property
+    def measured(self) -> int:
+        """Number of free measurements m."""
+        return int(self.C.shape[0])
+
+    @property
+    def disturbances(self) -> int:
+        """Number of disturbances nd."""
+        return int(self.B.shape[1])
+
+    @property
+    def weight_is_free(self) -> bool:
+        """Whether there is a V to choose at all."""
+        return self.free_weight and self.measured > 0
+
+    @property
+    def states_noise(self) -> bool:
+        """Whether there is a noise model; without one the noise is a unit one on the free measurements alone."""
+        return bool(np.any(self.Bn) or np.any(self.Zn))
+
+    @property
+    def disturbance_size(self) -> float:
+        """What the disturbance could do to xi at most in one step, whatever cancels: the scale of a gain."""
+        state, direct = np.vstack([self.B, self.D]), float(np.linalg.norm(self.Zd))
+        return float(np.linalg.norm(self.Z) * np.linalg.norm(state)) + direct
+
+    def without_disturbance(self) -> GainProblem:
+        """Return the problem without its disturbance."""
+        return replace(self, B=self.B[:, :0], D=self.D[:, :0], Zd=self.Zd[:, :0])
+
+    def with_state_noise(self, size: float) -> GainProblem:
+        """Return the problem with independent noise of this size on each state besides its own."""
+        n, m, q = self.order, self.measured, self.Z.shape[0]
+        return replace(
+            self,
+            Bn=np.hstack([self.Bn, size * np.eye(n)]),
+            Dn=np.hstack([self.Dn, np.zeros((m, n))]),
+            Zn=np.hstack([self.Zn, np.zeros((q, n))]),
+        )
+
+    def closed_loop(self, solution: Injection) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return ``(A, B, Z, Zd)`` of the error system d -> xi with the given gains."""
+        r, v = solution.R, solution.V
+        return self.A - r @ self.C, self.B - r @ self.D, self.Z + v @ self.C, self.Zd + v @ self.D
+
+    def noise_loop(self, solution: Injection) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return the error system w -> xi with the given gains."""
+        r, v = solution.R, solution.V
+        return self.A - r @ self.C, self.Bn - r @ self.Dn, self.Z + v @ self.C, self.Zn + v @ self.Dn
+
+    def noise_variance(self, solution: Injection) -> float:
+        """Return the true total variance of xi under the noise of the problem, with the given gains."""
+        return float(np.trace(output_covariance(*self.noise_loop(solution))))
+
+    def reaches(self, solution: Injection, level: float) -> bool:
+        """Return whether the true norm d -> xi is at most ``level``."""
+        return norm_is_at_most(*self.closed_loop(solution), level)
+
+    def achieved_gain(self, solution: Injection) -> float:
+        """Return the true H-infinity norm d -> xi with the given gains."""
+        return hinf_norm(*self.closed_loop(solution)).upper
+
+
+@dataclass(frozen=True, eq=False)
+class Injection:
+    """Gains of the error system.
+
+    Fields: R: ``(n, m)``; V: ``(q, m)``; zero when the weight is fixed.
+    """
+
+    R: FloatArray
+    V: FloatArray
+
+    @property
+    def parts(self) -> tuple[FloatArray, FloatArray]:
+        """R and V."""
+        return self.R, self.V
+
+
+@dataclass(frozen=True, eq=False)
+class NormalisedProblem:
+    """A `GainProblem` in coordinates in which the matrix inequality is well scaled.
+
+    States are changed by the inverse root of a rough Riccati solution, so that the solution of the
+    inequality is close to the identity; the disturbance is scaled so that the gain is close to one; the
+    measurements are made orthonormal.
+
+    Fields: problem: In the new coordinates; states: ``S (n, n)``, old state = S new state; measurements: ``K (m, m)``,
+    new measurement = K old measurement; gain: Gain of the starting filter: old gain = gain * new gain (1 without
+    disturbance); start: The starting filter in the original coordinates; stable; start_gain: Its true gain (0 without
+    disturbance).
+    """
+
+    problem: GainProblem
+    states: FloatArray
+    measurements: FloatArray
+    gain: float
+    start: Injection
+    start_gain: float
+
+    def restore(self, solution: Injection) -> Injection:
+        """Return gains for the original coordinates."""
+        return Injection(self.states @ solution.R @ self.measurements, solution.V @ self.measurements)
+
+    def contracted(self, solution: Injection) -> Injection:
+        """Return gains of the original coordinates in the normalised ones."""
+        inverse = np.linalg.inv(self.measurements) if self.measurements.size else self.measurements
+        return Injection(np.linalg.solve(self.states, solution.R) @ inverse, solution.V @ inverse)
+
+    def restore_matrix(self, p: FloatArray) -> FloatArray:
+        """Return the Lyapunov matrix for the original coordinates and the original gain level."""
+        inverse = np.linalg.inv(self.states)
+        return np.asarray(inverse.T @ p @ inverse)
+
+
+def normalise(
+    problem: GainProblem, *, start: Injection | None = None, gain: float | None = None, rotate: bool = True
+) -> NormalisedProblem:
+    """Return the problem in well-scaled coordinates."""
+    start = start if start is not None else _starting_filter(problem)
+    # As a scale, a gain that is attained is as good as the largest one, and for many states much cheaper.
+    gain = highest_gain_found(*problem.closed_loop(start)) if gain is None else gain
+    size = gain if np.isfinite(gain) and gain > 0.0 else 1.0
+    a, b, z, zd = problem.closed_loop(start)
+    tail = 1e-6 * max(float(np.linalg.norm(z, 2)) ** 2, np.finfo(np.float64).tiny)
+    p = bounded_real_matrix(a, b, z, zd, NORMALISING_LEVEL * size, slack=tail)
+    if p is None:
+        p = bounded_real_matrix(a, b[:, :0], z, zd[:, :0], 1.0, slack=tail)
+    if p is None:
+        states = np.eye(problem.order)
+    elif rotate:
+        states = normalising_change(p)
+    else:
+        states = np.eye(problem.order) / np.sqrt(np.trace(p) / problem.order)
+    inverse = np.linalg.inv(states)
+    c = problem.C @ states
+    measurements = np.linalg.inv(np.linalg.cholesky(c @ c.T)) if problem.measured else np.zeros((0, 0))
+    # With P near I in units of gain^2: B is scaled by 1/gain, and x by the root of P.
+    limit = problem.weight_limit
+    changed = replace(
+        problem,
+        weight_limit=None if limit is None else replace(limit, free=measurements @ limit.free),
+        A=inverse @ problem.A @ states,
+        C=measurements @ c,
+        Z=problem.Z @ states,
+        B=inverse @ problem.B / size,
+        D=measurements @ problem.D / size,
+        Zd=problem.Zd / size,
+        Bn=inverse @ problem.Bn,
+        Dn=measurements @ problem.Dn,
+    )
+    return NormalisedProblem(changed, states, measurements, size, start, gain)
+
+
+def _starting_filter(problem: GainProblem) -> Injection:
+    noise, through = np.hstack([problem.B, problem.Bn]), np.hstack([problem.D, problem.Dn])
+    gain = stabilising_gain(problem.A, problem.C, noise, through)
+    if gain is None:
+        raise SolverError(
+            "No stable starting filter was found, although the existence conditions hold. Without feedback the error "
+            f"grows by a factor of up to {spectral_radius(problem.A):.3g} per sample, with {problem.measured} free "
+            "measurement(s) against it: a fault that moves the outputs little within its delay makes it grow fast, "
+            "and many unstable modes need more outputs. Nothing is known."
+        )
+    return Injection(gain, np.zeros((problem.Z.shape[0], problem.measured)))

@@ -1,0 +1,140 @@
+"""What no measurement sees: the states that a disturbance can move, or that can grow, with the measurement at zero.
+
+An output-nulling pair is (x, d) with ``C x + D d = 0``; it leads to the state ``A x + B d`` whatever the gains.  Two
+kinds of states matter for what no filter can do better: those reached from rest by output-nulling pairs, and those
+that grow unseen from far back in time (invariant zeros from d to the measurement outside the unit circle).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from obsynth.methods.fault_estimation_filter.injection_problem import GainProblem
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.ranks import RANK_TOLERANCE
+
+#: An invariant zero must have a modulus above one by this much to count as growing.
+GROWTH_MARGIN = 1e-6
+
+
+def _rank(values: FloatArray) -> int:
+    """Return how many singular values, largest first, count; data are normalised, so that one is a natural size."""
+    return int(np.sum(values > RANK_TOLERANCE * max(1.0, float(values[0])))) if values.size else 0
+
+
+def null_space(matrix: FloatArray) -> FloatArray:
+    """Return an orthonormal null basis of a matrix of any rank."""
+    _, values, right = np.linalg.svd(matrix)
+    return np.asarray(right[_rank(values) :].T)
+
+
+def _range(matrix: FloatArray) -> FloatArray:
+    """Return an orthonormal basis of the range."""
+    left, values, _ = np.linalg.svd(matrix, full_matrices=False)
+    return np.asarray(left[:, : _rank(values)])
+
+
+def invisible_pairs(problem: GainProblem) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the states, the disturbances and the next states of a basis of the output-nulling pairs."""
+    basis = null_space(np.hstack([problem.C, problem.D]))
+    return basis[: problem.order], basis[problem.order :], np.hstack([problem.A, problem.B]) @ basis
+
+
+def _reached_from_rest(top: FloatArray, image: FloatArray) -> FloatArray:
+    """Return a basis of the least subspace with the next state of each output-nulling pair whose state is in it."""
+    subspace = np.zeros((top.shape[0], 0))
+    while True:
+        pairs = null_space(np.hstack([top, -subspace]))[: top.shape[1]]
+        larger = _range(np.hstack([subspace, image @ pairs]))
+        if larger.shape[1] == subspace.shape[1]:
+            return subspace
+        subspace = larger
+
+
+def _growing(top: FloatArray, image: FloatArray, reached: FloatArray) -> FloatArray:
+    """Return the states, outside of those reached from rest, that grow invisibly."""
+    from scipy.linalg import schur
+
+    outside = null_space(reached.T) if reached.shape[1] else np.eye(top.shape[0])
+    pairs = _range((outside.T @ top).T)  # one pair for each state outside; the other pairs stay inside
+    while True:
+        states, following = outside.T @ top @ pairs, outside.T @ image @ pairs
+        inverse = np.linalg.pinv(states)
+        kept = null_space(following - states @ inverse @ following)
+        if kept.shape[1] == pairs.shape[1]:
+            break
+        pairs = pairs @ kept
+    if pairs.shape[1] == 0:
+        return np.zeros((top.shape[0], 0))
+    _, vectors, count = schur(
+        inverse @ following, output="real", sort=lambda re, im: np.hypot(re, im) > 1.0 + GROWTH_MARGIN
+    )
+    return np.asarray(top @ pairs @ vectors[:, :count])
+
+
+def output_nulling_part(problem: GainProblem) -> GainProblem:
+    """Return the problem on the states that matter for what no filter can do better.
+
+    Outside of them the dual inequalities have no strict solution; restricted to them they lose nothing.
+    """
+    top, _, image = invisible_pairs(problem)
+    reached = _reached_from_rest(top, image)
+    subspace = _range(np.hstack([reached, _growing(top, image, reached)]))
+    t = subspace.T
+    return replace(
+        problem,
+        A=t @ problem.A @ subspace,
+        C=problem.C @ subspace,
+        Z=problem.Z @ subspace,
+        B=t @ problem.B,
+        Bn=t @ problem.Bn,
+    )
+
+
+def strict_point(top: FloatArray, image: FloatArray) -> FloatArray:
+    """Return ``Z1 > 0`` with ``image Z1 image' - top Z1 top' > 0``: what output-nulling pairs of all kinds add up to.
+
+    Shapes: ``top (n, k)``, ``image (n, k)``.
+    """
+    point, reached = _pairs_from_rest(top, image)
+    outside = null_space(reached.T) if reached.shape[1] else np.eye(top.shape[0])
+    if outside.shape[1] == 0:
+        return point
+    return _with_growing_pairs(point, top, image, reached, outside)
+
+
+def _pairs_from_rest(top: FloatArray, image: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return sequences from rest of every length, summed up, and a basis of the states they reach.
+
+    Step by step, half of what the states have reached goes on invisibly, and the other half is left as slack.
+    """
+    n, size = top.shape
+    point, reached = np.zeros((size, size)), np.zeros((n, 0))
+    for _ in range(n + 1):
+        pairs = null_space(np.hstack([top, -reached]))[:size]
+        point = point + 0.5 * pairs @ pairs.T
+        left, values, _ = np.linalg.svd(image @ pairs * np.sqrt(0.5), full_matrices=False)
+        rank = _rank(values)
+        reached = left[:, :rank] * values[:rank]
+    return 0.5 * (point + point.T), _range(reached)
+
+
+def _with_growing_pairs(
+    point: FloatArray, top: FloatArray, image: FloatArray, reached: FloatArray, outside: FloatArray
+) -> FloatArray:
+    """Add pairs on the growing states, and as many from rest as make up for what those do to the reached states."""
+    from scipy.linalg import solve_discrete_lyapunov
+
+    pairs = np.linalg.pinv(outside.T @ top)
+    back = np.linalg.inv(outside.T @ image @ pairs)
+    growing = pairs @ solve_discrete_lyapunov(back, back @ back.T) @ pairs.T
+    if reached.shape[1] == 0:
+        return np.asarray(growing)
+    slack = [image @ item @ image.T - top @ item @ top.T for item in (point, growing)]
+    inside = float(np.linalg.eigvalsh(reached.T @ slack[0] @ reached)[0])
+    # On the growing states the slack is the identity, so this Schur complement is all there is to fear.
+    spoilt = float(np.linalg.norm(reached.T @ slack[1] @ reached, 2))
+    spoilt += float(np.linalg.norm(reached.T @ slack[1] @ outside, 2)) ** 2
+    return np.asarray((1.0 + spoilt / inside) * point + growing)

@@ -1,0 +1,123 @@
+"""Small gains by the whole inequality, in the coordinates in which it is solved well.
+
+No number of a solver is believed: the true gain and the spectral radius of the closed loop decide.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from obsynth.errors import SolverError
+from obsynth.methods.fault_estimation_filter import inequality_solutions
+from obsynth.methods.fault_estimation_filter.inequality_search import LeastGain, coordinates
+from obsynth.methods.fault_estimation_filter.injection_problem import GainProblem, Injection, NormalisedProblem
+from obsynth.methods.fault_estimation_filter.second_stage_goal import Goal
+
+#: Descent in steps: ratios of successive levels, tried in turn, and how many steps at most.
+STEP_RATIOS = (0.6, 0.9)
+MOST_STEPS = 24
+#: A step counts when its level is met to this relative accuracy.
+LEVEL_ACCURACY = 1e-6
+#: Further solutions of the inequality at most, and the ratio of costs below which another one is worth its time.
+MOST_REPETITIONS = 2
+WORTH_REPEATING = 0.95
+
+
+def gains_by_inequality(goal: Goal, least: LeastGain, records: list[dict[str, Any]], *, solver: str) -> list[Injection]:
+    """Return what the inequality gives, in different coordinates until one is good and fast enough.
+
+    The bounds on P mean something else in other coordinates, and those of the least gain can be extreme: as long as
+    that gains much, the inequality is solved again in the coordinates of what it gave.
+    """
+    problem, gain, fresh = goal.problem, goal.gain, least.first
+    candidates: list[Injection] = []
+    close = coordinates(problem, solver=solver, start=least.injection, gain=least.gain)
+    attempts = ((close, 1.0), (fresh, 1.0), (None, 1.0), (close, goal.slowest), (fresh, goal.slowest))
+    for normalised, decay in attempts:
+        if normalised is None:
+            injection = _small_gains_step_by_step(goal, fresh, records, solver=solver)
+        else:
+            injection = _small_gains_in(problem, normalised, gain, records, solver=solver, decay=decay)
+        if injection is not None and goal.met(injection):
+            candidates.append(injection)
+            if goal.met_fast(injection):
+                candidates += _again(goal, injection, records, solver=solver, decay=decay)
+                break
+    if not candidates and problem.disturbances:
+        centre = inequality_solutions.feasible_point(close.problem, gain / close.gain, solver=solver)
+        candidates = [] if centre is None else [close.restore(centre.injection)]
+    return [item for item in candidates if goal.met(item)]
+
+
+def _again(
+    goal: Goal, injection: Injection, records: list[dict[str, Any]], *, solver: str, decay: float
+) -> list[Injection]:
+    """Return what the inequality gives in the coordinates of its own answer, while that costs much less each time."""
+    found: list[Injection] = []
+    before, cost = np.inf, goal.cost(injection)
+    for _ in range(MOST_REPETITIONS):
+        if found and cost > WORTH_REPEATING * before:
+            break
+        normalised = coordinates(goal.problem, solver=solver, start=injection)
+        better = _small_gains_in(goal.problem, normalised, goal.gain, records, solver=solver, decay=decay)
+        if better is None or not goal.met_fast(better):
+            break
+        found.append(better)
+        injection, before, cost = better, cost, goal.cost(better)
+    return found
+
+
+def _small_gains_in(
+    problem: GainProblem,
+    normalised: NormalisedProblem,
+    gain: float,
+    records: list[dict[str, Any]],
+    *,
+    solver: str,
+    decay: float = 1.0,
+) -> Injection | None:
+    try:
+        work, level = _with_scaled_noise(normalised), gain / normalised.gain
+        found = inequality_solutions.small_gains(work, level, solver=solver, decay=decay)
+    except (SolverError, np.linalg.LinAlgError) as error:
+        records.append(dict(getattr(error, "record", {})) | {"outcome": str(error)})
+        return None
+    records.append(found.record)
+    return normalised.restore(found.injection)
+
+
+def _small_gains_step_by_step(
+    goal: Goal, normalised: NormalisedProblem, records: list[dict[str, Any]], *, solver: str
+) -> Injection | None:
+    """Walk from the filter of ``normalised`` down to the goal, each filter giving the coordinates for the next level.
+
+    Far below the starting filter's gain its coordinates are too bad for one jump, and those of the least gain can
+    be extreme (a decoupled disturbance).
+    """
+    problem = goal.problem
+    reached = problem.achieved_gain(normalised.start)
+    for _ in range(MOST_STEPS):
+        for ratio in STEP_RATIOS:
+            level = max(goal.gain, ratio * reached)
+            injection = _small_gains_in(problem, normalised, level, records, solver=solver)
+            if injection is not None and goal.at(level * (1.0 + LEVEL_ACCURACY)).met(injection):
+                break
+        else:
+            return None
+        if goal.met(injection):
+            return injection
+        reached = problem.achieved_gain(injection)
+        normalised = coordinates(problem, solver=solver, start=injection)
+    return None
+
+
+def _with_scaled_noise(normalised: NormalisedProblem) -> GainProblem:
+    """Return the problem with its noise scaled so that the objective is of size one."""
+    work = normalised.problem
+    r = normalised.contracted(normalised.start).R
+    size = float(np.linalg.norm(np.vstack([work.Bn - r @ work.Dn, work.Zn])))
+    size = size if size > 0.0 else max(float(np.linalg.norm(work.Dn)), 1.0)
+    return replace(work, Bn=work.Bn / size, Dn=work.Dn / size, Zn=work.Zn / size)

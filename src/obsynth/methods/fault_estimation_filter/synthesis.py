@@ -1,0 +1,210 @@
+r"""Fault-estimation filter for discrete-time descriptor systems.
+
+Source: Z. Wang, M. Rodrigues, D. Theilliol, Y. Shen, *Fault estimation filter design for discrete-time descriptor
+systems*, IET Control Theory and Applications 9 (10), 2015: filter (23), gain structure (60), LMI (45).
+
+Our deviations
+    1. (48) has the sign of its second term wrong: L = TA Psi Upsilon^+ + P^-1 Y (I - Upsilon Upsilon^+), see (60).
+    2. W = Upsilon^+ of (47), not Psi^+ as the proof says.
+    3. Existence is decided before any solver, with the zero condition the paper never states.
+    4. Only the part of Y that matters is a variable (Y = y V', V = null Upsilon'), or none at all (eliminated form).
+    5. gamma^2 is minimised directly; Algorithm 1 never advances past one step, our bisection ends with a bracket.
+    6. A second stage at a slightly larger gamma picks small gains: the bare optimum has condition numbers of 1e7.
+    7. Feedthrough of inputs, faults, disturbances and noise, exactly (see `prepared_plant`).
+    8. What is shipped corrects the state estimate, which the paper leaves biased by Psi.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from obsynth.analysis.conditions import Condition, require_all
+from obsynth.errors import InfeasibleError
+from obsynth.methods.conic.lmi import FILTER_SOLVERS
+from obsynth.methods.fault_estimation_filter.certificate import bounded_real_certificate
+from obsynth.methods.fault_estimation_filter.conditions import examine_fault_filter, fault_filter_conditions
+from obsynth.methods.fault_estimation_filter.filter_search import NOMINAL_GAIN, found_gains, found_within
+from obsynth.methods.fault_estimation_filter.inequality_solutions import null_basis
+from obsynth.methods.fault_estimation_filter.injection_problem import GainProblem, Injection, WeightLimit
+from obsynth.methods.fault_estimation_filter.notes import notes
+from obsynth.methods.fault_estimation_filter.options import FilterOptions
+from obsynth.methods.fault_estimation_filter.prepared_plant import PreparedPlant, prepare
+from obsynth.methods.fault_estimation_filter.realisation import realise_filter
+from obsynth.methods.synthesis_result import Synthesis
+from obsynth.numerics.arrays import FloatArray, as_matrix
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.results.design import Certificate
+
+#: Fictitious noise on the measurements, relative to the given one, so that no direction of the gains is free of cost.
+BACKGROUND_NOISE = 1e-3
+
+
+def conditions(plant: DescriptorSystem) -> tuple[Condition, ...]:
+    """Return the existence conditions; the list ends at the first failure."""
+    return fault_filter_conditions(plant)
+
+
+def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **options: Any) -> Synthesis:
+    """Design the filter; see `obsynth.fault_estimation_filter` for the options, results and errors."""
+    asked = FilterOptions(**options)
+    progress("checking the existence conditions")
+    held, prepared = examine_fault_filter(plant)
+    require_all(held)
+    s = None if asked.S is None else as_matrix(asked.S, "S")
+    prepared = prepare(plant, s) if prepared is None or s is not None else prepared
+    limit = asked.residual_weight_limit
+    free = asked.free_residual_weight if asked.free_residual_weight is not None else plant.nw > 0 or limit is not None
+    problem, parts = gain_problem(prepared, free_weight=free)
+    size = max(problem.disturbance_size, NOMINAL_GAIN)
+    if limit is None:
+        found = found_gains(problem, asked, asked.engine, noisy=plant.nw > 0, progress=progress)
+    else:
+        problem, parts = centred(problem, prepared, parts)
+        limited = with_weight_limit(problem, prepared, parts, limit)
+        found = found_within(problem, limited, asked, noisy=plant.nw > 0, progress=progress)
+    problem, least, gamma, records = found.problem, found.least, found.gamma, found.records
+    gains = _gains(prepared, parts, found.chosen)
+    progress("building the realisation and its certificate")
+    observer, tracking, lag = realise_filter(plant, prepared.plant, gains, prepared.detectability)
+    level = gamma if problem.disturbances else NOMINAL_GAIN * size
+    factor = bounded_real_certificate(plant, observer, tracking, level, core=prepared.plant.nx, lag=lag)
+    claims = (
+        {"gamma": level, "gamma_min": least.gain, "state_lag": float(lag)} if plant.nd else {"state_lag": float(lag)}
+    )
+    if plant.nd and asked.gamma_search == "bisection":
+        claims |= {"gamma_bracket_low": least.bracket[0], "gamma_bracket_high": least.bracket[1]}
+    resolved = {
+        "gamma": asked.gamma,
+        "gamma_search": asked.gamma_search,
+        "gamma_margin": asked.gamma_margin,
+        "free_residual_weight": free,
+        "residual_weight_limit": limit,
+        "S": None if s is None else s.tolist(),
+        "engine": asked.engine,
+        "solver": asked.solver,
+        "tolerance": asked.tolerance,
+    }
+    return Synthesis(
+        resolved,
+        gains,
+        observer,
+        Certificate({"P_factor": factor, "tracking": tracking}, claims),
+        {"engine": _engine_of([*least.records, *records]), "runs": [*least.records, *records]},
+        (
+            *_gamma_notes(asked.gamma, level if plant.nd else np.inf),
+            *notes(plant, prepared.detectability, observer, largest_zero=held[-1].value),
+        ),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Parts:
+    """Fixed parts of the gains in balanced coordinates: L = L0 + R V', W = W0 + Vw V'."""
+
+    L0: FloatArray
+    W0: FloatArray
+    V: FloatArray
+
+
+def gain_problem(prepared: PreparedPlant, *, free_weight: bool) -> tuple[GainProblem, _Parts]:
+    """Return the convex problem behind Theorem 2, with (32) solved exactly, and the fixed parts of the gains."""
+    detectability = prepared.detectability
+    upsilon = detectability.Upsilon
+    w0, v = _left_inverse(upsilon), null_basis(upsilon.T)
+    l0 = prepared.TA @ detectability.Psi @ w0
+    measure, na = v.T, prepared.TA.shape[0]
+    if prepared.Bw.shape[1]:
+        size = BACKGROUND_NOISE * max(
+            float(np.linalg.norm(measure @ prepared.Dw)),
+            # In units of the outputs: W may be large.
+            float(np.linalg.norm(w0 @ prepared.Dw) / np.linalg.norm(w0)),
+        )
+        background = size if size > 0.0 else BACKGROUND_NOISE
+        bn = np.hstack([prepared.Bw - l0 @ prepared.Dw, np.zeros((na, v.shape[1]))])
+        dn = np.hstack([measure @ prepared.Dw, -background * np.eye(v.shape[1])])
+        zn = np.hstack([w0 @ prepared.Dw, np.zeros((w0.shape[0], v.shape[1]))])
+    else:
+        # Unit noise on the free measurements: the variance is then the size of R (and V) itself.
+        bn, dn, zn = np.zeros((na, v.shape[1])), -np.eye(v.shape[1]), np.zeros((w0.shape[0], v.shape[1]))
+    problem = GainProblem(
+        A=prepared.TA - l0 @ prepared.C,
+        C=measure @ prepared.C,
+        Z=w0 @ prepared.C,
+        B=prepared.Bd - l0 @ prepared.Dd,
+        D=measure @ prepared.Dd,
+        Zd=w0 @ prepared.Dd,
+        Bn=bn,
+        Dn=dn,
+        Zn=zn,
+        free_weight=free_weight,
+    )
+    return problem, _Parts(l0, w0, v)
+
+
+def _left_inverse(upsilon: FloatArray) -> FloatArray:
+    """Return the left inverse of least norm of a matrix of full column rank, whatever the units of the faults."""
+    units = np.exp2(np.round(np.log2(np.linalg.norm(upsilon, axis=0))))
+    return np.asarray(np.linalg.pinv(upsilon / units) / units[:, None])
+
+
+def _engine_of(records: list[dict[str, Any]]) -> str:
+    """Return which engine ran: the inequality comes in only where it may and where there is something to find."""
+    return "lmi" if any(record.get("solver") in FILTER_SOLVERS for record in records) else "riccati"
+
+
+def _gamma_notes(asked: float | None, shipped: float) -> tuple[str, ...]:
+    """Return a note where less is shipped than was asked for."""
+    if asked is None or shipped >= asked:
+        return ()
+    return (
+        f"gamma = {asked:.6g} was asked for, and {shipped:.6g} is proved: gains for more would only be scaled worse.",
+    )
+
+
+def _gains(prepared: PreparedPlant, parts: _Parts, chosen: Injection) -> dict[str, FloatArray]:
+    """Return the gains in the user's coordinates; the factors are powers of two, so this is exact."""
+    states, equations, outputs = (
+        prepared.scaling.states[:, None],
+        prepared.scaling.equations,
+        prepared.scaling.outputs,
+    )
+    free = chosen.R @ parts.V.T
+    return {
+        "T": states * prepared.T * equations,
+        "N": states * prepared.N * outputs,
+        "L": states * (parts.L0 + free) * outputs,
+        "W": (parts.W0 + chosen.V @ parts.V.T) * outputs,
+        "Psi": states * prepared.detectability.Psi,
+        "Upsilon": prepared.detectability.Upsilon / outputs[:, None],
+        "R": states * free * outputs,
+    }
+
+
+def centred(problem: GainProblem, prepared: PreparedPlant, parts: _Parts) -> tuple[GainProblem, _Parts]:
+    """Return the problem with a free weight written so that V = 0 is the W of least norm in the user's output units.
+
+    In balanced outputs another W has the least norm, which may be outside a limit that this one keeps.
+    """
+    outputs = prepared.scaling.outputs
+    w0 = _left_inverse(prepared.detectability.Upsilon / outputs[:, None]) / outputs
+    v = (w0 - parts.W0) @ parts.V
+    moved = replace(problem, Z=problem.Z + v @ problem.C, Zd=problem.Zd + v @ problem.D, Zn=problem.Zn + v @ problem.Dn)
+    return moved, replace(parts, W0=w0)
+
+
+def with_weight_limit(problem: GainProblem, prepared: PreparedPlant, parts: _Parts, bound: float) -> GainProblem:
+    """Return the problem with the norm of W bounded, in the user's output units."""
+    outputs = prepared.scaling.outputs
+    smallest = 1.0 / float(np.linalg.svd(prepared.detectability.Upsilon / outputs[:, None], compute_uv=False)[-1])
+    if smallest >= bound:
+        raise InfeasibleError(
+            f"No residual weight W with W Upsilon = I has a norm of {bound:.6g} or less: the least is {smallest:.6g}. "
+            "Raise residual_weight_limit.",
+            necessary=True,
+            lower_bound=smallest,
+        )
+    return replace(problem, weight_limit=WeightLimit(parts.W0 * outputs, parts.V.T * outputs, bound))

@@ -1,0 +1,171 @@
+r"""A certificate of Theorem 1 for gains in hand, without a solver.
+
+For a stable observer a solution P1, P3 of the inequality exists for every delta > 0 (elimination lemma): with P from a
+Lyapunov equation and coordinates in which the two factors around P3 are unit columns, P3 only has to cancel the
+off-diagonal block of what P1 contributes.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+
+from obsynth.methods.pd_observer.checks.inequality import prove_gain
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.continuous import spectral_abscissa
+from obsynth.proofs.balls import Ball
+
+#: delta is moved by this factor when -1/delta is close to an eigenvalue, where the construction breaks down.
+DELTA_STEP = 1.7
+#: Condition number of the change of coordinates that is good enough.
+GOOD_CONDITION = 1e3
+#: As many values of delta are tried.
+DELTA_TRIES = 12
+#: Slack of the Riccati equation relative to the output weight, largest first: the first that proves is taken.
+SLACKS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)
+
+
+def explicit_certificate(
+    Az: FloatArray, estimate: FloatArray, *, decay: float
+) -> tuple[FloatArray, FloatArray, float] | None:
+    """Return P1, P3 ``(n, n)`` and delta for a shipped observer; ``None`` when its errors do not decay so fast."""
+    from scipy.linalg import matrix_balance
+
+    moving = Az + decay * np.eye(len(Az))
+    if not spectral_abscissa(moving) < 0.0:
+        return None
+    balanced, (units, _) = matrix_balance(moving, permute=False, separate=True)
+    try:
+        p = _gram(balanced)
+        delta = _good_delta(balanced)
+        x = _coupling(balanced, p, delta)
+        inverse = np.linalg.inv(estimate)
+    except np.linalg.LinAlgError:
+        return None
+    p1 = inverse.T @ (p / units[:, None] / units) @ inverse
+    return 0.5 * (p1 + p1.T), (x / units[:, None] / units) @ inverse, delta
+
+
+@dataclass(frozen=True, eq=False)
+class SymmetricCertificate:
+    """A certificate with a symmetric P3 for an observer with L = 0, for every delta below a limit.
+
+    Fields: P3: ``(n, n)``, positive definite: ``A' P3 + P3 A = -weight`` for the observer's dynamics A; weight: ``(n,
+    n)``, positive definite; limit: The delta from which it does not serve; infinite where it always does.
+    """
+
+    P3: FloatArray
+    weight: FloatArray
+    limit: float
+
+    def P1(self, delta: float) -> FloatArray:
+        """Return P1 ``(n, n)`` for a delta below the limit."""
+        return self.P3 + 0.5 * delta * self.weight
+
+
+def symmetric_certificate(Az: FloatArray, *, decay: float) -> SymmetricCertificate | None:
+    """Return a certificate of Theorem 2 in closed form; ``None`` when errors do not decay so fast.
+
+    With ``P1 = P3 + (delta / 2) weight``, the lower left block of the inequality is delta times the skew part S of
+    ``P3 A``, so that it holds when ``weight > (delta / 2) S' P3^-1 S``.
+
+    Shapes: ``Az (n, n)``.
+    """
+    from scipy.linalg import eigvalsh, matrix_balance
+
+    moving = Az + decay * np.eye(len(Az))
+    if not spectral_abscissa(moving) < 0.0:
+        return None
+    balanced, (units, _) = matrix_balance(moving, permute=False, separate=True)
+    try:
+        p = _gram(balanced)
+        through = p @ balanced
+        weight, skew = -(through + through.T), 0.5 * (through - through.T)
+        largest = float(eigvalsh(skew.T @ np.linalg.solve(p, skew), weight)[-1])
+    except np.linalg.LinAlgError:
+        return None
+    limit = 2.0 / largest if largest > 0.0 else np.inf
+    return SymmetricCertificate(p / units[:, None] / units, weight / units[:, None] / units, limit)
+
+
+def coupled_certificate(a: FloatArray, delta: float) -> tuple[FloatArray, FloatArray]:
+    """Return P1 and P3 ``(n, n)`` of Theorem 1 for a stable observer with L = 0 and this delta.
+
+    Nothing but noise where ``-1 / delta`` is an eigenvalue: the inequality is then another one.
+    """
+    from scipy.linalg import matrix_balance
+
+    balanced, (units, _) = matrix_balance(a, permute=False, separate=True)
+    p = _gram(balanced)
+    x = _coupling(balanced, p, delta)
+    return p / units[:, None] / units, x / units[:, None] / units
+
+
+def gain_certificate(a: FloatArray, b: Ball, c: FloatArray, gain: float) -> FloatArray | None:
+    """Return P ``(n, n)`` that proves the l2 gain of ``x' = a x + b v``, ``z = c x`` below ``gain``, or ``None``.
+
+    The Riccati solution with the largest slack that gives a proof.
+
+    Shapes: ``a (n, n)``, ``c (p, n)``, ``b (n, m)``.
+    """
+    from scipy.linalg import matrix_balance, solve_continuous_are
+
+    balanced, (units, _) = matrix_balance(a, permute=False, separate=True)
+    entering, shown = b.midpoint / units[:, None], c * units
+    weight = max(float(np.linalg.norm(shown, 2)) ** 2, np.finfo(np.float64).tiny)
+    spare = None
+    for slack in SLACKS:
+        try:
+            p = np.asarray(
+                solve_continuous_are(
+                    balanced, entering, shown.T @ shown + slack * weight * np.eye(len(a)),
+                    -(gain**2) * np.eye(entering.shape[1]),
+                )
+            )  # fmt: skip
+        except (np.linalg.LinAlgError, ValueError):
+            continue
+        found = 0.5 * (p + p.T) / units[:, None] / units
+        found = np.asarray(0.5 * (found + found.T))
+        if not np.all(np.isfinite(found)):
+            continue
+        proof = prove_gain(a, b, c, found, gain)
+        if proof.in_double_precision:
+            return found
+        spare = found if proof.proved and spare is None else spare
+    return spare
+
+
+def _gram(a: FloatArray) -> FloatArray:
+    """Return P with ``a' P + P a = -norm(a) I`` for a stable ``a (n, n)``."""
+    from scipy.linalg import solve_continuous_lyapunov
+
+    with warnings.catch_warnings():
+        # "An eigenvalue pair whose sum is very close to zero": what comes of it is proved or thrown away.
+        warnings.simplefilter("ignore")
+        p = np.asarray(solve_continuous_lyapunov(a.T, -np.linalg.norm(a) * np.eye(len(a))))
+    return np.asarray(0.5 * (p + p.T))
+
+
+def _good_delta(a: FloatArray) -> float:
+    """Return a delta for which ``-1 / delta`` is far from the eigenvalues of a stable ``a``."""
+    one = np.eye(len(a))
+    middle = 1.0 / float(np.exp(np.mean(np.log(np.abs(np.linalg.eigvals(a))))))
+    steps = sorted(range(-DELTA_TRIES // 2, DELTA_TRIES // 2), key=abs)
+    candidates = [middle * DELTA_STEP**step for step in steps]
+    conditions = [float(np.linalg.cond(one + delta * a)) for delta in candidates]
+    good = [i for i, condition in enumerate(conditions) if condition <= GOOD_CONDITION]
+    return candidates[good[0] if good else int(np.argmin(conditions))]
+
+
+def _coupling(a: FloatArray, p: FloatArray, delta: float) -> FloatArray:
+    """Return X with ``He([a'; -I] X [I, delta I]) + [0, p; p, 0] < 0`` for a stable ``a`` with Gram matrix p.
+
+    With ``[xi1; xi2] = T [alpha; beta]``, ``alpha = a xi1 - xi2`` and ``beta = xi1 + delta xi2``, the first term is
+    ``2 alpha' X beta``; the second is negative on alpha = 0 and on beta = 0, whatever delta is.
+    """
+    n, one = len(a), np.eye(len(a))
+    change = np.linalg.inv(np.block([[a, -one], [one, delta * one]]))
+    form = change.T @ np.block([[np.zeros((n, n)), p], [p, np.zeros((n, n))]]) @ change
+    return np.asarray(-form[:n, n:])

@@ -1,0 +1,201 @@
+"""Checks of a PD observer, from the plant and the shipped realisation alone.
+
+Source of the claims: Filasova, Krokavec, Serbak, Theorems 1 and 2, eqs. (26)-(41); decay, disk, norms and the matrix G
+in the loop are ours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from obsynth.methods.pd_observer.augmentation import with_faults_as_states, with_sensor_noise
+from obsynth.methods.pd_observer.checks.certificate import fitting_claims, proof_rows, stacked_gains
+from obsynth.methods.pd_observer.checks.error_system import PdErrorSystem
+from obsynth.methods.pd_observer.checks.norms import norm_rows
+from obsynth.methods.pd_observer.conditions import pd_observer_conditions
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.continuous import spectral_abscissa
+from obsynth.numerics.pencils import pencil_structure
+from obsynth.numerics.ranks import RANK_TOLERANCE
+from obsynth.numerics.scaling import balance_by_least_squares
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.results.design import ObserverDesign
+from obsynth.results.report import Check, information, lower_bound_check, upper_bound_check
+from obsynth.verification.identities import equality, relative_tolerance, residual, tracking_identities, worst
+from obsynth.verification.plant import condition_rows, plant_information
+
+_IDENTITIES = {
+    "dynamics": ("unbiased: dynamics", "Az + By C = A, with the faults as states", "Filasova et al., eq. (29)"),
+    "inputs": ("unbiased: inputs", "Bu + By D = B", "Filasova et al., eq. (4)"),
+    "state estimate": (
+        "unbiased: estimates", "the estimates equal states and faults when the error is zero",
+        "Filasova et al., eqs. (22), (23)"),
+    "residual": ("unbiased: residual", "the residual is zero when the error is", "ours: y - D u - C xhat - Df fhat"),
+    "input feedthrough": ("unbiased: feedthrough", "no estimate sees the input directly (Du + Dy D = 0)", "ours"),
+}  # fmt: skip
+
+
+def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
+    """Yield every check of ``design``; see `obsynth.verification.verify`."""
+    plant, observer = design.linear
+    yield from plant_information(plant)
+    yield from condition_rows(pd_observer_conditions(plant))
+    fitting = _fits(plant, observer) and fitting_claims(design)
+    yield upper_bound_check(
+        "fits the plant", "observer, gains, certificate and plant have matching signals and shapes",
+        0.0 if fitting else 1.0, 0.0, source="shipped realisation",
+    )  # fmt: skip
+    if not fitting:
+        return
+    tolerance = relative_tolerance(printed_digits, plant.nx + plant.nf + plant.ny)
+    augmented = with_faults_as_states(with_sensor_noise(plant))
+    # The faults are states of the augmented plant, so that their estimates are state estimates of it.
+    whole = replace(
+        observer, state_names=augmented.state_names, fault_names=(), state_delays=(0,) * augmented.nx, fault_delays=()
+    )
+    for key, identity in tracking_identities(augmented, whole, np.eye(augmented.nx), 0).items():
+        if key in _IDENTITIES:
+            name, claim, source = _IDENTITIES[key]
+            yield equality(name, claim, identity.residual(), source, bound=tolerance)
+    errors = PdErrorSystem.of(augmented, observer, plant.nx)
+    yield _gains_row(design, augmented, tolerance)
+    yield from _spectra(design, errors)
+    yield _pencil_row(design, augmented)
+    yield from proof_rows(design)
+    yield from norm_rows(design, errors)
+
+
+def _fits(plant: DescriptorSystem, observer: LinearObserver) -> bool:
+    return bool(
+        np.array_equal(plant.E, np.eye(plant.nx))
+        and not plant.is_discrete
+        and observer.dt == 0.0
+        and observer.order == plant.nx + plant.nf
+        and observer.input_names == plant.input_names
+        and observer.output_names == plant.output_names
+        and observer.residual_names == plant.output_names
+        and observer.state_names == plant.state_names
+        and observer.fault_names == plant.fault_names
+        and not any((*observer.state_delays, *observer.fault_delays))
+    )
+
+
+def _negative(name: str, claim: str, value: float, *, source: str, detail: str) -> Check:
+    """Return a check that passes when ``value < 0``; NaN fails."""
+    return Check(name, claim, value, 0.0, -value, bool(value < 0.0), source, "computed", detail)
+
+
+def _gains_row(design: ObserverDesign, augmented: DescriptorSystem, tolerance: float) -> Check:
+    """Check that the listed gains are those of the realisation: ``S L = T`` and ``By = J + Az L``."""
+    observer, (gain_j, gain_l) = design.linear[1], stacked_gains(design)
+    estimate, direct = observer.Cz[: observer.order], observer.Dy[: observer.order]
+    # A gain on an output in small units must not hide behind one on an output in large units.
+    units = 1.0 / balance_by_least_squares(augmented.E, augmented.A, outputs=[augmented.C]).outputs
+    found = [
+        residual(estimate @ gain_l, -direct, factors=((estimate, gain_l),), units=units),
+        residual(
+            gain_j, observer.Az @ gain_l, -observer.By,
+            factors=(
+                (observer.Az, gain_l), (augmented.A, gain_l), (observer.By, augmented.C, gain_l),
+                (gain_j, augmented.C, gain_l),
+            ),
+            units=units,
+        ),
+    ]  # fmt: skip
+    return equality(
+        "gains", "the realisation is that of the listed J, L, M, N (and G)", worst(found),
+        "Filasova et al., eqs. (4)-(6), (31)", bound=tolerance,
+    )  # fmt: skip
+
+
+def _spectra(design: ObserverDesign, errors: PdErrorSystem) -> Iterator[Check]:
+    plant, claims = design.linear[0], design.certificate.claims
+    # The matrix maps states to states: in units that balance it, the condition number is that of the observer.
+    singular_values = np.linalg.svd(_balanced(errors.estimate), compute_uv=False)
+    largest, smallest = float(singular_values[0]), float(singular_values[-1])
+    yield lower_bound_check(
+        "det(I + L C)", "I + L C is nonsingular, so that the observer exists without derivatives",
+        smallest / largest if largest > 0.0 else 0.0, RANK_TOLERANCE, source="Filasova et al., Remark 1",
+        detail=f"inverse of its condition number; the determinant is {1.0 / np.linalg.det(errors.estimate):.6g}",
+    )  # fmt: skip
+    abscissa = spectral_abscissa(errors.Az)
+    yield _negative(
+        "error system", "every eigenvalue of the error system has a negative real part", abscissa,
+        source="Filasova et al., eq. (33)",
+        detail=f"eigenvalues {spectrum_text(errors.Az)}; computed, and proved by the row 'LMI'",
+    )  # fmt: skip
+    decay = claims["decay"]
+    if decay > 0.0:
+        yield upper_bound_check(
+            "decay rate", "errors die out at the claimed rate (largest real part of an eigenvalue, 1/s)", abscissa,
+            -decay, source="ours: the theorem for A + alpha I",
+        )  # fmt: skip
+    if "disk_radius" in claims:
+        centre, radius = claims["disk_centre"], claims["disk_radius"]
+        distance = float(np.max(np.abs(np.linalg.eigvals(errors.Az) + centre)))
+        yield upper_bound_check(
+            "disk", f"every eigenvalue of the error system lies within {radius:.6g} of {-centre:.6g}", distance, radius,
+            source="ours",
+        )  # fmt: skip
+    yield from _parts(plant, errors)
+
+
+def _balanced(matrix: FloatArray) -> FloatArray:
+    from scipy.linalg import matrix_balance
+
+    return np.asarray(matrix_balance(matrix, permute=False)[0])
+
+
+def _parts(plant: DescriptorSystem, errors: PdErrorSystem) -> Iterator[Check]:
+    """Yield the two spectra that the paper prints besides; neither theorem says anything about the second."""
+    nx = plant.nx
+    proportional = plant.A - errors.J[:nx] @ plant.C
+    together = _quotient(np.eye(nx) + errors.L[:nx] @ plant.C, proportional)
+    yield information(
+        "state part", "spectral abscissa of (I + L C)^-1 (A - J C), 1/s",
+        spectral_abscissa(together), source="Filasova et al., eq. (28)",
+        detail=f"eigenvalues {spectrum_text(together)}",
+    )  # fmt: skip
+    yield information(
+        "P part alone", "spectral abscissa of A - J C, 1/s: neither theorem promises that it is negative",
+        spectral_abscissa(proportional), source="Filasova et al., eq. (27)",
+        detail=f"eigenvalues {spectrum_text(proportional)}",
+    )  # fmt: skip
+
+
+def _quotient(matrix: FloatArray, right: FloatArray) -> FloatArray:
+    try:
+        return np.asarray(np.linalg.solve(matrix, right))
+    except np.linalg.LinAlgError:
+        return np.full_like(right, np.nan)
+
+
+def spectrum_text(matrix: FloatArray, most: int = 8) -> str:
+    """Return the eigenvalues of a matrix as text, slowest first, conjugate pairs once."""
+    if not np.all(np.isfinite(matrix)):
+        return "not finite"
+    values = sorted((complex(value) for value in np.linalg.eigvals(matrix)), key=lambda v: (-v.real, v.imag))
+    shown = [f"{v.real:.4g}" if v.imag == 0.0 else f"{v.real:.4g} +- {v.imag:.4g}j" for v in values if v.imag >= 0.0]
+    return ", ".join(shown[:most]) + (f", and {len(shown) - most} more" if len(shown) > most else "")
+
+
+def _pencil_row(design: ObserverDesign, augmented: DescriptorSystem) -> Check:
+    """Check the descriptor pair of the error from the listed gains: regular, impulse-free and stable."""
+    gain_j, gain_l = stacked_gains(design)
+    n = augmented.nx
+    one, zero = np.eye(n), np.zeros((n, n))
+    found = pencil_structure(
+        np.block([[one, zero], [zero, zero]]),
+        np.block([[zero, one], [augmented.A - gain_j @ augmented.C, -one - gain_l @ augmented.C]]),
+    )
+    impulse_free = found.regular and found.infinite_block_sizes == (1,) * n
+    abscissa = float(np.max(found.finite_eigenvalues.real)) if impulse_free else float("nan")
+    return _negative(
+        "descriptor pair", "(E*, A*) of the listed gains is admissible: regular, impulse-free, stable", abscissa,
+        source="Filasova et al., eqs. (38), (39), Definition 1",
+        detail=f"{len(found.finite_eigenvalues)} finite modes of {2 * n}",
+    )  # fmt: skip

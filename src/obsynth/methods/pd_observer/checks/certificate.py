@@ -1,0 +1,130 @@
+"""The certificate of a PD observer: what it must hold, and the proofs of its inequalities."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Literal
+
+import numpy as np
+
+from obsynth.methods.pd_observer.augmentation import with_faults_as_states, with_sensor_noise
+from obsynth.methods.pd_observer.checks.inequality import (
+    error_inputs,
+    prove_gain,
+    prove_gains,
+    prove_shipped_stability,
+    prove_symmetric_positive,
+)
+from obsynth.numerics.arrays import FloatArray
+from obsynth.proofs.definiteness import DefinitenessProof
+from obsynth.results.design import ObserverDesign
+from obsynth.results.report import Check
+
+#: Claims that a certificate always makes, those on l2 gains with the names of their certificates, and those that are
+#: positive.
+NEEDED_CLAIMS = ("theorem", "delta", "decay")
+GAIN_CLAIMS: dict[str, Literal["rate", "noise"]] = {"fault_rate_gain": "rate", "noise_gain": "noise"}
+POSITIVE_CLAIMS = ("delta", "gain_bound", "fault_rate_gain", "noise_gain", "disk_radius", "adaptation_low")
+
+
+def stacked_gains(design: ObserverDesign) -> tuple[FloatArray, FloatArray]:
+    """Return the gains in the loop, ``[J; G M]`` and ``[L; G N]``."""
+    gains = design.gains
+    g = gains.get("G", np.eye(design.linear[0].nf))
+    return np.vstack([gains["J"], g @ gains["M"]]), np.vstack([gains["L"], g @ gains["N"]])
+
+
+def fitting_claims(design: ObserverDesign) -> bool:
+    """Whether gains, matrices and claims are there, finite and of the right shapes."""
+    plant, claims = design.linear[0], design.certificate.claims
+    n = plant.nx + plant.nf
+    gains = {"J": (plant.nx, plant.ny), "L": (plant.nx, plant.ny), "M": (plant.nf, plant.ny), "N": (plant.nf, plant.ny)}
+    if "G" in design.gains:
+        gains["G"] = (plant.nf, plant.nf)
+    matrices = {"P1": (n, n), "P3": (n, n)}
+    matrices |= {f"P_{kind}": (n, n) for claim, kind in GAIN_CLAIMS.items() if claim in claims}
+    if "adaptation_low" in claims:
+        matrices |= {"P1_low": (n, n), "P1_high": (n, n)}
+    numbers = all(np.isfinite(value) for value in claims.values())
+    return bool(
+        set(NEEDED_CLAIMS) <= set(claims)
+        and numbers
+        and claims["theorem"] in (1.0, 2.0)
+        and claims["decay"] >= 0.0
+        and all(claims[name] > 0.0 for name in POSITIVE_CLAIMS if name in claims)
+        and ("adaptation_low" in claims) == ("adaptation_high" in claims)
+        and ("disk_centre" in claims) == ("disk_radius" in claims)
+        and set(design.gains) == set(gains)
+        and all(_is(design.gains[name], shape) for name, shape in gains.items())
+        and all(_is(design.certificate.matrices.get(name), shape) for name, shape in matrices.items())
+    )
+
+
+def _is(matrix: FloatArray | None, shape: tuple[int, int]) -> bool:
+    return matrix is not None and matrix.shape == shape and bool(np.all(np.isfinite(matrix)))
+
+
+def proof_rows(design: ObserverDesign) -> Iterator[Check]:
+    """Yield the rows that prove the inequalities of the theorem for what is shipped."""
+    matrices, claims = design.certificate.matrices, design.certificate.claims
+    p1, p3, delta, decay = matrices["P1"], matrices["P3"], claims["delta"], claims["decay"]
+    theorem = int(claims["theorem"])
+    labels = ("(40)", "(41)") if theorem == 1 else ("(61)", "(62)")
+    yield _proof("P1", "P1 is symmetric and positive definite", prove_symmetric_positive(p1), labels[0])
+    if theorem == 2:
+        yield _proof("Q", "Q = P3 is symmetric and positive definite", prove_symmetric_positive(p3), labels[0])
+    found = prove_shipped_stability(design.linear[1], p1, p3, delta=delta, decay=decay)
+    rate = f"errors decay faster than exp(-{decay:.6g} t)" if decay > 0.0 else "the observer is stable"
+    yield _proof(
+        "LMI", f"Theorem {theorem} holds for the shipped realisation (delta = {delta:.6g} s): {rate}", found, labels[1]
+    )
+    for claim, kind in GAIN_CLAIMS.items():
+        if claim in claims:
+            yield _gain_row(design, kind, claims[claim])
+    if "adaptation_low" in claims:
+        yield _range_row(design)
+
+
+def _gain_row(design: ObserverDesign, kind: Literal["rate", "noise"], gain: float) -> Check:
+    plant, observer = design.linear
+    entering = error_inputs(with_sensor_noise(plant), *stacked_gains(design), kind)
+    found = prove_gain(
+        observer.Az, entering, observer.Cz[observer.fault_rows], design.certificate.matrices[f"P_{kind}"], gain
+    )
+    source = {"rate": "the rate of the faults", "noise": "noise and its derivative, as free inputs,"}[kind]
+    claim = f"l2 gain from {source} to the fault error < {gain:.6g}"
+    return Check(
+        f"LMI, {kind}", claim, found.lower_bound, 0.0, found.lower_bound, found.proved, "ours: bounded real lemma",
+        "proved", found.text,
+    )  # fmt: skip
+
+
+def _proof(name: str, claim: str, found: DefinitenessProof, label: str) -> Check:
+    return Check(
+        name, claim, found.lower_bound, 0.0, found.lower_bound, found.proved, f"Filasova et al., eq. {label}", "proved",
+        found.text,
+    )  # fmt: skip
+
+
+def _range_row(design: ObserverDesign) -> Check:
+    """Prove the inequality at both ends of the range of g in G = g I; between them it is an average of the two."""
+    plant, matrices, claims = design.linear[0], design.certificate.matrices, design.certificate.claims
+    gains = design.gains
+    gain_j, gain_l = np.vstack([gains["J"], gains["M"]]), np.vstack([gains["L"], gains["N"]])
+    loop = np.eye(plant.nx + plant.nf)
+    loop[plant.nx :, plant.nx :] = gains.get("G", np.eye(plant.nf))
+    p3 = loop.T @ matrices["P3"] @ loop
+    proofs = []
+    for name in ("low", "high"):
+        p1 = matrices[f"P1_{name}"]
+        end = with_faults_as_states(plant, claims[f"adaptation_{name}"] * np.eye(plant.nf))
+        proofs.append(prove_symmetric_positive(p1))
+        proofs.append(prove_gains(end.A, end.C, gain_j, gain_l, p1, p3, delta=claims["delta"], decay=claims["decay"]))
+    worst = min(proofs, key=lambda proof: (proof.proved, proof.lower_bound))
+    low, high = claims["adaptation_low"], claims["adaptation_high"]
+    return Check(
+        "adaptation range", f"stable for every G = g I with g from {low:.6g} to {high:.6g}", worst.lower_bound, 0.0,
+        worst.lower_bound, all(proof.proved for proof in proofs), "ours: the theorem at both ends, with common P3",
+        "proved",
+        worst.text,
+    )  # fmt: skip

@@ -1,0 +1,154 @@
+"""When a PD observer for states and faults exists, decided before any solver runs.
+
+Source: Filasova, Krokavec, Serbak, section 2.  Our finding: Theorem 1 has a solution, for every delta > 0, exactly when
+the plant with its faults as states is detectable; away from s = 0 this is detectability of (A, C), and at s = 0, where
+the model of a constant fault has its modes, it is the paper's rank condition (3).  Observability of (A, C), which the
+paper supposes, is more than needed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from obsynth.analysis.conditions import Condition, rank_condition
+from obsynth.analysis.far_zeros import equilibrated_at
+from obsynth.analysis.structure import analyse_structure
+from obsynth.analysis.transformations import Transformation, eliminate_algebraic_states
+from obsynth.analysis.zeros import leading_names
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.pencils import pencil_structure
+from obsynth.numerics.ranks import decide_rank, equilibrate
+from obsynth.plants.descriptor import DescriptorSystem
+
+#: At most this many signals are named in a failed condition.
+MOST_NAMES = 4
+_SOURCE = "Filasova et al., eqs. (1), (2)"
+
+
+def pd_observer_conditions(plant: DescriptorSystem) -> tuple[Condition, ...]:
+    """Return the existence conditions of the PD observer, in order; the list ends at the first failure."""
+    found: list[Condition] = []
+    for condition in _all_conditions(plant):
+        found.append(condition)
+        if not condition.holds:
+            break
+    return tuple(found)
+
+
+def explicit_form(plant: DescriptorSystem) -> Transformation | None:
+    """Return the elimination of the algebraic states; ``None`` for a plant with ``E = I``."""
+    return None if np.array_equal(plant.E, np.eye(plant.nx)) else eliminate_algebraic_states(plant)
+
+
+def _all_conditions(plant: DescriptorSystem) -> Iterator[Condition]:
+    """Yield the conditions; each may rely on those before it."""
+    yield _condition(
+        "continuous time", "a continuous-time plant (dt = 0)", not plant.is_discrete, plant.dt, 0.0, _SOURCE,
+        f"a plant sampled every {plant.dt:g} s. Give the continuous one (no sample_time in its transform): the "
+        "observer is sampled afterwards, by obsynth.sample_observer.",
+    )  # fmt: skip
+    yield _condition(
+        "faults", "at least one fault", plant.nf > 0, float(plant.nf), 1.0, _SOURCE,
+        "none. Name the fault to estimate in Bf or Df.",
+    )  # fmt: skip
+    pencil = pencil_structure(plant.E, plant.A)
+    yield _condition(
+        "regularity", "a regular pencil (det(A - sE) not identically zero)", pencil.regular,
+        float(pencil.normal_rank), float(plant.nx), "definition of a descriptor plant",
+        f"normal rank {pencil.normal_rank} of {plant.nx}: the equations do not determine the states. Add what is "
+        "missing.",
+    )  # fmt: skip
+    index = pencil.index or 0
+    yield _condition(
+        "index", "index 0 or 1: the algebraic states can be eliminated", index <= 1, float(index), 1.0,
+        "ours: elimination of algebraic states",
+        f"index {index}: the algebraic equations cannot be solved for the algebraic states without differentiating. "
+        "Differentiate the constraints first.",
+    )  # fmt: skip
+    dynamic = len(pencil.finite_eigenvalues)
+    yield _condition(
+        "dynamic states", "at least one dynamic state", dynamic > 0, float(dynamic), 1.0,
+        "ours: elimination of algebraic states",
+        "none: every state is algebraic. Solve the equations directly.",
+    )  # fmt: skip
+    form = explicit_form(plant)
+    yield from _explicit_conditions(plant if form is None else form.plant)
+
+
+def _explicit_conditions(plant: DescriptorSystem) -> Iterator[Condition]:
+    yield _condition(
+        "nf <= ny", "no more faults than outputs (nf <= ny)", plant.nf <= plant.ny, float(plant.nf), float(plant.ny),
+        "Filasova et al., eq. (3)",
+        f"{plant.nf} faults and {plant.ny} output(s). Measure more, or leave a fault out.",
+        signals=plant.fault_names,
+    )  # fmt: skip
+    columns = np.vstack([plant.Bf, plant.Df])
+    yield rank_condition(
+        "rank F", decide_rank(columns, expected=plant.nf),
+        "some faults act nowhere, or in the same direction as others, and cannot be told apart.",
+        source="Filasova et al., eq. (3)", signals=_null_names(columns, plant.fault_names),
+    )  # fmt: skip
+    yield _detectability(plant)
+    rosenbrock = np.block([[plant.A, plant.Bf], [plant.C, plant.Df]])
+    hidden = leading_names(_null_vector(rosenbrock)[plant.nx :], plant.fault_names, most=MOST_NAMES)
+    at_zero = rank_condition(
+        "rank [A F; C Df]", decide_rank(rosenbrock, expected=plant.nx + plant.nf),
+        f"there is a zero at s = 0, where a constant fault {', '.join(map(repr, hidden))} does not show in the outputs "
+        "once the states have settled. Measure another signal.",
+        source="Filasova et al., eq. (3)", signals=hidden,
+    )  # fmt: skip
+    yield at_zero if at_zero.holds else replace(at_zero, mode=0j)
+
+
+def _condition(
+    name: str, claim: str, holds: bool, value: float, bound: float, source: str, failure: str,
+    *, signals: tuple[str, ...] = (),
+) -> Condition:  # fmt: skip
+    return Condition(
+        name, claim, holds, value, bound, source, "" if holds else failure, signals=() if holds else signals
+    )
+
+
+def _detectability(plant: DescriptorSystem) -> Condition:
+    """Return the condition that every mode that does not decay shows in the outputs."""
+    structure = analyse_structure(plant)
+    claim = "every mode that does not decay shows in the outputs ((A, C) detectable)"
+    source = "necessary and sufficient with (3); Filasova et al. suppose observability"
+    hidden = structure.undetectable_modes
+    if structure.detectable:
+        slowest = max((mode.real for mode in structure.unobservable_modes), default=-np.inf)
+        detail = f"{len(structure.unobservable_modes)} unobservable mode(s)" + (
+            f", slowest real part {slowest:.6g}" if structure.unobservable_modes else ""
+        )
+        return Condition("detectability", claim, True, 0.0, 0.0, source, detail)
+    mode = max(hidden, key=lambda value: value.real)
+    signals = leading_names(_hidden_direction(plant, mode), plant.state_names, most=MOST_NAMES)
+    value = f"{mode.real:.6g}" if mode.imag == 0.0 else f"{mode:.6g}"
+    detail = (
+        f"the mode s = {value} (states {', '.join(map(repr, signals))}) never shows in the outputs and does not "
+        "decay: measure something it moves."
+    )
+    return Condition("detectability", claim, False, float(len(hidden)), 0.0, source, detail, mode=mode, signals=signals)
+
+
+def _hidden_direction(plant: DescriptorSystem, mode: complex) -> FloatArray:
+    """Return the sizes ``(nx,)`` of the states in the direction that ``[A - s I; C]`` shows least at a mode."""
+    still = np.vstack([plant.E, np.zeros_like(plant.C)])
+    pencil = equilibrated_at(still, np.vstack([plant.A, plant.C]), mode, nx=plant.nx)
+    point = mode if mode.imag else mode.real
+    return np.asarray(np.abs(pencil.columns * np.linalg.svd(pencil.A - point * pencil.E)[2][-1]))
+
+
+def _null_vector(matrix: FloatArray) -> FloatArray:
+    """Return the direction (of unit columns) that a matrix shows least."""
+    return np.asarray(np.linalg.svd(equilibrate(matrix))[2][-1])
+
+
+def _null_names(matrix: FloatArray, names: tuple[str, ...]) -> tuple[str, ...]:
+    lengths = np.linalg.norm(matrix, axis=0)
+    if np.any(lengths == 0.0):
+        return tuple(name for name, length in zip(names, lengths, strict=True) if length == 0.0)
+    return leading_names(_null_vector(matrix), names, most=MOST_NAMES)

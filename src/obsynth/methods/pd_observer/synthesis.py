@@ -1,0 +1,206 @@
+r"""PD observer for states and actuator faults of continuous-time plants.
+
+Source: A. Filasova, D. Krokavec, V. Serbak, *Application of descriptor approaches in design of PD observer-based
+actuator fault estimation*: observer (4)-(6), Theorem 1 (40)-(44), Theorem 2 (61)-(65).
+
+Our deviations
+    1. Both P and Q are variables in Theorem 2; its statement declares Q alone.
+    2. What is minimised, ``||[Y Z]||_F + ||P3||_F`` with ``P3 + P3' >= 2 I``: the inequalities alone allow P3 close to
+       singular, and solvers go there (gains of 1e9, called optimal).
+    3. Existence is decided before any solver: (A, C) detectable and (3); observability is more than needed.
+    4. The matrix G of (25) acts inside the loop, as G M and G N, and is in no theorem: it is designed for, with F G in
+       place of F, or for a whole range.
+    5. Decay rate, disk, bounds on the gains and on two l2 gains, all as inequalities with the same P3, Y, Z.
+    6. Feedthrough of inputs, faults, disturbances and noise; singular E of index 1, by elimination.
+    7. What is shipped never differentiates the outputs (see `obsynth.methods.pd_observer.realisation`).
+    8. The inequality is proved for the shipped realisation; where the solver's certificate does not do, one is
+       computed from the gains.
+    9. For hundreds of states the gains come from a smaller inequality or in closed form (see
+       `obsynth.methods.pd_observer.reduced_inequality`), with L = 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from obsynth.analysis.conditions import Condition, require_all
+from obsynth.errors import SpecError
+from obsynth.methods.pd_observer.augmentation import with_faults_as_states
+from obsynth.methods.pd_observer.certificate import explicit_certificate
+from obsynth.methods.pd_observer.conditions import explicit_form, pd_observer_conditions
+from obsynth.methods.pd_observer.delta_scan import scan_delta
+from obsynth.methods.pd_observer.gain_search import design_gains
+from obsynth.methods.pd_observer.gains import PdGains
+from obsynth.methods.pd_observer.options import PdOptions, checked_adaptation_gain
+from obsynth.methods.pd_observer.realisation import realise_pd_observer
+from obsynth.methods.synthesis_result import Synthesis
+from obsynth.numerics.arrays import FloatArray, as_matrix
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.results.design import Certificate
+
+#: Gains from sensor noise to a fault estimate above this are worth a note.
+WARN_AMPLIFICATION = 50.0
+
+
+def conditions(plant: DescriptorSystem) -> tuple[Condition, ...]:
+    """Return the existence conditions; the list ends at the first failure."""
+    return pd_observer_conditions(plant)
+
+
+def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **options: Any) -> Synthesis:
+    """Design the observer; see `obsynth.pd_observer` for the options, results and errors."""
+    asked = PdOptions(**options)
+    progress("checking the existence conditions")
+    require_all(conditions(plant))
+    form = explicit_form(plant)
+    work = plant if form is None else form.plant
+    g = asked.gain_matrix(work.nf)
+    progress("solving the matrix inequalities")
+    gains, records = design_gains(work, asked)
+    solver: dict[str, Any] = {"engine": gains.engine, "runs": records}
+    if asked.delta_scan is not None:
+        progress("scanning delta")
+        scan = scan_delta(work, asked, np.ravel(asked.delta_scan), decay=gains.decay)
+        solver["delta_scan"] = scan.as_dict()
+    shipped = asked.range_numbers and min(max(1.0, asked.range_numbers[0]), asked.range_numbers[1])
+    loop = shipped * np.eye(work.nf) if shipped else g
+    return Synthesis(
+        _resolved(asked, gains, g),
+        listed_gains(work, gains.J, gains.L, loop),
+        gains.observer,
+        _certificate(asked, gains),
+        solver,
+        notes(work, asked, gains),
+        transformation=form,
+    )
+
+
+def _resolved(asked: PdOptions, gains: PdGains, g: FloatArray | None) -> dict[str, Any]:
+    return {
+        "theorem": asked.theorem,
+        "delta": gains.asked_delta,
+        "decay": gains.decay,
+        "disk": None if asked.disk_numbers is None else list(asked.disk_numbers),
+        "gain_bound": asked.gain_bound,
+        "fault_rate_gain": asked.fault_rate_gain,
+        "noise_gain": asked.noise_gain,
+        "adaptation_gain": None if g is None else g.tolist(),
+        "adaptation_range": None if asked.range_numbers is None else list(asked.range_numbers),
+        "delta_scan": None if asked.delta_scan is None else np.ravel(asked.delta_scan).tolist(),
+        "engine": asked.engine,
+        "solver": asked.solver,
+    }
+
+
+def listed_gains(plant: DescriptorSystem, J: FloatArray, L: FloatArray, g: FloatArray | None) -> dict[str, FloatArray]:
+    """Return the paper's J, L, M, N (and G) of gains in the loop ``[J; G M]`` and ``[L; G N]``."""
+    nx = plant.nx
+    inner = np.eye(plant.nf) if g is None else g
+    bottom = [np.asarray(np.linalg.solve(inner, part[nx:])) for part in (J, L)]
+    gains = {"J": J[:nx], "L": L[:nx], "M": bottom[0], "N": bottom[1]}
+    return gains if g is None else {**gains, "G": g}
+
+
+def _certificate(asked: PdOptions, gains: PdGains) -> Certificate:
+    claims = {"theorem": float(gains.theorem), "delta": gains.delta, "decay": gains.decay}
+    bounds: dict[str, float | None] = {
+        "gain_bound": asked.gain_bound, "fault_rate_gain": asked.fault_rate_gain, "noise_gain": asked.noise_gain,
+    }  # fmt: skip
+    claims |= {name: float(bound) for name, bound in bounds.items() if bound is not None}
+    matrices = {"P1": gains.P1, "P3": gains.P3, **gains.gain_certificates}
+    if asked.disk_numbers is not None:
+        claims |= {"disk_centre": asked.disk_numbers[0], "disk_radius": asked.disk_numbers[1]}
+    if asked.range_numbers is not None:
+        claims |= {"adaptation_low": asked.range_numbers[0], "adaptation_high": asked.range_numbers[1]}
+        matrices |= {"P1_low": gains.ends[0], "P1_high": gains.ends[1]}
+    return Certificate(matrices, claims)
+
+
+def notes(plant: DescriptorSystem, asked: PdOptions, gains: PdGains) -> tuple[str, ...]:
+    """Return what a user should know: how delta and the decay rate were chosen, slow or noisy estimates."""
+    found = []
+    if asked.delta is None:
+        less = ", or as much of it as the closed form serves" if gains.engine == "riccati" else ""
+        found.append(f"delta = {gains.asked_delta:.4g} s was chosen, from the plant's fastest mode{less}.")
+    if asked.decay is None and gains.decay > 0.0:
+        found.append(
+            f"A decay rate of {gains.decay:.4g} 1/s was imposed: a tenth of the plant's fastest mode, or what of it is "
+            "reachable with moderate gains; without it errors would die out more slowly. decay: 0 takes the smallest "
+            "gains."
+        )
+    found += _engine_notes(asked, gains, plant.nx + plant.nf)
+    return (*found, *_noise_notes(plant, gains))
+
+
+_ENGINES = {"lmi": "the whole inequality", "reduced-lmi": "the smaller inequality", "riccati": "a Riccati equation"}
+
+
+def _engine_notes(asked: PdOptions, gains: PdGains, states: int) -> list[str]:
+    wanted = asked.engines_for(states)[0]
+    if gains.engine != wanted:
+        return [
+            f"The engine {wanted!r} failed: these gains come from {_ENGINES[gains.engine]} (engine {gains.engine!r}), "
+            "with L = 0 and N = 0."
+        ]
+    if asked.engine == "auto" and wanted != "lmi":
+        return [
+            f"With {states} unknown states the gains come from {_ENGINES[wanted]} (engine {wanted!r}), with L = 0 and "
+            "N = 0; engine 'lmi' may find smaller ones."
+        ]
+    return []
+
+
+def _noise_notes(plant: DescriptorSystem, gains: PdGains) -> list[str]:
+    direct = gains.observer.Dy[gains.observer.fault_rows]
+    return [
+        f"The estimate of {name!r} multiplies fast errors of the measurements by up to {np.linalg.norm(row):.3g}."
+        for name, row in zip(plant.fault_names, direct, strict=True)
+        if np.linalg.norm(row) > WARN_AMPLIFICATION
+    ]
+
+
+def synthesis_from_gains(
+    plant: DescriptorSystem, *, gains: Mapping[str, Any], adaptation_gain: Any, decay: float
+) -> Synthesis:
+    """Return the realisation and certificate of given gains; see `obsynth.pd_observer_from_gains`."""
+    require_all(conditions(plant))
+    form = explicit_form(plant)
+    work = plant if form is None else form.plant
+    matrices = {name: as_matrix(value, name) for name, value in gains.items()}
+    for name, rows in (("J", work.nx), ("L", work.nx), ("M", work.nf), ("N", work.nf)):
+        if matrices[name].shape != (rows, work.ny):
+            raise SpecError(f"{name} is {matrices[name].shape}, but {(rows, work.ny)} is needed.", path=name)
+    if not (np.isfinite(decay) and decay >= 0.0):
+        raise SpecError(f"decay is {decay}: give 0 or a positive number in 1/seconds.", path="decay")
+    g = None if adaptation_gain is None else checked_adaptation_gain(adaptation_gain, work.nf)
+    inner = np.eye(work.nf) if g is None else g
+    gain_j, gain_l = (
+        np.vstack([matrices["J"], inner @ matrices["M"]]),
+        np.vstack([matrices["L"], inner @ matrices["N"]]),
+    )
+    observer = _realised(work, gain_j, gain_l)
+    found = explicit_certificate(observer.Az, observer.Cz[: observer.order], decay=decay)
+    if found is None:  # not stable, or too slow: the report will say so
+        found = np.eye(observer.order), np.eye(observer.order), 1.0
+    return Synthesis(
+        {"from_gains": True, "decay": decay},
+        matrices if g is None else {**matrices, "G": g},
+        observer,
+        Certificate({"P1": found[0], "P3": found[1]}, {"theorem": 1.0, "delta": found[2], "decay": float(decay)}),
+        {"runs": []},
+        transformation=form,
+    )
+
+
+def _realised(plant: DescriptorSystem, gain_j: FloatArray, gain_l: FloatArray) -> LinearObserver:
+    augmented = with_faults_as_states(plant)
+    singular = SpecError(
+        "I + L C is singular with these gains: the observer's equations do not determine its estimates.", path="L"
+    )
+    if not np.linalg.cond(np.eye(augmented.nx) + gain_l @ augmented.C) < 1.0 / np.finfo(np.float64).eps:
+        raise singular
+    return realise_pd_observer(plant, augmented, gain_j, gain_l)

@@ -1,0 +1,170 @@
+"""Kalman gains with a prescribed rate of decay.
+
+Source: Share Pasand, Aliyari, Taghirad mention "the optimal estimation scheme of Kalman"; the prescribed rate is
+Anderson and Moore's.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.doubling import continuous_riccati_solution, doubled_riccati_solution
+from obsynth.numerics.spectra import abscissa, noise_covariance
+
+#: Times the Riccati equation is solved, each time in the coordinates of the last solution, which improve it.
+ROUNDS = 2
+#: From so many states on the Riccati equation is solved by doubling first.
+MANY_STATES = 40
+#: A rate that cannot be had at once is gone to in steps of this factor, from one that is at most so many below.
+RATE_FACTOR = 4.0
+MOST_STEPS = 12
+
+
+@dataclass(frozen=True, eq=False)
+class KalmanProblem:
+    """A pair with noise: ``e+ = F e + B w + drive v``, innovation ``C e + D w + background n``.
+
+    Fields: F, C: ``(n, n)`` and ``(ny, n)``, observable; B, D: ``(n, k)`` and ``(ny, k)``: how the noise that counts,
+    of unit covariance (intensity for ``dt == 0``), enters; drive: ``(n, p)``: what the states are driven by besides, so
+    that the filter stays awake; background: ``(ny, q)``: keeps the equation regular where an innovation has no noise;
+    estimates: ``(k, n)``: what the noise is counted in, the fault estimates; dt: Seconds between samples, 0 for
+    continuous time.
+    """
+
+    F: FloatArray
+    C: FloatArray
+    B: FloatArray
+    D: FloatArray
+    drive: FloatArray
+    background: FloatArray
+    estimates: FloatArray
+    dt: float
+
+    def gain(self, decay: float, *, persistent: bool = False) -> FloatArray | None:
+        """Return the gain whose poles all decay at ``decay`` (1/s) or faster; ``None`` when the equation has none.
+
+        References
+        ----------
+        .. [AndersonMoore1971] B. D. O. Anderson, J. B. Moore, "Linear optimal control", 1971, section 4.
+        """
+        plain = np.eye(self.F.shape[0])
+        best, change = self.solved(decay, plain)
+        if best is not None or not persistent:
+            return best
+        slower = [decay]
+        while best is None and len(slower) <= MOST_STEPS:
+            slower.append(slower[-1] / RATE_FACTOR)
+            best, change = self.solved(slower[-1], plain)
+        for rate in reversed(slower[:-1]):
+            if best is None:
+                break
+            best, change = self.solved(rate, change)
+        return best
+
+    def solved(self, decay: float, change: FloatArray) -> tuple[FloatArray | None, FloatArray]:
+        """Return the gain of a rate, and coordinates in which its error covariance is the identity.
+
+        Shapes: ``change (n, n)``.
+        """
+        if not self.F.size:
+            return np.zeros((0, self.C.shape[0])), change
+        # The part of the process noise that the measurements carry is taken out first.
+        measured = self.D @ self.D.T + self.background @ self.background.T
+        direct = np.linalg.solve(measured, self.D @ self.B.T).T
+        free = self.F - direct @ self.C
+        rest = self.B @ self.B.T + self.drive @ self.drive.T - direct @ self.D @ self.B.T
+        rest = 0.5 * (rest + rest.T)
+        bound = float(np.exp(-decay * self.dt)) if self.dt > 0.0 else -decay
+        best: FloatArray | None = None
+        for _ in range(ROUNDS):
+            found = _filtered(free, self.C, rest, measured, (bound, self.dt), change)
+            if found is None:
+                break
+            total = found[0] + direct
+            # Strictly: a rate that is only met within rounding is none.
+            if abscissa(self.F - total @ self.C, self.dt) < bound:
+                best = total
+            change = found[1]
+        return best, change
+
+    def deviations(self, gain: FloatArray, change: FloatArray) -> FloatArray:
+        """Return the standard deviation of each estimate under the noise that counts (for unit intensity, dt = 0).
+
+        Shapes: ``gain (n, ny)``, ``change (n, n)``.
+        """
+        entering = np.asarray(np.linalg.solve(change, self.B - gain @ self.D), dtype=np.float64)
+        moved = np.asarray(np.linalg.solve(change, (self.F - gain @ self.C) @ change), dtype=np.float64)
+        direct = np.zeros((self.estimates.shape[0], entering.shape[1]))
+        bound = 1.0 if self.dt > 0.0 else 0.0
+        if not abscissa(moved, self.dt) < bound:
+            # Stable in some coordinates and not in others: only rounding tells.
+            return np.full(len(direct), np.inf)
+        covariance = noise_covariance(moved, entering, self.estimates @ change, direct, self.dt)
+        return np.asarray(np.sqrt(np.maximum(np.diag(covariance), 0.0)))
+
+
+def _filtered(
+    f: FloatArray,
+    c: FloatArray,
+    driven: FloatArray,
+    measured: FloatArray,
+    asked: tuple[float, float],
+    change: FloatArray,
+) -> tuple[FloatArray, FloatArray] | None:
+    """Return the gain of a Kalman filter, and states in which its error covariance is the identity.
+
+    Shapes: ``change (n, n)``.
+    """
+    bound, dt = asked
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        # What a badly conditioned equation gives is judged by its poles.
+        warnings.simplefilter("ignore")
+        try:
+            inverse = np.linalg.inv(change)
+            moved, noise = inverse @ f @ change, inverse @ driven @ inverse.T
+            moved = moved / bound if dt > 0.0 else moved - bound * np.eye(len(f))
+            noise = 0.5 * (noise + noise.T)
+            for equation in (_by_doubling, _by_the_library) if len(f) >= MANY_STATES else (_by_the_library,):
+                found, covariance = equation(moved, c @ change, noise, measured, dt)
+                gain = change @ (bound * found if dt > 0.0 else found)
+                values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
+                if np.all(np.isfinite(gain)) and abscissa(f - gain @ c, dt) < bound:
+                    break
+        except (np.linalg.LinAlgError, ValueError, ArithmeticError):
+            return None
+    if not np.all(np.isfinite(gain)) or not np.all(np.isfinite(values)) or values[-1] <= 0.0:
+        return None
+    floor = float(np.finfo(np.float64).eps) * values[-1]
+    return np.asarray(gain), np.asarray(change @ (vectors * np.sqrt(np.maximum(values, floor))))
+
+
+def _by_doubling(
+    f: FloatArray, c: FloatArray, noise: FloatArray, measured: FloatArray, dt: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return gain and error covariance of a Kalman filter; NaN where the doubling breaks down."""
+    nothing = np.full((len(f), len(c)), np.nan)
+    if dt > 0.0:
+        y = doubled_riccati_solution(f, c, noise, measured, np.zeros_like(nothing))
+        if y is None:
+            return nothing, np.eye(len(f))
+        return np.asarray(np.linalg.solve(c @ y @ c.T + measured, c @ y @ f.T).T), y
+    y = continuous_riccati_solution(f, c, noise, measured)
+    if y is None:
+        return nothing, np.eye(len(f))
+    return np.asarray(np.linalg.solve(measured, c @ y).T), y
+
+
+def _by_the_library(
+    f: FloatArray, c: FloatArray, noise: FloatArray, measured: FloatArray, dt: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return the same by the QZ algorithm, which takes several times as long and hardly ever breaks down."""
+    import control
+
+    # By scipy, so that no gain depends on whether slycot is there.
+    solve = control.dlqe if dt > 0.0 else control.lqe
+    found, covariance, _ = solve(f, np.eye(len(f)), c, noise, measured, method="scipy")
+    return np.asarray(found), np.asarray(covariance)

@@ -1,0 +1,137 @@
+"""Splitting a pair into its observable part and the modes that no gain moves.
+
+Source: Share Pasand, Aliyari, Taghirad, step 7 of procedure 1.  Difference: Lemma 6 promises that the pair is always
+observable, which is false; a library that places the poles of a pair that is not returns garbage without a word.  A
+staircase of rank decisions loses its way on large stiff pairs (three of four fixed modes of the Kundur network); the
+fixed modes are known from the zeros of the plant's pencil, so they are peeled off one eigenspace at a time instead.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from obsynth.errors import PreconditionError
+from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.numerics.log_balance import LogBalance
+from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, HIDDEN_MODE_TOLERANCE, RANK_TOLERANCE
+from obsynth.numerics.spectra import eigenvalues
+
+#: Fixed modes closer than this, relative to their size, are peeled off together, at their mean: a double one that
+#: rounding split lies at about the square root of the unit roundoff from it.
+SAME_MODE = 1e-5
+
+
+@dataclass(frozen=True, eq=False)
+class ObservableSplit:
+    """A pair in coordinates that show its observable part.
+
+    With ``x = units * basis @ [observable; hidden]``: ``F = [F_o 0; F_ho F_h]`` and ``C = [C_o 0]``.
+
+    Fields: basis: ``(n, n)``, orthogonal; units: ``(n,)``: the states are balanced first; F, C: The observable part,
+    ``(no, no)`` and ``(ny, no)``; fixed_modes: Eigenvalues of the hidden part.
+    """
+
+    basis: FloatArray
+    units: FloatArray
+    F: FloatArray
+    C: FloatArray
+    fixed_modes: ComplexArray
+
+    @property
+    def order(self) -> int:
+        """Number of observable states."""
+        return int(self.F.shape[0])
+
+    def lift(self, gain: FloatArray) -> FloatArray:
+        """Return the gain ``(n, ny)`` of the whole pair for one of the observable part ``(no, ny)``."""
+        return np.asarray(self.units[:, None] * (self.basis[:, : self.order] @ gain))
+
+    def lower(self, matrix: FloatArray) -> FloatArray:
+        """Return the observable rows of an input matrix ``(n, *)`` of the whole pair."""
+        return np.asarray(self.basis[:, : self.order].T @ (matrix / self.units[:, None]))
+
+    def shown(self, matrix: FloatArray) -> FloatArray:
+        """Return the observable columns of an output matrix ``(*, n)`` of the whole pair."""
+        return np.asarray((matrix * self.units) @ self.basis[:, : self.order])
+
+
+def observable_split(f: FloatArray, c: FloatArray, fixed_modes: ComplexArray) -> ObservableSplit:
+    """Split the pair ``(F, C)`` at its fixed modes.
+
+    Shapes: ``f (n, n)``, ``c (ny, n)``.
+    """
+    n = f.shape[0]
+    units = _balancing(f, c)
+    work_f, work_c, basis = f * units / units[:, None], c * units, np.eye(n)
+    size = max(float(np.linalg.norm(work_f, 2)), float(np.linalg.norm(work_c, 2))) if n else 1.0
+    waiting = _upper_half(fixed_modes)
+    seen = n
+    while waiting:
+        value = waiting[0]
+        cluster = [other for other in waiting if abs(other - value) <= SAME_MODE * max(1.0, abs(value))]
+        kernel = _hidden_directions(work_f[:seen, :seen], work_c[:, :seen], sum(cluster) / len(cluster), size)
+        found = kernel.shape[1] // (2 if value.imag > 0.0 else 1)
+        if found == 0 or found > len(cluster):
+            raise PreconditionError(
+                f"By the zeros of plant and fault model {value:.6g} is a fixed mode, but the pair (U A, C) shows it: "
+                "double precision cannot tell. Lower the order of the fault model, or rescale the plant.",
+                condition="fixed modes",
+                mode=value,
+            )
+        turn = np.eye(n)
+        # Observable directions first, the hidden ones behind them.
+        left = np.linalg.svd(kernel)[0]
+        turn[:seen, :seen] = np.hstack([left[:, kernel.shape[1] :], left[:, : kernel.shape[1]]])
+        work_f, work_c, basis = turn.T @ work_f @ turn, work_c @ turn, basis @ turn
+        seen -= kernel.shape[1]
+        for other in cluster[:found]:
+            waiting.remove(other)
+    hidden = eigenvalues(work_f[seen:, seen:])
+    return ObservableSplit(basis, units, work_f[:seen, :seen], work_c[:, :seen], hidden)
+
+
+def _upper_half(modes: ComplexArray) -> list[complex]:
+    """Return one mode of each pair; a double real mode that rounding has split into a pair is real twice."""
+    found: list[complex] = []
+    for mode in map(complex, modes):
+        if 0.0 < abs(mode.imag) <= SAME_MODE * max(1.0, abs(mode)):
+            found.append(complex(mode.real, 0.0))
+        elif mode.imag >= 0.0:
+            found.append(mode)
+    return found
+
+
+def _hidden_directions(f: FloatArray, c: FloatArray, value: complex, size: float) -> FloatArray:
+    """Return a real orthonormal basis of the states that stay invisible at the mode, and at its conjugate."""
+    shifted = f - (value if value.imag else value.real) * np.eye(f.shape[0])
+    _, values, right = np.linalg.svd(np.vstack([shifted, c]))
+    kernel = right[values <= HIDDEN_MODE_TOLERANCE * max(size, abs(value))].conj().T
+    if value.imag == 0.0:
+        return np.asarray(kernel.real)
+    both = np.hstack([kernel.real, kernel.imag])
+    if both.shape[1] == 0:
+        return both
+    left, lengths, _ = np.linalg.svd(both, full_matrices=False)
+    return np.asarray(left[:, lengths > RANK_TOLERANCE])
+
+
+def _balancing(f: FloatArray, c: FloatArray) -> FloatArray:
+    """Return factors of the states with which the entries of F, and those of C, are alike.
+
+    Least squares on the logarithms, with the common size of F free: unlike the usual balancing it does not run away
+    where F is reducible, as that of a fault model is.
+    """
+    n = f.shape[0]
+    problem = LogBalance(n + 2)
+    states = range(n)
+    links = np.where(np.eye(n, dtype=bool), 0.0, f)
+    # All outputs together: which combinations of them are looked at must not matter.
+    shown = np.linalg.norm(c, axis=0, keepdims=True)
+    floor_f, floor_c = (CANCELLATION_TOLERANCE * float(np.max(np.abs(part), initial=0.0)) for part in (f, shown))
+    problem.add(np.where(np.abs(links) > floor_f, f, 0.0), states, states, signs=(-1, 1), common=n)
+    problem.add(np.where(shown > floor_c, shown, 0.0), range(n + 1, n + 2), states)
+    for state in states:
+        problem.wish(state, 0.0)
+    return np.asarray(np.exp2(problem.solve()[:n]))

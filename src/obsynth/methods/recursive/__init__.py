@@ -1,0 +1,1 @@
+"""What the recursive methods share: conditions, synthesis, checks."""

@@ -1,0 +1,183 @@
+"""Checks of a recursive observer: fit, a batch solution, contraction, excitation, and consistency by Monte Carlo.
+
+Source of the claims: Moussa Ali, Zhang 2013, (6), (13), (26) and Lemma 3.1; the residual directions are our finding.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from obsynth.analysis.time_varying import horizon_ranks
+from obsynth.errors import ObsynthError
+from obsynth.methods.recursive.checks.batch import batch_residuals
+from obsynth.methods.recursive.conditions import recursive_conditions
+from obsynth.observers.recursive.building import observer_from_options
+from obsynth.observers.recursive.gain_schedule_summary import (
+    STEPS_TO_CONTRACT,
+    GainScheduleSummary,
+    gain_schedule_summary,
+    looked_at,
+)
+from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.plants.sequences import MatrixSequence
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.results.design import ObserverDesign
+from obsynth.results.report import Check, information, upper_bound_check
+from obsynth.verification.consistency import consistency
+from obsynth.verification.plant import condition_rows
+
+#: Claims may differ from what is recomputed by this much: they are the same numbers from another run.
+CLAIM_TOLERANCE = 1e-6
+#: The recursion may differ from the batch solution by this much, relative to standard deviations, times cond H.
+BATCH_TOLERANCE = 1e-9
+
+_SOURCE = "Moussa Ali, Zhang 2013"
+
+
+def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
+    """Yield every check of ``design``; see `obsynth.verification.verify`."""
+    plant, observer = design.recursive
+    form = None if observer.adaptation is None else observer.adaptation.form
+    yield information("plant: steps", "length of the horizon (0: without end)", float(plant.horizon or 0),
+                      source="the plant")  # fmt: skip
+    conditions = tuple(
+        recursive_conditions(
+            plant, parameters=form is not None, literal=form == "literal", early=observer.early_constraints
+        )
+    )
+    yield from condition_rows(conditions)
+    if not all(condition.holds for condition in conditions):
+        return
+    problem = misfit(design)
+    yield upper_bound_check(
+        "fits the plant", "observer, options and plant hold the same matrices at every k", float(bool(problem)), 0.0,
+        source="shipped observer", kind="equality", detail=problem,
+    )  # fmt: skip
+    stated = _stated(design)
+    if stated is None or observer.plant.nx != plant.nx or observer.plant.ne != plant.ne:
+        return
+    try:
+        yield from _dynamic_rows(design, observer, stated)
+    except (ObsynthError, np.linalg.LinAlgError, ValueError) as error:
+        yield upper_bound_check("runs", "the observer runs on its own model", 1.0, 0.0, source="shipped observer",
+                                detail=str(error))  # fmt: skip
+
+
+def _dynamic_rows(design: ObserverDesign, observer: RecursiveObserver, stated: RecursiveObserver) -> Iterator[Check]:
+    ranks = horizon_ranks(observer.plant, early=observer.early_constraints)
+    facts = gain_schedule_summary(observer)
+    yield information(
+        "condition of H", "largest condition number of [E_k; C_k]", ranks.condition, source=f"{_SOURCE}, (6)",
+        detail=f"at k = {ranks.condition_k}",
+    )  # fmt: skip
+    yield information(
+        "residual directions", "least rank E_k + ny - nx: what (18f) can see", float(ranks.directions),
+        source="our finding", detail=f"at k = {ranks.directions_k}",
+    )  # fmt: skip
+    for name, found in batch_residuals(stated, observer).items():
+        yield upper_bound_check(
+            f"batch: {name}", "the recursion equals the least-squares solution of the whole record", found,
+            BATCH_TOLERANCE * ranks.condition, source=f"{_SOURCE}, (6)-(10)", kind="equality",
+        )  # fmt: skip
+    yield from _contraction_rows(facts)
+    if observer.adaptation is not None:
+        yield information(
+            "excitation", "least information on the parameters in a window", facts.excitation,
+            source=f"{_SOURCE}, (26)",
+            detail=f"window of {observer.adaptation.window} ends at k = {facts.excitation_k}",
+        )  # fmt: skip
+        for name, deviation in zip(observer.fault_names, facts.deviations, strict=True):
+            yield information(
+                f"noise in fhat[{name}]", "standard deviation of the parameter after the last step", float(deviation),
+                source="recomputed", detail=observer.plant.units.get(name, ""),
+            )  # fmt: skip
+    yield _claims_row(design, facts, ranks.condition, float(ranks.directions))
+    yield from consistency(stated, observer, looked_at(observer))
+
+
+def _contraction_rows(facts: GainScheduleSummary) -> Iterator[Check]:
+    claim = "mean factor per step of the product of L_k A_k"
+    detail = f"{facts.steps} steps, {facts.span}; an error grows at most by {facts.growth:.3g} on the way"
+    if facts.steps < STEPS_TO_CONTRACT:
+        yield information("contraction", claim, facts.contraction, source=f"{_SOURCE}, (13)", detail=detail)
+    else:
+        yield upper_bound_check(
+            "contraction", claim, facts.contraction, np.nextafter(1.0, 0.0), source=f"{_SOURCE}, (13)", detail=detail
+        )
+
+
+def _claims_row(design: ObserverDesign, facts: GainScheduleSummary, condition: float, directions: float) -> Check:
+    claims = design.certificate.claims
+    found = {
+        "condition": condition, "residual_directions": directions, "contraction": facts.contraction,
+        "steps": float(facts.steps),
+    }  # fmt: skip
+    if not np.isnan(facts.excitation):
+        found["excitation"] = facts.excitation
+    scale = {name: max(abs(value), np.finfo(np.float64).tiny) for name, value in found.items()}
+    # An excitation that is all rounding has no digits to compare.
+    scale["excitation"] = max(scale.get("excitation", 1.0), CLAIM_TOLERANCE)
+    gaps = [abs(claims.get(name, np.nan) - value) / scale[name] for name, value in found.items()]
+    return upper_bound_check(
+        "claims", "every claimed number is found again", float(np.max(gaps)), CLAIM_TOLERANCE, source="certificate"
+    )
+
+
+def _stated(design: ObserverDesign) -> RecursiveObserver | None:
+    """Return the observer that plant and options stand for, or ``None`` when they stand for none."""
+    try:
+        return observer_from_options(design.recursive[0], design.options)
+    except (ObsynthError, KeyError, TypeError):
+        return None
+
+
+def misfit(design: ObserverDesign) -> str:
+    """Return what does not fit between a design's plant, options and shipped observer; empty when all does."""
+    plant, observer = design.recursive
+    stated = _stated(design)
+    if stated is None:
+        return "the options stand for no observer of this plant"
+    if stated.early_constraints != observer.early_constraints:
+        return "early_constraints"
+    for field in ("state_names", "input_names", "output_names", "parameter_names", "dt", "horizon"):
+        if getattr(plant, field) != getattr(observer.plant, field):
+            return field
+    ours, theirs = stated.adaptation, observer.adaptation
+    if (ours is None) != (theirs is None):
+        return "adaptation"
+    if ours is not None and theirs is not None:
+        for field in (
+            "form",
+            "forgetting",
+            "guard",
+            "window",
+            "reset",
+            "initial_parameters",
+            "initial_covariance",
+            "walk",
+        ):
+            if not np.array_equal(getattr(ours, field), getattr(theirs, field)):
+                return field
+    for field in ("initial_state", "initial_covariance"):
+        if not np.array_equal(getattr(stated, field), getattr(observer, field)):
+            return field
+    return _different_matrix(plant, observer, stated)
+
+
+def _different_matrix(
+    plant: TimeVaryingDescriptorSystem, observer: RecursiveObserver, stated: RecursiveObserver
+) -> str:
+    pairs: dict[str, tuple[MatrixSequence, MatrixSequence]] = {
+        name: (matrix, observer.plant.matrices[name]) for name, matrix in plant.matrices.items()
+    }
+    pairs |= {"Q": (stated.Q, observer.Q), "R": (stated.R, observer.R)}
+    steps = looked_at(stated)
+    for name, (first, second) in pairs.items():
+        begin = 1 if name in ("E", "C") else 0
+        last = begin + 1 if first.is_constant and second.is_constant else begin + steps
+        for k in range(begin, last):
+            if not np.array_equal(first.at(k), second.at(k)):
+                return f"{name}({k})"
+    return ""

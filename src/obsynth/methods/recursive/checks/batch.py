@@ -1,0 +1,122 @@
+"""A second route to the recursive estimates: one least-squares problem over the first steps as a whole."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.least_squares_step import LeastSquaresStep, least_squares_step, rank_revealing_step
+from obsynth.numerics.ranks import RANK_TOLERANCE
+from obsynth.observers.recursive.gain_schedule_summary import looked_at
+from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.recursive.running import RunningRecursiveObserver, step_model_of
+from obsynth.observers.recursive.step_model import EarlyConstraintSteps, StepMatrices
+from obsynth.verification.consistency import data_deviations, state_terms
+
+#: Steps in the batch: enough for every matrix to matter, few enough for one dense problem.
+BATCH_STEPS = 6
+#: Seed of the record that both are given; the estimators are linear, so any record will do.
+SEED = 2013
+
+
+def batch_residuals(stated: RecursiveObserver, shipped: RecursiveObserver) -> dict[str, float]:
+    """Return how far the shipped recursion is from the batch solution of the stated problem."""
+    steps = min(BATCH_STEPS, looked_at(stated))
+    y, u = _record(stated, steps + 1)
+    running, reference = RunningRecursiveObserver(shipped), RunningRecursiveObserver(stated)
+    for k in range(steps + 1):
+        before = reference.x, reference.factor, reference.Upsilon
+        running.raw_step(y[k], u[k])
+        reference.raw_step(y[k], u[k])
+    exact = _solved(stated, y, u)
+    made_of = _terms(reference.model.at(steps - 1), before, (y[-1], u[-2], u[-1]))
+    covariance = exact.factor @ exact.factor.T
+    size = made_of[:, 0] + np.abs(exact.estimate[:, 0]) + np.finfo(np.float64).tiny
+    found = running.factor @ running.factor.T
+    gaps = {
+        "state": np.abs(running.x - exact.estimate[:, 0]) / size,
+        "covariance": np.abs(found - covariance) / np.maximum(np.outer(size, size), np.finfo(np.float64).tiny),
+    }
+    if running.Upsilon.shape[1]:
+        regressor = exact.estimate[:, 1:]
+        sizes = np.linalg.norm(regressor, axis=0) + np.linalg.norm(made_of[:, 1:], axis=0) + np.finfo(np.float64).tiny
+        gaps["regressor"] = np.abs(running.Upsilon - regressor) / sizes
+    return {name: float(np.max(gap)) for name, gap in gaps.items()}
+
+
+def _terms(
+    step: StepMatrices, before: tuple[FloatArray, FloatArray, FloatArray], data: tuple[FloatArray, ...]
+) -> FloatArray:
+    """Return what state (with its deviation) and regressor of the last step are made of, ``(nx, 1 + nq)``.
+
+    A deviation or a regressor that tends to zero is a difference of such terms, and rounds as they do.
+    """
+    (x, factor, upsilon), (y, u, after) = before, data
+    driven = np.abs(step.A) @ np.abs(x) + np.abs(step.B) @ np.abs(u)
+    values = np.concatenate([driven, np.abs(y), np.abs(step.Dn) @ np.abs(after)]) + data_deviations(step, factor)
+    nq = upsilon.shape[1]
+    regressors = np.vstack([np.abs(step.A) @ np.abs(upsilon) + np.abs(step.Phi[:, :nq]), np.abs(step.Psi[:, :nq])])
+    return state_terms(step, np.hstack([values[:, None], regressors]))
+
+
+def _record(observer: RecursiveObserver, samples: int) -> tuple[FloatArray, FloatArray]:
+    """Return a random record, changed as little as is needed where equations without noise would contradict it."""
+    plant, rng = observer.plant, np.random.default_rng(SEED)
+    y, u = rng.standard_normal((samples, plant.ny)), rng.standard_normal((samples, plant.nu))
+    H, S, data = _problem(observer, y, u)
+    left, values, _ = np.linalg.svd(np.hstack([H, S]))
+    perfect = left[:, int(np.sum(values > RANK_TOLERANCE * values[0])) :]
+    if not perfect.shape[1]:
+        return y, u
+    # The data are affine in the record: a column of the map is the difference that one sample makes.
+    zero = np.zeros(y.size + u.size)
+    none = _problem(observer, *_split(zero, y, u))[2][:, 0]
+    unit = np.eye(zero.size)
+    effect = np.array([perfect.T @ (_problem(observer, *_split(one, y, u))[2][:, 0] - none) for one in unit]).T
+    flat = np.concatenate([y.ravel(), u.ravel()])
+    return _split(flat - np.linalg.pinv(effect, rcond=RANK_TOLERANCE) @ (perfect.T @ data[:, 0]), y, u)
+
+
+def _split(flat: FloatArray, y: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray]:
+    return flat[: y.size].reshape(y.shape), flat[y.size :].reshape(u.shape)
+
+
+def _solved(observer: RecursiveObserver, y: FloatArray, u: FloatArray) -> LeastSquaresStep:
+    """Return the last state of the solution over all states at once; further columns belong to the parameters."""
+    H, S, data = _problem(observer, y, u)
+    n = H.shape[1] // len(y)
+    found = least_squares_step(H, S, data) or rank_revealing_step(H, S, data, np.zeros((len(H), 0)))
+    return LeastSquaresStep(found.estimate[-n:], found.factor[-n:], found.innovation, found.diffuse[-n:])
+
+
+def _problem(observer: RecursiveObserver, y: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return H, S and data of ``data = H x + S e`` for all states at once."""
+    start = RunningRecursiveObserver(observer)
+    model, steps = step_model_of(observer), len(y) - 1
+    n, nq = len(start.x), start.Upsilon.shape[1]
+    listed: list[tuple[StepMatrices, FloatArray]] = [
+        (model.at(k), np.concatenate([model.at(k).B @ u[k], y[k + 1], model.at(k).Dn @ u[k + 1]])) for k in range(steps)
+    ]
+    rows = n + sum(len(step.H) for step, _ in listed)
+    H, data = np.zeros((rows, n * (steps + 1))), np.zeros((rows, 1 + nq))
+    roots = [start.factor, *(step.noise for step, _ in listed)]
+    H[:n, :n], data[:n, 0] = np.eye(n), start.x
+    top = n
+    for k, (step, values) in enumerate(listed):
+        here, ne = slice(top, top + len(step.H)), len(step.A)
+        H[here, (k + 1) * n : (k + 2) * n] = step.H
+        H[top : top + ne, k * n : (k + 1) * n] = -step.A
+        data[here, 0] = values
+        data[here, 1:] = np.vstack([step.Phi, -step.Psi])[:, :nq] if nq else 0.0
+        top += len(step.H)
+    if isinstance(model, EarlyConstraintSteps):
+        first, late = model.first(), len(model.late)
+        H = np.vstack([H, np.hstack([first.H[n:], np.zeros((late, n * steps))])])
+        data = np.vstack([data, np.hstack([(first.Dn @ u[0])[:, None], -first.Psi[:, :nq]])])
+        roots.append(first.noise[n:])
+    S = np.zeros((len(H), max(sum(root.shape[1] for root in roots), len(H))))
+    top = left = 0
+    for root in roots:
+        S[top : top + len(root), left : left + root.shape[1]] = root
+        top, left = top + len(root), left + root.shape[1]
+    return H, S, data

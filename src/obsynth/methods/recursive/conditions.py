@@ -1,0 +1,145 @@
+"""Whether a recursive method can work for a plant: rank of H_k, detectability, parameters that show."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from obsynth.analysis.conditions import Condition, rank_condition
+from obsynth.analysis.time_varying import HorizonRanks, as_time_varying, early_rows, horizon_ranks, step_blocks
+from obsynth.analysis.zeros import are_outside, leading_names
+from obsynth.errors import SpecError
+from obsynth.methods.recursive.parameter_traces import identifiability_condition
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.pencils import finite_zeros
+from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, RANK_TOLERANCE
+from obsynth.numerics.scaling import equilibrate_pencil
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+
+_SOURCE = "Moussa Ali, Zhang 2013"
+
+
+def recursive_conditions(
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem,
+    *,
+    parameters: bool,
+    literal: bool = False,
+    early: bool = False,
+) -> Iterator[Condition]:
+    """Yield the existence conditions of the recursive methods; the list ends at the first failure."""
+    try:
+        varying = as_time_varying(plant)
+    except SpecError as error:
+        yield Condition("plant of this kind", "discrete time, no feedthrough, no unknown disturbance", False, 0.0, 1.0,
+                        f"{_SOURCE}, eq. (4)", str(error))  # fmt: skip
+        return
+    ranks = horizon_ranks(varying, early=early)
+    yield _rank_of_steps(varying, ranks, early=early)
+    if not ranks.worst.full:
+        return
+    if varying.E.is_constant and varying.A.is_constant and varying.C.is_constant:
+        detectable = detectability_condition(varying)
+        yield detectable
+        if not detectable.holds:
+            return
+    if not parameters:
+        return
+    yield Condition("parameters", "the plant has parameters (Phi or Psi)", varying.nq > 0, float(varying.nq), 1.0,
+                    f"{_SOURCE}, eq. (4)", f"{varying.nq} parameter(s)")  # fmt: skip
+    if not varying.nq:
+        return
+    yield identifiability_condition(varying, early=early)
+    if literal:
+        yield residual_condition(ranks)
+
+
+def _rank_of_steps(plant: TimeVaryingDescriptorSystem, ranks: HorizonRanks, *, early: bool) -> Condition:
+    """Return the condition that equations and outputs determine the state at every step."""
+    name = "rank [E; C; algebraic rows of A]" if early else "rank [E; C]"
+    condition = rank_condition(name, ranks.worst, "", source=f"{_SOURCE}, A2")
+    where = "for every k" if ranks.steps == 1 else f"for k = 1 ... {ranks.steps}, worst at k = {ranks.worst_k}"
+    condition = replace(condition, claim=f"{condition.claim} {where}")
+    if condition.holds:
+        return condition
+    k = ranks.worst_k - 1
+    blocks = step_blocks(plant, k, early_rows(plant, early=early))
+    H = np.vstack([blocks.E, blocks.C])
+    names = _open_states(np.zeros_like(H), H, 0.0, plant)
+    remedies = ["measure something that they act on"]
+    if not early:
+        late = early_rows(plant, early=True)
+        if late.size and horizon_ranks(plant, early=True).worst.full:
+            remedies.append("use the algebraic equations one step earlier (early_constraints: true)")
+        if late.size:
+            remedies.append("eliminate the algebraic states (transform: {eliminate_algebraic_states: true} in "
+                            "continuous time, before sampling)")  # fmt: skip
+    remedies.append("leave out states that nothing depends on")
+    at = "" if ranks.steps == 1 else f"at k = {ranks.worst_k} "
+    detail = (
+        f"{ranks.worst.describe()}: {at}equations and outputs do not determine {_listed(names)}. {_sentence(remedies)}"
+    )
+    return replace(condition, detail=detail, signals=names)
+
+
+def detectability_condition(plant: TimeVaryingDescriptorSystem) -> Condition:
+    """Return the condition that every mode that does not die out by itself shows in the outputs."""
+    E, A, C = plant.E.at(1), plant.A.at(0), plant.C.at(1)
+    tall_e, tall_a = np.vstack([E, np.zeros_like(C)]), np.vstack([A, C])
+    zeros = finite_zeros(tall_e, tall_a)
+    outside = are_outside(tall_e, tall_a, zeros, plant.dt)
+    hidden = sorted(
+        (complex(z) for z, out in zip(zeros.values, outside, strict=True) if out), key=lambda z: (-abs(z), -z.imag)
+    )
+    claim = f"rank [A - zE; C] = {plant.nx} for all |z| >= 1"
+    source = "Nikoukhah, Willsky, Levy 1992"
+    if not hidden:
+        rest = f"{len(zeros.values)} unobservable mode(s), all of which die out" if len(zeros.values) else "observable"
+        return Condition("detectability", claim, True, 0.0, 0.0, source, rest)
+    mode = hidden[0]
+    names = _open_states(tall_e, tall_a, mode, plant)
+    others = [described_mode(z) for z in hidden[1:] if z.imag >= 0.0 and z != mode]
+    detail = (
+        f"the mode z = {described_mode(mode)} of {_listed(names)} shows in no output"
+        + (f" (as the modes {', '.join(others)})" if others else "")
+        + f", so that an error in it {'grows' if abs(mode) > 1.0 + RANK_TOLERANCE else 'stays'} for ever. Measure "
+        "something that it moves, or leave it out of the model."
+    )
+    return Condition("detectability", claim, False, float(len(hidden)), 0.0, source, detail, mode, names)
+
+
+def residual_condition(ranks: HorizonRanks) -> Condition:
+    """Return the condition that (18) can learn at all, which the paper never states."""
+    return Condition(
+        "residual directions", "rank E_k + ny - nx >= 1 for every k", ranks.directions >= 1, float(ranks.directions),
+        1.0,         "our finding: missing in Moussa Ali, Zhang 2013",
+        f"at k = {ranks.directions_k} (18) sees only rank E + ny - nx = {ranks.directions} residual directions"
+        + ("" if ranks.directions >= 1 else ": y - C xhat is zero whatever the parameters are, so it never learns. Use "
+           "form 'innovation', which sees all the parity directions."),
+    )  # fmt: skip
+
+
+def _open_states(E: FloatArray, A: FloatArray, point: complex, plant: TimeVaryingDescriptorSystem) -> tuple[str, ...]:
+    """Return the states in the null space of ``A - point E``, by their shares when the pencil is equilibrated."""
+    pencil = equilibrate_pencil(E, A)
+    _, values, right = np.linalg.svd(pencil.A - (point if point.imag else point.real) * pencil.E)
+    kept = int(np.sum(values > RANK_TOLERANCE * values[0])) if values.size else 0
+    kernel = right[min(kept, plant.nx - 1) :]
+    return leading_names(np.linalg.norm(kernel, axis=0), plant.state_names)
+
+
+def described_mode(value: complex) -> str:
+    """Return an eigenvalue as a text, a pair as one."""
+    real = 0.0 if abs(value.real) <= CANCELLATION_TOLERANCE * abs(value) else value.real
+    return f"{real:.6g}" if value.imag == 0.0 else f"{real:.6g} +/- {abs(value.imag):.6g}j"
+
+
+def _listed(names: Sequence[str]) -> str:
+    return f"the state{'s' if len(names) > 1 else ''} {', '.join(map(repr, names))}"
+
+
+def _sentence(remedies: Sequence[str]) -> str:
+    first, *rest = remedies
+    return f"{first[0].upper()}{first[1:]}" + "".join(f", {text}" for text in rest[:-1]) + f", or {rest[-1]}."

@@ -1,0 +1,129 @@
+"""What the recursive methods have in common: noise that the plant states, gains to read, claims, notes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from obsynth.analysis.time_varying import WARN_CONDITION, HorizonRanks, horizon_ranks
+from obsynth.analysis.zeros import leading_names
+from obsynth.errors import PreconditionError, SpecError
+from obsynth.methods.recursive.steady_filter import reached_condition
+from obsynth.methods.synthesis_result import Synthesis
+from obsynth.numerics.covariances import covariance_factor
+from obsynth.observers.recursive.building import observer_from_options, plain_options
+from obsynth.observers.recursive.gain_schedule_summary import (
+    STEPS_TO_CONTRACT,
+    GainScheduleSummary,
+    gain_schedule_summary,
+)
+from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.results.design import Certificate
+
+#: Information on the parameters in a window below this share of their prior's is as good as none.
+LOST_EXCITATION = 1.0
+
+
+def with_stated_noise(
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem, options: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return the options with Q and R from the noise that a time-invariant plant states, where none are given."""
+    resolved = dict(options)
+    wanted = [name for name in ("Q", "R") if resolved[name] is None]
+    if not isinstance(plant, DescriptorSystem) or not plant.nw or not wanted:
+        return resolved
+    if np.any(plant.Bw @ plant.Dw.T):
+        raise SpecError(
+            "The plant's noise drives equations and outputs at once (Bw Dw' is not zero), which these methods do not "
+            "know: state independent noises, or give Q and R.", path="Dw",
+        )  # fmt: skip
+    for name, matrix in (("Q", plant.Bw), ("R", plant.Dw)):
+        if resolved[name] is None:
+            resolved[name] = matrix @ matrix.T
+    return resolved
+
+
+def recursive_synthesis(plant: TimeVaryingDescriptorSystem, options: Mapping[str, Any]) -> Synthesis:
+    """Return observer, gains, claims and notes."""
+    observer = observer_from_options(plant, options)
+    ranks = horizon_ranks(plant, early=observer.early_constraints)
+    facts = gain_schedule_summary(observer)
+    _require_contraction(observer, facts)
+    claims = {
+        "condition": ranks.condition,
+        "condition_k": float(ranks.condition_k),
+        "residual_directions": float(ranks.directions),
+        "contraction": facts.contraction,
+        "steps": float(facts.steps),
+    }
+    if observer.adaptation is not None:
+        claims |= {"excitation": facts.excitation, "excitation_k": float(facts.excitation_k)}
+    resolved = {**options, "Q": observer.Q, "R": observer.R}
+    return Synthesis(
+        plain_options(resolved),
+        {"L": facts.L, "K": facts.K},
+        observer,
+        Certificate({}, claims),
+        notes=tuple(_notes(observer, ranks, facts, options)),
+        plant=plant,
+    )
+
+
+def _require_contraction(observer: RecursiveObserver, facts: GainScheduleSummary) -> None:
+    """Raise `PreconditionError` where errors do not die out along the horizon."""
+    if facts.steps < STEPS_TO_CONTRACT or facts.contraction < 1.0:
+        return
+    names = leading_names(facts.survivors, observer.state_names)
+    kept = (
+        f"keeps the mean factor {facts.contraction:.6g} per step" if facts.contraction < float("inf")
+        else "grows without bound"
+    )  # fmt: skip
+    raise PreconditionError(
+        f"Errors do not die out: over {facts.steps} steps the product of L_k A_k {kept}, in "
+        f"{', '.join(map(repr, names))}. Either the outputs do not show these "
+        "states: measure more, or leave them out; or Q and initial_covariance claim that they are known exactly: give "
+        "them a variance.", condition="contraction", signals=names,
+    )  # fmt: skip
+
+
+def _notes(
+    observer: RecursiveObserver, ranks: HorizonRanks, facts: GainScheduleSummary, options: Mapping[str, Any]
+) -> Iterator[str]:
+    missing = [name for name in ("Q", "R") if options[name] is None]
+    if missing:
+        yield f"No noise is stated: {' and '.join(missing)} taken as the identity, which sets gains and deviations."
+    if ranks.condition > WARN_CONDITION:
+        yield (
+            f"H_k has the condition number {ranks.condition:.3g} at k = {ranks.condition_k}: about "
+            f"{np.log10(ranks.condition):.0f} digits of the estimate are lost there."
+        )
+    if observer.plant.is_time_invariant and observer.Q.is_constant and observer.R.is_constant:
+        roots = covariance_factor(observer.Q.at(0), "Q"), covariance_factor(observer.R.at(0), "R")
+        reached = reached_condition(observer.plant, *roots)
+        if not reached.holds:
+            yield f"The filter has no steady state: {reached.detail}"
+    adaptation = observer.adaptation
+    if adaptation is None:
+        return
+    if adaptation.window > facts.steps:
+        yield (
+            f"The window of {adaptation.window} samples is longer than the {facts.steps} steps of the horizon: "
+            "excitation is not watched."
+        )
+    prior = float(np.linalg.eigvalsh(np.linalg.inv(adaptation.initial_covariance))[0])
+    if facts.excitation < LOST_EXCITATION * prior:
+        yield (
+            f"The parameters are hardly excited in the window that ends at k = {facts.excitation_k} (information "
+            f"{facts.excitation:.3g}, the prior has {prior:.3g}): what is reported there is what was known before"
+            + ("." if adaptation.form == "random-walk" or adaptation.guard != "none" else
+               ", and without a guard S winds up.")
+        )  # fmt: skip
+    if adaptation.form == "literal" and ranks.directions < observer.plant.ny:
+        yield (
+            f"The literal form (18) sees {ranks.directions} residual direction(s) of {observer.plant.ny} output(s); "
+            "the innovation form sees all parity directions."
+        )

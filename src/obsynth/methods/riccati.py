@@ -1,0 +1,169 @@
+"""Riccati equations: a rough observer gain, and certificates of a bounded gain in closed form."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+
+import numpy as np
+
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.doubling import REFUTED, doubled_riccati_solution, is_clearly_negative, is_positive
+from obsynth.numerics.norms import spectral_radius
+
+#: Relative sizes of the fictitious process and measurement noise, tried in turn, that make the equation regular.
+REGULARISATIONS = (1e-6, 1e-4, 1e-2, 1.0)
+#: A starting filter with this spectral radius forgets fast enough.
+FAST_ENOUGH = 0.999
+#: Eigenvalues of a normalising matrix are kept above this fraction of the largest.
+CONDITION_LIMIT = 1e-20
+
+
+def stabilising_gain(a: FloatArray, c: FloatArray, noise_a: FloatArray, noise_c: FloatArray) -> FloatArray | None:
+    """Return R ``(n, m)`` such that ``A - R C`` is Schur stable, by a Kalman filter Riccati equation.
+
+    The first regularisation that forgets fast enough is taken, or the fastest filter of all.
+
+    Shapes: ``a (n, n)``, ``c (m, n)``, ``noise_a (n, k)``, ``noise_c (m, k)``.
+    """
+    n, m = a.shape[0], c.shape[0]
+    if m == 0:
+        return np.zeros((n, 0)) if spectral_radius(a) < 1.0 else None
+    process, cross, measured = noise_a @ noise_a.T, noise_a @ noise_c.T, noise_c @ noise_c.T
+    best, least = None, 1.0
+    process_size = max(float(np.linalg.norm(noise_a, 2)) ** 2, 1e-8 * float(np.linalg.norm(a, 2)) ** 2, 1e-8)
+    for epsilon in REGULARISATIONS:
+        q = process + epsilon * process_size * np.eye(n)
+        size = float(np.linalg.norm(c @ q @ c.T, 2)) + float(np.linalg.norm(measured, 2))
+        r = measured + epsilon * size * np.eye(m)
+        # Far outside the circle doubling may settle on what is no solution: its poles tell.
+        for solve in (_by_doubling, _by_qz):
+            x = solve(a, c, q, r, cross)
+            if x is None:
+                continue
+            gain = np.linalg.solve(c @ x @ c.T + r, c @ x @ a.T + cross.T).T
+            radius = spectral_radius(a - gain @ c) if np.all(np.isfinite(gain)) else np.inf
+            if radius < least:
+                best, least = np.asarray(gain), radius
+            if radius < 1.0:
+                break
+        if least <= FAST_ENOUGH:
+            break
+    return best
+
+
+def bounded_real_matrix(
+    a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, level: float, *, slack: float
+) -> FloatArray | None:
+    """Return P > 0 with the bounded real inequality strict at ``level``, or ``None``.
+
+    Solves ``P = A'PA + C'C + slack*I + (A'PB + C'D)(level^2 I - D'D - B'PB)^-1 (A'PB + C'D)'`` for its
+    stabilising solution; the slack makes the inequality strict.
+
+    Shapes: ``a (n, n)``, ``b (n, m)``, ``c (p, n)``, ``d (p, m)``.
+    """
+    n = a.shape[0]
+    if n == 0:
+        return np.zeros((0, 0))
+    weight = c.T @ c + slack * np.eye(n)
+    cross, gap = c.T @ d, d.T @ d - level**2 * np.eye(b.shape[1])
+    if b.shape[1]:
+        p = riccati_solution(a.T, b.T, weight, gap, cross, impossible=_Exceeded(b, gap))
+    else:
+        p = _lyapunov_solution(a, weight)
+    if p is None:
+        return None
+    p = 0.5 * (p + p.T)
+    return p if np.all(np.isfinite(p)) and is_positive(p) else None
+
+
+class _Exceeded:
+    """Says whether the gain is above the level over as many steps as a solution stands for, beyond rounding.
+
+    Fields: b, gap: ``(n, m)``, and ``D'D - level^2 I (m, m)``.
+    """
+
+    def __init__(self, b: FloatArray, gap: FloatArray) -> None:
+        self.b, self.gap = b, gap
+        self.last: FloatArray | None = None
+
+    def __call__(self, p: FloatArray) -> bool:
+        left, sizes = -(self.gap + self.b.T @ p @ self.b), np.diag(p)
+        if not np.all(np.isfinite(left)):
+            return False
+        # Over more steps the solution grows: one that does not is behind a level that was exceeded in between.
+        shrunk = self.last is not None and np.any(sizes < self.last - REFUTED * np.max(self.last))
+        self.last = sizes.copy()
+        return bool(shrunk) or is_clearly_negative(left, self.b, p)
+
+
+def _lyapunov_solution(a: FloatArray, weight: FloatArray) -> FloatArray | None:
+    from scipy.linalg import solve_discrete_lyapunov
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return np.asarray(solve_discrete_lyapunov(a.T, weight))
+    except (np.linalg.LinAlgError, ValueError):
+        return None
+
+
+def riccati_solution(
+    a: FloatArray,
+    h: FloatArray,
+    process: FloatArray,
+    weight: FloatArray,
+    cross: FloatArray,
+    *,
+    impossible: Callable[[FloatArray], bool] | None = None,
+) -> FloatArray | None:
+    """Return the stabilising solution by doubling, or where that breaks down by SciPy; ``None`` without one."""
+    ended = False
+
+    def possible(found: FloatArray) -> bool:
+        nonlocal ended
+        ended = impossible is not None and impossible(found)
+        return not ended
+
+    doubled = _by_doubling(a, h, process, weight, cross, possible=possible)
+    if ended or doubled is not None:
+        return None if ended else doubled
+    return _by_qz(a, h, process, weight, cross)
+
+
+def _by_doubling(
+    a: FloatArray,
+    h: FloatArray,
+    process: FloatArray,
+    weight: FloatArray,
+    cross: FloatArray,
+    *,
+    possible: Callable[[FloatArray], bool] | None = None,
+) -> FloatArray | None:
+    try:
+        with warnings.catch_warnings():
+            # An ill-conditioned equation only makes a worse filter or certificate, which is then not taken.
+            warnings.simplefilter("ignore")
+            return doubled_riccati_solution(a, h, process, weight, cross, possible=possible)
+    except np.linalg.LinAlgError:
+        return None
+
+
+def _by_qz(
+    a: FloatArray, h: FloatArray, process: FloatArray, weight: FloatArray, cross: FloatArray
+) -> FloatArray | None:
+    from scipy.linalg import solve_discrete_are
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return np.asarray(solve_discrete_are(a.T, h.T, process, weight, s=cross))
+    except (np.linalg.LinAlgError, ValueError):
+        return None
+
+
+def normalising_change(p: FloatArray) -> FloatArray:
+    """Return S ``(n, n)`` with ``S' P S`` close to the identity, of bounded condition."""
+    values, vectors = np.linalg.eigh(0.5 * (p + p.T))
+    floor = CONDITION_LIMIT * max(float(values[-1]), np.finfo(np.float64).tiny)
+    return np.asarray(vectors / np.sqrt(np.maximum(values, floor)))

@@ -1,0 +1,188 @@
+r"""Faults as states and unknown inputs removed: the plant behind an unknown-input PI observer.
+
+Source: Share Pasand, Aliyari, Taghirad, eqs. (10), (11), (13), (19).  Differences: sensor faults (Df); disturbances in
+the outputs (Dd); ``decouple`` instead of the Moore-Penrose ``E#``, with which ``U`` loses rank and the unobservable
+modes change.
+
+With the augmented plant ``Ea xa+ = Aa xa + Ba u + Bda d``, ``y = Ca xa + D u + Dd d``, ``xa = [x; w]``, the observer
+``z+ = Ahat z + Jhat u + Bhat y``, ``xahat = z + D_a y`` is unbiased and sees no disturbance if
+
+    U_a Ea + D_a Ca = I,   D_a Dd = 0,   U_a Bda = K_a Dd,   Ahat = U_a Aa - K_a Ca,   Bhat = Ahat D_a + K_a.
+
+Where ``Dd != 0``, the outputs that show d directly are solved for it: ``d1 = Dd^+ (y - C x - Df f)`` is put into the
+equations of the states, and what is left is a plant without ``Dd`` (`Decoupled.injection` keeps that step).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.ranks import RANK_TOLERANCE, decide_rank
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.exosystems import Exosystem
+
+
+@dataclass(frozen=True, eq=False)
+class AugmentedPlant:
+    """A plant whose state holds the exosystem of its faults: ``xa = [x; w]``.
+
+    Fields: E, A: ``(na, na)``, ``na = nx + nw``; B, Bd: ``(na, nu)`` and ``(na, nd)``; C, D, Dd: ``(ny, na)``, ``(ny,
+    nu)``, ``(ny, nd)``; names: Names of the states.
+    """
+
+    E: FloatArray
+    A: FloatArray
+    B: FloatArray
+    Bd: FloatArray
+    C: FloatArray
+    D: FloatArray
+    Dd: FloatArray
+    names: tuple[str, ...]
+
+    @classmethod
+    def of(cls, plant: DescriptorSystem, model: Exosystem) -> AugmentedPlant:
+        """Return the augmented plant, eq. (13) with ``Bf Cw`` and ``Df Cw``."""
+        nx, count = plant.nx, model.order
+        e, a = np.eye(nx + count), np.zeros((nx + count, nx + count))
+        e[:nx, :nx], a[:nx, :nx], a[:nx, nx:], a[nx:, nx:] = plant.E, plant.A, plant.Bf @ model.Cw, model.Phi
+
+        def below(matrix: FloatArray) -> FloatArray:
+            return np.vstack([matrix, np.zeros((count, matrix.shape[1]))])
+
+        c = np.hstack([plant.C, plant.Df @ model.Cw])
+        return cls(e, a, below(plant.B), below(plant.Bd), c, plant.D, plant.Dd, (*plant.state_names, *model.names))
+
+    @property
+    def order(self) -> int:
+        """Number of states."""
+        return int(self.E.shape[0])
+
+
+@dataclass(frozen=True, eq=False)
+class Decoupled:
+    """A solution of ``U E + Dhat C = I``, ``Dhat Dd = 0``, and all others.
+
+    Every solution is ``U + Z free_U``, ``Dhat + Z free_D`` with any Z ``(nx, n_free)``: the freedom that the paper has
+    in G.  ``injection`` is the part ``Bd Dd^+`` of the equations that is fed with y.
+
+    Fields: U, Dhat: ``(nx, nx)`` and ``(nx, ny)``; free_U, free_D: ``(n_free, nx)`` and ``(n_free, ny)``; seen: ``(ny2,
+    ny)``, orthonormal rows: the combinations of outputs that no disturbance reaches directly; injection: ``(nx, ny)``.
+    """
+
+    U: FloatArray
+    Dhat: FloatArray
+    free_U: FloatArray
+    free_D: FloatArray
+    seen: FloatArray
+    injection: FloatArray
+
+
+def direct_part(plant: DescriptorSystem) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the outputs without direct disturbance, ``Bd Dd^+``, and a basis of the disturbances left."""
+    if not plant.Dd.any():
+        return np.eye(plant.ny), np.zeros((plant.nx, plant.ny)), _range_basis(plant.Bd)
+    left, values, right = np.linalg.svd(plant.Dd)
+    rank = int(np.sum(values > RANK_TOLERANCE * values[0]))
+    inverse = right[:rank].T @ (left[:, :rank] / values[:rank]).T
+    return left[:, rank:].T, plant.Bd @ inverse, _range_basis(plant.Bd @ right[rank:].T)
+
+
+def _range_basis(matrix: FloatArray) -> FloatArray:
+    if matrix.shape[1] == 0 or not matrix.any():
+        return np.zeros((matrix.shape[0], 0))
+    lengths = np.linalg.norm(matrix, axis=0)
+    left, values, _ = np.linalg.svd(matrix / np.where(lengths > 0.0, lengths, 1.0), full_matrices=False)
+    return np.asarray(left[:, : int(np.sum(values > RANK_TOLERANCE * values[0]))])
+
+
+def decouple(plant: DescriptorSystem) -> Decoupled:
+    r"""Return U and Dhat with ``U E + Dhat C = I``, ``U Bd2 = 0`` and ``ker U = im Bd2``; (D1) must hold.
+
+    With the annihilator Bp of Bd2 and ``Q = [Bp E; C2]``: ``[Ut Dt] = Q^+ + Z N``, N a basis of the left null space of
+    Q, and Z such that Ut has full column rank: the polar factor of what makes ``[Ut; N_U]`` orthogonal.
+    """
+    seen, injection, remaining = direct_part(plant)
+    nx, left_over = plant.nx, plant.nx - remaining.shape[1]
+    kept = np.linalg.svd(remaining)[0][:, remaining.shape[1] :].T if remaining.shape[1] else np.eye(nx)
+    stacked = np.vstack([kept @ plant.E, seen @ plant.C])
+    q, r = np.linalg.qr(stacked, mode="complete")
+    inverse = np.linalg.solve(r[:nx], q[:, :nx].T)
+    inverse = inverse + (np.eye(nx) - inverse @ stacked) @ inverse
+    null = q[:, nx:].T
+    ut, dt = inverse[:, :left_over], inverse[:, left_over:]
+    nu, nd = null[:, :left_over], null[:, left_over:]
+    z = _completing(ut, nu, (kept @ plant.A).T)
+    return Decoupled((ut + z @ nu) @ kept, (dt + z @ nd) @ seen, nu @ kept, nd @ seen, seen, injection)
+
+
+def _completing(ut: FloatArray, nu: FloatArray, wanted: FloatArray) -> FloatArray:
+    """Return Z such that ``ut + Z nu`` has full column rank; ``[ut; nu]`` has, so what ut lacks, nu sees.
+
+    Kernel directions of ut (all those whose singular value is small) are sent to directions outside its range: as
+    nearly as can be to where ``wanted`` (like ut, the transposed equations) sends them, so that the choice does not
+    hang on rounding.
+    """
+    rows, columns = ut.shape
+    if columns == 0 or nu.shape[0] == 0:
+        return np.zeros((rows, nu.shape[0]))
+    left, values, right = np.linalg.svd(ut)
+    largest = float(values[0]) if values.size and values[0] > 0.0 else 1.0
+    rank = int(np.sum(values > RANK_TOLERANCE * largest)) if values.size else 0
+    lacking = columns - rank
+    if lacking == 0:
+        return np.zeros((rows, nu.shape[0]))
+    kernel = right[rank:].T
+    outside = left[:, rank:] @ _nearest_isometry(left[:, rank:].T @ wanted @ kernel)
+    shown = nu @ kernel
+    return np.asarray(outside @ np.linalg.pinv(shown) * largest)
+
+
+def _nearest_isometry(matrix: FloatArray) -> FloatArray:
+    """Return the matrix ``(m, n)``, ``m >= n``, with orthonormal columns that is nearest: the polar factor."""
+    left, _, right = np.linalg.svd(matrix, full_matrices=False)
+    return np.asarray(left @ right)
+
+
+def paper_decoupling(
+    plant: DescriptorSystem, *, e_sharp: FloatArray, c_sharp: FloatArray, g: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return L, U and Dhat of the paper, eqs. (10), (11), for given ``E#``, ``C#`` and ``G``.
+
+    Shapes: ``e_sharp (nx, nx)``, ``c_sharp (nx, ny)``, ``g (nx, ny)``.
+    """
+    nx, ny = plant.nx, plant.ny
+    shapes = {"E_sharp": (e_sharp, (nx, nx)), "C_sharp": (c_sharp, (nx, ny)), "G": (g, (nx, ny))}
+    for name, (matrix, shape) in shapes.items():
+        if matrix.shape != shape:
+            raise SpecError(f"{name} is {matrix.shape}, but {shape} is needed.", path=name)
+    if plant.Dd.any():
+        raise SpecError("E_sharp, C_sharp and G are for plants without Dd: leave them out.", path="E_sharp")
+    miss = np.abs(e_sharp @ plant.E + c_sharp @ plant.C - np.eye(nx))
+    size = np.abs(e_sharp) @ np.abs(plant.E) + np.abs(c_sharp) @ np.abs(plant.C) + np.eye(nx)
+    if np.max(miss) > RANK_TOLERANCE * np.max(size):
+        raise SpecError(f"E_sharp E + C_sharp C misses the identity by {np.max(miss):.3g}.", path="E_sharp")
+    shown = plant.C @ e_sharp @ plant.Bd
+    # Judged against its factors, not against its own norm: it may be nothing but rounding.
+    norms = [float(np.linalg.norm(part, 2)) for part in (plant.C, e_sharp, plant.Bd)] if plant.nd else [1.0]
+    rank = decide_rank(shown, expected=plant.nd, scale=float(np.prod(norms)), equilibrated=False)
+    if not rank.full:
+        raise SpecError(
+            f"With this E_sharp, C E# Bd has {rank.describe()}: choose another E_sharp, or leave it out.",
+            path="E_sharp",
+        )
+    remaining = np.eye(nx) - g @ plant.C
+    if not decide_rank(remaining, expected=nx, equilibrated=False).full:
+        raise SpecError("I - G C is singular, which adds an unobservable mode: choose another G.", path="G")
+    inverse: FloatArray = np.zeros((0, ny))
+    if plant.nd:
+        # By normal equations, so that simple numbers stay exact; one refinement makes up for their condition.
+        inverse = np.asarray(np.linalg.solve(shown.T @ shown, shown.T), dtype=np.float64)
+        inverse = inverse + (np.eye(plant.nd) - inverse @ shown) @ inverse
+    basis = e_sharp @ plant.Bd @ inverse
+    correction = basis + g @ (np.eye(ny) - plant.C @ basis)
+    u = remaining @ (np.eye(nx) - basis @ plant.C) @ e_sharp
+    return correction, u, c_sharp + correction @ (np.eye(ny) - plant.C @ c_sharp)

@@ -1,0 +1,203 @@
+r"""What an observer makes of faults that its model does not describe: fhat/f, steady errors, and what no gain can do.
+
+For any fault, whatever its course, the estimate is ``fhat = T(s) f`` once the start is forgotten (see
+`obsynth.verification.error_system`).  At a zero of (f, d) -> y outside the region of stability T(s) f0 = 0 for every
+stable decoupled observer: a step is then first answered in the wrong direction.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from obsynth.analysis.plant_units import PlantUnits
+from obsynth.analysis.zeros import invariant_zeros, is_outside, leading_names
+from obsynth.errors import SpecError
+from obsynth.methods.ui_pi_observer.checks.decoupling import frequency_grid
+from obsynth.methods.ui_pi_observer.pencils import number, system_pencil
+from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.numerics.norms import balanced_realisation
+from obsynth.numerics.pencils import finite_zeros
+from obsynth.numerics.ranks import NEGLIGIBLE_INPUT
+from obsynth.numerics.spectra import abscissa, boundary_points, decay_rates, eigenvalues, response
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.fault_model_spectra import balanced_transition
+from obsynth.results.report import Check, information
+from obsynth.verification.error_system import ErrorSystem
+
+if TYPE_CHECKING:
+    from obsynth.results.design import ObserverDesign
+
+#: A fault estimate counts as faithful up to the frequency where it misses by this share of the fault.
+FAITHFUL = 0.1
+#: A step counts as settled within this share, after this many time constants of the slowest pole.
+SETTLED, TIME_CONSTANTS = 0.02, 4.0
+#: Eigenvalues of a fault model closer to constant courses than this, relative to the model's size, are constants.
+CONSTANT = 1e-9
+
+
+def fault_response(design: ObserverDesign, frequencies: ArrayLike) -> ComplexArray:
+    """Return the frequency response from the faults to their estimates: what a sinusoidal fault looks like.
+
+    Parameters
+    ----------
+    design : ObserverDesign
+        By ``ui-pi-observer``; the fault model plays no role here.
+    frequencies : array_like, rad/s
+        ``(k,)``.
+
+    Returns
+    -------
+    ComplexArray
+        ``(k, nf, nf)``: entry (i, j) is ``fhat_i / f_j``; the identity where the estimates are faithful.
+
+    Raises
+    ------
+    SpecError
+        The design holds no tracking map.
+    """
+    if "tracking" not in design.certificate.matrices:
+        raise SpecError("The design holds no tracking map: fhat/f cannot be computed.", path="certificate")
+    points = boundary_points(np.atleast_1d(np.asarray(frequencies, dtype=np.float64)), design.linear[0].dt)
+    return _transfer(*design.linear, design.certificate.matrices["tracking"], points)
+
+
+def _system(
+    plant: DescriptorSystem, observer: LinearObserver, tracking: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    errors = ErrorSystem.of(plant, observer, tracking[:, : plant.nx], 0)
+    # In balanced states: units must not cost digits.
+    return *balanced_realisation(errors.Az, errors.fault, -errors.fault_output[0]), errors.fault_output[1]
+
+
+def _transfer(
+    plant: DescriptorSystem, observer: LinearObserver, tracking: FloatArray, points: ComplexArray
+) -> ComplexArray:
+    return response(*_system(plant, observer, tracking), points)
+
+
+@dataclass(frozen=True)
+class SteadyError:
+    """The constant error of a fault estimate when the fault is one order higher than its model.
+
+    Fields: order: The fault is ``t^order / order!``: 0 a step, 1 a ramp; error: ``fhat - f`` in the end, in units of
+    that derivative.
+    """
+
+    order: int
+    error: float
+
+
+def steady_errors(
+    plant: DescriptorSystem, observer: LinearObserver, tracking: FloatArray, phi: FloatArray, cw: FloatArray
+) -> tuple[SteadyError, ...]:
+    """Return, for each fault, the error for a polynomial of the least order that its model does not hold.
+
+    Shapes: ``tracking (nz, nx + nw)``, ``phi (nw, nw)``, ``cw (nf, nw)``.
+    """
+    a, b, c, d = _system(plant, observer, tracking)
+    shift = np.eye(len(a)) if plant.dt > 0.0 else np.zeros_like(a)
+    step = plant.dt if plant.dt > 0.0 else 1.0
+    found = []
+    for fault in range(plant.nf):
+        order = _constants(phi, cw[fault], shift=1.0 if plant.dt > 0.0 else 0.0)
+        # T(s) = D + C (sI - A)^-1 B = D - C A^-1 B - C A^-2 B s - ...
+        vector: FloatArray = b[:, fault]
+        for _ in range(order + 1):
+            vector = np.asarray(np.linalg.solve(a - shift, vector), dtype=np.float64)
+        coefficient = -float(c[fault] @ vector) + (float(d[fault, fault]) - 1.0 if order == 0 else 0.0)
+        found.append(SteadyError(order, coefficient * step**order))
+    return tuple(found)
+
+
+def _constants(phi: FloatArray, row: FloatArray, *, shift: float) -> int:
+    """Return how often 0 (1 in discrete time) is an eigenvalue of the part of ``phi`` that a fault is made of."""
+    reached = row != 0.0
+    for _ in range(len(row)):
+        reached = reached | (np.any(phi[reached] != 0.0, axis=0) if reached.any() else reached)
+    part = phi[np.ix_(reached, reached)]
+    if not part.size:
+        return 0
+    balanced = balanced_transition(part)[0]
+    reach = CONSTANT * float(np.linalg.norm(balanced, 2))
+    return int(np.sum(np.abs(np.linalg.eigvals(balanced) - shift) <= reach))
+
+
+def tracking_rows(
+    plant: DescriptorSystem, observer: LinearObserver, tracking: FloatArray, phi: FloatArray, cw: FloatArray
+) -> Iterator[Check]:
+    """Yield what a user should know about faults outside the model; nothing here fails."""
+    source = "recomputed from plant and realisation"
+    if not abscissa(observer.Az, observer.dt) < (1.0 if observer.dt > 0.0 else 0.0):
+        return
+    frequencies = frequency_grid(observer)
+    gains = _transfer(plant, observer, tracking, boundary_points(frequencies, plant.dt))
+    errors = steady_errors(plant, observer, tracking, phi, cw)
+    for fault, name in enumerate(plant.fault_names):
+        own = gains[:, fault, fault]
+        peak = int(np.argmax(np.abs(own)))
+        missed = np.flatnonzero(np.abs(own - 1.0) > FAITHFUL)
+        limit = frequencies[missed[0]] if missed.size else np.inf
+        yield information(
+            f"fhat/f[{name}]",
+            f"frequency in rad/s up to which the estimate of an unmodelled sinusoid misses by {FAITHFUL:.0%} or less",
+            float(limit),
+            source=source,
+            detail=f"largest |fhat/f| {abs(own[peak]):.3g} at {frequencies[peak]:.3g} rad/s; |fhat/f| = 1 is faithful",
+        )
+        order = errors[fault].order
+        course = {0: "a step of 1", 1: "a ramp of 1 per s"}.get(order, f"t^{order} / {order}!")
+        yield information(
+            f"steady error[{name}]",
+            f"fhat - f in the end when the fault is {course}, one order above its model",
+            errors[fault].error,
+            source=source,
+            detail=plant.units.get(name, ""),
+        )
+    yield from _limits(plant, observer, tracking)
+
+
+def _limits(plant: DescriptorSystem, observer: LinearObserver, tracking: FloatArray) -> Iterator[Check]:
+    """Yield a row for each zero of (f, d) -> y outside the region of stability: it limits every gain."""
+    units = PlantUnits.of(plant).rounded()
+    scaled = units.scaled_plant(plant)
+    inputs, direct = np.hstack([scaled.Bf, scaled.Bd]), np.hstack([scaled.Df, scaled.Dd])
+    padded, whole = system_pencil(scaled.E, scaled.A, inputs, scaled.C, direct)
+    if plant.nf == 0 or finite_zeros(padded, whole).normal_rank < whole.shape[1]:
+        return
+    slowest = float(np.min(decay_rates(eigenvalues(observer.Az), plant.dt), initial=np.inf))
+    for zero in invariant_zeros(scaled.E, scaled.A, inputs, scaled.C, direct):
+        if zero.value.imag < 0.0 or not is_outside(zero.value, plant.dt):
+            continue
+        if float(np.linalg.norm(zero.input_direction[: plant.nf])) <= NEGLIGIBLE_INPUT:
+            continue
+        fault, place = units.faults * zero.input_direction[: plant.nf], units.eigenvalue(zero.value)
+        value = _transfer(plant, observer, tracking, np.array([place]))[0] @ fault
+        names = leading_names(np.abs(fault), plant.fault_names)
+        yield information(
+            f"limit at {number(place)}",
+            f"at this zero of (f, d) -> y the estimate of {', '.join(names)} cannot follow, whatever the gains: "
+            "|T(zero) f0| of this observer",
+            float(np.linalg.norm(value) / np.linalg.norm(fault)),
+            source="a zero outside the region of stability",
+            detail=_undershoot(plant, place, slowest),
+        )
+
+
+def _undershoot(plant: DescriptorSystem, zero: complex, slowest: float) -> str:
+    if plant.nf != 1 or zero.imag != 0.0 or not np.isfinite(slowest) or slowest <= 0.0:
+        return ""
+    rate = np.log(zero.real) / plant.dt if plant.dt > 0.0 and zero.real > 0.0 else zero.real
+    if (plant.dt > 0.0 and zero.real <= 1.0) or rate <= 0.0:
+        return ""
+    settling = TIME_CONSTANTS / slowest
+    least = (1.0 - SETTLED) / np.expm1(rate * settling)
+    return (
+        f"inverse response: a step fault that is settled to {SETTLED:.0%} after {settling:.3g} s first shows at least "
+        f"{least:.3g} of its size in the wrong direction"
+    )

@@ -1,0 +1,177 @@
+r"""When an unknown-input PI observer exists, decided before any gain is looked for.
+
+Source: Share Pasand, Aliyari, Taghirad, Lemma 4, Theorems 1 and 2, Lemma 6, all four replaced: Theorems 1 and 2 and
+Lemma 6 are false as printed (the column of ``Bd`` is missing from the test of the fault model), and ``rank C E# Bd``
+depends on the choice of ``E#``.  On the plant's own data:
+
+(D1) ``rank [E 0 Bd; C Dd 0; 0 0 Dd] = nx + rank Dd + rank [Bd; Dd]``,
+(D2) ``rank [sE - A, -Bd; C, Dd] = nx + rank [Bd; Dd]`` for every s on or outside the boundary of stability,
+(D3) at each unstable eigenvalue of Phi, tested exactly there, with V a basis of ``ker (lambda I - Phi)``:
+``rank [lambda E - A, -Bf Cw V, -Bd; C, Df Cw V, Dd] = nx + dim V + rank [Bd; Dd]``.
+
+(D2) and (D3) are necessary for any observer of state and fault; (D1) for any that does not differentiate.  Neither
+regularity nor index 1 is needed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from obsynth.analysis.conditions import Condition
+from obsynth.analysis.plant_units import PlantUnits
+from obsynth.analysis.transformations import Transformation
+from obsynth.analysis.zeros import Zero, are_outside, invariant_zeros, leading_names
+from obsynth.methods.ui_pi_observer.augmented_plant import AugmentedPlant
+from obsynth.methods.ui_pi_observer.decoupling_condition import (
+    SOURCE,
+    decoupling_data,
+    decoupling_rank,
+    disturbance_rank,
+)
+from obsynth.methods.ui_pi_observer.fault_model_condition import lost_in_rounding, model_conditions, order_conditions
+from obsynth.methods.ui_pi_observer.pencils import (
+    MOST_NAMES,
+    in_disturbances,
+    independent_disturbances,
+    instability,
+    number,
+    numbers,
+    system_pencil,
+)
+from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.numerics.pencils import finite_zeros
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.exosystems import Exosystem
+
+#: Drops of the augmented pencil this close to each other, relative to their size or one, may be one multiple mode.
+SCATTER = 1e-2
+
+__all__ = ["Existence", "decoupling_rank", "existence"]
+
+
+@dataclass(frozen=True, eq=False)
+class Existence:
+    """What was decided about a plant.
+
+    Fields: conditions: In order; after a failed (D2) there is no (D3), and fixed modes come last, when all others hold;
+    plant: For which they were decided: the plant as given, or without its algebraic states; transformation: The
+    elimination, where there was one; fixed_modes: Poles that every such observer has; all stable when the conditions
+    hold.
+    """
+
+    conditions: tuple[Condition, ...]
+    plant: DescriptorSystem
+    transformation: Transformation | None
+    fixed_modes: ComplexArray
+
+
+def existence(plant: DescriptorSystem, model: Exosystem) -> Existence:
+    """Return the existence conditions of the unknown-input PI observer, and the plant to design for."""
+    nothing = np.zeros(0, dtype=np.complex128)
+    enough = _enough_outputs(plant)
+    if not enough.holds:
+        return Existence((enough,), plant, None, nothing)
+    working, transformation, solvable = decoupling_data(plant)
+    # Powers of two: what is exact in the data, such as a zero at the origin, stays exact.
+    units = PlantUnits.of(working, model).rounded()
+    scaled, courses = units.scaled_plant(working), units.scaled_model(model)
+    # (D1) and the others fail independently: a user wants to know both.
+    found = [enough, solvable, _zero_condition(scaled, units)]
+    if found[-1].holds:
+        found += model_conditions(scaled, courses, units)
+    if not all(condition.holds for condition in found):
+        return Existence(tuple(found), working, transformation, nothing)
+    found += order_conditions(scaled, courses, units)
+    if not found[-1].holds:
+        return Existence(tuple(found), working, transformation, nothing)
+    fixed, condition = _fixed_modes(scaled, courses, units)
+    return Existence((*found, condition), working, transformation, fixed)
+
+
+def _enough_outputs(plant: DescriptorSystem) -> Condition:
+    rank = disturbance_rank(plant)
+    holds = rank <= plant.ny
+    return Condition(
+        "nd <= ny",
+        "no more independent unknown inputs than outputs",
+        holds,
+        float(rank),
+        float(plant.ny),
+        SOURCE,
+        f"{rank} unknown input(s), {plant.ny} output(s)"
+        + ("" if holds else ". Measure more, or leave an unknown input out."),
+        signals=() if holds else plant.disturbance_names,
+    )
+
+
+def _zero_condition(plant: DescriptorSystem, units: PlantUnits) -> Condition:
+    claim = "rank [sE - A, -Bd; C, Dd] = nx + rank [Bd; Dd] on and outside the boundary of stability"
+    source = "Share Pasand, Lemma 4 (9.2)"
+    inputs, direct = independent_disturbances(plant)
+    wide_e, wide_a = system_pencil(plant.E, plant.A, inputs, plant.C, direct)
+    found = finite_zeros(wide_e, wide_a)
+    full = wide_e.shape[1]
+    if found.normal_rank < full:
+        detail = f"normal rank {found.normal_rank} of {full}: the plant hides whole trajectories from its outputs."
+        return Condition("(D2) zeros", claim, False, float(found.normal_rank), float(full), source, detail)
+    zeros = invariant_zeros(plant.E, plant.A, inputs, plant.C, direct)
+    outside = [zero for zero, out in zip(zeros, are_outside(wide_e, wide_a, found, plant.dt), strict=True) if out]
+    if outside:
+        worst = max(outside, key=lambda zero: instability(zero.value, plant.dt))
+        return _zero_failure(plant, units, worst, inputs, direct, claim, source)
+    return Condition(
+        "(D2) zeros", claim, True, float(found.normal_rank), float(full), source, f"{len(zeros)} stable zero(s)"
+    )
+
+
+def _zero_failure(
+    plant: DescriptorSystem,
+    units: PlantUnits,
+    zero: Zero,
+    inputs: FloatArray,
+    direct: FloatArray,
+    claim: str,
+    source: str,
+) -> Condition:
+    value = units.eigenvalue(zero.value)
+    states = leading_names(np.abs(zero.state_direction), plant.state_names, most=MOST_NAMES)
+    shares = in_disturbances(plant, inputs, direct, zero.input_direction)
+    disturbances = () if zero.is_unobservable_mode else leading_names(shares, plant.disturbance_names, most=MOST_NAMES)
+    where = f"s = {number(value)}" if plant.dt == 0.0 else f"z = {number(value)}"
+    masked = f" under the unknown input {', '.join(map(repr, disturbances))}" if disturbances else ""
+    detail = (
+        f"at {where} the states {', '.join(map(repr, states))} move{masked} without showing in any output, and do not "
+        "come to rest: no observer can know them. Measure something they move."
+    )
+    return Condition(
+        "(D2) zeros", claim, False, value.real if plant.dt == 0.0 else abs(value), 0.0, source, detail, mode=value,
+        signals=(*states, *disturbances),
+    )  # fmt: skip
+
+
+def _fixed_modes(plant: DescriptorSystem, model: Exosystem, units: PlantUnits) -> tuple[ComplexArray, Condition]:
+    augmented = AugmentedPlant.of(plant, model)
+    inputs, direct = independent_disturbances(plant)
+    below = np.vstack([inputs, np.zeros((model.order, inputs.shape[1]))])
+    drops = finite_zeros(*system_pencil(augmented.E, augmented.A, below, augmented.C, direct)).values
+    zeros = units.eigenvalues(drops)
+    text = ", ".join(numbers(zeros))
+    # Rounding scatters a multiple mode around its mean.  (D2) and (D3) exclude an unstable one: it is no mode at all.
+    bound = 1.0 if plant.dt > 0.0 else 0.0
+    means = [np.mean(drops[np.abs(drops - value) <= SCATTER * max(1.0, abs(value))]) for value in drops]
+    unstable = [mean for mean in means if instability(complex(mean), plant.dt) >= bound]
+    if unstable:
+        return zeros, lost_in_rounding(
+            model, plant.fault_names, units.eigenvalue(complex(unstable[0])), augmented.order
+        )
+    return zeros, Condition(
+        "fixed modes",
+        "every pole that no gain moves is stable",
+        True,
+        float(len(zeros)),
+        float(augmented.order),
+        "drops of the augmented pencil",
+        f"{len(zeros)} of {augmented.order} poles are fixed" + (f": {text}" if text else ""),
+    )

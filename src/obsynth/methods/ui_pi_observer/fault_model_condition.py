@@ -1,0 +1,152 @@
+"""Whether a fault model can be told from states and unknown inputs: (D3), and the order of the model.
+
+Source: in place of Share Pasand, Aliyari, Taghirad, Theorems 1 and 2, which are false as printed: (D3) has the column
+of ``Bd``, and is tested exactly at the eigenvalues of Phi.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.analysis.conditions import Condition
+from obsynth.analysis.plant_units import PlantUnits
+from obsynth.analysis.zeros import is_outside, leading_names
+from obsynth.methods.ui_pi_observer.augmented_plant import AugmentedPlant
+from obsynth.methods.ui_pi_observer.pencils import (
+    MOST_NAMES,
+    equilibrated,
+    in_disturbances,
+    independent_disturbances,
+    kernel,
+    number,
+    system_pencil,
+)
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.pencils import finite_zeros
+from obsynth.numerics.ranks import RankDecision, decide_rank
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.exosystems import Exosystem
+
+
+def model_conditions(plant: DescriptorSystem, model: Exosystem, units: PlantUnits) -> list[Condition]:
+    """Test (D3) at each unstable eigenvalue of the fault model, upper half plane only."""
+    unstable = [complex(value) for value in model.eigenvalues if value.imag >= 0.0 and is_outside(value, plant.dt)]
+    found = []
+    for value in sorted(unstable, key=lambda value: (value.real, value.imag)):
+        found.append(_model_condition(plant, model, value, units))
+        if not found[-1].holds:
+            break
+    return found
+
+
+def _model_condition(plant: DescriptorSystem, model: Exosystem, value: complex, units: PlantUnits) -> Condition:
+    inputs, direct = independent_disturbances(plant)
+    courses = model.Cw @ kernel(model.Phi - value * np.eye(model.order))
+    width = courses.shape[1]
+    matrix = np.block([
+        [value * plant.E - plant.A, -plant.Bf @ courses, -inputs],
+        [plant.C.astype(complex), plant.Df @ courses, direct],
+    ])  # fmt: skip
+    scaled, columns = equilibrated(matrix)
+    decision = decide_rank(scaled, expected=matrix.shape[1], equilibrated=False)
+    own = units.eigenvalue(value)
+    where = f"{'s' if plant.dt == 0.0 else 'z'} = {number(own)}"
+    signals: tuple[str, ...] = ()
+    detail = decision.describe()
+    if not decision.full:
+        direction = columns * np.linalg.svd(scaled)[2][-1].conj()
+        faults = leading_names(np.abs(courses @ direction[plant.nx : plant.nx + width]), plant.fault_names)
+        shares = in_disturbances(plant, inputs, direct, direction[plant.nx + width :])
+        disturbances = _masking(scaled, plant, width, shares)
+        signals = (*faults, *disturbances)
+        masked = f" is masked by the unknown input {', '.join(map(repr, disturbances))}" if disturbances else ""
+        who = (
+            f"the fault {faults[0]!r}"
+            if len(faults) == 1
+            else f"a combination of the faults {', '.join(map(repr, faults))}"
+        )
+        detail += (
+            f": at {where} {who}{masked or ' can persist'} without showing in any output, so no observer can estimate "
+            f"{'it' if len(faults) == 1 else 'them'}. Measure another signal, or leave one of them out."
+        )
+    return Condition(
+        f"(D3) fault model at {number(own)}",
+        f"rank [lambda E - A, -Bf Cw V, -Bd; C, Df Cw V, Dd] full at {where}, an eigenvalue of Phi",
+        decision.full,
+        float(decision.rank),
+        float(decision.expected),
+        "in place of Share Pasand, Theorems 1 and 2, which are false",
+        detail,
+        mode=None if decision.full else own,
+        signals=signals,
+    )
+
+
+def order_conditions(plant: DescriptorSystem, model: Exosystem, units: PlantUnits) -> list[Condition]:
+    """Test that the fault model is not lost in rounding, at the zeros where faults can hide longest.
+
+    At a zero z0 of (f, d) -> y outside the region of stability, a polynomial model of order n is seen with a strength
+    of about abs(z0)^(n + 1) only: a high order is observable on paper and lost in double precision.
+    """
+    inputs, direct = np.hstack([plant.Bf, plant.Bd]), np.hstack([plant.Df, plant.Dd])
+    wide_e, wide_a = system_pencil(plant.E, plant.A, inputs, plant.C, direct)
+    zeros = finite_zeros(wide_e, wide_a)
+    if zeros.normal_rank < wide_e.shape[1]:
+        return []
+    points = [complex(value) for value in zeros.values if value.imag >= 0.0 and is_outside(value, plant.dt)]
+    augmented = AugmentedPlant.of(plant, model)
+    own, shown = independent_disturbances(plant)
+    below = np.vstack([own, np.zeros((model.order, own.shape[1]))])
+    worst: tuple[RankDecision, complex] | None = None
+    for point in points:
+        matrix = np.block([[point * augmented.E - augmented.A, -below], [augmented.C.astype(complex), shown]])
+        scaled, _ = equilibrated(matrix)
+        decision = decide_rank(scaled, expected=matrix.shape[1], equilibrated=False)
+        if worst is None or (decision.rank, decision.smallest_kept) < (worst[0].rank, worst[0].smallest_kept):
+            worst = (decision, point)
+    if worst is None:
+        return []
+    decision, point = worst[0], units.eigenvalue(worst[1])
+    lost = (
+        f": at the zero {number(point)} of (f, d) -> y the fault model (order {model.order}) cannot be told from "
+        "nothing in double precision. Lower its order."
+    )
+    return [
+        Condition(
+            "order of the fault model",
+            "the augmented plant is observable in double precision where faults can hide longest",
+            decision.full,
+            float(decision.rank),
+            float(decision.expected),
+            "ours: observable on paper is not enough",
+            f"{decision.describe()} at {number(point)}" + ("" if decision.full else lost),
+            mode=None if decision.full else point,
+            signals=() if decision.full else plant.fault_names,
+        )
+    ]
+
+
+def lost_in_rounding(model: Exosystem, fault_names: tuple[str, ...], mode: complex, order: int) -> Condition:
+    """Return the failing condition for a mode that seems fixed and unstable, against all other conditions."""
+    return Condition(
+        "fault model in double precision",
+        "no mode of plant and fault model seems hidden by rounding alone",
+        False,
+        order - 1.0,
+        float(order),
+        "ours: observable on paper is not enough",
+        f"plant and fault model (order {model.order}) seem to hide an unstable mode at {number(mode)}, which the "
+        "conditions above exclude: in double precision the model is too long a chain. Lower its order.",
+        mode=mode,
+        signals=fault_names,
+    )
+
+
+def _masking(scaled: NDArray[Any], plant: DescriptorSystem, width: int, shares: FloatArray) -> tuple[str, ...]:
+    """Return the disturbances of a null vector; none where states alone already hide the fault."""
+    without = scaled[:, : plant.nx + width]
+    alone = decide_rank(without, expected=plant.nx + width, equilibrated=False)
+    return leading_names(shares, plant.disturbance_names, most=MOST_NAMES) if alone.full else ()

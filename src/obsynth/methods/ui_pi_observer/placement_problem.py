@@ -1,0 +1,169 @@
+"""The pair behind an unknown-input PI observer: what is decoupled, what can be placed, and the noise on it.
+
+Source: Share Pasand, Aliyari, Taghirad, Lemma 5 and procedure 1; the joint design over K and Z is ours: their free
+matrix G is itself an output injection, from the rows ``N_U A`` that the decoupling leaves over.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from obsynth.analysis.plant_units import PlantUnits
+from obsynth.errors import SpecError
+from obsynth.methods.placement.observable import ObservableSplit, observable_split
+from obsynth.methods.ui_pi_observer.augmented_plant import (
+    AugmentedPlant,
+    Decoupled,
+    decouple,
+    direct_part,
+    paper_decoupling,
+)
+from obsynth.methods.ui_pi_observer.realisation import ObserverGains
+from obsynth.numerics.arrays import ComplexArray, FloatArray, as_matrix
+from obsynth.numerics.pencils import finite_zeros, pencil_structure
+from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
+from obsynth.numerics.spectra import DEAD_BEAT, eigenvalues, speeds
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.exosystems import Exosystem
+
+#: Modes slower than this share of the fastest do not count for the plant's time scale: integrators and rounding.
+SLOW_SHARE = 1e-6
+#: Where all modes are slower than this share of the pair's size, they are integrators that rounding has scattered.
+SCATTER = 3e-5
+#: Poles of sampled plants are not asked to decay by more than this exponent in one sample: nearer to zero they cannot
+#: be told apart, and printed gains miss them.
+MOST_PER_SAMPLE = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class PlacementProblem:
+    """A decoupled plant in units of its own, and the pair whose poles are to be placed.
+
+    Fields: plant: Scaled; model: Of its faults, scaled; units: Between the user's plant and the scaled one; decoupled:
+    Of the scaled plant; U, D: ``(na, na)`` and ``(na, ny)`` of the scaled augmented plant, without the free part; F, C:
+    The pair ``(na, na)`` and ``(rows, na)``; the first ``free`` rows of C are those of the free part Z; free: Number of
+    rows of the free part; 0 unless K and Z are designed together; split: Of the pair; rate: The plant's own speed, in
+    scaled time: the median of ``abs(s)`` over its modes.
+    """
+
+    plant: DescriptorSystem
+    model: Exosystem
+    units: PlantUnits
+    decoupled: Decoupled
+    U: FloatArray
+    D: FloatArray
+    F: FloatArray
+    C: FloatArray
+    free: int
+    split: ObservableSplit
+    rate: float
+
+    def gains(self, placed: FloatArray) -> ObserverGains:
+        """Return the gains in the user's units for one of the observable part ``(no, rows)``."""
+        k = self.split.lift(placed)
+        u, d, k = _completed(self, k)
+        states, outputs = self.units.augmented_states[:, None], self.units.outputs
+        return ObserverGains(
+            states * u * self.units.augmented_equations, states * d * outputs, states * k * outputs / self.units.rate
+        )
+
+    @property
+    def fixed_modes(self) -> ComplexArray:
+        """Poles that no gain moves, in the user's time."""
+        return self.units.eigenvalues(self.split.fixed_modes)
+
+
+def placement_problem(
+    plant: DescriptorSystem,
+    model: Exosystem,
+    fixed_modes: ComplexArray,
+    *,
+    joint: bool = False,
+    given: Mapping[str, Any] | None = None,
+) -> PlacementProblem:
+    """Return the pair to place; the existence conditions must hold."""
+    units = PlantUnits.of(plant, model).for_decoupling(plant)
+    if given is not None:
+        # Powers of two: the given numbers come back as they are.
+        units = units.rounded()
+    scaled, model = units.scaled_plant(plant), units.scaled_model(model)
+    decoupled = decouple(scaled) if given is None else _given_decoupling(plant, units, given)
+    u, d = with_faults(decoupled.U, decoupled.Dhat, scaled, model)
+    augmented = AugmentedPlant.of(scaled, model)
+    injection = np.vstack([decoupled.injection, np.zeros((model.order, plant.ny))])
+    injected = _product(injection, augmented.C, augmented.A)
+    f, c = _product(u, injected), _product(decoupled.seen, augmented.C)
+    fixed_modes = units.rate * fixed_modes
+    free = 0
+    if joint:
+        more, _ = _free_part(decoupled, scaled, model)
+        c, free = np.vstack([more @ injected, c]), len(more)
+    if given is not None:
+        # Another U may have other unobservable modes than the plant's pencil.
+        n = len(f)
+        fixed_modes = finite_zeros(np.vstack([np.eye(n), np.zeros((len(c), n))]), np.vstack([f, c])).values
+    split = observable_split(f, c, fixed_modes)
+    return PlacementProblem(scaled, model, units, decoupled, u, d, f, c, free, split, _own_rate(scaled, split.F))
+
+
+def _product(left: FloatArray, right: FloatArray, minuend: FloatArray | None = None) -> FloatArray:
+    """Return ``left @ right``, or ``minuend - left @ right``, without entries that are only rounding."""
+    found, size = left @ right, np.abs(left) @ np.abs(right)
+    if minuend is not None:
+        found, size = minuend - found, np.abs(minuend) + size
+    return np.where(np.abs(found) > CANCELLATION_TOLERANCE * size, found, 0.0)
+
+
+def with_faults(
+    u: FloatArray, d: FloatArray, plant: DescriptorSystem, model: Exosystem
+) -> tuple[FloatArray, FloatArray]:
+    """Return ``U_a = [U, -Dhat Df Cw; 0, I]`` and ``D_a = [Dhat; 0]``: the faults are never read from y directly."""
+    nx, count = plant.nx, model.order
+    whole = np.eye(nx + count)
+    whole[:nx, :nx], whole[:nx, nx:] = u, -d @ plant.Df @ model.Cw
+    return whole, np.vstack([d, np.zeros((count, plant.ny))])
+
+
+def _free_part(decoupled: Decoupled, plant: DescriptorSystem, model: Exosystem) -> tuple[FloatArray, FloatArray]:
+    return np.hstack([decoupled.free_U, -decoupled.free_D @ plant.Df @ model.Cw]), decoupled.free_D
+
+
+def _completed(problem: PlacementProblem, k: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return U_a, D_a, K_a of the scaled plant: the gain of the pair is ``[-Z K]``."""
+    decoupled, plant, model = problem.decoupled, problem.plant, problem.model
+    u, d = problem.U, problem.D
+    if problem.free:
+        more_u, more_d = _free_part(decoupled, plant, model)
+        z = -k[:, : problem.free]
+        u, d = u + z @ more_u, d + z @ more_d
+    injection = np.vstack([decoupled.injection, np.zeros((model.order, plant.ny))])
+    return u, d, k[:, problem.free :] @ decoupled.seen + u @ injection
+
+
+def _given_decoupling(plant: DescriptorSystem, units: PlantUnits, given: Mapping[str, Any]) -> Decoupled:
+    if plant.Dd.any():
+        raise SpecError("E_sharp, C_sharp and G are for plants without Dd: leave them out.", path="E_sharp")
+    matrices = [as_matrix(given[name], name) for name in ("E_sharp", "C_sharp", "G")]
+    _, u, d = paper_decoupling(plant, e_sharp=matrices[0], c_sharp=matrices[1], g=matrices[2])
+    seen, injection, _ = direct_part(plant)
+    u = u / units.states[:, None] / units.equations
+    d = d / units.states[:, None] / units.outputs
+    return Decoupled(u, d, np.zeros((0, plant.nx)), np.zeros((0, plant.ny)), seen, injection)
+
+
+def _own_rate(plant: DescriptorSystem, f: FloatArray) -> float:
+    """Return the median speed of the plant's modes; of the pair's where it has none; or its size."""
+    structure = pencil_structure(plant.E, plant.A)
+    size = float(np.linalg.norm(f, 2)) if f.size else 0.0
+    for values in (structure.finite_eigenvalues, eigenvalues(f)):
+        found = speeds(values, plant.dt)
+        found = found[np.isfinite(found)]
+        found = found[found > max(SLOW_SHARE * float(np.max(found, initial=0.0)), DEAD_BEAT)]
+        if found.size and (plant.dt > 0.0 or np.max(found) > SCATTER * size):
+            median = float(np.median(found))
+            return min(median, MOST_PER_SAMPLE / plant.dt) if plant.dt > 0.0 else median
+    return 1.0 / plant.dt if plant.dt > 0.0 else size or 1.0

@@ -1,0 +1,254 @@
+r"""Unknown-input PI observer for descriptor systems, continuous or discrete time.
+
+Source: M. M. Share Pasand, M. Aliyari Sh., H. D. Taghirad, *Unknown Input-Proportional Integral Observer for Singular
+Systems: Application to fault detection*: observer (4), identities (19), procedures 1 and 2.
+
+Our deviations
+    1. Existence by (D1)-(D3) on the plant's own data; Theorems 1 and 2 and Lemma 6 are false as printed.
+    2. Vector faults, each with its own exosystem, block-diagonal (6); faults and disturbances in the outputs.
+    3. U with full rank by construction; ``E#, C#, G`` (10), (11) only on request: with the Moore-Penrose ``E#`` U loses
+       rank and the unobservable modes change.
+    4. Poles of the observable part only; fixed modes are kept and named; repeated poles by Jordan chains.
+    5. Poles in a region, Kalman gains with a prescribed rate, and a default that needs no numbers.
+    6. K and the free part of the decoupling (the paper's G) can be designed together.
+    7. Where (D1) fails on the plant as written and it has index 1, its algebraic states are eliminated first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from obsynth.analysis.conditions import Condition, require_all
+from obsynth.analysis.zeros import is_outside
+from obsynth.errors import PreconditionError, SolverError, SpecError
+from obsynth.methods.lyapunov import lyapunov_factor
+from obsynth.methods.placement.compromise import compromise
+from obsynth.methods.placement.eigenstructure import place
+from obsynth.methods.placement.kalman import KalmanProblem
+from obsynth.methods.placement.region import Region, region_gain
+from obsynth.methods.synthesis_result import Synthesis
+from obsynth.methods.ui_pi_observer.conditions import existence
+from obsynth.methods.ui_pi_observer.noise import NoiseWeights, kalman_problem
+from obsynth.methods.ui_pi_observer.notes import elimination_note, fixed_mode_notes, slow_note
+from obsynth.methods.ui_pi_observer.options import UiPiOptions, checked_poles, plain
+from obsynth.methods.ui_pi_observer.pencils import number
+from obsynth.methods.ui_pi_observer.placement_problem import PlacementProblem, placement_problem, with_faults
+from obsynth.methods.ui_pi_observer.realisation import ObserverGains, combinations_seen, realise
+from obsynth.numerics.arrays import ComplexArray, FloatArray, as_matrix
+from obsynth.numerics.spectra import abscissa, certain_noise_covariance, decay_rates, eigenvalues
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.exosystems import Exosystem, exosystem
+from obsynth.results.design import Certificate
+
+#: A region with a radius and no decay asks for at most this share of its radius.
+RADIUS_SHARE = 0.5
+
+
+def conditions(plant: DescriptorSystem, *, fault_model: Any = "step") -> tuple[Condition, ...]:
+    """Return the existence conditions; they are independent of each other, so several may fail."""
+    return existence(plant, exosystem(fault_model, plant.fault_names, plant.dt)).conditions
+
+
+def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **options: Any) -> Synthesis:
+    """Design the observer; see `obsynth.ui_pi_observer` for the options, results and errors."""
+    asked = UiPiOptions(**options)
+    model = exosystem(asked.fault_model, plant.fault_names, plant.dt)
+    region = asked.checked_region(plant.dt)
+    weights = asked.checked_noise(plant.output_names)
+    progress("checking the existence conditions")
+    found = existence(plant, model)
+    _require_all(found.conditions)
+    working = found.plant
+    progress("decoupling the unknown inputs")
+    problem = placement_problem(working, model, found.fixed_modes, joint=asked.joint, given=asked.given_decoupling())
+    if asked.G is not None:
+        _require_stable(problem)
+    progress("choosing the gains")
+    chosen = _chosen(asked, problem, region, weights, plant.dt)
+    progress("building the realisation and its certificate")
+    gains = problem.gains(chosen.gain)
+    poles = None if chosen.poles is None else np.array([*chosen.poles, *problem.fixed_modes])
+    synthesis = _assembled(working, model, gains, poles, dict(chosen.claims), structured=not asked.joint)
+    return Synthesis(
+        asked.resolved(model, plant.fault_names),
+        synthesis.gains,
+        synthesis.observer,
+        synthesis.certificate,
+        {"runs": list(chosen.runs)},
+        (
+            *elimination_note(found.conditions, found.transformation is not None),
+            *fixed_mode_notes(problem, asked, plant.dt),
+            *slow_note(problem, asked, synthesis.certificate.claims.get("decay")),
+        ),
+        found.transformation,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Chosen:
+    """A gain of the observable part, its poles where they were asked for, and what is claimed about the choice."""
+
+    gain: FloatArray
+    poles: Sequence[complex] | None
+    claims: Mapping[str, float]
+    runs: tuple[Mapping[str, Any], ...] = ()
+
+
+def _placed(problem: PlacementProblem, wanted: Sequence[complex], objective: str) -> _Chosen:
+    """Return the gain for given poles; its size is that in the user's units where outputs are not mixed."""
+    split, plant, units = problem.split, problem.plant, problem.units
+    plain_outputs = problem.free == 0 and np.array_equal(problem.decoupled.seen, np.eye(plant.ny))
+    outputs = units.outputs if plain_outputs else np.ones(len(split.C))
+    scaled_poles = [units.rate * pole for pole in wanted]
+    found = place(
+        split.F, split.C / outputs[:, None], scaled_poles, dt=plant.dt, objective=objective,
+        weight=units.augmented_states[:, None] * split.lift(np.eye(split.order)),
+    )  # fmt: skip
+    return _Chosen(found.K / outputs, wanted, {"condition": found.condition})
+
+
+def _chosen(
+    asked: UiPiOptions, problem: PlacementProblem, region: Region | None, weights: NoiseWeights, dt: float
+) -> _Chosen:
+    split, time = problem.split, problem.units.time
+    if asked.poles is not None:
+        wanted = checked_poles(asked.poles, split.order, problem.fixed_modes, dt)
+        return _placed(problem, wanted, asked.objective)
+    kalman = kalman_problem(problem, weights)
+    claims: dict[str, float] = {}
+    runs: tuple[Mapping[str, Any], ...] = ()
+    if region is not None:
+        gain, record = _in_region(kalman, region.in_time(time), problem.rate, asked)
+        runs = (record,)
+    elif asked.decay is not None:
+        found = kalman.gain(time * asked.decay, persistent=True)
+        if found is None:
+            raise SolverError(
+                f"The Riccati equation for decay {asked.decay:g} 1/s has no solution that double precision could tell "
+                "from rounding, not even by way of slower rates: some mode shows too little for so much speed. Ask for "
+                "less, leave decay out, or give poles, which are placed without this equation."
+            )
+        gain = found
+    else:
+        fair = compromise(kalman, problem.rate)
+        if fair is None:
+            raise SolverError("The Riccati equation has no usable solution: give poles= or a slow decay=.")
+        gain, claims = fair.K, {"noise_price": fair.price}
+    return _Chosen(gain, None, claims, runs)
+
+
+def _in_region(
+    kalman: KalmanProblem, region: Region, rate: float, asked: UiPiOptions
+) -> tuple[FloatArray, dict[str, Any]]:
+    """Return a gain for the region; one without a decay gets that of the default, as far as that can be had.
+
+    Least noise alone would make an observer that hardly moves.
+    """
+    if asked.region.get("decay") is None:
+        fair = compromise(kalman, rate)
+        most = np.inf if region.radius is None else RADIUS_SHARE * region.radius
+        wanted = replace(region, decay=float(min(fair.decay, most)) if fair is not None else 0.0)
+        try:
+            return region_gain(kalman, wanted, solver=asked.solver)
+        except SolverError:
+            # What was asked may be possible all the same.
+            pass
+    return region_gain(kalman, region, solver=asked.solver)
+
+
+def _require_all(found: Sequence[Condition]) -> None:
+    """Raise for the first condition that fails, and say which others fail too."""
+    failed = [condition for condition in found if not condition.holds]
+    if len(failed) <= 1:
+        require_all(found)
+        return
+    others = "; ".join(f"{condition.name}: {condition.detail}" for condition in failed[1:])
+    try:
+        failed[0].require()
+    except PreconditionError as error:
+        mode = next((condition.mode for condition in failed if condition.mode is not None), None)
+        signals = tuple(dict.fromkeys(name for condition in failed for name in condition.signals))
+        raise PreconditionError(
+            f"{error} Also fails: {others}", condition=failed[0].name, mode=mode, signals=signals
+        ) from None
+
+
+def _require_stable(problem: PlacementProblem) -> None:
+    """Raise when a mode that no gain moves is not stable: only a given ``E#`` or ``G`` can bring one in."""
+    # On the boundary within rounding is not stable either: an equation that is lost leaves a mode at zero.
+    modes = zip(problem.split.fixed_modes, problem.fixed_modes, strict=True)
+    unstable = [complex(own) for scaled, own in modes if is_outside(complex(scaled), problem.plant.dt)]
+    if unstable:
+        raise PreconditionError(
+            f"With these E_sharp, C_sharp and G the mode {number(unstable[0])} is fixed and not stable: U has lost "
+            "rank and with it equations of the plant. Leave E_sharp, C_sharp and G out.",
+            condition="fixed modes",
+            mode=unstable[0],
+        )
+
+
+def synthesis_from_gains(plant: DescriptorSystem, *, U: Any, D: Any, K: Any, F: Any, fault_model: Any) -> Synthesis:
+    """Return the realisation of given gains; see `obsynth.ui_pi_observer_from_gains`."""
+    model = exosystem(fault_model, plant.fault_names, plant.dt)
+    nx, ny, count = plant.nx, plant.ny, model.order
+    given = {name: as_matrix(value, name) for name, value in (("U", U), ("D", D), ("K", K), ("F", F))}
+    shapes = {"U": (nx, nx), "D": (nx, ny), "K": (nx, ny), "F": (count, ny)}
+    for name, shape in shapes.items():
+        if given[name].shape != shape:
+            raise SpecError(f"{name} is {given[name].shape}, but {shape} is needed.", path=name)
+    u, d = with_faults(given["U"], given["D"], plant, model)
+    gains = ObserverGains(u, d, np.vstack([given["K"], given["F"]]))
+    options = {"from_gains": True, "fault_model": plain(fault_model)}
+    found = _assembled(plant, model, gains, None, {}, structured=True)
+    return Synthesis(options, found.gains, found.observer, found.certificate)
+
+
+def _assembled(
+    plant: DescriptorSystem,
+    model: Exosystem,
+    gains: ObserverGains,
+    poles: ComplexArray | None,
+    claims: dict[str, float],
+    *,
+    structured: bool,
+) -> Synthesis:
+    """Return realisation and certificate of gains in the plant's units; poles that were not asked for are computed."""
+    observer, letters = realise(plant, model, gains, combinations_seen(plant))
+    nx = plant.nx
+    if structured:
+        letters |= {"U": gains.U[:nx, :nx], "D": gains.D[:nx], "K": gains.K[:nx], "F": gains.K[nx:]}
+        letters["Hhat"] = letters["U"] @ plant.Bf
+    letters |= {"Phi": model.Phi, "Cw": model.Cw}
+    poles = eigenvalues(observer.Az) if poles is None else poles
+    order = np.lexsort((poles.imag, poles.real))
+    matrices = {
+        "tracking": gains.U,
+        "Phi": model.Phi,
+        "Cw": model.Cw,
+        "poles": np.column_stack([poles.real, poles.imag])[order] if poles.size else np.zeros((0, 2)),
+        "stability": lyapunov_factor(observer.Az, plant.dt),
+    }
+    slowest = float(np.min(decay_rates(eigenvalues(observer.Az), plant.dt), initial=np.inf))
+    claims = {"decay": slowest, "noise_amplification": noise_amplification(observer), **claims}
+    finite = {name: value for name, value in claims.items() if np.isfinite(value)}
+    return Synthesis({}, letters, observer, Certificate(matrices, finite))
+
+
+def noise_amplification(observer: LinearObserver) -> float:
+    """Return the largest H2 norm from unit white noise on every output to a fault estimate, the direct part left out.
+
+    Times the square root of the sample time it is a standard deviation, for dt = 0 and noise held between samples.  NaN
+    where rounding leaves no digit of it.
+    """
+    rows = observer.Cz[observer.fault_rows]
+    direct = observer.Dy[observer.fault_rows] * (observer.dt > 0.0)
+    stable = abscissa(observer.Az, observer.dt) < (1.0 if observer.dt > 0.0 else 0.0)
+    if not len(rows) or not stable:
+        return 0.0 if not len(rows) else float("inf")
+    covariance = certain_noise_covariance(observer.Az, observer.By, rows, direct, observer.dt)
+    return float(np.sqrt(np.max(np.maximum(np.diag(covariance), 0.0))))

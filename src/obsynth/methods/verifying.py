@@ -1,0 +1,57 @@
+"""Verification: every claim recomputed from the plant and the shipped realisation, without synthesis or solvers."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.numerics.threads import one_thread_if_small
+from obsynth.results.report import VerificationReport
+
+if TYPE_CHECKING:
+    from obsynth.results.design import ObserverDesign
+
+#: Method id -> module with ``checks(design, printed_digits)``.
+_CHECKERS = {
+    "fault-estimation-filter": "obsynth.methods.fault_estimation_filter.checks",
+    "pd-observer": "obsynth.methods.pd_observer.checks",
+    "ui-pi-observer": "obsynth.methods.ui_pi_observer.checks",
+    "descriptor-kalman": "obsynth.methods.recursive.checks",
+    "adaptive-observer": "obsynth.methods.recursive.checks",
+    "dae-adaptive-observer": "obsynth.methods.dae_adaptive_observer.checks",
+}
+
+
+def verify(design: ObserverDesign, *, printed_digits: int | None = None) -> VerificationReport:
+    """Recompute every claim of a design from its plant and its shipped realisation.
+
+    Parameters
+    ----------
+    design : ObserverDesign
+        Made by a method, loaded from a file, or put together by hand.
+    printed_digits : int, optional
+        Decimals to which the gains T, N, L and W were printed, for gains from a paper: equalities are then judged
+        against what half a unit in the last decimal of every entry can do, to first order.  By default they are judged
+        against double precision.
+
+    Returns
+    -------
+    VerificationReport
+        Inequalities are proved with rounding bounds; equalities are residuals against a bound scaled by the data.
+
+    Raises
+    ------
+    SpecError
+        The design's method is unknown, or ``printed_digits`` is not between 1 and 15.
+    """
+    if design.method not in _CHECKERS:
+        raise SpecError(f"Designs of method {design.method!r} cannot be verified by this version.", path="method")
+    if printed_digits is not None and not 1 <= printed_digits <= 15:
+        raise SpecError(f"printed_digits is {printed_digits}: give 1 to 15 decimals.", path="printed_digits")
+    checker = import_module(_CHECKERS[design.method])
+    # A corrupted design may overflow; what is not a number fails its check, so no warning is needed.
+    with np.errstate(all="ignore"), one_thread_if_small(design.plant.nx):
+        return VerificationReport.of(tuple(checker.checks(design, printed_digits)))

@@ -1,5 +1,0 @@
-"""Plants: what is known about the process, with named signals."""
-
-from obsynth.models.descriptor import DescriptorSystem
-
-__all__ = ["DescriptorSystem"]

@@ -1,0 +1,1 @@
+"""Observers of nonlinear differential-algebraic plants."""

@@ -1,0 +1,133 @@
+"""Batches of trials with one observer of a DAE."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from obsynth.errors import SolverError, SpecError
+from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.observers.dae.c_code import BATCH_PARTS
+from obsynth.observers.dae.compiled_library import compiler
+from obsynth.observers.dae.estimates import DAERow
+from obsynth.observers.dae.observer import DAEObserver
+from obsynth.observers.dae.records import advanced
+from obsynth.observers.progress import shown_progress
+
+#: Samples in one call of the library: a second or less, so that progress shows and an interrupt is heard.
+SAMPLES_PER_CALL = 100_000
+#: Steps from which it pays to compile unasked: compiling takes about a second, and the rest thirty microseconds a step.
+WORTH_COMPILING = 50_000
+
+
+@dataclass(frozen=True, eq=False)
+class DAEBatchEstimates:
+    """Estimates of many trials with one observer.
+
+    Parameters
+    ----------
+    states : FloatArray
+        ``(trials, samples, nx)``: after the measurement of the same sample.
+    parameters : FloatArray
+        ``(trials, samples, nq)``.
+    parameter_covariances : FloatArray
+        ``(trials, samples, nq, nq)``.
+    innovations : FloatArray
+        ``(trials, samples, ny)``; NaN where a sample is missing.
+    nis, nis_degrees : FloatArray
+        ``(trials, samples)``: squared innovations in units of their covariance, and degrees of freedom.
+    residuals : FloatArray
+        ``(trials, samples)``: scaled residual of each step.
+    """
+
+    states: FloatArray
+    parameters: FloatArray
+    parameter_covariances: FloatArray
+    innovations: FloatArray
+    nis: FloatArray
+    nis_degrees: FloatArray
+    residuals: FloatArray
+
+
+def run_dae_batch(
+    observer: DAEObserver, y: ArrayLike, u: ArrayLike | None = None, *, compiled: bool | None = None,
+    progress: bool | Callable[[int], None] | None = None,
+) -> DAEBatchEstimates:  # fmt: skip
+    """Run many trials; see `obsynth.run_batch`.
+
+    Shapes: ``y (trials, samples, ny)``.
+    """
+    outputs, inputs = _checked(observer, y, u)
+    trials, samples = outputs.shape[:2]
+    if compiled is None:
+        compiled = trials * samples >= WORTH_COMPILING and compiler() is not None
+    take = _in_c if compiled else _in_casadi
+    with shown_progress(progress, trials, "trials") as note:
+        parts = take(observer, outputs, inputs, note)
+    seen = ~np.isnan(outputs)
+    return DAEBatchEstimates(
+        read_only(parts["posterior"]), read_only(parts["theta"]), read_only(parts["spread"]),
+        read_only(np.where(seen, parts["innovation"], np.nan)), read_only(parts["nis"][..., 0]),
+        read_only(seen.sum(axis=2)), read_only(parts["residual"][..., 0]),
+    )  # fmt: skip
+
+
+def _checked(observer: DAEObserver, y: ArrayLike, u: ArrayLike | None) -> tuple[FloatArray, FloatArray]:
+    model = observer.model
+    outputs = np.asarray(y, dtype=np.float64)
+    if outputs.ndim != 3 or outputs.shape[2] != model.ny or not outputs.size:
+        raise SpecError(f"y has shape {outputs.shape}, but (trials, samples, {model.ny}) is needed.", path="y")
+    if np.isinf(outputs).any():
+        raise SpecError("y holds an infinity: mark a missing sample by NaN.", path="y")
+    samples = outputs.shape[1]
+    known = np.zeros((samples, 0)) if u is None and not model.nu else np.asarray(u, dtype=np.float64)
+    if known.shape not in ((samples, model.nu), (len(outputs), samples, model.nu)):
+        raise SpecError(f"u has shape {known.shape}, but (trials, samples, {model.nu}) is needed.", path="u")
+    if not np.isfinite(known).all():
+        *trial, k, i = np.argwhere(~np.isfinite(known))[0]
+        where = f" of trial {trial[0]}" if trial else ""
+        raise SpecError(f"The input {model.input_names[i]!r}{where} is {known[*trial, k, i]} at k = {k}: inputs must "
+                        "be known.", path="u")  # fmt: skip
+    return outputs, known
+
+
+def _of_trial(inputs: FloatArray, trials: slice | int) -> FloatArray:
+    return inputs if inputs.ndim == 2 else inputs[trials]
+
+
+def _in_c(observer: DAEObserver, y: FloatArray, u: FloatArray, note: Callable[[int], object]) -> dict[str, FloatArray]:
+    library, begin = observer.library, 0
+    found: list[dict[str, FloatArray]] = []
+    while begin < len(y):
+        trials = slice(begin, min(begin + max(1, SAMPLES_PER_CALL // y.shape[1]), len(y)))
+        taken, parts = library.batch(y[trials], _of_trial(u, trials))
+        found.append({name: part[:taken] for name, part in parts.items()})
+        begin += taken
+        if begin < trials.stop:
+            # The message is written there.
+            found.append({name: part[None] for name, part in _one(observer, y, u, begin).items()})
+            begin += 1
+        note(begin)
+    return {name: np.concatenate([parts[name] for parts in found]) for name in BATCH_PARTS}
+
+
+def _in_casadi(
+    observer: DAEObserver, y: FloatArray, u: FloatArray, note: Callable[[int], object]
+) -> dict[str, FloatArray]:
+    found = []
+    for trial in range(len(y)):
+        found.append(_one(observer, y, u, trial))
+        note(trial + 1)
+    return {name: np.array([parts[name] for parts in found]) for name in BATCH_PARTS}
+
+
+def _one(observer: DAEObserver, y: FloatArray, u: FloatArray, trial: int) -> dict[str, FloatArray]:
+    rows: list[DAERow] = []
+    try:
+        advanced(observer.start(), y[trial], _of_trial(u, trial), rows.append)
+    except SolverError as error:
+        raise SolverError(f"Trial {trial}: {error}", record={**error.record, "trial": trial}) from error
+    return {name: np.concatenate([row.several.part(name) for row in rows]) for name in BATCH_PARTS}

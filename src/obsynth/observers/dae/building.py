@@ -1,0 +1,121 @@
+"""An observer of a DAE from a model and plain options: used to design one, and to check the one that was shipped."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
+from obsynth.observers.dae.observer import DAEObserver
+from obsynth.plants.dae.checks import finite_vector
+from obsynth.plants.dae.model import DAEModel
+from obsynth.plants.names import index_of
+
+#: Deviation of an initial state that is not stated, as a share of its nominal size.
+DEFAULT_STATE_SHARE = 0.01
+#: Deviation of an initial parameter that is not stated, as a share of its nominal value.
+DEFAULT_PARAMETER_SHARE = 0.1
+
+OPTIONS = (
+    "dt", "Q", "R", "form", "forgetting", "guard", "weight", "integration", "random_walk", "initial_state",
+    "initial_covariance", "initial_parameters", "initial_parameter_covariance", "bounds", "largest_move", "window",
+)  # fmt: skip
+
+
+def dae_observer_from_options(model: DAEModel, options: Mapping[str, Any]) -> DAEObserver:
+    """Return the observer that options stand for."""
+    states, parameters = model.state_names, model.parameter_names
+    bounds = _bounds(options["bounds"], parameters)
+    return DAEObserver(
+        model=model, dt=options["dt"],
+        Q=_covariance(options["Q"], model.equation_names, "Q", None),
+        R=_covariance(options["R"], model.output_names, "R", None),
+        initial_state=_vector(options["initial_state"], states, model.nominal_state, "initial_state"),
+        initial_covariance=_covariance(
+            options["initial_covariance"], states, "initial_covariance",
+            (DEFAULT_STATE_SHARE * model.state_scales) ** 2,
+        ),
+        initial_parameters=_vector(
+            options["initial_parameters"], parameters, model.nominal_parameters, "initial_parameters"
+        ),
+        initial_parameter_covariance=_covariance(
+            options["initial_parameter_covariance"], parameters, "initial_parameter_covariance",
+            _default_parameter_variances(model, options["initial_parameter_covariance"]),
+        ),
+        random_walk=_covariance(options["random_walk"], parameters, "random_walk", np.zeros(model.nq)),
+        lower=bounds[:, 0], upper=bounds[:, 1], form=options["form"], forgetting=options["forgetting"],
+        guard=options["guard"], weight=options["weight"], integration=options["integration"],
+        largest_move=options["largest_move"], window=options["window"],
+    )  # fmt: skip
+
+
+def resolved_options(observer: DAEObserver) -> dict[str, Any]:
+    """Return every option as it was resolved, plain data: the observer can be built from them again."""
+    bounds = read_only(np.column_stack([observer.lower, observer.upper]))
+    return {name: bounds if name == "bounds" else getattr(observer, name) for name in OPTIONS}
+
+
+def _default_parameter_variances(model: DAEModel, given: Any) -> FloatArray:
+    sizes = np.abs(model.nominal_parameters)
+    if given is None and not sizes.all():
+        name = model.parameter_names[int(np.argmin(sizes))]
+        raise SpecError(
+            f"initial_parameter_covariance is missing, and the nominal value of {name!r} is zero: say how large it may "
+            "be.", path="initial_parameter_covariance",
+        )  # fmt: skip
+    return np.asarray((DEFAULT_PARAMETER_SHARE * sizes) ** 2)
+
+
+def _covariance(value: Any, names: Sequence[str], what: str, default: FloatArray | None) -> FloatArray:
+    if value is None:
+        if default is None:
+            raise SpecError(f"{what} is missing: give variances, for example by the names {', '.join(names)}.",
+                            path=what)  # fmt: skip
+        return np.diag(default)
+    if isinstance(value, Mapping):
+        variances = np.zeros(len(names))
+        for name, variance in value.items():
+            variances[index_of(name, names, what=what)] = _number(variance, f"{what}.{name}")
+        return np.diag(variances)
+    matrix = as_matrix(value, what) if np.size(value) else np.zeros((0, 0))
+    return float(matrix[0, 0]) * np.eye(len(names)) if np.ndim(value) == 0 else matrix
+
+
+def _vector(value: Any, names: Sequence[str], default: FloatArray, what: str) -> FloatArray:
+    if value is None:
+        return np.array(default)
+    if isinstance(value, Mapping):
+        vector = np.array(default)
+        for name, entry in value.items():
+            vector[index_of(name, names, what=what)] = _number(entry, f"{what}.{name}")
+        return vector
+    return finite_vector(value, names, default, what)
+
+
+def _number(value: Any, path: str) -> float:
+    if not isinstance(value, (int, float, np.number)) or isinstance(value, bool):
+        raise SpecError(f"{path} is {value!r}: give a number.", path=path)
+    return float(value)
+
+
+def _bounds(value: Any, names: Sequence[str]) -> FloatArray:
+    """Return lower and upper bounds ``(nq, 2)`` from rows or from pairs by name."""
+    found = np.tile([-np.inf, np.inf], (len(names), 1))
+    if isinstance(value, Mapping):
+        for name, pair in value.items():
+            if np.shape(pair) != (2,):
+                raise SpecError(f"bounds.{name} must be [lower, upper].", path=f"bounds.{name}")
+            found[index_of(name, names, what="bounds")] = [_number(bound, f"bounds.{name}") for bound in pair]
+        return found
+    if value is None:
+        return found
+    try:
+        rows = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        rows = np.zeros(0)
+    if rows.shape != found.shape:
+        raise SpecError(f"bounds must be {len(names)} pairs [lower, upper], or pairs by name.", path="bounds")
+    return rows

@@ -1,0 +1,118 @@
+"""An observer of a DAE as C99: CasADi writes its graph, and around it stands the loop of Newton and its homotopy.
+
+The loop is that of `obsynth.numerics.newton` and `obsynth.plants.dae.step`, with the same constants.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from obsynth.numerics import newton
+from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.dae.c_template import ADVANCE, RECORD
+from obsynth.observers.dae.memory_layout import initial_memory
+from obsynth.observers.dae.observer import DAEObserver
+from obsynth.observers.dae.running import PROJECTION_NOTICE, PROJECTION_SHARE
+from obsynth.observers.dae.step_graph import ObserverGraph
+from obsynth.plants.dae import step as implicit_step
+from obsynth.plants.dae.functions import DAEFunctions
+from obsynth.plants.dae.step_graph import step_graph
+
+#: What `RECORD` hands out of a batch, in this order.
+BATCH_PARTS = ("posterior", "theta", "spread", "innovation", "nis", "residual")
+_NUMBERS_PER_LINE = 4
+
+
+def observer_code(observer: DAEObserver) -> str:
+    """Return everything static: constants, CasADi's functions, ``struct observer``, ``reset`` and ``advance``."""
+    graph = observer.graph
+    short = step_graph(DAEFunctions(observer.model), PROJECTION_SHARE * observer.dt, np.inf)
+    functions = {"project": short.newton, "newton": graph.step.newton, "first": graph.first, "sample": graph.sample}
+    return "\n".join([
+        "#include <math.h>", "", *_constants(observer, graph, functions.values()), "", _generated(functions), "",
+        ADVANCE,
+    ])  # fmt: skip
+
+
+def record_code(observer: DAEObserver) -> str:
+    """Return the whole source of a library with functions ``record`` and ``batch``."""
+    graph, copies, total = observer.graph, [], 0
+    for name in BATCH_PARTS:
+        layout, source = (graph.memory, "after") if name in graph.memory.shapes else (graph.row, "said")
+        part = layout.slices[name]
+        size = part.stop - part.start
+        copies.append(f"    copy(out + {total}, {source} + {part.start}, {size});")
+        total += size
+    return observer_code(observer) + "\n" + RECORD.replace("/* PARTS */", "\n".join(copies)).replace(
+        "PARTS_SIZE", str(total)
+    )  # fmt: skip
+
+
+def _constants(observer: DAEObserver, graph: ObserverGraph, functions: Iterable[Any]) -> list[str]:
+    """Return sizes, settings and tables."""
+    model, move = observer.model, observer.largest_move
+    listed = list(functions)
+    work = {name: max(max(getattr(function, f"sz_{name}")() for function in listed), 1) for name in
+            ("arg", "res", "iw", "w")}  # fmt: skip
+    numbers = {
+        "NX": model.nx, "NU": model.nu, "NY": model.ny, "NQ": model.nq, "STAGES": graph.functions.stages,
+        "MEMORY": graph.memory.size, "ROW": graph.row.size, "AT_POSTERIOR": graph.memory.slices["posterior"].start,
+        "AT_X": graph.memory.slices["x"].start, "AT_THETA": graph.memory.slices["theta"].start,
+        "AT_SPREAD": graph.memory.slices["spread"].start, "AT_INNOVATION": graph.row.slices["innovation"].start,
+        "AT_COVARIANCE": graph.row.slices["covariance"].start, "AT_NIS": graph.row.slices["nis"].start,
+        "AT_RESIDUAL": graph.row.slices["residual"].start,
+        "MOST_ITERATIONS": newton.MOST_ITERATIONS, "MOST_HALVINGS": newton.MOST_HALVINGS,
+        "MOST_SUBSOLVES": implicit_step.MOST_SUBSOLVES, "LAST_STEP": newton.LAST_STEP,
+        "LARGEST_RESIDUAL": newton.LARGEST_RESIDUAL, "FIRST_FRACTION": implicit_step.FIRST_FRACTION,
+        "LEAST_FRACTION": implicit_step.LEAST_FRACTION, "PROJECTION_NOTICE": PROJECTION_NOTICE,
+        "LARGEST_MOVE": "HUGE_VAL" if move is None else float(move),
+        **{f"WORK_{name.upper()}": size for name, size in work.items()},
+    }  # fmt: skip
+    return [
+        *(f"#define {name} {value!r}" if not isinstance(value, str) else f"#define {name} {value}"
+          for name, value in numbers.items()),
+        "/* Arrays of no length are none in C. */", "#define LENGTH(n) ((n) > 0 ? (n) : 1)", "",
+        *c_table("SIZES", np.asarray(model.state_scales)),
+        *c_table("START", initial_memory(observer, observer.initial_state)),
+    ]  # fmt: skip
+
+
+def c_table(name: str, values: FloatArray) -> list[str]:
+    """Return a constant table of C; numbers are read back bit for bit.
+
+    Shapes: ``values (n,)``.
+    """
+    texts = [repr(value) for value in values.tolist()] or ["0.0"]
+    lines = [", ".join(texts[i : i + _NUMBERS_PER_LINE]) for i in range(0, len(texts), _NUMBERS_PER_LINE)]
+    return [f"static const double {name}[{len(texts)}] = {{", "    " + ",\n    ".join(lines) + "};"]
+
+
+def _generated(functions: dict[str, Any]) -> str:
+    """Return CasADi's functions, all of them static, so that two observers can be linked into one program."""
+    import casadi as ca
+
+    options: Any = {"with_header": False, "with_mem": False, "casadi_int": "int", "main": False, "verbose": False}
+    generator = ca.CodeGenerator("observer", options)
+    for name, function in functions.items():
+        generator.add(_renamed(function, name))
+    return "\n".join([
+        "/* What follows was written by CasADi, with parameters and functions that are not used. */",
+        "#if defined(__GNUC__)", "#pragma GCC diagnostic push",
+        *(f'#pragma GCC diagnostic ignored "-W{name}"' for name in ("unused-parameter", "unused-function",
+                                                                     "unused-const-variable")),
+        "#if !defined(__clang__)", '#pragma GCC diagnostic ignored "-Wmaybe-uninitialized"', "#endif", "#endif",
+        "#define CASADI_SYMBOL_EXPORT static", generator.dump().rstrip(),
+        "#if defined(__GNUC__)", "#pragma GCC diagnostic pop", "#endif",
+    ])  # fmt: skip
+
+
+def _renamed(function: Any, name: str) -> Any:
+    import casadi as ca
+
+    if function.name() == name:
+        return function
+    inputs = function.sx_in() if function.is_a("SXFunction") else function.mx_in()
+    return ca.Function(name, inputs, function.call(inputs))

@@ -1,0 +1,319 @@
+"""The C text around the functions that CasADi writes; see `obsynth.observers.dae.c_code`."""
+
+#: One sample: Newton with damping, the homotopy in the input, and the order of a step.
+ADVANCE = r"""
+typedef int (*generated)(const double **arg, double **res, int *iw, double *w, int mem);
+
+#ifndef OBSERVER_IS_DECLARED
+struct observer {
+    double memory[MEMORY];
+    double u[LENGTH(NU)];
+    int started;
+};
+#endif
+
+static void copy(double *to, const double *from, int n)
+{
+    int i;
+    for (i = 0; i < n; i++) {
+        to[i] = from[i];
+    }
+}
+
+static int all_finite(const double *values, int n)
+{
+    int i;
+    for (i = 0; i < n; i++) {
+        if (!isfinite(values[i])) {
+            return 0;
+        }
+    }
+    return 1;
+}
+
+static int call(generated f, const double **inputs, int n_in, double **outputs, int n_out)
+{
+    const double *arg[WORK_ARG];
+    double *res[WORK_RES];
+    int iw[WORK_IW];
+    double w[WORK_W];
+    int i;
+    for (i = 0; i < n_in; i++) {
+        arg[i] = inputs[i];
+    }
+    for (i = 0; i < n_out; i++) {
+        res[i] = outputs[i];
+    }
+    return f(arg, res, iw, w, 0);
+}
+
+/* A point of Newton's iteration: the unknowns, and there the residual, the scale of its rows, and the Newton step. */
+struct point {
+    double X[NX * STAGES];
+    double value[NX * STAGES];
+    double rows[NX * STAGES];
+    double move[NX * STAGES];
+};
+
+static void evaluate(generated f, struct point *at, const double *x, const double *u, const double *theta)
+{
+    const double *inputs[4];
+    double *outputs[3];
+    inputs[0] = at->X;
+    inputs[1] = x;
+    inputs[2] = u;
+    inputs[3] = theta;
+    outputs[0] = at->value;
+    outputs[1] = at->rows;
+    outputs[2] = at->move;
+    if (call(f, inputs, 4, outputs, 3) != 0) {
+        at->move[0] = NAN;
+    }
+}
+
+/* The largest residual in the scale of given rows; not a number where one is. */
+static double largest(const double *rows, const double *value, int n)
+{
+    double found = 0.0;
+    int i;
+    for (i = 0; i < n; i++) {
+        double size = fabs(rows[i] * value[i]);
+        if (!(size <= found)) {
+            found = size;
+        }
+        if (isnan(found)) {
+            return found;
+        }
+    }
+    return found;
+}
+
+/* Damped Newton from at->X; returns whether it converged. */
+static int newton_loop(generated f, struct point *at, const double *x, const double *u, const double *theta, int stages,
+                       double *residual)
+{
+    struct point tried;
+    int n = NX * stages;
+    int iteration, halvings, i;
+    evaluate(f, at, x, u, theta);
+    for (iteration = 0; iteration < MOST_ITERATIONS; iteration++) {
+        double before = largest(at->rows, at->value, n);
+        double share = 1.0;
+        double step = 0.0;
+        int found = 0;
+        if (!all_finite(at->value, n) || !all_finite(at->move, n)) {
+            return 0;
+        }
+        for (i = 0; i < n; i++) {
+            step = fmax(step, fabs(at->move[i]) / fmax(fabs(at->X[i]), SIZES[i % NX]));
+        }
+        for (halvings = 0; halvings <= MOST_HALVINGS && !found; halvings++) {
+            double after;
+            for (i = 0; i < n; i++) {
+                tried.X[i] = at->X[i] + share * at->move[i];
+            }
+            evaluate(f, &tried, x, u, theta);
+            after = largest(at->rows, tried.value, n);
+            if (step <= LAST_STEP) {
+                *at = tried;
+                *residual = after;
+                return after <= LARGEST_RESIDUAL;
+            }
+            found = after < before;
+            share *= 0.5;
+        }
+        if (!found) {
+            return 0;
+        }
+        *at = tried;
+    }
+    return 0;
+}
+
+static double moved(const double *X, const double *start, int stages)
+{
+    double found = 0.0;
+    int i;
+    for (i = 0; i < NX * stages; i++) {
+        found = fmax(found, fabs(X[i] - start[i]) / SIZES[i % NX]);
+    }
+    return found;
+}
+
+/* The implicit step from x; returns whether a solution was found, which is left in X. */
+static int solve(double *X, const double *x, const double *before, const double *u, const double *theta,
+                 double *residual)
+{
+    struct point at;
+    double start[NX * STAGES];
+    double between[LENGTH(NU)];
+    double reached = 0.0;
+    double fraction = FIRST_FRACTION;
+    int changes = 0;
+    int subsolves, converged, i;
+    for (i = 0; i < NX * STAGES; i++) {
+        start[i] = x[i % NX];
+    }
+    copy(at.X, start, NX * STAGES);
+    converged = newton_loop(newton, &at, x, u, theta, STAGES, residual);
+    for (i = 0; i < NU; i++) {
+        changes = changes || before[i] != u[i];
+    }
+    if (converged && (!changes || moved(at.X, start, STAGES) <= LARGEST_MOVE)) {
+        copy(X, at.X, NX * STAGES);
+        return 1;
+    }
+    if (!changes) {
+        return 0;
+    }
+    copy(at.X, start, NX * STAGES);
+    if (!newton_loop(newton, &at, x, before, theta, STAGES, residual)) {
+        return 0;
+    }
+    copy(X, at.X, NX * STAGES);
+    for (subsolves = 1; reached < 1.0; subsolves++) {
+        double target = fmin(1.0, reached + fraction);
+        if (fraction < LEAST_FRACTION || subsolves > MOST_SUBSOLVES) {
+            return 0;
+        }
+        for (i = 0; i < NU; i++) {
+            between[i] = before[i] + target * (u[i] - before[i]);
+        }
+        copy(at.X, X, NX * STAGES);
+        converged = newton_loop(newton, &at, x, between, theta, STAGES, residual);
+        if (converged && moved(at.X, X, STAGES) <= LARGEST_MOVE) {
+            copy(X, at.X, NX * STAGES);
+            reached = target;
+            fraction *= 2.0;
+        } else {
+            fraction *= 0.5;
+        }
+    }
+    return 1;
+}
+
+/* Put the initial state onto its constraint; a move that is only the motion during the short step is not taken. */
+static int put_on_constraint(double *memory, const double *u)
+{
+    struct point at;
+    double residual;
+    copy(at.X, memory + AT_POSTERIOR, NX);
+    if (!newton_loop(project, &at, memory + AT_POSTERIOR, u, memory + AT_THETA, 1, &residual)) {
+        return 0;
+    }
+    if (moved(at.X, memory + AT_POSTERIOR, 1) > PROJECTION_NOTICE) {
+        copy(memory + AT_POSTERIOR, at.X, NX);
+        copy(memory + AT_X, at.X, NX);
+    }
+    return 1;
+}
+
+static void reset(struct observer *state)
+{
+    copy(state->memory, START, MEMORY);
+    state->started = 0;
+}
+
+/* Take one sample: 0; 1 if an input is not finite or an output infinite; 2 if the step has no solution. */
+static int advance(struct observer *state, const double *u, const double *y, double *after, double *said)
+{
+    double memory[MEMORY];
+    double X[NX * STAGES];
+    double heard[NY];
+    double seen[NY];
+    double residual = 0.0;
+    const double *inputs[5];
+    double *outputs[2];
+    int failed, i;
+    if (!all_finite(u, NU)) {
+        return 1;
+    }
+    for (i = 0; i < NY; i++) {
+        if (isinf(y[i])) {
+            return 1;
+        }
+        seen[i] = isnan(y[i]) ? 0.0 : 1.0;
+        heard[i] = isnan(y[i]) ? 0.0 : y[i];
+    }
+    copy(memory, state->memory, MEMORY);
+    outputs[0] = after;
+    outputs[1] = said;
+    inputs[0] = memory;
+    if (state->started) {
+        if (!solve(X, memory + AT_POSTERIOR, state->u, u, memory + AT_THETA, &residual)) {
+            return 2;
+        }
+        inputs[1] = X;
+        inputs[2] = u;
+        inputs[3] = heard;
+        inputs[4] = seen;
+        failed = call(sample, inputs, 5, outputs, 2);
+    } else {
+        if (!put_on_constraint(memory, u)) {
+            return 2;
+        }
+        inputs[1] = heard;
+        inputs[2] = seen;
+        failed = call(first, inputs, 3, outputs, 2);
+    }
+    if (failed || !all_finite(after, MEMORY)) {
+        return 2;
+    }
+    said[AT_RESIDUAL] = residual;
+    copy(state->memory, after, MEMORY);
+    copy(state->u, u, NU);
+    state->started = 1;
+    return 0;
+}
+"""
+
+#: Whole records and batches, for a shared library.
+RECORD = r"""
+long state_bytes(void)
+{
+    return (long)sizeof(struct observer);
+}
+
+void begin(struct observer *state)
+{
+    reset(state);
+}
+
+/* Go on over some samples; returns the number of those that were taken. */
+int record(struct observer *state, int samples, const double *u, const double *y, double *after, double *said)
+{
+    int k;
+    for (k = 0; k < samples; k++) {
+        if (advance(state, u + k * NU, y + k * NY, after + (long)k * MEMORY, said + (long)k * ROW) != 0) {
+            return k;
+        }
+    }
+    return samples;
+}
+
+static void hand_out(double *out, const double *after, const double *said)
+{
+/* PARTS */
+}
+
+/* Run over several records one after the other, with inputs `apart` numbers apart; returns the first run that
+   cannot be finished, or their number. */
+int batch(int runs, int samples, long apart, const double *u, const double *y, double *out)
+{
+    struct observer state;
+    double after[MEMORY];
+    double said[ROW];
+    int run, k;
+    for (run = 0; run < runs; run++) {
+        reset(&state);
+        for (k = 0; k < samples; k++) {
+            long row = (long)run * samples + k;
+            if (advance(&state, u + run * apart + (long)k * NU, y + row * NY, after, said) != 0) {
+                return run;
+            }
+            hand_out(out + row * PARTS_SIZE, after, said);
+        }
+    }
+    return runs;
+}
+"""

@@ -1,0 +1,236 @@
+"""The eleven steps of each sample as one CasADi graph, the only place where they are written.
+
+The order makes (12)-(23) explicit: prediction and its covariance with K, H and L of k - 1; the innovation before any
+update; the parameters; the state that follows them; H, L and K at the result.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from obsynth.numerics.symbolic_solve import definite_solved
+from obsynth.observers.dae.memory_layout import Layout, memory_layout, row_layout
+from obsynth.plants.dae.functions import DAEFunctions
+from obsynth.plants.dae.step_graph import StepGraph, step_graph
+
+if TYPE_CHECKING:
+    from obsynth.observers.dae.observer import DAEObserver
+
+Arrays = dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class ObserverGraph:
+    """The functions of an observer.
+
+    Fields: memory, row: Of what is carried on, and of what is said besides; functions: The model with its method of
+    integration; step: Its implicit step; first: From memory, outputs and one for each that is seen, at k = 0, to memory
+    and row; sample: From memory, stages of the solved step, input, outputs and what is seen to memory and row; whole:
+    The implicit step and `sample`: from memory and ``[u; y; seen]`` to memory and row.
+    """
+
+    memory: Layout
+    row: Layout
+    functions: DAEFunctions
+    step: StepGraph
+    first: Any
+    sample: Any
+    whole: Any
+    _stretches: dict[int, Any] = field(default_factory=dict, repr=False)
+
+    def over(self, samples: int) -> Any:
+        """Return `whole` over several samples: from memory and arriving columns to columns of memory and row."""
+        if samples not in self._stretches:
+            self._stretches[samples] = self.whole.mapaccum(samples)
+        return self._stretches[samples]
+
+
+def observer_graph(observer: DAEObserver) -> ObserverGraph:
+    """Return the functions of an observer."""
+    import casadi as ca
+
+    functions = DAEFunctions(observer.model, observer.integration)
+    step = step_graph(functions, observer.dt, np.inf if observer.largest_move is None else observer.largest_move)
+    memory, row = memory_layout(observer), row_layout(observer)
+    nx, nu, ny = observer.model.nx, observer.model.nu, observer.model.ny
+    packed, X = ca.MX.sym("memory", memory.size), ca.MX.sym("stages", nx * functions.stages)
+    u, y, seen = ca.MX.sym("u", nu), ca.MX.sym("y", ny), ca.MX.sym("seen", ny)
+    nothing = {name: ca.MX(*shape) for name, shape in row.shapes.items()}
+    begun = {**nothing, **memory.symbols(packed)}
+    first = ca.Function("first", [packed, y, seen], _outcome(_Update(observer, functions, y, seen).first(begun),
+                                                             memory, row))  # fmt: skip
+    before = memory.symbols(packed)
+    local = step.sensitivities(X, before["posterior"], u, before["theta"])
+    predicted = _predicted(observer, before, X[-nx:], local)
+    found = {**nothing, **_Update(observer, functions, y, seen).later(predicted)}
+    sample = ca.Function("sample", [packed, X, u, y, seen], _outcome(found, memory, row))
+    if step.small:
+        first, sample = first.expand(), sample.expand()
+    arriving = ca.MX.sym("arriving", nu + 2 * ny)
+    u, y, seen = arriving[:nu], arriving[nu : nu + ny], arriving[nu + ny :]
+    before = memory.symbols(packed)
+    stages, residual, trusted = step.step(before["posterior"], u, before["theta"])
+    after, said = sample(packed, stages, u, y, seen)
+    # The residual and the verdict are the last two entries of a row.
+    said = ca.vertcat(said[: row.size - 2], residual, trusted)
+    whole = ca.Function("whole", [packed, arriving], [after, said])
+    return ObserverGraph(memory, row, functions, step, first, sample, whole)
+
+
+def _outcome(found: Arrays, memory: Layout, row: Layout) -> list[Any]:
+    return [memory.column(found), row.column(found)]
+
+
+def _predicted(observer: DAEObserver, before: Arrays, x: Any, local: tuple[Any, ...]) -> Arrays:
+    """Steps 1 to 5: the prediction and its covariance, with K, H and L of k - 1."""
+    import casadi as ca
+
+    F, G, noise, scaled = local
+    P, K, H, L, spread = (before[name] for name in ("P", "K", "H", "L", "spread"))
+    added = noise @ ca.DM(observer.Q) @ noise.T
+    kept = ca.DM.eye(observer.model.nx) - K @ H
+    after = {**before, "x": x, "F": F, "G": G, "kept": F @ kept, "scaled": scaled}
+    if observer.form == "augmented-kalman":
+        through = F @ before["cross"] @ G.T
+        P = F @ P @ F.T + through + through.T + G @ spread @ G.T + added
+        after["cross"], after["spread"] = F @ before["cross"] + G @ spread, spread + ca.DM(observer.random_walk)
+    else:
+        P = F @ (kept @ P @ kept.T + K @ ca.DM(observer.R) @ K.T) @ F.T + added
+    after["P"] = 0.5 * (P + P.T)
+    after["Upsilon"] = F @ kept @ before["Upsilon"] + G - F @ K @ L
+    return after
+
+
+class _Update:
+    """The measurement of one sample; a channel that is not seen has an innovation of zero and no gain."""
+
+    def __init__(self, observer: DAEObserver, functions: DAEFunctions, y: Any, seen: Any) -> None:
+        import casadi as ca
+
+        self.observer, self.functions, self.y, self.seen = observer, functions, y, seen
+        # The rows and columns of R that are not seen become those of the identity, which nothing else touches.
+        self.R = ca.DM(observer.R) * (seen @ seen.T) + ca.diag(1.0 - seen)
+
+    def first(self, found: Arrays) -> Arrays:
+        """Correct the state only: y(0) says nothing of the parameters that the start does not."""
+        innovation = self._innovation(found)
+        return self._joint(innovation, learns=False) if self._is_joint else self._corrected(innovation)
+
+    def later(self, found: Arrays) -> Arrays:
+        """Update parameters and state."""
+        innovation = self._innovation(found)
+        if self._is_joint:
+            return self._joint(innovation, learns=True)
+        return self._corrected(self._learnt(innovation))
+
+    @property
+    def _is_joint(self) -> bool:
+        return self.observer.form == "augmented-kalman"
+
+    def _seen_outputs(self, found: Arrays) -> tuple[Any, Any, Any, Any, Any]:
+        """Return H and L as they are, and innovation, H and L with zeros where nothing is seen."""
+        import casadi as ca
+
+        predicted, H, L = self.functions.output_function(found["x"], found["theta"])
+        mask = ca.diag(self.seen)
+        return H, L, self.seen * (self.y - predicted), mask @ H, mask @ L
+
+    def _innovation(self, found: Arrays) -> Arrays:
+        """Step 6, with the square of the innovation in units of its covariance and what it says of the parameters."""
+        _, _, e, H, L = self._seen_outputs(found)
+        Sigma = H @ found["P"] @ H.T + self.R
+        Omega = H @ found["Upsilon"] + L
+        if self._is_joint:
+            through = H @ found["cross"] @ L.T
+            covariance = Sigma + through + through.T + L @ found["spread"] @ L.T
+        else:
+            covariance = Sigma + Omega @ found["spread"] @ Omega.T
+        return {
+            **found, "innovation": e, "nis": e.T @ definite_solved(covariance, e), "Sigma": Sigma, "Omega": Omega,
+            "information": Omega.T @ definite_solved(Sigma, Omega), "seen H": H, "seen L": L,
+        }  # fmt: skip
+
+    def _learnt(self, found: Arrays) -> Arrays:
+        """Steps 7 to 9 and 11: (17)-(19); a sample of which nothing is seen changes nothing and forgets nothing."""
+        import casadi as ca
+
+        observer, Sigma, Omega = self.observer, found["Sigma"], found["Omega"]
+        prior, spread = self._remembered(found["S"]), found["spread"]
+        if observer.form == "random-walk":
+            spread = spread + ca.DM(observer.random_walk)
+        weight = self.R if observer.weight == "paper" else Sigma
+        gain = definite_solved(weight + Omega @ prior @ Omega.T, Omega @ prior).T
+        S = prior - gain @ Omega @ prior
+        kept = ca.DM.eye(observer.model.nq) - gain @ Omega
+        theta = self._bounded(found["theta"] + gain @ found["innovation"])
+        spread = kept @ spread @ kept.T + gain @ Sigma @ gain.T
+        after = {
+            "S": 0.5 * (S + S.T), "spread": 0.5 * (spread + spread.T), "theta": theta,
+            "x": found["x"] + found["Upsilon"] @ (theta - found["theta"]),
+        }  # fmt: skip
+        anything = ca.sum1(self.seen) > 0.0
+        return {**found, **{name: ca.if_else(anything, value, found[name]) for name, value in after.items()}}
+
+    def _remembered(self, S: Any) -> Any:
+        """Return S / lambda, or its walk, or what is left of the information beside that of S_0."""
+        import casadi as ca
+
+        observer = self.observer
+        if observer.form == "random-walk":
+            return S + ca.DM(observer.random_walk)
+        if observer.guard == "none" or observer.forgetting == 1.0:
+            return S / observer.forgetting
+        one = ca.MX(ca.DM.eye(observer.model.nq))
+        start = np.linalg.inv(observer.initial_parameter_covariance) if observer.model.nq else np.zeros((0, 0))
+        kept = observer.forgetting * definite_solved(S, one) + (1.0 - observer.forgetting) * ca.DM(start)
+        prior = definite_solved(kept, one)
+        return 0.5 * (prior + prior.T)
+
+    def _bounded(self, theta: Any) -> Any:
+        import casadi as ca
+
+        entries = ca.vertsplit(theta) if theta.shape[0] else []
+        for i, (low, high) in enumerate(zip(self.observer.lower, self.observer.upper, strict=True)):
+            entries[i] = ca.fmax(entries[i], low) if np.isfinite(low) else entries[i]
+            entries[i] = ca.fmin(entries[i], high) if np.isfinite(high) else entries[i]
+        return ca.vertcat(*entries) if entries else theta
+
+    def _corrected(self, found: Arrays) -> Arrays:
+        """Step 10: the gain at the updated estimate, the state after the measurement, and its covariance."""
+        import casadi as ca
+
+        full_H, full_L, e, H, _ = self._seen_outputs(found)
+        P = found["P"]
+        K = definite_solved(H @ P @ H.T + self.R, H @ P).T @ ca.diag(self.seen)
+        kept = ca.DM.eye(self.observer.model.nx) - K @ full_H
+        through = kept @ found["Upsilon"] - K @ full_L
+        own = kept @ P @ kept.T + K @ ca.DM(self.observer.R) @ K.T
+        covariance = own + through @ found["spread"] @ through.T
+        return {**found, "H": full_H, "L": full_L, "K": K, "posterior": found["x"] + K @ e, "covariance": covariance}
+
+    def _joint(self, found: Arrays, *, learns: bool) -> Arrays:
+        """Update states and parameters together, in Joseph's form."""
+        import casadi as ca
+
+        nx, nq = self.observer.model.nx, self.observer.model.nq
+        P, cross, spread, H, L = (found[name] for name in ("P", "cross", "spread", "seen H", "seen L"))
+        whole = ca.vertcat(ca.horzcat(P, cross), ca.horzcat(cross.T, spread))
+        rows, mask = ca.horzcat(H, L), ca.diag(self.seen)
+        if learns:
+            gain = definite_solved(rows @ whole @ rows.T + self.R, rows @ whole).T @ mask
+        else:
+            gain = ca.vertcat(definite_solved(H @ P @ H.T + self.R, H @ P).T @ mask, ca.DM.zeros(nq, mask.shape[0]))
+        kept = ca.DM.eye(nx + nq) - gain @ rows
+        whole = kept @ whole @ kept.T + gain @ self.R @ gain.T
+        whole = 0.5 * (whole + whole.T)
+        correction = gain @ found["innovation"]
+        after = {
+            **found, "P": whole[:nx, :nx], "cross": whole[:nx, nx:], "spread": whole[nx:, nx:],
+            "x": found["x"] + correction[:nx], "theta": self._bounded(found["theta"] + correction[nx:]),
+            "K": gain[:nx, :], "covariance": whole[:nx, :nx],
+        }  # fmt: skip
+        full_H, full_L, *_ = self._seen_outputs(after)
+        return {**after, "H": full_H, "L": full_L, "posterior": after["x"]}

@@ -1,0 +1,1 @@
+"""Linear observers: one realisation."""

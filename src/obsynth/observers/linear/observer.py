@@ -1,0 +1,269 @@
+"""The linear observer that a design ships: one realisation, `run` over a record, `step` sample by sample."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from obsynth.errors import SpecError
+from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
+from obsynth.observers.linear.checking import NAME_FIELDS, checked_record, checked_sample, is_delay, require_names
+
+
+@dataclass(frozen=True, eq=False)
+class LinearObserver:
+    r"""A realisation from known inputs and outputs to estimates.
+
+    .. math::
+        z^+ = A_z z + B_u u + B_y y, \qquad
+        [\hat x; \hat f; r] = C_z z + D_u u + D_y y
+
+    Parameters
+    ----------
+    Az, Bu, By : array_like
+        ``(nz, nz)``, ``(nz, nu)``, ``(nz, ny)``.
+    Cz, Du, Dy : array_like
+        ``(nx + nf + nr, nz)``, ``(nx + nf + nr, nu)``, ``(nx + nf + nr, ny)``: state estimates first, then
+        fault estimates, then residuals.
+    dt : float
+        Seconds between samples; 0 for continuous time.
+    input_names, output_names : tuple of str
+        The signals of ``u`` and ``y``, in order.
+    state_names, fault_names, residual_names : tuple of str
+        The signals that are estimated, in order.
+    state_delays, fault_delays : tuple of int
+        Samples by which each estimate lags: at time k it is the estimate of the signal at ``k - delay``.
+
+    Raises
+    ------
+    SpecError
+        Shapes do not fit together, names are no tuple of unique texts, or delays no tuple of whole numbers.
+    """
+
+    Az: FloatArray
+    Bu: FloatArray
+    By: FloatArray
+    Cz: FloatArray
+    Du: FloatArray
+    Dy: FloatArray
+    dt: float
+    input_names: tuple[str, ...]
+    output_names: tuple[str, ...]
+    state_names: tuple[str, ...]
+    fault_names: tuple[str, ...]
+    residual_names: tuple[str, ...]
+    state_delays: tuple[int, ...]
+    fault_delays: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        for field in NAME_FIELDS:
+            require_names(getattr(self, field), field)
+        given = {name: as_matrix(getattr(self, name), name) for name in ("Az", "Bu", "By", "Cz", "Du", "Dy")}
+        nz, nu, ny = given["Az"].shape[0], len(self.input_names), len(self.output_names)
+        rows = len(self.state_names) + len(self.fault_names) + len(self.residual_names)
+        shapes = {"Az": (nz, nz), "Bu": (nz, nu), "By": (nz, ny), "Cz": (rows, nz), "Du": (rows, nu), "Dy": (rows, ny)}
+        for name, shape in shapes.items():
+            matrix = np.zeros(shape) if 0 in shape and given[name].size == 0 else given[name]
+            if matrix.shape != shape:
+                raise SpecError(f"{name} of the observer is {matrix.shape}, but {shape} is needed.", path=name)
+            object.__setattr__(self, name, read_only(matrix))
+        if not (math.isfinite(self.dt) and self.dt >= 0.0):
+            raise SpecError(f"dt of the observer is {self.dt}: give seconds, or 0 for continuous time.", path="dt")
+        for names, delays in ((self.state_names, self.state_delays), (self.fault_names, self.fault_delays)):
+            if not isinstance(delays, tuple) or len(names) != len(delays) or not all(map(is_delay, delays)):
+                raise SpecError("The observer needs one delay >= 0, in samples, for each signal.", path="delays")
+
+    @property
+    def order(self) -> int:
+        """Number of observer states ``nz``."""
+        return int(self.Az.shape[0])
+
+    @property
+    def state_rows(self) -> slice:
+        """Rows of ``Cz`` that hold the state estimates."""
+        return slice(0, len(self.state_names))
+
+    @property
+    def fault_rows(self) -> slice:
+        """Rows of ``Cz`` that hold the fault estimates."""
+        return slice(len(self.state_names), len(self.state_names) + len(self.fault_names))
+
+    @property
+    def residual_rows(self) -> slice:
+        """Rows of ``Cz`` that hold the residuals."""
+        return slice(len(self.state_names) + len(self.fault_names), int(self.Cz.shape[0]))
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return every field, as the constructor takes it."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> LinearObserver:
+        """Return the observer that `as_dict` described.
+
+        Parameters
+        ----------
+        data : mapping
+            Every field by name; lists stand for tuples.
+        """
+        # JSON has lists where we have tuples of names and delays.
+        values: dict[str, Any] = {
+            key: tuple(value) if isinstance(value, list) else value for key, value in data.items()
+        }
+        return cls(**values)
+
+    def start(self, initial_state: ArrayLike | None = None) -> RunningObserver:
+        """Return an observer that takes one sample at a time.
+
+        Parameters
+        ----------
+        initial_state : array_like, optional
+            ``z(0)``, ``(nz,)``; zero by default.
+        """
+        return RunningObserver(self, initial_state)
+
+    def run(self, y: ArrayLike, u: ArrayLike | None = None, *, initial_state: ArrayLike | None = None) -> Estimates:
+        """Run over a whole record of a discrete-time observer.
+
+        Parameters
+        ----------
+        y : array_like
+            Outputs ``(steps, ny)``.
+        u : array_like, optional
+            Known inputs ``(steps, nu)``; may be left out when there are none.
+        initial_state : array_like, optional
+            ``z(0)``, ``(nz,)``; zero by default.
+
+        Returns
+        -------
+        Estimates
+            One row per sample.
+
+        Raises
+        ------
+        SpecError
+            Shapes do not fit, or a sample is not finite.
+        """
+        outputs = checked_record(y, len(self.output_names), "y")
+        known = np.zeros((len(outputs), 0)) if u is None and not self.input_names else u
+        inputs = checked_record(known, len(self.input_names), "u")
+        if len(inputs) != len(outputs):
+            raise SpecError(f"u has {len(inputs)} samples and y has {len(outputs)}: give the same number.", path="u")
+        running = self.start(initial_state)
+        rows = np.empty((len(outputs), self.Cz.shape[0]))
+        for k in range(len(outputs)):
+            rows[k] = running.raw_step(outputs[k], inputs[k])
+        return Estimates.split(self, rows)
+
+
+class RunningObserver:
+    """A running linear observer: `step` takes y(k) and u(k) and returns the estimates at k.
+
+    Parameters
+    ----------
+    observer : LinearObserver
+        The realisation; discrete time.
+    initial_state : array_like, optional
+        ``z(0)``, ``(nz,)``; zero by default.
+
+    Raises
+    ------
+    SpecError
+        The observer is a continuous-time one, or the initial state has the wrong length.
+    """
+
+    def __init__(self, observer: LinearObserver, initial_state: ArrayLike | None = None) -> None:
+        if observer.dt <= 0.0:
+            raise SpecError(
+                "This observer is continuous in time: it must be discretised before it can step.", path="dt"
+            )
+        start = np.zeros(observer.order) if initial_state is None else initial_state
+        self.state = checked_sample(start, observer.order, "initial_state").copy()
+        self.observer = observer
+
+    def raw_step(self, y: FloatArray, u: FloatArray) -> FloatArray:
+        """Return the row ``[xhat, fhat, r]`` and advance, without checking the samples.
+
+        Parameters
+        ----------
+        y, u : FloatArray
+            ``(ny,)`` and ``(nu,)``, finite.
+        """
+        system = self.observer
+        row = system.Cz @ self.state + system.Du @ u + system.Dy @ y
+        self.state = system.Az @ self.state + system.Bu @ u + system.By @ y
+        return np.asarray(row)
+
+    def step(self, y: ArrayLike, u: ArrayLike = ()) -> Estimates:
+        """Take ``y (ny,)`` and ``u (nu,)`` of one sample; return the estimates at that sample.
+
+        Parameters
+        ----------
+        y : array_like
+            Outputs ``(ny,)``.
+        u : array_like, optional
+            Known inputs ``(nu,)``.
+
+        Raises
+        ------
+        SpecError
+            A sample has the wrong length or is not finite; the state is left as it was.
+        """
+        outputs = checked_sample(y, len(self.observer.output_names), "y")
+        inputs = checked_sample(u, len(self.observer.input_names), "u")
+        return Estimates.split(self.observer, self.raw_step(outputs, inputs)[None, :])
+
+
+@dataclass(frozen=True, eq=False)
+class Estimates:
+    """What an observer says, one row per sample.
+
+    Parameters
+    ----------
+    states : FloatArray
+        ``(steps, nx)``; column i estimates state i at ``k - state_delays[i]``.
+    faults : FloatArray
+        ``(steps, nf)``; column i estimates fault i at ``k - fault_delays[i]``.
+    residuals : FloatArray
+        ``(steps, nr)``.
+    state_names, fault_names, residual_names : tuple of str
+        Names of the columns.
+    state_delays, fault_delays : tuple of int
+        Delays in samples.
+    """
+
+    states: FloatArray
+    faults: FloatArray
+    residuals: FloatArray
+    state_names: tuple[str, ...]
+    fault_names: tuple[str, ...]
+    residual_names: tuple[str, ...]
+    state_delays: tuple[int, ...]
+    fault_delays: tuple[int, ...]
+
+    @classmethod
+    def split(cls, observer: LinearObserver, rows: FloatArray) -> Estimates:
+        """Return the estimates in the output rows of an observer.
+
+        Parameters
+        ----------
+        observer : LinearObserver
+            Whose rows they are.
+        rows : FloatArray
+            ``(steps, nx + nf + nr)``.
+        """
+        return cls(
+            read_only(rows[:, observer.state_rows]),
+            read_only(rows[:, observer.fault_rows]),
+            read_only(rows[:, observer.residual_rows]),
+            observer.state_names,
+            observer.fault_names,
+            observer.residual_names,
+            observer.state_delays,
+            observer.fault_delays,
+        )

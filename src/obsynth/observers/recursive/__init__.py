@@ -1,0 +1,1 @@
+"""Recursive observers of time-varying plants."""

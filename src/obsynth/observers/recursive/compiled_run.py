@@ -1,0 +1,164 @@
+"""Whole records: step by step, or through the compiled kernel with single steps where it does not reach.
+
+The kernel (`obsynth.numerics.compiled_steps`, numba) covers filters of every plant, with early constraints too, without
+parameters or with parameters as a random walk; not the forms that learn by least squares.  It propagates square roots
+at each step as the normal path does, with equal results up to rounding.  Steps with missing samples, with undetermined
+states, or where a rank has to be decided (perfect equations) are taken by the normal path.  It is used unasked when
+numba is installed, the record has `LONG_RECORD` samples and the observer no more than `SMALL_ORDER` states.  The first
+use of an installation compiles for some seconds; numba keeps the result.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from dataclasses import dataclass
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.least_squares_step import SUSPECT_PARITY
+from obsynth.observers.recursive.estimates import RecursiveEstimates, deviations_of, received_in
+from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.recursive.running import RawEstimate, RunningRecursiveObserver
+from obsynth.observers.recursive.step_stacks import stacked_matrices, stacked_steps
+
+#: Samples from which the kernel is used unasked: they take seconds without it, which is what loading numba, or the
+#: first compilation of an installation, takes.
+LONG_RECORD = 100_000
+#: Numbers in the state up to which the kernel is faster than LAPACK.
+SMALL_ORDER = 25
+#: Steps that are prepared together: bounds the memory of plants that vary.
+CHUNK = 4096
+#: Fewer complete samples in a row than this are faster step by step.
+SHORT_STRETCH = 8
+
+
+def kernel_covers(observer: RecursiveObserver) -> bool:
+    """Return whether the kernel knows the recursion: that of a filter, with parameters as a random walk or none."""
+    return observer.adaptation is None or observer.adaptation.form == "random-walk"
+
+
+def kernel_is_chosen(observer: RecursiveObserver, samples: int, compiled: bool | None) -> bool:
+    """Return whether a record goes through the kernel."""
+    if compiled is False:
+        return False
+    covered, installed = kernel_covers(observer), importlib.util.find_spec("numba") is not None
+    if compiled is None:
+        return covered and installed and samples >= LONG_RECORD and observer.order <= SMALL_ORDER
+    if not installed:
+        raise SpecError(
+            "compiled=True needs numba, which is not installed: pip install 'obsynth[fast]', or leave the option out.",
+            path="compiled",
+        )
+    if not covered:
+        raise SpecError(
+            "compiled=True: the kernel runs filters, without parameters or with form 'random-walk'. The forms "
+            "'innovation' and 'literal' run without it: leave the option out.", path="compiled",
+        )  # fmt: skip
+    return True
+
+
+def run_record(observer: RecursiveObserver, y: FloatArray, u: FloatArray, compiled: bool | None) -> RecursiveEstimates:
+    """Run over a whole record.
+
+    Shapes: ``y (samples, ny)``, ``u (samples, nu)``.
+    """
+    if kernel_is_chosen(observer, len(y), compiled):
+        return run_compiled(observer, y, u)
+    running = observer.start()
+    return RecursiveEstimates.of(observer, [running.raw_step(y[k], u[k]) for k in range(len(y))])
+
+
+@dataclass
+class _Record:
+    """The estimates of a record while it is being filled; innovations are padded by NaN."""
+
+    states: FloatArray
+    deviations: FloatArray
+    parameters: FloatArray
+    covariances: FloatArray
+    innovations: FloatArray
+    degrees: FloatArray
+
+    @classmethod
+    def empty(cls, samples: int, nx: int, nq: int, rows: int) -> _Record:
+        """Return a record of samples without estimates."""
+        return cls(
+            np.empty((samples, nx)), np.empty((samples, nx)), np.empty((samples, nq)), np.empty((samples, nq, nq)),
+            np.full((samples, rows), np.nan), np.zeros(samples),
+        )  # fmt: skip
+
+    def note(self, k: int, row: RawEstimate) -> None:
+        """Keep one sample of a running observer."""
+        self.states[k], self.deviations[k] = row.x, deviations_of(row)
+        self.parameters[k], self.covariances[k] = row.parameters.theta, row.parameters.spread @ row.parameters.spread.T
+        self.innovations[k, : len(row.innovation)], self.degrees[k] = row.innovation, len(row.innovation)
+
+    def estimates(self, observer: RecursiveObserver, y: FloatArray) -> RecursiveEstimates:
+        """Return the whole."""
+        most = int(self.degrees.max(initial=0.0))
+        innovations = self.innovations[:, :most]
+        samples, nq = self.parameters.shape
+        # Without parameters there is nothing to excite; with a random walk no window is watched.
+        excitation = np.full(samples, 0.0 if observer.adaptation is None else np.nan)
+        return RecursiveEstimates(
+            read_only(self.states), read_only(self.deviations), read_only(self.parameters),
+            read_only(self.covariances), read_only(innovations), read_only(np.full((samples, most, nq), np.nan)),
+            read_only(np.nansum(innovations * innovations, axis=1)), read_only(self.degrees),
+            read_only(excitation), observer.state_names, observer.fault_names, received_in(y),
+        )  # fmt: skip
+
+
+def run_compiled(observer: RecursiveObserver, y: FloatArray, u: FloatArray) -> RecursiveEstimates:
+    """Run over a whole record with the kernel; single steps where samples are missing or a rank has to be decided.
+
+    Shapes: ``y (samples, ny)``, ``u (samples, nu)``.
+    """
+    running, plant = observer.start(), observer.plant
+    nq = 0 if observer.adaptation is None else plant.nq
+    record = _Record.empty(len(y), plant.nx, nq, plant.ne + plant.ny + nq)
+    stretches = _complete_stretches(y)
+    pause, patience = 1, 1
+    k = 0
+    while k < len(y):
+        count = min(int(stretches[k]), CHUNK)
+        if pause or count < SHORT_STRETCH or running.diffuse.shape[1]:
+            record.note(k, running.raw_step(y[k], u[k]))
+            k, pause = k + 1, max(pause - 1, 0)
+            continue
+        taken = _kernel_steps(running, record, y[k : k + count], u[k - 1 : k + count])
+        k += taken
+        if taken < count:
+            # A step for the other path; where such steps are the rule, the kernel is tried less and less often.
+            pause, patience = patience, 2 * patience
+    return record.estimates(observer, y)
+
+
+def _complete_stretches(y: FloatArray) -> FloatArray:
+    """Return, for each sample, how many complete ones begin with it."""
+    missing = np.flatnonzero(np.isnan(y).any(axis=1))
+    after = np.append(missing, len(y))[np.searchsorted(missing, np.arange(len(y)))]
+    return np.asarray(after - np.arange(len(y)))
+
+
+def _kernel_steps(running: RunningRecursiveObserver, record: _Record, y: FloatArray, u: FloatArray) -> int:
+    """Take as many steps as the kernel can; ``u`` begins one sample before ``y``."""
+    from obsynth.numerics.compiled_steps import square_root_steps
+
+    first = running.k
+    stack = stacked_steps(stacked_matrices(running.model, first - 1, len(y)), u[:-1], y, u[1:])
+    if stack is None:
+        return 0
+    count, rows = stack.data.shape
+    n, nx = len(running.x), record.states.shape[1]
+    x, factor = np.array(running.x), np.array(running.factor, order="C")
+    states, innovations = np.empty((count, n)), np.empty((count, rows - n))
+    deviations, covariances = np.empty((count, nx)), np.empty((count, n - nx, n - nx))
+    taken = square_root_steps(x, factor, *stack, states, innovations, deviations, covariances, SUSPECT_PARITY)
+    kept = slice(first, first + taken)
+    record.states[kept], record.parameters[kept] = states[:taken, :nx], states[:taken, nx:]
+    record.deviations[kept], record.covariances[kept] = deviations[:taken], covariances[:taken]
+    record.innovations[kept, : rows - n], record.degrees[kept] = innovations[:taken], rows - n
+    running.x, running.factor, running.k, running.u = x, factor, first + taken, u[taken]
+    return taken

@@ -1,0 +1,165 @@
+"""Everything a recursive observer computes that does not depend on data, and whole batches of trials run with it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import chain
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from obsynth.errors import SpecError
+from obsynth.numerics.arguments import real_array
+from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.least_squares_step import least_squares_step, rank_revealing_step
+from obsynth.numerics.recursive_least_squares import update
+from obsynth.observers.recursive.literal_form import posterior_residual
+from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.recursive.records import require_horizon
+from obsynth.observers.recursive.running import RunningRecursiveObserver
+from obsynth.observers.recursive.step_model import EarlyConstraintSteps, StepMatrices, require_in_range
+
+
+class GainStep(NamedTuple):
+    """The gains of one step; data are the rows ``[A x + B u; outputs]``.
+
+    Fields: step: Of the model as it is run; gain: ``[L K] (nx, rows)`` of (11); parity: ``(m, rows)``: from data to the
+    whitened innovation; G: ``(m, nq)``: its regressor; Upsilon: ``(nx, nq)``, after the step; factor: ``(nx, nx)``:
+    square root of the covariance of the state, the parameters being known; learn: ``(nq, rows)``: from data to the
+    correction of the parameters; forget: ``(nq, nq)``: ``theta^+ = forget theta + learn data``; spread: ``(nq, nq)``:
+    square root of the covariance of the parameters.
+    """
+
+    step: StepMatrices
+    gain: FloatArray
+    parity: FloatArray
+    G: FloatArray
+    Upsilon: FloatArray
+    factor: FloatArray
+    learn: FloatArray
+    forget: FloatArray
+    spread: FloatArray
+
+
+def gain_steps(
+    observer: RecursiveObserver, steps: int, *, received: NDArray[np.bool_] | None = None
+) -> Iterator[GainStep]:
+    """Yield the gains of the first steps.
+
+    Shapes: ``received (samples, ny)``.
+    """
+    start = RunningRecursiveObserver(observer)
+    factor, Upsilon, parameters, diffuse = start.factor, start.Upsilon, start.parameters, start.diffuse
+    adaptation, model = observer.adaptation, start.model
+    first = [model.first()] if isinstance(model, EarlyConstraintSteps) else []
+    for k, step in enumerate(chain(first, (model.at(k) for k in range(steps))), 1 - len(first)):
+        ne, rows, nq = len(step.A), len(step.H), Upsilon.shape[1]
+        S = np.zeros((rows, max(factor.shape[1] + step.noise.shape[1], rows)))
+        S[:ne, : factor.shape[1]] = step.A @ factor
+        S[:, factor.shape[1] : factor.shape[1] + step.noise.shape[1]] = step.noise
+        require_in_range(S, factor, k, observer.state_names)
+        right = np.eye(rows)
+        if nq:
+            right = np.hstack([right, np.vstack([step.A @ Upsilon + step.Phi, -step.Psi])])
+        unknown = np.vstack([step.A @ diffuse, np.zeros((rows - ne, diffuse.shape[1]))])
+        H = step.H
+        if received is not None and k and not received[k].all():
+            kept = np.concatenate([np.ones(ne, dtype=bool), received[k], np.ones(len(step.Dn), dtype=bool)])
+            H, S, right, unknown = H[kept], S[kept], right[kept], unknown[kept]
+        found = None if unknown.shape[1] else least_squares_step(H, S, right)
+        found = found or rank_revealing_step(H, S, right, unknown, mapped=rows)
+        diffuse = found.diffuse
+        gain, Upsilon, factor = found.estimate[:, :rows], found.estimate[:, rows:], found.factor
+        parity, G = found.innovation[:, :rows], -found.innovation[:, rows:]
+        learn, forget = np.zeros((nq, rows)), np.eye(nq)
+        if adaptation is not None and nq:
+            seen, regressor, noise = parity, G, None
+            if start.literal and len(H) > ne:
+                seen, regressor, noise = posterior_residual(found, H, S, right, ne, unknown=unknown, columns=rows)
+            parameters, theta_gain = update(
+                parameters, np.zeros(len(regressor)), regressor, forgetting=adaptation.forgetting,
+                regular=start.regular, directional=start.directional, noise=noise,
+            )  # fmt: skip
+            learn, forget = theta_gain @ seen, np.eye(nq) - theta_gain @ regressor
+        yield GainStep(step, gain, parity, G, Upsilon, factor, learn, forget, parameters.spread)
+
+
+@dataclass(frozen=True, eq=False)
+class BatchEstimates:
+    """Estimates of many trials that share one model.
+
+    Parameters
+    ----------
+    states : FloatArray
+        ``(trials, samples, nx)``.
+    parameters : FloatArray
+        ``(trials, samples, nq)``.
+    innovations : FloatArray
+        ``(trials, samples, m)``: whitened, of the model without parameters; NaN at k = 0.
+    """
+
+    states: FloatArray
+    parameters: FloatArray
+    innovations: FloatArray
+
+
+def run_batch(observer: RecursiveObserver, y: ArrayLike, u: ArrayLike | None = None) -> BatchEstimates:
+    """Run many trials at once: the gains do not depend on data, so a step is one product for all trials.
+
+    Shapes: ``y (trials, samples, ny)``.
+    """
+    if observer.adaptation is not None and observer.adaptation.reset:
+        raise SpecError("Resets depend on the data of each trial: run them one by one, or without reset.", path="reset")
+    outputs = real_array(y, "y")
+    if outputs.ndim != 3 or outputs.shape[2] != observer.plant.ny:
+        raise SpecError(f"y has shape {outputs.shape}, but (trials, samples, {observer.plant.ny}) is needed.", path="y")
+    trials, samples = outputs.shape[:2]
+    known = np.zeros((samples, 0)) if u is None and not observer.plant.nu else real_array(u, "u")
+    if known.ndim not in (2, 3) or known.shape[-2:] != (samples, observer.plant.nu):
+        raise SpecError(f"u has shape {known.shape}, but (trials, samples, {observer.plant.nu}) is needed.", path="u")
+    if not (np.isfinite(outputs[:, 1:]).all() and np.isfinite(known).all()):
+        raise SpecError("A batch must be complete: run trials with missing samples one by one.", path="y")
+    require_horizon(observer.plant.horizon, samples, early=observer.early_constraints)
+    inputs = np.broadcast_to(known, (trials, *known.shape[-2:]))
+    start = RunningRecursiveObserver(observer)
+    early = isinstance(start.model, EarlyConstraintSteps)
+    x = np.broadcast_to(start.x, (trials, len(start.x)))
+    theta = np.broadcast_to(start.parameters.theta, (trials, len(start.parameters.theta)))
+    nx = observer.plant.nx
+    states: list[FloatArray] = []
+    parameters: list[FloatArray] = []
+    innovations: list[FloatArray] = []
+    if not early:
+        _note(states, parameters, x, theta, np.zeros((nx, theta.shape[1])), nx)
+        innovations.append(np.full((trials, 0), np.nan))
+    for k, gains in enumerate(gain_steps(observer, samples - 1), 0 if early else 1):
+        step, arriving = gains.step, outputs[:, k] if k else outputs[:, k, :0]
+        before = inputs[:, k - 1] if k else np.zeros((trials, observer.plant.nu))
+        data = np.concatenate(
+            (x @ step.A.T + before @ step.B.T, arriving, inputs[:, k] @ step.Dn.T), axis=1
+        )  # fmt: skip
+        x, theta = data @ gains.gain.T, theta @ gains.forget.T + data @ gains.learn.T
+        _note(states, parameters, x, theta, gains.Upsilon, nx)
+        innovations.append(data @ gains.parity.T)
+    most = max(found.shape[1] for found in innovations)
+    padded = np.full((trials, samples, most), np.nan)
+    for k, found in enumerate(innovations):
+        padded[:, k, : found.shape[1]] = found
+    return BatchEstimates(
+        read_only(np.stack(states, axis=1)), read_only(np.stack(parameters, axis=1)), read_only(padded)
+    )
+
+
+def _note(
+    states: list[FloatArray], parameters: list[FloatArray], x: FloatArray, theta: FloatArray,
+    Upsilon: FloatArray, nx: int,
+) -> None:  # fmt: skip
+    """Keep states and parameters: of a walk they are parts of x, else the states follow the parameters."""
+    if x.shape[1] > nx:
+        states.append(x[:, :nx])
+        parameters.append(x[:, nx:])
+    else:
+        states.append(x + theta @ Upsilon.T)
+        parameters.append(theta)

@@ -1,0 +1,166 @@
+"""The matrices of one step as the recursion needs them, of a plant as it is or with early constraints.
+
+Early constraints: an equation of step k + 1 without x(k + 2) is an output of x(k + 1) already.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from obsynth.analysis.time_varying import IntArray
+from obsynth.analysis.zeros import leading_names
+from obsynth.errors import PreconditionError, SpecError
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.covariances import covariance_factor
+from obsynth.numerics.ranks import OUTGROWN
+from obsynth.plants.sequences import MatrixSequence
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+
+
+class StepMatrices(NamedTuple):
+    """One step ``E x(k+1) = A x(k) + B u(k) + Phi theta + q``, ``[y(k+1); Dn u(k+1)] = C x(k+1) + Psi theta + r``.
+
+    Fields: H: ``(ne + ny, nx)``: E above C; A, B, Phi: ``(ne, nx)``, ``(ne, nu)``, ``(ne, nq)``; Psi: ``(ny, nq)``; Dn:
+    ``(ny - measured, nu)``: outputs that are made of the next input; noise: ``(ne + ny, any)``: square root of the
+    covariance of q and r.
+    """
+
+    H: FloatArray
+    A: FloatArray
+    B: FloatArray
+    Phi: FloatArray
+    Psi: FloatArray
+    Dn: FloatArray
+    noise: FloatArray
+
+
+class StepModel(Protocol):
+    """Something that knows the matrices of every step."""
+
+    def at(self, k: int) -> StepMatrices:
+        """Return the matrices of the step from k to k + 1."""
+        ...
+
+
+def stacked_noise(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Return the block-diagonal square root of two independent noises."""
+    noise = np.zeros((len(first) + len(second), first.shape[1] + second.shape[1]))
+    noise[: len(first), : first.shape[1]], noise[len(first) :, first.shape[1] :] = first, second
+    return noise
+
+
+def require_in_range(S: FloatArray, factor: FloatArray, k: int, state_names: Sequence[str]) -> None:
+    """Raise `PreconditionError` when deviations outgrow double precision on the way to sample ``k``.
+
+    Shapes: ``factor (nx or more, any)``.
+    """
+    if float(np.max(np.abs(S), initial=0.0)) < OUTGROWN:
+        return
+    sizes = np.max(np.abs(np.nan_to_num(factor[: len(state_names)])), axis=1, initial=0.0)
+    names = leading_names(sizes, state_names)
+    raise PreconditionError(
+        f"The errors outgrow double precision at k = {k}: the outputs do not show, or not often enough, what grows in "
+        f"{', '.join(map(repr, names))}. Measure more, shorten the horizon, or leave out what grows unseen.",
+        condition="bounded errors", signals=names,
+    )  # fmt: skip
+
+
+@dataclass
+class PlantSteps:
+    """The steps of a plant as it is.
+
+    Fields: plant: The plant; Q, R: ``(ne, ne)`` and ``(ny, ny)`` for each k.
+    """
+
+    plant: TimeVaryingDescriptorSystem
+    Q: MatrixSequence
+    R: MatrixSequence
+
+    def __post_init__(self) -> None:
+        self._constant: StepMatrices | None = None
+        self._noise: FloatArray | None = None
+        self._H: FloatArray | None = None
+        self._Dn = np.zeros((0, self.plant.nu))
+        self._noise_is_constant = self.Q.is_constant and self.R.is_constant
+        self._H_is_constant = self.plant.E.is_constant and self.plant.C.is_constant
+        self._is_constant = self._noise_is_constant and self._H_is_constant and self.plant.is_time_invariant
+
+    def at(self, k: int) -> StepMatrices:
+        """Return the matrices of the step from k to k + 1."""
+        if self._constant is not None:
+            return self._constant
+        plant = self.plant
+        noise, H = self._noise, self._H
+        if noise is None:
+            noise = stacked_noise(
+                covariance_factor(self.Q.at(k), f"Q({k})"), covariance_factor(self.R.at(k), f"R({k})")
+            )
+            self._noise = noise if self._noise_is_constant else None
+        if H is None:
+            H = np.asfortranarray(np.vstack([plant.E.at(k + 1), plant.C.at(k + 1)]))
+            self._H = H if self._H_is_constant else None
+        found = StepMatrices(H, plant.A.at(k), plant.B.at(k), plant.Phi.at(k), plant.Psi.at(k), self._Dn, noise)
+        self._constant = found if self._is_constant else None
+        return found
+
+
+@dataclass
+class EarlyConstraintSteps:
+    """The steps of a plant with its algebraic equations used as outputs one step earlier.
+
+    Fields: plant: The plant; Q, R: Covariances; Q must not couple algebraic equations with the others; rows: The
+    algebraic equations, see `obsynth.analysis.time_varying.algebraic_rows`.
+    """
+
+    plant: TimeVaryingDescriptorSystem
+    Q: MatrixSequence
+    R: MatrixSequence
+    rows: IntArray
+
+    def __post_init__(self) -> None:
+        if not self.rows.size:
+            raise SpecError(
+                "early_constraints needs equations in which x(k+1) does not appear (rows of E that are zero for every "
+                "k): this plant has none. Bring E into that form, or leave the option out.",
+                path="method.options.early_constraints",
+            )
+        self.late = self.rows
+        self.others = np.setdiff1d(np.arange(self.plant.ne), self.late)
+
+    def _factors(self, k: int) -> tuple[FloatArray, FloatArray]:
+        covariance = self.Q.at(k)
+        if np.any(covariance[np.ix_(self.others, self.late)]):
+            raise SpecError(
+                f"Q({k}) couples the noise of algebraic equations with that of the others: early_constraints needs "
+                "them independent.", path="method.options.early_constraints",
+            )  # fmt: skip
+        name = f"Q({k})"
+        return (
+            covariance_factor(covariance[np.ix_(self.others, self.others)], name),
+            covariance_factor(covariance[np.ix_(self.late, self.late)], name),
+        )
+
+    def at(self, k: int) -> StepMatrices:
+        """Return the matrices of the step from k to k + 1."""
+        plant, late, others = self.plant, self.late, self.others
+        H = np.vstack([plant.E.at(k + 1)[others], plant.C.at(k + 1), plant.A.at(k + 1)[late]])
+        outputs = stacked_noise(covariance_factor(self.R.at(k), f"R({k})"), self._factors(k + 1)[1])
+        return StepMatrices(
+            np.asfortranarray(H), plant.A.at(k)[others], plant.B.at(k)[others], plant.Phi.at(k)[others],
+            np.vstack([plant.Psi.at(k), plant.Phi.at(k + 1)[late]]), -plant.B.at(k + 1)[late],
+            stacked_noise(self._factors(k)[0], outputs),
+        )  # fmt: skip
+
+    def first(self) -> StepMatrices:
+        """Return the correction of x(0) by the algebraic equations of step 0: the prior is the 'equation'."""
+        plant, late = self.plant, self.late
+        H = np.vstack([np.eye(plant.nx), plant.A.at(0)[late]])
+        noise = stacked_noise(np.zeros((plant.nx, 0)), self._factors(0)[1])
+        return StepMatrices(
+            H, np.eye(plant.nx), np.zeros((plant.nx, plant.nu)), np.zeros((plant.nx, plant.nq)),
+            plant.Phi.at(0)[late], -plant.B.at(0)[late], noise,
+        )  # fmt: skip

@@ -1,1 +1,0 @@
-"""The doors: analyse, synthesise, verify, and hand over an `ObserverDesign`."""

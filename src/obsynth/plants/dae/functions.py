@@ -1,0 +1,121 @@
+"""Compiled evaluation of a DAE: the residual of one implicit step and the outputs, with exact derivatives."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.numerics.arrays import FloatArray
+from obsynth.plants.dae.model import DAEModel
+from obsynth.plants.dae.symbols import DAESymbols, symbols_of
+
+_ROOT = np.sqrt(6.0)
+#: Butcher matrices of the implicit methods whose last stage is the result (stiffly accurate).
+BUTCHER: dict[str, FloatArray] = {
+    "backward-euler": np.array([[1.0]]),
+    "radau": np.array([
+        [(88 - 7 * _ROOT) / 360, (296 - 169 * _ROOT) / 1800, (-2 + 3 * _ROOT) / 225],
+        [(296 + 169 * _ROOT) / 1800, (88 + 7 * _ROOT) / 360, (-2 - 3 * _ROOT) / 225],
+        [(16 - _ROOT) / 36, (16 + _ROOT) / 36, 1 / 9],
+    ]),
+}  # fmt: skip
+
+
+class Compiled:
+    """A CasADi function that is called on float arrays without conversion.
+
+    Fields: function: Of columns, with dense results.
+    """
+
+    def __init__(self, function: Any) -> None:
+        # CasADi's own annotations of these two do not fit what they return.
+        found: Any = function.buffer()
+        self._buffer, self._run = found
+        self._sizes = [function.numel_in(i) for i in range(function.n_in())]
+        self._arguments = [np.zeros(max(size, 1)) for size in self._sizes]
+        self._shapes = [function.size_out(i) for i in range(function.n_out())]
+        self._results = [np.zeros(max(rows * columns, 1)) for rows, columns in self._shapes]
+        for i, argument in enumerate(self._arguments):
+            self._buffer.set_arg(i, memoryview(argument.data))
+        for i, result in enumerate(self._results):
+            self._buffer.set_res(i, memoryview(result.data))
+
+    def __call__(self, *values: FloatArray) -> tuple[FloatArray, ...]:
+        """Return fresh arrays, NaN or infinite where there is no value."""
+        for argument, size, value in zip(self._arguments, self._sizes, values, strict=True):
+            argument[:size] = value
+        self._run()
+        if self._buffer.ret():
+            # A factorisation inside met a singular matrix; what is in the buffers belongs to another call.
+            return tuple(np.full(shape, np.nan) for shape in self._shapes)
+        return tuple(
+            np.array(result[: shape[0] * shape[1]]).reshape(shape, order="F")
+            for result, shape in zip(self._results, self._shapes, strict=True)
+        )
+
+
+class DAEFunctions:
+    """What an observer or a simulation needs of a model, compiled.
+
+    Fields: model: The model; method: The implicit method.
+    """
+
+    def __init__(self, model: DAEModel, method: str = "backward-euler") -> None:
+        if method not in BUTCHER:
+            raise SpecError(f"The method of integration is {method!r}: use one of {', '.join(BUTCHER)}.", path="method")
+        self.model, self.method, self.stages = model, method, len(BUTCHER[method])
+        if (method,) not in model.graphs:
+            model.graphs[(method,)] = _graphs(model, method)
+        self.residual_function, self.derivative_function, self.output_function = model.graphs[(method,)]
+        # Buffers belong to one user each, functions to all.
+        self.residual, self._outputs = Compiled(self.residual_function), Compiled(self.output_function)
+
+    def outputs(self, x: FloatArray, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return ``y (ny,)``, ``H = dh/dx (ny, nx)`` and ``L = dh/dtheta (ny, nq)``.
+
+        Shapes: ``x (nx,)``, ``theta (nq,)``.
+        """
+        y, H, L = self._outputs(x, theta)
+        return y[:, 0], H, L
+
+
+def _graphs(model: DAEModel, method: str) -> tuple[Any, Any, Any]:
+    import casadi as ca
+
+    symbols = symbols_of(model)
+    stages = ca.SX.sym("X", model.nx, len(BUTCHER[method]))
+    start, dt = ca.SX.sym("start", model.nx), ca.SX.sym("dt")
+    weights = np.asarray(np.linalg.inv(BUTCHER[method]), dtype=np.float64)
+    residual, X = _stage_equations(symbols, stages, start, dt, weights), ca.vec(stages)
+    inputs = [X, start, symbols.u, symbols.theta, dt]
+    jacobians = [ca.jacobian(residual, X), ca.jacobian(residual, start), ca.jacobian(residual, symbols.theta)]
+    seen = [symbols.outputs, ca.jacobian(symbols.outputs, symbols.x), ca.jacobian(symbols.outputs, symbols.theta)]
+    return (
+        _dense("residual", inputs, [residual, jacobians[0]]), _dense("derivatives", inputs, jacobians),
+        _dense("outputs", [symbols.x, symbols.theta], seen),
+    )  # fmt: skip
+
+
+def _dense(name: str, inputs: list[Any], outputs: list[Any]) -> Any:
+    import casadi as ca
+
+    return ca.Function(name, inputs, [ca.densify(output) for output in outputs])
+
+
+def _stage_equations(symbols: DAESymbols, stages: Any, start: Any, dt: Any, weights: FloatArray) -> Any:
+    """Return the equations of all stages: derivatives of stored quantities are combinations of their differences."""
+    import casadi as ca
+
+    def stored_at(x: Any) -> Any:
+        return ca.substitute(symbols.stored, symbols.x, x)
+
+    count = len(weights)
+    gained = [stored_at(stages[:, i]) - stored_at(start) for i in range(count)]
+    rows = []
+    for i in range(count):
+        rates = sum((weights[i, j] * gained[j] for j in range(1, count)), weights[i, 0] * gained[0]) / dt
+        rows.append(ca.substitute(symbols.equations, ca.vertcat(symbols.x, symbols.rates),
+                                  ca.vertcat(stages[:, i], rates)))  # fmt: skip
+    return ca.vertcat(*rows)

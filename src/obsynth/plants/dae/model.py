@@ -1,0 +1,254 @@
+"""Nonlinear differential-algebraic plants with unknown parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from dataclasses import fields as fields_of
+from functools import cached_property, partial
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.plants.dae.checks import (
+    check_distinct,
+    check_structure,
+    checked_equation_names,
+    checked_signals,
+    checked_texts,
+)
+from obsynth.plants.validation import Problems, checked_units
+
+Equations = Mapping[str, str] | Callable[..., Sequence[Any]]
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class DAEModel:
+    r"""A nonlinear descriptor plant with constant or slowly changing parameters.
+
+    .. math::
+        F\left(\tfrac{d}{dt} q(x, \theta),\; x,\; u,\; \theta\right) = 0, \qquad y = h(x, \theta)
+
+    As texts, ``der(...)`` may be taken of any expression of states: ``der(v * p / (R * T))`` is a balance in
+    conservative form, whose discretisation neither makes nor loses mass.  As functions, ``q`` is ``storage`` (x
+    itself by default).
+
+    Parameters
+    ----------
+    equations : mapping of str to str, or callable
+        Name -> ``"left = right"`` (or an expression that is zero), as many as states; or a function
+        ``F(rates, x, u, theta)`` of lists that returns a list, written with numpy's functions (``where`` instead of
+        ``if``).
+    outputs : mapping of str to str, or callable
+        Name -> expression of states and parameters; or a function ``h(x, theta)`` that returns a list.
+    states : mapping of str to float
+        Name -> nominal value, which also scales it (one where the value is zero).
+    inputs : mapping of str to float, optional
+        Known inputs: name -> nominal value.
+    parameters : mapping of str to float, optional
+        Name -> nominal value.
+    units : mapping of str to str
+        Unit of every state, input, parameter and output (``"1"`` for what has none); of constants where you like.
+    constants : mapping of str to float, optional
+        Names that texts may use.
+    definitions : mapping of str to str, optional
+        Names for expressions, each of which may use those before it.
+    storage : callable, optional
+        ``q(x, theta)`` for equations given as a function.
+    equation_names, output_names : list of str, optional
+        For functions: names; ``equation 1, ...`` and ``y1, ...`` by default.
+
+    Raises
+    ------
+    SpecError
+        A text does not belong to the language or uses an unknown name; there are more or fewer equations than states;
+        an equation contains neither states nor their derivatives; an input enters no equation, a parameter no equation
+        and no output; a unit is missing; a derivative is taken of an input; a function decides with ``if`` on a state.
+
+    Examples
+    --------
+    >>> tank = DAEModel(
+    ...     {"balance": "area * der(level) = inflow - outflow", "valve": "outflow = c * sqrt(level)"},
+    ...     {"flow": "outflow"}, states={"level": 1.0, "outflow": 0.5}, inputs={"inflow": 0.5}, parameters={"c": 0.5},
+    ...     constants={"area": 2.0},
+    ...     units={"level": "m", "outflow": "m3/s", "inflow": "m3/s", "c": "m2.5/s", "flow": "m3/s"},
+    ... )
+    >>> tank.nx, tank.nu, tank.ny, tank.nq
+    (2, 1, 1, 1)
+
+    References
+    ----------
+    .. [MoussaAliDAE2013] Adaptive observer based fault diagnosis applied to differential-algebraic systems, IFAC SSSC
+       2013, (3)-(4).  There h does not depend on theta only in the derivation; (21) needs it, and we allow it.
+    """
+
+    equations: Equations
+    outputs: Equations
+    states: Mapping[str, float]
+    inputs: Mapping[str, float]
+    parameters: Mapping[str, float]
+    constants: Mapping[str, float]
+    definitions: Mapping[str, str]
+    units: Mapping[str, str]
+    storage: Callable[..., Sequence[Any]] | None
+    equation_names: tuple[str, ...]
+    output_names: tuple[str, ...]
+
+    def __init__(
+        self,
+        equations: Equations,
+        outputs: Equations,
+        *,
+        states: Mapping[str, float],
+        units: Mapping[str, str],
+        inputs: Mapping[str, float] | None = None,
+        parameters: Mapping[str, float] | None = None,
+        constants: Mapping[str, float] | None = None,
+        definitions: Mapping[str, str] | None = None,
+        storage: Callable[..., Sequence[Any]] | None = None,
+        equation_names: Sequence[str] | None = None,
+        output_names: Sequence[str] | None = None,
+    ) -> None:
+        problems = Problems()
+        fields: dict[str, Any] = {"storage": storage}
+        given = {"states": states, "inputs": inputs, "parameters": parameters, "constants": constants}
+        for field, values in given.items():
+            fields[field] = problems.collect(partial(checked_signals, values, field))
+        for field, texts in (("equations", equations), ("outputs", outputs), ("definitions", definitions or {})):
+            fields[field] = texts if callable(texts) else problems.collect(partial(checked_texts, texts, field))
+        problems.raise_if_any()
+        for field, names, what in (("equation_names", equation_names, "equations"),
+                                   ("output_names", output_names, "outputs")):  # fmt: skip
+            fields[field] = problems.collect(partial(checked_equation_names, names, fields[what], field, len(states)))
+        problems.raise_if_any()
+        for field, value in fields.items():
+            object.__setattr__(self, field, MappingProxyType(value) if isinstance(value, dict) else value)
+        problems.collect(lambda: check_distinct(self))
+        problems.raise_if_any()
+        check_structure(self, problems)
+        required = [*self.state_names, *self.input_names, *self.parameter_names, *self.output_names]
+        missing = [name for name in required if units.get(name, "") == ""]
+        if missing:
+            problems.collect(partial(_units_missing, missing))
+        known = {*required, *self.constants, *self.definitions}
+        object.__setattr__(self, "units", problems.collect(lambda: checked_units(units, known)))
+        problems.raise_if_any()
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """Names of the states, in order."""
+        return tuple(self.states)
+
+    @property
+    def input_names(self) -> tuple[str, ...]:
+        """Names of the known inputs, in order."""
+        return tuple(self.inputs)
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of the parameters, in order."""
+        return tuple(self.parameters)
+
+    @property
+    def nx(self) -> int:
+        """Number of states, and of equations."""
+        return len(self.states)
+
+    @property
+    def nu(self) -> int:
+        """Number of known inputs."""
+        return len(self.inputs)
+
+    @property
+    def ny(self) -> int:
+        """Number of outputs."""
+        return len(self.output_names)
+
+    @property
+    def nq(self) -> int:
+        """Number of parameters."""
+        return len(self.parameters)
+
+    @property
+    def nominal_state(self) -> FloatArray:
+        """Nominal values of the states ``(nx,)``."""
+        return read_only(np.array(list(self.states.values()), dtype=np.float64))
+
+    @property
+    def nominal_input(self) -> FloatArray:
+        """Nominal values of the inputs ``(nu,)``."""
+        return read_only(np.array(list(self.inputs.values()), dtype=np.float64))
+
+    @property
+    def nominal_parameters(self) -> FloatArray:
+        """Nominal values of the parameters ``(nq,)``."""
+        return read_only(np.array(list(self.parameters.values()), dtype=np.float64))
+
+    @property
+    def state_scales(self) -> FloatArray:
+        """Size of each state ``(nx,)``: its nominal value, or one where that is zero."""
+        sizes = np.abs(self.nominal_state)
+        return read_only(np.where(sizes > 0.0, sizes, 1.0))
+
+    @property
+    def is_data(self) -> bool:
+        """Whether the model is given as texts, so that it can be saved."""
+        return not callable(self.equations)
+
+    @cached_property
+    def graphs(self) -> dict[tuple[Any, ...], Any]:
+        """CasADi functions that were made of the model, by what they were made for, so that each is made once."""
+        return {}
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return every field as data, as the constructor takes it.
+
+        Raises
+        ------
+        SpecError
+            The model is given as Python functions.
+        """
+        if callable(self.equations) or callable(self.outputs):
+            raise SpecError(
+                "The model is given as Python functions, which cannot be saved as data: write its equations as texts.",
+                path="equations",
+            )
+        names = ("equations", "outputs", "states", "inputs", "parameters", "constants", "definitions", "units")
+        return {name: dict(getattr(self, name)) for name in names}
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return what makes it again in another process: read-only mappings do not travel, functions by their names."""
+        given: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields_of(self)}
+        if self.is_data:
+            del given["equation_names"], given["output_names"]
+        return _made, ({name: dict(value) if isinstance(value, Mapping) else value for name, value in given.items()},)
+
+    def replace(self, **changes: Any) -> DAEModel:
+        """Return a model with some fields changed, checked again as a whole.
+
+        Parameters
+        ----------
+        **changes
+            Any argument of the constructor.
+        """
+        fields = ("equations", "outputs", "states", "inputs", "parameters", "constants", "definitions", "units",
+                  "storage")  # fmt: skip
+        given = {name: getattr(self, name) for name in fields}
+        if not self.is_data:
+            given |= {"equation_names": self.equation_names, "output_names": self.output_names}
+        return DAEModel(**{**given, **changes})
+
+    def __repr__(self) -> str:
+        return f"DAEModel(nx={self.nx}, nu={self.nu}, ny={self.ny}, nq={self.nq}, states={list(self.states)})"
+
+
+def _made(given: dict[str, Any]) -> DAEModel:
+    return DAEModel(**given)
+
+
+def _units_missing(names: Sequence[str]) -> None:
+    raise SpecError(f"units says nothing of {', '.join(map(repr, names))}: give each a unit, '1' for none.",
+                    path="units")  # fmt: skip

@@ -1,0 +1,161 @@
+"""One implicit step of a DAE: Newton, then homotopy in the input, with sensitivities and the residual that is left."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from obsynth.errors import SolverError
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.newton import NewtonResult, condition_number, newton
+from obsynth.plants.dae.functions import Compiled, DAEFunctions
+from obsynth.plants.dae.step_graph import StepGraph, step_graph
+
+#: First fraction of a homotopy; it grows twofold after each success and is halved after each failure.
+FIRST_FRACTION = 0.125
+#: A homotopy that needs smaller fractions than this, or more sub-solves, is not going anywhere.
+LEAST_FRACTION = 2.0**-20
+MOST_SUBSOLVES = 10_000
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """The state at the end of a step.
+
+    Fields: x: ``(nx,)``; stages: ``(stages * nx,)``; residual: Largest residual in units of the states' sizes;
+    subsolves: Newton iterations that were started: 1, or more where a homotopy was needed.
+    """
+
+    x: FloatArray
+    stages: FloatArray
+    residual: float
+    subsolves: int
+
+
+@dataclass(frozen=True, eq=False)
+class Sensitivities:
+    """Derivatives of a step.
+
+    Fields: F: ``(nx, nx)``: with respect to the state before, (8); G: ``(nx, nq)``: with respect to the parameters,
+    (9); noise: ``(nx, nx)``: with respect to what is added to the right sides of the equations; condition: Condition
+    number of the equilibrated matrix of (7).
+    """
+
+    F: FloatArray
+    G: FloatArray
+    noise: FloatArray
+    condition: float
+
+
+class ImplicitStep:
+    """Steps of a fixed length.
+
+    Fields: functions: The compiled model, with its method of integration; dt: Seconds, positive; largest_move: In sizes
+    of the states: a solution further away than this is taken only along a homotopy none of whose parts is longer, so
+    that of several roots the one connected with the last is found.
+    """
+
+    def __init__(self, functions: DAEFunctions, dt: float, *, largest_move: float | None = None) -> None:
+        self.functions, self.dt = functions, dt
+        self.largest_move = np.inf if largest_move is None else largest_move
+        self.sizes = np.tile(functions.model.state_scales, functions.stages)
+
+    @cached_property
+    def graph(self) -> StepGraph:
+        """The step as CasADi functions."""
+        return step_graph(self.functions, self.dt, self.largest_move)
+
+    @cached_property
+    def _fast(self) -> Compiled:
+        return Compiled(self.graph.step)
+
+    @cached_property
+    def _local(self) -> Compiled:
+        return Compiled(self.graph.sensitivities)
+
+    def solve(
+        self, x: FloatArray, u: FloatArray, theta: FloatArray, *, before: FloatArray | None = None, k: int = 0
+    ) -> Solution:
+        """Return the state after one step.
+
+        Shapes: ``x (nx,)``, ``u (nu,)``, ``theta (nq,)``, ``before (nu,)``.
+        """
+        stages, residual, trusted = self._fast(x, u, theta)
+        if trusted[0, 0] == 1.0:
+            return Solution(stages[-self.functions.model.nx :, 0], stages[:, 0], float(residual[0, 0]), 1)
+        return self.solve_carefully(x, u, theta, before=before, k=k)
+
+    def solve_carefully(
+        self, x: FloatArray, u: FloatArray, theta: FloatArray, *, before: FloatArray | None = None, k: int = 0
+    ) -> Solution:
+        """Return the state after one step, by damped Newton and by a homotopy where that is needed."""
+        start = np.tile(x, self.functions.stages)
+        found = self._newton(start, x, u, theta)
+        if found.converged and self._move(found.x, start) <= self.largest_move:
+            return self._solution(found, 1)
+        if before is None or np.array_equal(before, u):
+            if found.converged:
+                return self._solution(found, 1)
+            raise self._error(found, k, "")
+        return self._homotopy(start, x, before, u, theta, k)
+
+    def sensitivities(self, solution: Solution, x: FloatArray, u: FloatArray, theta: FloatArray) -> Sensitivities:
+        """Return the derivatives of a step that was solved."""
+        F, G, noise, scaled = self._local(solution.stages, x, u, theta)
+        if not (np.isfinite(F).all() and np.isfinite(G).all() and np.isfinite(noise).all()):
+            raise SolverError("The matrix of (7), dF/dx' / dt + dF/dx, is singular: the step has no unique solution.")
+        return Sensitivities(F, G, noise, condition_number(scaled))
+
+    def _move(self, stages: FloatArray, start: FloatArray) -> float:
+        return float(np.abs((stages - start) / self.sizes).max())
+
+    def _newton(self, start: FloatArray, x: FloatArray, u: FloatArray, theta: FloatArray) -> NewtonResult:
+        return newton(self._evaluation(x, u, theta), start, self.sizes)
+
+    def _evaluation(
+        self, x: FloatArray, u: FloatArray, theta: FloatArray
+    ) -> Callable[[FloatArray], tuple[FloatArray, FloatArray]]:
+        dt = np.array([self.dt])
+
+        def evaluate(stages: FloatArray) -> tuple[FloatArray, FloatArray]:
+            value, jacobian = self.functions.residual(stages, x, u, theta, dt)
+            return value[:, 0], jacobian
+
+        return evaluate
+
+    def _homotopy(
+        self, start: FloatArray, x: FloatArray, before: FloatArray, u: FloatArray, theta: FloatArray, k: int
+    ) -> Solution:
+        """Lead the input from its last value to the new one, as fast as Newton follows."""
+        found = self._newton(start, x, before, theta)
+        if not found.converged:
+            raise self._error(found, k, " (with the input of the step before)")
+        reached, fraction, subsolves = 0.0, FIRST_FRACTION, 1
+        while reached < 1.0:
+            target = min(1.0, reached + fraction)
+            tried = self._newton(found.x, x, before + target * (u - before), theta)
+            subsolves += 1
+            if tried.converged and self._move(tried.x, found.x) <= self.largest_move:
+                found, reached, fraction = tried, target, 2.0 * fraction
+            else:
+                fraction *= 0.5
+            if fraction < LEAST_FRACTION or subsolves > MOST_SUBSOLVES:
+                raise self._error(tried, k, f" (homotopy: {100 * reached:.3g} % of the change of the input)")
+        return self._solution(found, subsolves)
+
+    def _solution(self, found: NewtonResult, subsolves: int) -> Solution:
+        return Solution(found.x[-self.functions.model.nx :], found.x, found.residual, subsolves)
+
+    def _error(self, found: NewtonResult, k: int, where: str) -> SolverError:
+        model = self.functions.model
+        name = model.equation_names[found.worst % model.nx]
+        defined = np.isfinite(found.residual)
+        worst = f"residual {found.residual:.3g} in sizes of the states" if defined else "which is not defined there"
+        return SolverError(
+            f"No solution at k = {k}{where}: Newton stopped after iteration {found.iterations}, and the worst equation "
+            f"is {name!r} ({worst}). Check that input and state at this k are possible, or take smaller steps.",
+            record={"k": k, "iteration": found.iterations, "equation": name, "residual": found.residual},
+        )  # fmt: skip

@@ -1,0 +1,228 @@
+"""Linear time-invariant descriptor systems with named signals."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
+from obsynth.plants.names import checked_names
+from obsynth.plants.validation import (
+    Problems,
+    checked_dt,
+    checked_point,
+    checked_scales,
+    checked_units,
+    expected_shapes,
+    matrix_or_picks,
+    picked_names,
+    signal_counts,
+    square,
+    uncounted_signals,
+)
+
+MatrixOrNames = ArrayLike | Sequence[str] | None
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class DescriptorSystem:
+    r"""A linear descriptor system with faults, unknown inputs and noise.
+
+    .. math::
+        E x^+ = A x + B u + B_d d + B_f f + B_w w, \qquad
+        y = C x + D u + D_d d + D_f f + D_w w
+
+    where :math:`x^+` is :math:`\dot x` for ``dt == 0`` and :math:`x(k+1)` for ``dt > 0``.
+
+    Parameters
+    ----------
+    E : array_like or None
+        ``(nx, nx)``, may be singular; ``None`` means the identity.
+    A : array_like
+        ``(nx, nx)``.
+    B : array_like, optional
+        Known inputs ``(nx, nu)``.
+    C : array_like or list of str, optional
+        Outputs ``(ny, nx)``, or the names of the states that are measured.
+    D : array_like, optional
+        Feedthrough of the known inputs ``(ny, nu)``.
+    Bf, Df : array_like, optional
+        Faults ``(nx, nf)`` and ``(ny, nf)``.  ``Bf`` may be a list of state names: the fault is then
+        added to the equation of the same number as that state.
+    Bd, Dd : array_like, optional
+        Unknown inputs (disturbances) ``(nx, nd)`` and ``(ny, nd)``; ``Bd`` by name as ``Bf``.
+    Bw, Dw : array_like, optional
+        Noise ``(nx, nw)`` and ``(ny, nw)``: ``w`` is white with unit covariance, so the columns hold
+        standard deviations (per sample for ``dt > 0``, and always per sample in ``Dw``).
+    dt : float, optional
+        Seconds between samples; 0 for continuous time.
+    state_names, input_names, output_names, fault_names, disturbance_names, noise_names : list of str, optional
+        Signal names; ``x1, x2, ...`` and so on by default.
+    operating_point : mapping, optional
+        Value of named signals at the point where a linear model was taken, in the signal's unit.
+    scales : mapping, optional
+        Factor of named inputs and outputs: what a log holds, times the factor, is in the signal's unit.
+    units : mapping, optional
+        Unit of named signals, as text.
+
+    Raises
+    ------
+    SpecError
+        A matrix has the wrong shape, holds something that is no finite number, or a name is unknown
+        or repeated; all problems are listed at once.
+
+    Examples
+    --------
+    >>> plant = DescriptorSystem([[1, 0], [0, 0]], [[0.5, 1], [1, 1]], C=[[1, 0], [0, 1]], Bf=[[1], [0]], dt=1.0)
+    >>> plant.nx, plant.ny, plant.nf
+    (2, 2, 1)
+    """
+
+    E: FloatArray
+    A: FloatArray
+    B: FloatArray
+    C: FloatArray
+    D: FloatArray
+    Bf: FloatArray
+    Df: FloatArray
+    Bd: FloatArray
+    Dd: FloatArray
+    Bw: FloatArray
+    Dw: FloatArray
+    dt: float
+    state_names: tuple[str, ...]
+    input_names: tuple[str, ...]
+    output_names: tuple[str, ...]
+    fault_names: tuple[str, ...]
+    disturbance_names: tuple[str, ...]
+    noise_names: tuple[str, ...]
+    operating_point: Mapping[str, float]
+    scales: Mapping[str, float]
+    units: Mapping[str, str]
+
+    def __init__(
+        self,
+        E: ArrayLike | None,
+        A: ArrayLike,
+        B: ArrayLike | None = None,
+        C: MatrixOrNames = None,
+        *,
+        D: ArrayLike | None = None,
+        Bf: MatrixOrNames = None,
+        Df: ArrayLike | None = None,
+        Bd: MatrixOrNames = None,
+        Dd: ArrayLike | None = None,
+        Bw: ArrayLike | None = None,
+        Dw: ArrayLike | None = None,
+        dt: float = 0.0,
+        state_names: Sequence[str] | None = None,
+        input_names: Sequence[str] | None = None,
+        output_names: Sequence[str] | None = None,
+        fault_names: Sequence[str] | None = None,
+        disturbance_names: Sequence[str] | None = None,
+        noise_names: Sequence[str] | None = None,
+        operating_point: Mapping[str, float] | None = None,
+        scales: Mapping[str, float] | None = None,
+        units: Mapping[str, str] | None = None,
+    ) -> None:
+        problems = Problems()
+        a = problems.collect(lambda: square(as_matrix(A, "A"), "A"))
+        problems.raise_if_any()
+        nx = a.shape[0]
+        states = problems.collect(lambda: checked_names(state_names, nx, prefix="x", what="state_names"))
+        problems.raise_if_any()
+        given: dict[str, FloatArray | None] = {"A": a, "E": np.eye(nx) if E is None else None}
+        asked = {"E": E, "B": B, "C": C, "D": D, "Bf": Bf, "Df": Df, "Bd": Bd, "Dd": Dd, "Bw": Bw, "Dw": Dw}
+        for name, value in asked.items():
+            if value is not None:
+                given[name] = problems.collect(partial(matrix_or_picks, value, name, states))
+        sizes = signal_counts(given)
+        # What depends on a matrix that could not be read is not judged: its own message is enough.
+        broken = {name for name, value in asked.items() if value is not None and given[name] is None}
+        unknown = uncounted_signals(given, broken)
+        values: dict[str, Any] = {
+            name: problems.shaped(given.get(name), name, shape)
+            for name, shape in expected_shapes(nx, sizes, unknown).items()
+        }
+        values |= {"dt": problems.collect(lambda: checked_dt(dt)), "state_names": states}
+        named = {
+            "input_names": (input_names, "u"),
+            "output_names": (output_names or picked_names(C), "y"),
+            "fault_names": (fault_names or picked_names(Bf), "f"),
+            "disturbance_names": (disturbance_names or picked_names(Bd), "d"),
+            "noise_names": (noise_names, "w"),
+        }
+        for field, (names, signal) in named.items():
+            if signal in unknown:
+                continue
+            values[field] = problems.collect(partial(checked_names, names, sizes[signal], prefix=signal, what=field))
+        problems.raise_if_any()
+        known = {name for field in ("state_names", *named) for name in values[field]}
+        values["operating_point"] = problems.collect(lambda: checked_point(operating_point, known))
+        measured = {*values["input_names"], *values["output_names"]}
+        values["scales"] = problems.collect(lambda: checked_scales(scales, measured))
+        values["units"] = problems.collect(lambda: checked_units(units, known))
+        problems.raise_if_any()
+        for field, value in values.items():
+            object.__setattr__(self, field, read_only(value) if isinstance(value, np.ndarray) else value)
+
+    @property
+    def nx(self) -> int:
+        """Number of states."""
+        return int(self.A.shape[0])
+
+    @property
+    def nu(self) -> int:
+        """Number of known inputs."""
+        return int(self.B.shape[1])
+
+    @property
+    def ny(self) -> int:
+        """Number of outputs."""
+        return int(self.C.shape[0])
+
+    @property
+    def nf(self) -> int:
+        """Number of faults."""
+        return int(self.Bf.shape[1])
+
+    @property
+    def nd(self) -> int:
+        """Number of unknown inputs."""
+        return int(self.Bd.shape[1])
+
+    @property
+    def nw(self) -> int:
+        """Number of noise inputs."""
+        return int(self.Bw.shape[1])
+
+    @property
+    def is_discrete(self) -> bool:
+        """Whether the plant is sampled (``dt > 0``)."""
+        return self.dt > 0.0
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return every field, as the constructor takes it."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    def replace(self, **changes: Any) -> DescriptorSystem:
+        """Return a plant with some fields changed, checked again as a whole.
+
+        Parameters
+        ----------
+        **changes
+            Any argument of the constructor.
+        """
+        return DescriptorSystem(**{**self.as_dict(), **changes})
+
+    def __repr__(self) -> str:
+        time = f"dt={self.dt:g} s" if self.is_discrete else "continuous"
+        return (
+            f"DescriptorSystem(nx={self.nx}, nu={self.nu}, ny={self.ny}, nf={self.nf}, nd={self.nd}, "
+            f"nw={self.nw}, {time})"
+        )

@@ -1,0 +1,213 @@
+r"""What is known about the course of a fault: an exosystem ``w+ = Phi w, f = Cw w`` for each fault.
+
+Source: Share Pasand, Aliyari, Taghirad, eqs. (2), (5), (6).  Differences: each fault has its own exosystem and the
+faults are stacked block-diagonally (the row of (6) would add them up); ``f = Cw w``, not ``f' = Phi f``; the states of
+a polynomial are f, f', f'', ... (so their initial values are ``i! f_i``, not ``f_i``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.numerics.arrays import ComplexArray, FloatArray, as_matrix, read_only
+from obsynth.numerics.ranks import decide_rank
+from obsynth.plants.fault_model_spectra import (
+    MULTIPLE_EIGENVALUE,
+    SAME_EIGENVALUE,
+    balanced_transition,
+    distinct_eigenvalues,
+)
+
+#: Words for polynomials, and their orders.
+POLYNOMIAL_WORDS = {"step": 0, "ramp": 1, "parabola": 2}
+#: Keys of a model given as data; the last two come together.
+MODEL_KEYS = ("polynomial", "sinusoid", "exponential", "sum", "Phi", "Cw")
+#: A polynomial of higher order has no meaning in data of double precision.
+HIGHEST_ORDER = 60
+
+
+@dataclass(frozen=True, eq=False)
+class FaultModel:
+    """The exosystem of one fault.
+
+    Parameters
+    ----------
+    Phi : FloatArray
+        ``(n, n)``; in continuous time (per second) unless ``sampled``.
+    Cw : FloatArray
+        ``(1, n)``.
+    description : str
+        In words.
+    sampled : bool
+        Whether ``Phi`` is the transition over one sample of the plant, as given by the user.
+    """
+
+    Phi: FloatArray
+    Cw: FloatArray
+    description: str
+    sampled: bool = False
+
+    def __post_init__(self) -> None:
+        """Make the arrays private and read-only."""
+        for name in ("Phi", "Cw"):
+            object.__setattr__(self, name, read_only(getattr(self, name)))
+
+    @property
+    def order(self) -> int:
+        """Number of states."""
+        return int(self.Phi.shape[0])
+
+    def transition(self, dt: float) -> FloatArray:
+        """Return ``Phi`` in the time of a plant.
+
+        Parameters
+        ----------
+        dt : float, seconds
+            Between samples of the plant; 0 for continuous time.
+        """
+        if dt == 0.0 or self.sampled:
+            return self.Phi
+        from scipy.linalg import expm
+
+        return np.asarray(expm(self.Phi * dt))
+
+    def eigenvalues(self, dt: float) -> ComplexArray:
+        """Return each eigenvalue of `transition` once; a multiple one, which rounding scatters, as a mean.
+
+        Parameters
+        ----------
+        dt : float, seconds
+            As for `transition`.
+        """
+        return distinct_eigenvalues(self.transition(dt), MULTIPLE_EIGENVALUE if self.sampled else SAME_EIGENVALUE)
+
+
+def polynomial(order: int) -> FaultModel:
+    """Return the model of a polynomial in time: order 0 is a step, 1 a ramp."""
+    if isinstance(order, bool) or not isinstance(order, int) or not 0 <= order <= HIGHEST_ORDER:
+        raise SpecError(
+            f"A polynomial fault model has order {order!r}: give a whole number from 0 (step) to {HIGHEST_ORDER}.",
+            path="fault_model",
+        )
+    words = {number: word for word, number in POLYNOMIAL_WORDS.items()}
+    description = words.get(order, f"polynomial of order {order}")
+    return FaultModel(np.eye(order + 1, k=1), np.eye(1, order + 1), description)
+
+
+def sinusoid(frequency: float) -> FaultModel:
+    """Return the model of a sinusoid of known frequency, unknown amplitude and phase."""
+    value = _number(frequency, "sinusoid")
+    if value <= 0.0:
+        raise SpecError(f"The sinusoid has frequency {value}: give a positive number in rad/s.", path="fault_model")
+    return FaultModel(np.array([[0.0, value], [-value, 0.0]]), np.eye(1, 2), f"sinusoid of {value:g} rad/s")
+
+
+def exponential(rate: float) -> FaultModel:
+    """Return the model of ``exp(rate t)``; a negative rate decays."""
+    value = _number(rate, "exponential")
+    return FaultModel(np.array([[value]]), np.eye(1), f"exponential of rate {value:g} 1/s")
+
+
+def from_matrices(Phi: Any, Cw: Any) -> FaultModel:
+    """Return the model of any exosystem, in the time of the plant: ``w' = Phi w``, or ``w(k+1) = Phi w(k)``.
+
+    Shapes: ``Phi (n, n)``, ``Cw (1, n)``.
+    """
+    transition, row = as_matrix(Phi, "Phi"), as_matrix(Cw, "Cw")
+    count = transition.shape[0]
+    if transition.shape != (count, count) or count == 0 or row.shape != (1, count):
+        raise SpecError(
+            f"A fault model has Phi {transition.shape} and Cw {row.shape}: Phi must be square and Cw one row of the "
+            "same length.",
+            path="fault_model",
+        )
+    model = FaultModel(transition, row, f"given exosystem of order {count}", sampled=True)
+    return _observable(model)
+
+
+def summed(models: Sequence[FaultModel]) -> FaultModel:
+    """Return the model of a fault that is the sum of several signals, such as a step and a sinusoid."""
+    from scipy.linalg import block_diag
+
+    if not models or len({model.sampled for model in models}) > 1:
+        raise SpecError(
+            "A sum of fault models needs at least one part, and either built-in parts or given matrices, not both.",
+            path="fault_model",
+        )
+    description = " plus ".join(model.description for model in models)
+    whole = FaultModel(
+        block_diag(*(model.Phi for model in models)),
+        np.hstack([model.Cw for model in models]),
+        description,
+        models[0].sampled,
+    )
+    return _observable(whole)
+
+
+def fault_model(data: Any) -> FaultModel:
+    """Return a model from data: a word, a mapping such as ``{sinusoid: 1.5}``, or a model itself.
+
+    Parameters
+    ----------
+    data : str, mapping or FaultModel
+        ``step``, ``ramp``, ``parabola``; ``{polynomial: order}``, ``{sinusoid: rad/s}``, ``{exponential: 1/s}``,
+        ``{Phi: ..., Cw: ...}``, or ``{sum: [...]}`` of such.
+
+    Returns
+    -------
+    FaultModel
+        The exosystem of one fault.
+
+    Raises
+    ------
+    SpecError
+        There is no such model.
+    """
+    if isinstance(data, FaultModel):
+        return data
+    if isinstance(data, str) and data in POLYNOMIAL_WORDS:
+        return polynomial(POLYNOMIAL_WORDS[data])
+    if isinstance(data, Mapping):
+        keys = set(data)
+        if keys == {"Phi", "Cw"}:
+            return from_matrices(data["Phi"], data["Cw"])
+        makers = {"polynomial": polynomial, "sinusoid": sinusoid, "exponential": exponential}
+        if len(keys) == 1:
+            key, value = next(iter(data.items()))
+            if key in makers:
+                return makers[key](value)
+            if key == "sum" and isinstance(value, Sequence) and not isinstance(value, str):
+                return summed([fault_model(part) for part in value])
+    raise SpecError(
+        f"There is no fault model {data!r}: use {', '.join(POLYNOMIAL_WORDS)}, or one of {{polynomial: order}}, "
+        "{sinusoid: rad/s}, {exponential: 1/s}, {Phi: ..., Cw: ...}, {sum: [...]}.",
+        path="fault_model",
+    )
+
+
+def _observable(model: FaultModel) -> FaultModel:
+    balanced, states = balanced_transition(model.Phi)
+    shown = model.Cw * states
+    size = float(np.linalg.norm(balanced, 2)) / (float(np.linalg.norm(shown)) or 1.0)
+    for value in model.eigenvalues(0.0):
+        tested = np.vstack([balanced - value * np.eye(model.order), (size or 1.0) * shown.astype(complex)])
+        if not decide_rank(tested, expected=model.order, equilibrated=False).full:
+            raise SpecError(
+                f"Some state of the fault model ({model.description}) never shows in the fault, at the eigenvalue "
+                f"{value:.6g}: leave it out.",
+                path="fault_model",
+            )
+    return model
+
+
+def _number(value: Any, what: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
+        raise SpecError(f"The {what} model needs a number, not {value!r}.", path="fault_model")
+    if not np.isfinite(value):
+        raise SpecError(f"The {what} model needs a finite number, not {value}.", path="fault_model")
+    return float(value)

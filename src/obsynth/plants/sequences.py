@@ -1,0 +1,195 @@
+"""Matrices that change with k: callables, stacked arrays, or expressions; checked at every k they are asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from obsynth.errors import SpecError
+from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
+from obsynth.numerics.expressions import CONSTANTS, Expression, parse_expression
+
+#: A matrix, a stack of matrices, a function of k, or rows whose entries may be texts.
+MatrixLike: TypeAlias = ArrayLike | Callable[[int], ArrayLike] | Sequence[Sequence[float | str]] | None
+
+#: The name of the time index in expressions.
+INDEX_NAME = "k"
+
+
+@dataclass(frozen=True, eq=False)
+class MatrixSequence:
+    """A matrix for each k.
+
+    Fields: name: For messages, such as ``A``; shape: Rows and columns, the same for every k; length: Number of entries,
+    k = 0 ... length - 1; ``None`` when there is one for every k; values: ``(rows, columns)`` for a constant, ``(length,
+    rows, columns)`` for a stack; function: From k to a matrix; entries: Rows of expressions; constants: Values of the
+    names in the expressions; still: Of expressions, the entries that do not depend on k; moving: Row and column of
+    those that do.
+    """
+
+    name: str
+    shape: tuple[int, int]
+    length: int | None
+    values: FloatArray | None = None
+    function: Callable[[int], ArrayLike] | None = None
+    entries: tuple[tuple[Expression, ...], ...] | None = None
+    constants: Mapping[str, float] | None = None
+    still: FloatArray | None = None
+    moving: tuple[tuple[int, int], ...] = ()
+
+    @classmethod
+    def of(
+        cls, value: Any, name: str, *, first: int = 0, constants: Mapping[str, float] | None = None
+    ) -> MatrixSequence:
+        """Return the sequence that ``value`` stands for."""
+        if isinstance(value, MatrixSequence):
+            return value
+        if callable(value):
+            shape = _named(lambda: as_matrix(value(first), name), name, first).shape
+            return cls(name, (int(shape[0]), int(shape[1])), None, function=value)
+        if _has_text(value):
+            entries = _parsed(value, name, constants or {})
+            known = dict(constants or {})
+            still, moving = _split(entries, known)
+            shape = (len(entries), len(entries[0]))
+            return cls(name, shape, None, entries=entries, constants=known, still=still, moving=moving)
+        array = _array(value, name)
+        if array.ndim != 3:
+            matrix = as_matrix(value, name)
+            return cls(name, (matrix.shape[0], matrix.shape[1]), None, values=matrix)
+        bad = np.argwhere(~np.isfinite(array[first:]))
+        if bad.size:
+            k = int(bad[0][0]) + first
+            as_matrix(array[k], f"{name}({k})")
+        if len(array) <= first:
+            raise SpecError(f"{name} is a stack of {len(array)} matrices: at least {first + 1} are needed.", path=name)
+        return cls(name, (array.shape[1], array.shape[2]), len(array), values=read_only(array))
+
+    @property
+    def is_constant(self) -> bool:
+        """Whether it is the same matrix for every k: numbers, or expressions none of which contains k."""
+        if self.entries is not None:
+            return not self.moving
+        return self.values is not None and self.values.ndim == 2
+
+    @property
+    def is_data(self) -> bool:
+        """Whether it can be saved: everything but a callable."""
+        return self.function is None
+
+    def at(self, k: int) -> FloatArray:
+        """Return the matrix at ``k``."""
+        if self.values is not None:
+            if self.values.ndim == 2:
+                return self.values
+            if not 0 <= k < len(self.values):
+                raise SpecError(f"{self.name}({k}) is asked for, but the stack ends at {len(self.values) - 1}.",
+                                path=f"{self.name}({k})")  # fmt: skip
+            return np.asarray(self.values[k])
+        matrix = _named(partial(self._computed, k), self.name, k)
+        if matrix.shape != self.shape:
+            raise SpecError(
+                f"{self.name}({k}) is {matrix.shape[0]} by {matrix.shape[1]}, but {self.name} was {self.shape[0]} by "
+                f"{self.shape[1]} before: shapes must not change with k.",
+                path=f"{self.name}({k})",
+            )
+        return matrix
+
+    def _computed(self, k: int) -> FloatArray:
+        if self.function is not None:
+            return as_matrix(self.function(k), f"{self.name}({k})")
+        values = {**(self.constants or {}), INDEX_NAME: np.float64(k)}
+        matrix = np.array(self.still)
+        for i, j in self.moving:
+            matrix[i, j] = (self.entries or ())[i][j](values)
+        return as_matrix(matrix, f"{self.name}({k})")
+
+    def as_data(self) -> Any:
+        """Return an array or rows of texts."""
+        if self.function is not None:
+            raise SpecError(
+                f"{self.name} is a Python function, and only data can be saved: give a stack of matrices, or "
+                f"expressions in {INDEX_NAME}.",
+                path=self.name,
+            )
+        return self.values if self.entries is None else [[entry.text for entry in row] for row in self.entries]
+
+
+def zeros(name: str, shape: tuple[int, int]) -> MatrixSequence:
+    """Return a constant zero matrix as a sequence."""
+    return MatrixSequence(name, shape, None, values=read_only(np.zeros(shape)))
+
+
+def _named(make: Callable[[], FloatArray], name: str, k: int) -> FloatArray:
+    try:
+        return make()
+    except SpecError as error:
+        raise SpecError(f"At k = {k}: {error}", path=f"{name}({k})") from error
+    except Exception as error:
+        # A function of the user may raise anything: say for which k it did.
+        raise SpecError(f"The function for {name} fails at k = {k}: {type(error).__name__}: {error}.",
+                        path=f"{name}({k})") from error  # fmt: skip
+
+
+def _has_text(value: Any) -> bool:
+    if isinstance(value, str):
+        return True
+    return isinstance(value, (list, tuple)) and any(_has_text(item) for item in value)
+
+
+def _array(value: Any, name: str) -> FloatArray:
+    try:
+        array = np.asarray(value)
+    except ValueError:
+        raise SpecError(
+            f"{name} has matrices or rows of different sizes: shapes must not change with k.", path=name
+        ) from None
+    if array.ndim != 3:
+        return np.zeros((0, 0))
+    if array.dtype.kind not in "fiu":
+        raise SpecError(f"{name} holds entries that are no real numbers.", path=name)
+    return array.astype(np.float64)
+
+
+def _parsed(value: Any, name: str, constants: Mapping[str, float]) -> tuple[tuple[Expression, ...], ...]:
+    rows = [[value]] if isinstance(value, str) else value
+    listed = [row if isinstance(row, (list, tuple)) else [row] for row in rows]
+    if len({len(row) for row in listed}) != 1:
+        raise SpecError(f"{name} has rows of different lengths: give a full matrix.", path=name)
+    parsed = []
+    for i, row in enumerate(listed, 1):
+        expressions = []
+        for j, entry in enumerate(row, 1):
+            where = f"{name}, row {i}, column {j}"
+            if isinstance(entry, bool) or not isinstance(entry, (str, int, float)):
+                raise SpecError(f"{where}: {entry!r} is neither a number nor an expression.", path=name)
+            try:
+                expression = parse_expression(entry if isinstance(entry, str) else repr(float(entry)))
+            except SpecError as error:
+                raise SpecError(f"{where}: {error}", path=name) from error
+            unknown = sorted(expression.names - {INDEX_NAME} - set(constants))
+            if unknown:
+                known = ", ".join(sorted([INDEX_NAME, *constants, *CONSTANTS]))
+                raise SpecError(f"{where}: {unknown[0]!r} is unknown; the known names are: {known}.", path=name)
+            expressions.append(expression)
+        parsed.append(tuple(expressions))
+    return tuple(parsed)
+
+
+def _split(
+    entries: tuple[tuple[Expression, ...], ...], constants: Mapping[str, float]
+) -> tuple[FloatArray, tuple[tuple[int, int], ...]]:
+    """Evaluate once what does not depend on k; return it with the places of what does."""
+    still, moving = np.zeros((len(entries), len(entries[0]))), []
+    for i, row in enumerate(entries):
+        for j, entry in enumerate(row):
+            if INDEX_NAME in entry.names:
+                moving.append((i, j))
+            else:
+                still[i, j] = entry(constants)
+    return still, tuple(moving)

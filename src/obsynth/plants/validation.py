@@ -1,0 +1,167 @@
+"""Checking what a plant is made of, and collecting every problem before raising."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Container, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.numerics.arrays import FloatArray, as_matrix
+from obsynth.plants.names import is_name_list, rows_picking
+
+#: Matrix, signal of its rows, signal of its columns.
+MATRIX_LAYOUT = (
+    ("E", "x", "x"),
+    ("A", "x", "x"),
+    ("C", "y", "x"),
+    ("B", "x", "u"),
+    ("D", "y", "u"),
+    ("Bf", "x", "f"),
+    ("Df", "y", "f"),
+    ("Bd", "x", "d"),
+    ("Dd", "y", "d"),
+    ("Bw", "x", "w"),
+    ("Dw", "y", "w"),
+)
+
+
+class Problems:
+    """Collects every problem of one plant, to raise them together."""
+
+    def __init__(self) -> None:
+        self.messages: list[str] = []
+        self.first_path: str | None = None
+
+    def collect(self, make: Callable[[], Any]) -> Any:
+        """Return what ``make`` returns; note its `SpecError` and return ``None`` otherwise."""
+        try:
+            return make()
+        except SpecError as error:
+            self._note(str(error), error.path)
+            return None
+
+    def shaped(self, value: FloatArray | None, name: str, shape: tuple[int, int]) -> FloatArray:
+        """Return ``value``, or zeros of ``shape`` where it is missing or empty; note a wrong shape."""
+        if value is None or (value.size == 0 and 0 in shape):
+            return np.zeros(shape)
+        if value.shape != shape:
+            self._note(f"{name} is {_by(value.shape)}, but {_by(shape)} is needed.", name)
+        return value
+
+    def raise_if_any(self) -> None:
+        """Raise one `SpecError` with all problems noted so far."""
+        if len(self.messages) == 1:
+            raise SpecError(self.messages[0], path=self.first_path)
+        if self.messages:
+            raise SpecError("The plant is not well formed:", path=self.first_path, problems=self.messages)
+
+    def _note(self, message: str, path: str | None) -> None:
+        self.messages.append(message)
+        self.first_path = self.first_path or path
+
+
+def square(matrix: FloatArray, name: str) -> FloatArray:
+    """Return a non-empty square matrix as it is; raise `SpecError` otherwise."""
+    if matrix.shape[0] == 0 or matrix.shape[0] != matrix.shape[1]:
+        raise SpecError(f"{name} is {_by(matrix.shape)}, but it must be square (nx by nx, nx >= 1).", path=name)
+    return matrix
+
+
+def matrix_or_picks(value: Any, name: str, states: Sequence[str]) -> FloatArray:
+    """Return a matrix, or the selection that a list of state names stands for (rows of C, columns of inputs)."""
+    if not is_name_list(value):
+        return as_matrix(value, name)
+    rows = rows_picking(value, states, what=name)
+    return rows if name == "C" else rows.T
+
+
+def picked_names(value: Any) -> tuple[str, ...] | None:
+    """Return the names when signals were picked by name, else ``None``."""
+    return tuple(value) if is_name_list(value) else None
+
+
+def signal_counts(given: Mapping[str, FloatArray | None]) -> dict[str, int]:
+    """Return the number of signals of each kind, from the first matrix that tells."""
+
+    def columns(*names: str) -> int:
+        found = (given.get(name) for name in names)
+        return next((m.shape[1] for m in found if m is not None and m.size), 0)
+
+    outputs = given.get("C")
+    return {
+        "y": 0 if outputs is None else outputs.shape[0],
+        "u": columns("B", "D"),
+        "f": columns("Bf", "Df"),
+        "d": columns("Bd", "Dd"),
+        "w": columns("Bw", "Dw"),
+    }
+
+
+def uncounted_signals(given: Mapping[str, FloatArray | None], broken: Container[str]) -> set[str]:
+    """Return the kinds of signals whose number nothing tells, since a matrix that might is ``broken``."""
+    telling = {"y": ("C",), "u": ("B", "D"), "f": ("Bf", "Df"), "d": ("Bd", "Dd"), "w": ("Bw", "Dw")}
+    return {
+        signal
+        for signal, names in telling.items()
+        if any(name in broken for name in names) and not any(given.get(name) is not None for name in names)
+    }
+
+
+def expected_shapes(nx: int, counts: Mapping[str, int], unknown: Container[str] = ()) -> dict[str, tuple[int, int]]:
+    """Return the shape every matrix must have, of those whose signals have a known number."""
+    sizes = {"x": nx, **counts}
+    return {
+        name: (sizes[rows], sizes[columns])
+        for name, rows, columns in MATRIX_LAYOUT
+        if rows not in unknown and columns not in unknown
+    }
+
+
+def _by(shape: tuple[int, ...]) -> str:
+    return " by ".join(map(str, shape))
+
+
+def checked_dt(dt: Any) -> float:
+    """Return a sampling time in seconds, 0 for continuous time."""
+    if isinstance(dt, bool) or not isinstance(dt, (int, float, np.integer, np.floating)):
+        raise SpecError(f"dt is {dt!r}: give the sampling time in seconds, or 0 for continuous time.", path="dt")
+    if not np.isfinite(dt) or dt < 0:
+        raise SpecError(f"dt is {dt}: give a sampling time >= 0 in seconds (0 for continuous time).", path="dt")
+    return float(dt)
+
+
+def checked_point(point: Mapping[str, float] | None, known: set[str]) -> dict[str, float]:
+    """Return an operating point whose signals all exist."""
+    checked: dict[str, float] = {}
+    for name, value in (point or {}).items():
+        if name not in known:
+            raise SpecError(f"operating_point names {name!r}, which is no signal of the plant.", path="operating_point")
+        checked[name] = float(as_matrix(value, f"operating_point[{name!r}]")[0, 0])
+    return checked
+
+
+def checked_scales(scales: Mapping[str, float] | None, known: set[str]) -> dict[str, float]:
+    """Return factors of measured signals, which all exist."""
+    checked: dict[str, float] = {}
+    for name, value in (scales or {}).items():
+        if name not in known:
+            raise SpecError(f"scales names {name!r}, which is no input or output of the plant.", path="scales")
+        factor = float(as_matrix(value, f"scales[{name!r}]")[0, 0])
+        if factor == 0.0:
+            raise SpecError(f"The scale of {name!r} is 0: give a factor that is not zero.", path="scales")
+        checked[name] = factor
+    return checked
+
+
+def checked_units(units: Mapping[str, str] | None, known: set[str]) -> dict[str, str]:
+    """Return units whose signals all exist."""
+    if units is not None and not isinstance(units, Mapping):
+        raise SpecError(f"units is a {type(units).__name__}: give signal names and their units.", path="units")
+    for name, value in (units or {}).items():
+        if name not in known:
+            raise SpecError(f"units names {name!r}, which is no signal of the plant.", path="units")
+        if not isinstance(value, str):
+            raise SpecError(f"The unit of {name!r} must be a text.", path="units")
+    return dict(units or {})

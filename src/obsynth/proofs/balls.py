@@ -1,0 +1,194 @@
+r"""Matrices with guaranteed error bounds: midpoint and radius, rounding included.
+
+A `Ball` stands for every real matrix within ``radius`` of ``midpoint``, entry by entry.  Sums and products
+of balls contain every sum and product of members, whatever the order in which BLAS adds up.  A ball that overflowed
+has an entry that is not finite, and every product with it too: nothing is claimed about it.
+
+The bound (Higham, *Accuracy and Stability of Numerical Algorithms*, 2nd ed., section 3.1): with unit
+roundoff :math:`u = 2^{-53}` and :math:`\gamma_k = k u / (1 - k u)`, a dot product of length k computed in
+any order, with or without fused multiply-add, differs from the exact one by at most
+:math:`\gamma_k |x|^T |y|`, plus :math:`k\,2^{-1074}` where products underflow.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol, Self, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.numerics.arrays import FloatArray
+
+#: Unit roundoff of IEEE double precision.
+UNIT_ROUNDOFF = 2.0**-53
+#: Twice the smallest positive number: more than one underflow can lose.
+UNDERFLOW = 2.0**-1073
+
+
+def gamma(terms: int) -> float:
+    """Return an upper bound on ``k u / (1 - k u)`` for ``k = terms`` (far below ``1 / u``)."""
+    return terms * UNIT_ROUNDOFF * (1.0 + 2.0 * (terms + 2) * UNIT_ROUNDOFF)
+
+
+def rounded_up(value: FloatArray, operations: int) -> FloatArray:
+    """Return an upper bound on a non-negative exact value that was computed with ``operations`` roundings."""
+    return value * (1.0 + 2.0 * (operations + 2) * UNIT_ROUNDOFF) + (operations + 1) * UNDERFLOW
+
+
+class Enclosure(ABC):
+    """A set of real matrices on which sums and products can be formed so that they hold those of all members.
+
+    `Ball` does so in double precision, `obsynth.proofs.extended_balls.ExtendedBall` in any other.
+    """
+
+    @classmethod
+    @abstractmethod
+    def exact(cls, matrix: FloatArray) -> Self:
+        """Return the set that holds ``matrix`` alone: floating-point numbers are exact data."""
+
+    @classmethod
+    @abstractmethod
+    def of(cls, ball: Ball) -> Self:
+        """Return a set that holds every member of ``ball``."""
+
+    @classmethod
+    @abstractmethod
+    def blocks(cls, rows: Sequence[Sequence[Self]]) -> Self:
+        """Return the set of block matrices with the given rows of blocks."""
+
+    @property
+    @abstractmethod
+    def shape(self) -> tuple[int, ...]:
+        """Rows and columns."""
+
+    @property
+    @abstractmethod
+    def T(self) -> Self:
+        """The transpose."""
+
+    @abstractmethod
+    def __add__(self, other: Self) -> Self:
+        """Return a set that holds all sums of members."""
+
+    @abstractmethod
+    def __neg__(self) -> Self:
+        """Return the set of the negative members."""
+
+    def __sub__(self, other: Self) -> Self:
+        """Return a set that holds all differences of members."""
+        return self + (-other)
+
+    @abstractmethod
+    def __matmul__(self, other: Self) -> Self:
+        """Return a set that holds all products of members."""
+
+    @abstractmethod
+    def scaled(self, factor: float) -> Self:
+        """Return a set that holds ``factor`` times every member."""
+
+
+Enclosed = TypeVar("Enclosed", bound=Enclosure)
+
+
+class Formula(Protocol):
+    """How a matrix is formed, in an arithmetic of whoever calls it: ``formula(Ball)`` for double precision."""
+
+    def __call__(self, kind: type[Enclosed], /) -> Enclosed:
+        """Return the matrix with what forming it may have cost."""
+
+
+@dataclass(frozen=True, eq=False)
+class Ball(Enclosure):
+    """All real matrices within ``radius`` of ``midpoint``, entry by entry.
+
+    Fields: midpoint, radius: ``(rows, cols)`` each; the radius is not negative.
+    """
+
+    midpoint: FloatArray
+    radius: FloatArray
+
+    @classmethod
+    def exact(cls, matrix: FloatArray) -> Self:
+        """Return the ball that holds ``matrix`` alone: floating-point numbers are exact data."""
+        return cls(np.asarray(matrix, dtype=np.float64), np.zeros(np.shape(matrix)))
+
+    @classmethod
+    def of(cls, ball: Ball) -> Self:
+        """Return ``ball``."""
+        return cls(ball.midpoint, ball.radius)
+
+    @classmethod
+    def blocks(cls, rows: Sequence[Sequence[Self]]) -> Self:
+        """Return the ball of the block matrix with the given rows of blocks."""
+        heights, widths = [row[0].shape[0] for row in rows], [ball.shape[1] for ball in rows[0]]
+        midpoint, radius = (np.zeros((sum(heights), sum(widths))) for _ in range(2))
+        bottom = 0
+        for row, height in zip(rows, heights, strict=True):
+            right = 0
+            for ball, width in zip(row, widths, strict=True):
+                place = slice(bottom, bottom + height), slice(right, right + width)
+                midpoint[place], radius[place] = ball.midpoint, ball.radius
+                right += width
+            bottom += height
+        return cls(midpoint, radius)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Rows and columns."""
+        return tuple(self.midpoint.shape)
+
+    @property
+    def T(self) -> Self:
+        """The transpose."""
+        return type(self)(self.midpoint.T, self.radius.T)
+
+    def __add__(self, other: Self) -> Self:
+        """Return the ball of all sums of members."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            total = self.midpoint + other.midpoint
+            radius = rounded_up(self.radius + other.radius + UNIT_ROUNDOFF * np.abs(total), 3)
+        return type(self)(total, radius)
+
+    def __neg__(self) -> Self:
+        """Return the ball of the negative members; exact."""
+        return type(self)(-self.midpoint, self.radius)
+
+    def __matmul__(self, other: Self) -> Self:
+        """Return the ball of all products of members."""
+        length = self.shape[1]
+        size, other_size = np.abs(self.midpoint), np.abs(other.midpoint)
+        with np.errstate(over="ignore", invalid="ignore"):
+            # gamma multiplies the product, not a factor: what a factor loses by underflow, the other may magnify.
+            spread = gamma(length + 1) * (size @ other_size)
+            if not other.is_exact:
+                spread = spread + size @ other.radius
+            if not self.is_exact:
+                spread = spread + self.radius @ (other_size + other.radius)
+            radius = rounded_up(spread, 2 * length + 6) + 3 * length * UNDERFLOW
+            return type(self)(self.midpoint @ other.midpoint, radius)
+
+    def scaled(self, factor: float) -> Self:
+        """Return the ball of ``factor`` times every member."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            product = factor * self.midpoint
+            radius = abs(factor) * self.radius + UNIT_ROUNDOFF * np.abs(product) + UNDERFLOW
+            return type(self)(product, rounded_up(radius, 4))
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether there is one member alone."""
+        return not np.any(self.radius)
+
+    def congruent(self, exponents: NDArray[np.int64]) -> Ball:
+        """Return ``diag(2^k) X diag(2^k)``, k the ``exponents``: exact but for underflow."""
+        total = exponents[:, None] + exponents
+        with np.errstate(over="ignore"):
+            return Ball(np.ldexp(self.midpoint, total), np.ldexp(self.radius, total) + UNDERFLOW)
+
+
+def block(rows: Sequence[Sequence[Enclosed]]) -> Enclosed:
+    """Return the set of block matrices with the given rows of blocks."""
+    return type(rows[0][0]).blocks(rows)

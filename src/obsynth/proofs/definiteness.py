@@ -1,0 +1,251 @@
+r"""Proofs that a symmetric matrix, known up to rounding, is positive definite.
+
+An eigenvalue computed in floating point proves nothing near zero.  A Cholesky factorisation that runs to completion
+does (S. M. Rump, *Verification of positive definiteness*, BIT 46, 2006; formally proved, with the constants below, by
+P. Roux in Coq).  With unit roundoff :math:`u`, :math:`\gamma_k = k u / (1 - k u)`, and R the computed factor of the
+floating-point matrix :math:`\tilde A` of order n:
+
+1. For :math:`i \le j`, :math:`r_{ij}` is the rounded quotient (or root) of
+   :math:`\tilde a_{ij} - \sum_{k<i} r_{ki} r_{kj}`.  Each of these terms goes through one product, at most i - 1 sums
+   and the quotient, whatever the order: at most i + 1 roundings.  So
+   :math:`|\tilde a_{ij} - \sum_{k \le i} r_{ki} r_{kj}| \le \gamma_{n+1} \sum_{k \le i} |r_{ki}| |r_{kj}|
+   \le \gamma_{n+1} \|r_i\| \|r_j\|` with the columns r of R (Cauchy, Schwarz).
+2. On the diagonal this reads :math:`\|r_j\|^2 \le \tilde a_{jj} + \gamma_{n+1} \|r_j\|^2`, so that
+   :math:`\|r_j\|^2 \le \tilde a_{jj} / (1 - \gamma_{n+1})`.
+3. Hence :math:`R^T R = \tilde A + \Delta` with :math:`|\Delta| \le \frac{\gamma_{n+1}}{1 - \gamma_{n+1}} d d^T`,
+   :math:`d_j = \sqrt{\tilde a_{jj}}`, whose norm is :math:`d^T d`:
+   :math:`\lambda_{\min}(\tilde A) \ge -\frac{\gamma_{n+1}}{1 - \gamma_{n+1}} \mathrm{tr}\,\tilde A - \eta`.
+   Underflow adds to an entry at most :math:`4 (n + 1 + \max_i \tilde a_{ii}) 2^{-1074}`, n times that to the norm.
+
+We take 2 (n + 4) for n + 1, since kernels may multiply by a rounded reciprocal, and twice the underflow.  Arithmetic is
+supposed to round to nearest with gradual underflow, and kernels to form products as sums of products (no Strassen).
+So, with :math:`\tilde A = \mathrm{fl}(A - c I)`, completion proves
+
+.. math::
+    \lambda_{\min}(A) \ge c - \frac{\gamma_k}{1-\gamma_k} \mathrm{tr}\,\tilde A - u \max_i |\tilde a_{ii}| - \eta .
+
+The error of forming A enters as the largest row sum of its radii, a bound on the spectral norm of any
+symmetric perturbation within them.
+
+Where that is too much, a congruence brings the matrix near the identity and the same is tried again; and where the
+margin is below the rounding errors of double precision altogether, the matrix is formed and factored in more digits
+(`obsynth.proofs.extended_balls`), if python-flint is installed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.numerics.arrays import FloatArray
+from obsynth.proofs.balls import UNDERFLOW, UNIT_ROUNDOFF, Ball, Enclosed, Formula, gamma, rounded_up
+from obsynth.proofs.extended_balls import MOST_ROWS, is_available, prove_by_ball_arithmetic
+
+#: The first shift that is tried, relative to the error bound: as little as leaves a bound above zero.
+LEAST_SHIFT = 1.0 + 2.0**-5
+#: Shares of the estimated eigenvalue that are tried as lower bounds, in turn.
+SHARES = (0.5, 2.0**-4)
+#: Steps of inverse iteration behind that estimate.
+INVERSE_ITERATIONS = 4
+
+Means = Literal["Cholesky", "preconditioned Cholesky", "ball arithmetic", "none"]
+
+
+@dataclass(frozen=True)
+class DefinitenessProof:
+    """The outcome of an attempt to prove positive definiteness.
+
+    Fields: proved: Whether every symmetric member of the ball is proved positive definite; lower_bound: Proved lower
+    bound on the smallest eigenvalue after a congruence: scaling the diagonal near one or, where that leaves too little,
+    preconditioning to near the identity.  Without a proof, the computed eigenvalue less the error bounds, or zero;
+    error_bound: What rounding and forming could have contributed in double precision, on the same scale; means: What
+    proved it; reason: With ball arithmetic, its precision; without a proof, why there is none.
+    """
+
+    proved: bool
+    lower_bound: float
+    error_bound: float
+    means: Means = "none"
+    reason: str = ""
+
+    @property
+    def in_double_precision(self) -> bool:
+        """Whether it is proved without python-flint: a certificate to prefer, since everybody can check it."""
+        return self.proved and self.means != "ball arithmetic"
+
+    @property
+    def text(self) -> str:
+        """How it was proved, or why not, for reports."""
+        if self.means == "ball arithmetic":
+            return f"ball arithmetic with {self.reason} (python-flint), on a unit diagonal"
+        if not self.proved:
+            return f"not proved: {self.reason}" if self.reason else "not proved"
+        change = " after preconditioning" if self.means == "preconditioned Cholesky" else ""
+        return f"Cholesky{change} with rounding bound {self.error_bound:.1e}, on a unit diagonal"
+
+
+def unproved(reason: str) -> DefinitenessProof:
+    """Return that nothing is proved, for a reason found before any factorisation."""
+    return DefinitenessProof(False, -float("inf"), 0.0, reason=reason)
+
+
+def prove_positive_definite(matrix: Formula | Ball | FloatArray) -> DefinitenessProof:
+    """Try to prove that every symmetric member of ``matrix (n, n)`` is positive definite."""
+    formula = _as_formula(matrix)
+    ball = formula(Ball)
+    if ball.shape[0] == 0:
+        return DefinitenessProof(True, float("inf"), 0.0, "Cholesky")
+    if not _is_finite(ball):
+        return unproved("an entry is not finite")
+    diagonal = np.diag(ball.midpoint)
+    if np.any(diagonal <= 0.0):
+        place = int(np.argmin(diagonal))
+        return unproved(f"diagonal entry {place + 1} is {diagonal[place]:.3g}: not positive definite")
+    exponents = -np.round(np.log2(diagonal) / 2.0).astype(np.int64)
+    scaled = _symmetric(ball.congruent(exponents))
+    if not _is_finite(scaled):
+        return unproved("an entry beside the diagonal is larger than the diagonal allows: not positive definite")
+    first = _by_cholesky(scaled)
+    if first.proved:
+        return first
+    return _by_preconditioning(scaled) or _in_more_digits(formula, exponents, first)
+
+
+def _as_formula(matrix: Formula | Ball | FloatArray) -> Formula:
+    if isinstance(matrix, (Ball, np.ndarray)):
+        ball = matrix if isinstance(matrix, Ball) else Ball.exact(matrix)
+
+        def given(kind: type[Enclosed]) -> Enclosed:
+            return kind.of(ball)
+
+        return given
+    return matrix
+
+
+def _is_finite(ball: Ball) -> bool:
+    return bool(np.all(np.isfinite(ball.midpoint)) and np.all(np.isfinite(ball.radius)))
+
+
+def _symmetric(ball: Ball) -> Ball:
+    """Return a ball with symmetric midpoint that holds every symmetric member of ``ball``.
+
+    Such members lie in the ball and in its transpose, so averaging the midpoints loses none; the difference of the
+    midpoints more than covers the rounding of the average.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        middle = 0.5 * (ball.midpoint + ball.midpoint.T)
+        radius = np.maximum(ball.radius, ball.radius.T) + np.abs(ball.midpoint - ball.midpoint.T)
+        return Ball(middle, rounded_up(radius, 4))
+
+
+def _by_cholesky(ball: Ball, means: Means = "Cholesky") -> DefinitenessProof:
+    size = ball.shape[0]
+    forming = float(rounded_up(np.max(np.sum(ball.radius, axis=1)), size + 2))
+    error = forming + _factorisation_bound(ball.midpoint)
+    shift = LEAST_SHIFT * error
+    factor = _cholesky_factor(ball.midpoint - shift * np.eye(size))
+    if factor is None:
+        estimate = float(np.linalg.eigvalsh(ball.midpoint)[0])
+        reason = (
+            f"the smallest eigenvalue, computed as {estimate:.3g} on a unit diagonal, is not above the rounding and "
+            f"forming errors, {error:.3g}"
+        )
+        return DefinitenessProof(False, min(estimate - error, 0.0), error, reason=reason)
+    # That is a proof.  How much there is besides is estimated, and proved by another factorisation.
+    left = _smallest_eigenvalue(factor)
+    for share in SHARES:
+        larger = shift + share * left
+        if larger > shift and _cholesky_factor(ball.midpoint - larger * np.eye(size)) is not None:
+            return DefinitenessProof(True, larger - error, error, means)
+    return DefinitenessProof(True, shift - error, error, means)
+
+
+def _smallest_eigenvalue(factor: FloatArray) -> float:
+    """Return an estimate of the smallest eigenvalue of ``factor factor'``, from above, by inverse iteration."""
+    from scipy.linalg.lapack import dpotrs
+
+    vector = np.ones(len(factor)) / np.sqrt(len(factor))
+    # Signs that alternate where those of the factor do keep the start away from a right angle.
+    vector = np.where(factor[-1] > 0.0, -vector, vector)
+    size = 0.0
+    for _ in range(INVERSE_ITERATIONS):
+        vector = dpotrs(factor, vector, lower=1)[0]
+        size = float(np.linalg.norm(vector))
+        if not np.isfinite(size) or size == 0.0:
+            return 0.0
+        vector = vector / size
+    return 1.0 / size
+
+
+def _by_preconditioning(ball: Ball) -> DefinitenessProof | None:
+    """Prove ``C' X C`` instead, with C close to the inverse Cholesky factor; ``None`` when that does not help.
+
+    A congruence with any nonsingular C keeps definiteness, and this one makes the matrix close to the identity, so
+    that a condition number up to about 1e12 no longer eats the margin.  C is triangular with a nonzero diagonal,
+    hence nonsingular exactly; the product is formed with error bounds.
+    """
+    factor = _cholesky_factor(ball.midpoint)
+    if factor is None:
+        return None
+    try:
+        change = np.triu(np.linalg.inv(factor).T)
+    except np.linalg.LinAlgError:
+        # Pivoting can make pivots underflow although the diagonal of the factor does not.
+        return None
+    if not np.all(np.isfinite(change)) or np.any(np.diag(change) == 0.0):
+        return None
+    exact = Ball.exact(change)
+    near_identity = _symmetric(exact.T @ ball @ exact)
+    if not _is_finite(near_identity):
+        return None
+    proof = _by_cholesky(near_identity, "preconditioned Cholesky")
+    return proof if proof.proved else None
+
+
+def _in_more_digits(formula: Formula, exponents: NDArray[np.int64], first: DefinitenessProof) -> DefinitenessProof:
+    """Prove by ball arithmetic what double precision left open; or return ``first`` with the reason."""
+    if first.lower_bound < -2.0 * first.error_bound:
+        return first  # negative beyond all errors
+    if len(exponents) > MOST_ROWS:
+        return _with(
+            first, f"{first.reason}; ball arithmetic is tried up to order {MOST_ROWS}, this is {len(exponents)}"
+        )
+    if not is_available():
+        return _with(first, f"{first.reason}; with python-flint (pip install 'obsynth[proof]') more digits are tried")
+    units = np.diag(np.ldexp(1.0, exponents))
+
+    def scaled(kind: type[Enclosed]) -> Enclosed:
+        change = kind.exact(units)
+        return change @ formula(kind) @ change
+
+    found = prove_by_ball_arithmetic(scaled)
+    if not found.proved:
+        return _with(first, f"{first.reason}; {found.reason}")
+    return DefinitenessProof(True, found.lower_bound, first.error_bound, "ball arithmetic", f"{found.bits} bits")
+
+
+def _with(proof: DefinitenessProof, reason: str) -> DefinitenessProof:
+    return DefinitenessProof(False, proof.lower_bound, proof.error_bound, reason=reason)
+
+
+def _factorisation_bound(symmetric: FloatArray) -> float:
+    """Bound on what a completed Cholesky factorisation of ``symmetric`` less a shift leaves open."""
+    size = symmetric.shape[0]
+    growth = gamma(2 * (size + 4))
+    trace = float(rounded_up(np.sum(np.abs(np.diag(symmetric))), size))
+    largest = float(np.max(np.abs(np.diag(symmetric))))
+    # The shift only lowers a diagonal that stays positive, so the unshifted trace bounds the shifted one.
+    bound = growth * (1.0 + 2.0 * growth) * trace + 2.0 * UNIT_ROUNDOFF * largest
+    underflow = 4.0 * size * (2.0 * size + largest) * UNDERFLOW
+    return float(rounded_up(np.asarray(bound + underflow), 8))
+
+
+def _cholesky_factor(matrix: FloatArray) -> FloatArray | None:
+    try:
+        factor = np.linalg.cholesky(matrix)
+    except np.linalg.LinAlgError:
+        return None
+    return np.asarray(factor) if np.all(np.isfinite(factor)) else None

@@ -1,0 +1,255 @@
+r"""Pencils ``A - s E`` of rational numbers, decided exactly: normal rank, zeros, index, left null space.
+
+The greatest common divisor of all r-minors, r the normal rank, has the finite zeros as its roots.  Two random integer
+compressions of rows (and columns) to r by r give two determinants that both are combinations of all these minors
+(Cauchy, Binet): their greatest common divisor is the wanted one unless chance adds a factor, which a third compression
+then removes.  Determinants are polynomials of degree rank E at most, found from their values at integers.
+
+A normal rank is bounded from below by the rank at any point (modulo a prime), and from above where it is not full: all
+(r + 1)-minors are polynomials of degree rank E at most, so rank r or less at one point more than that proves it.
+"""
+
+from __future__ import annotations
+
+import random
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import cached_property
+
+from flint import fmpq, fmpq_mat, fmpq_poly, fmpz_mat, fmpz_poly, nmod_mat
+
+from obsynth.numerics.arrays import FloatArray
+from obsynth.proofs.exact_matrices import (
+    blocks,
+    identity,
+    null_basis,
+    pivot_columns,
+    with_integer_entries,
+    zeros_matrix,
+)
+from obsynth.proofs.root_location import RootLocation, locate_roots, primitive
+from obsynth.proofs.written_numbers import written_matrix
+
+#: Primes for ranks that are only bounded from below.
+_PRIMES = ((1 << 61) - 1, 2305843009213693921, 2305843009213693907)
+#: Size of the random integers of a compression, and the seed that makes every decision repeatable.
+_COMPRESSION_SIZE = 1 << 12
+_SEED = 20150709
+#: Compressions after which a factor that all of them share is a factor of all minors.
+_MOST_COMPRESSIONS = 6
+
+
+__all__ = ["ExactPencil", "blocks", "identity", "null_basis", "pivot_columns", "system_pencil", "zeros_matrix"]
+
+
+@dataclass(frozen=True, eq=False)
+class ExactPencil:
+    """The pencil ``A - s E`` with rational matrices ``(m, n)``; its parts are computed once and kept.
+
+    Parameters
+    ----------
+    E, A : fmpq_mat
+        ``(m, n)``.
+    """
+
+    E: fmpq_mat
+    A: fmpq_mat
+
+    @classmethod
+    def written(cls, E: FloatArray, A: FloatArray) -> ExactPencil:
+        """Return the pencil of two matrices ``(m, n)`` of doubles, each as the number it was written as."""
+        return cls(written_matrix(E), written_matrix(A))
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return int(self.A.nrows()), int(self.A.ncols())
+
+    @cached_property
+    def normal_rank(self) -> int:
+        """Rank of ``A - s E`` at almost every s."""
+        e, a = self._integers
+        least = max((_rank_modulo(e, a, prime, self._rng) for prime in _PRIMES), default=0)
+        if least == min(self.shape):
+            return least
+        return max([least, *(_at(e, a, point).rank() for point in _points(self._degree + 1))])
+
+    @cached_property
+    def zero_polynomial(self) -> fmpz_poly:
+        """Primitive polynomial whose roots, with multiplicity, are the finite zeros; 1 where there are none."""
+        rank = self.normal_rank
+        if rank == 0 or self._degree == 0:
+            return fmpz_poly([1])
+        found = self._compressed_determinant(rank)
+        if self.shape == (rank, rank):
+            return found
+        for _ in range(_MOST_COMPRESSIONS):
+            if found.degree() == 0:
+                break
+            other = found.gcd(self._compressed_determinant(rank))
+            settled = other.degree() == found.degree() and other.degree() < self._degree
+            found = primitive(fmpq_poly(other))
+            if settled:
+                break
+        return found
+
+    def zeros(self, *, discrete: bool) -> RootLocation:
+        """Return the finite zeros and where they are: exact, however close to the stability boundary."""
+        return locate_roots(self.zero_polynomial, discrete=discrete)
+
+    def rank_at(self, point: Fraction) -> int:
+        """Return the rank at a rational point."""
+        e, a = self._integers
+        return int((a * point.denominator - e * point.numerator).rank())
+
+    def rank_at_root(self, polynomial: fmpz_poly) -> int:
+        """Return the rank at a root of an irreducible polynomial: the same at all of them."""
+        degree = polynomial.degree()
+        if degree == 1:
+            constant, leading = (int(value) for value in polynomial.coeffs())
+            return self.rank_at(Fraction(-constant, leading))
+        companion = fmpq_mat(degree, degree)
+        for row in range(degree):
+            companion[row, degree - 1] = -fmpq(polynomial[row], polynomial[degree])
+            if row:
+                companion[row, row - 1] = fmpq(1)
+        rows, columns = self.shape
+        whole = fmpq_mat(rows * degree, columns * degree)
+        for i in range(rows):
+            for j in range(columns):
+                for k in range(degree):
+                    whole[i * degree + k, j * degree + k] = self.A[i, j]
+                if self.E[i, j] != 0:
+                    for k in range(degree):
+                        for m in range(degree):
+                            whole[i * degree + k, j * degree + m] -= self.E[i, j] * companion[k, m]
+        return int(whole.rank()) // degree
+
+    @cached_property
+    def index(self) -> int | None:
+        """Size of the largest block at infinity, 0 for nonsingular E; ``None`` for a pencil that is not regular."""
+        rows, columns = self.shape
+        if rows != columns or self.normal_rank < columns:
+            return None
+        e, a = self._integers
+        shift = next(point for point in _points(self._degree + 2) if _at(e, a, point).rank() == columns)
+        chain = fmpq_mat(_at(e, a, shift)).solve(fmpq_mat(e))
+        power, ranks = chain, [columns, int(chain.rank())]
+        while ranks[-1] != ranks[-2]:
+            power = power * chain
+            ranks.append(int(power.rank()))
+        return len(ranks) - 2
+
+    def left_null_basis(self, *, most: int | None = None) -> list[list[fmpq_poly]]:
+        """Return a minimal polynomial basis ``N(s)`` of the left null space: rows of polynomials, by degree.
+
+        ``most`` bounds the degrees looked for (the number of columns by default).  The cost grows with the cube of
+        (degree times rows): for large pencils of high degree ask `zero_polynomial` of bordered pencils instead.
+        """
+        rows, columns = self.shape
+        wanted, basis = rows - self.normal_rank, list[list[fmpq_poly]]()
+        for degree in range((columns if most is None else most) + 1):
+            if len(basis) == wanted:
+                break
+            known = [_shifted(row, k) for row in basis for k in range(degree - _degree_of(row) + 1)]
+            for vector in _left_kernel(_toeplitz(self.E, self.A, degree)):
+                candidate = [fmpq_poly([vector[k * rows + i] for k in range(degree + 1)]) for i in range(rows)]
+                if _coefficient_rank([*known, candidate], degree) == len(known) + 1:
+                    basis.append(candidate)
+                    known.append(candidate)
+        return basis
+
+    @cached_property
+    def _integers(self) -> tuple[fmpz_mat, fmpz_mat]:
+        """E and A with rows and columns multiplied by rational numbers, so that all entries are small integers."""
+        return with_integer_entries(self.E, self.A)
+
+    @cached_property
+    def _degree(self) -> int:
+        return int(self.E.rank())
+
+    @cached_property
+    def _rng(self) -> random.Random:
+        return random.Random(_SEED)
+
+    def _compressed_determinant(self, rank: int) -> fmpz_poly:
+        e, a = self._integers
+        rows, columns = self.shape
+        if rows > rank:
+            left = self._random(rank, rows)
+            e, a = left * e, left * a
+        if columns > rank:
+            right = self._random(columns, rank)
+            e, a = e * right, a * right
+        return _determinant(e, a, min(self._degree, rank))
+
+    def _random(self, rows: int, columns: int) -> fmpz_mat:
+        size = _COMPRESSION_SIZE
+        return fmpz_mat(rows, columns, [self._rng.randint(-size, size) for _ in range(rows * columns)])
+
+
+def system_pencil(E: fmpq_mat, A: fmpq_mat, B: fmpq_mat, C: fmpq_mat, D: fmpq_mat) -> ExactPencil:
+    """Return ``[A - s E, B; C, D]``."""
+    rows, columns = A.nrows() + C.nrows(), A.ncols() + B.ncols()
+    padded = fmpq_mat(rows, columns)
+    for i in range(E.nrows()):
+        for j in range(E.ncols()):
+            padded[i, j] = E[i, j]
+    return ExactPencil(padded, blocks([[A, B], [C, D]]))
+
+
+def _rank_modulo(e: fmpz_mat, a: fmpz_mat, prime: int, rng: random.Random) -> int:
+    point = rng.randrange(prime)
+    return int((nmod_mat(a, prime) - nmod_mat(e, prime) * point).rank())
+
+
+def _at(e: fmpz_mat, a: fmpz_mat, point: int) -> fmpz_mat:
+    return a - e * point
+
+
+def _points(count: int) -> list[int]:
+    """Return so many different integers of small size."""
+    return [(k + 1) // 2 * (1 if k % 2 else -1) for k in range(count)]
+
+
+def _determinant(e: fmpz_mat, a: fmpz_mat, degree: int) -> fmpz_poly:
+    """Return ``det(a - s e)``, of at most this degree, as a primitive polynomial, by Newton's divided differences."""
+    points = _points(degree + 1)
+    differences = [fmpq(_at(e, a, point).det()) for point in points]
+    for order in range(1, degree + 1):
+        for k in range(degree, order - 1, -1):
+            differences[k] = (differences[k] - differences[k - 1]) / (points[k] - points[k - order])
+    found = fmpq_poly([differences[degree]])
+    for k in range(degree - 1, -1, -1):
+        found = found * fmpq_poly([-points[k], 1]) + fmpq_poly([differences[k]])
+    return primitive(found)
+
+
+def _toeplitz(E: fmpq_mat, A: fmpq_mat, degree: int) -> fmpq_mat:
+    """Return the matrix whose left kernel holds the coefficients of all null vectors of at most this degree."""
+    rows, columns = int(A.nrows()), int(A.ncols())
+    whole = fmpq_mat((degree + 1) * rows, (degree + 2) * columns)
+    for k in range(degree + 1):
+        for i in range(rows):
+            for j in range(columns):
+                whole[k * rows + i, k * columns + j] = A[i, j]
+                whole[k * rows + i, (k + 1) * columns + j] = -E[i, j]
+    return whole
+
+
+def _left_kernel(matrix: fmpq_mat) -> list[list[fmpq]]:
+    basis = null_basis(matrix.transpose())
+    return [[basis[i, k] for i in range(basis.nrows())] for k in range(basis.ncols())]
+
+
+def _shifted(row: list[fmpq_poly], power: int) -> list[fmpq_poly]:
+    return [entry.left_shift(power) if power else entry for entry in row]
+
+
+def _degree_of(row: list[fmpq_poly]) -> int:
+    return max(int(entry.degree()) for entry in row)
+
+
+def _coefficient_rank(rows: list[list[fmpq_poly]], degree: int) -> int:
+    entries = [entry[k] for row in rows for entry in row for k in range(degree + 1)]
+    return int(fmpq_mat(len(rows), len(entries) // len(rows), entries).rank())

@@ -1,0 +1,181 @@
+r"""Matrices of real balls in any precision, and the signs of a quadratic form decided with them: python-flint's Arb.
+
+Where the margin of an inequality is below the rounding errors of double precision, the matrix is formed again from the
+same numbers with more digits, and factored as :math:`L D L^T`.  If every pivot is a ball to the right of zero, each
+symmetric member of the matrix is positive definite (Sylvester's law of inertia holds for every member, and each pivot
+of a member lies in the ball).  More digits are taken until the pivots are decided, or `MOST_BITS` are reached.
+
+python-flint is an optional extra (``pip install 'obsynth[proof]'``) and is loaded only here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+
+from obsynth.numerics.arrays import FloatArray
+from obsynth.proofs.balls import Ball, Enclosure, Formula
+
+#: Digits to try, in bits.
+PRECISIONS = (128, 512, 2048)
+#: The largest order that is tried: 128 takes 0.1 s where 128 bits decide, 0.5 s where nothing does.
+MOST_ROWS = 128
+
+
+@dataclass(frozen=True)
+class ExtendedProof:
+    """What ball arithmetic found out.
+
+    Fields: proved: Whether every symmetric member is positive definite; lower_bound: Below the smallest eigenvalue of
+    every member; zero without a proof; bits: Precision that decided, or the last that was tried; reason: Why there is
+    no proof; empty with one.
+    """
+
+    proved: bool
+    lower_bound: float
+    bits: int
+    reason: str = ""
+
+
+def is_available() -> bool:
+    """Whether python-flint is installed."""
+    from importlib.util import find_spec
+
+    return find_spec("flint") is not None
+
+
+def prove_by_ball_arithmetic(formula: Formula) -> ExtendedProof:
+    """Try to prove that every symmetric member of a matrix is positive definite, with as many digits as it takes.
+
+    Shapes: ``formula (n, n)``.
+    """
+    import flint
+
+    reason = ""
+    for bits in PRECISIONS:
+        # A local precision: the one in python-flint's context is for the whole process.
+        with flint.ctx.workprec(bits):
+            matrix = formula(ExtendedBall)
+            pivot = _undecided_pivot(matrix.entries())
+            if pivot is None:
+                return ExtendedProof(True, _lower_bound(matrix), bits)
+        if pivot.certain:
+            return ExtendedProof(False, 0.0, bits, f"pivot {pivot.place} is not positive: not positive definite")
+        reason = f"{bits} bits of ball arithmetic leave the sign of pivot {pivot.place} open: singular, or next to it"
+        if pivot.hopeless:
+            break
+    return ExtendedProof(False, 0.0, bits, reason)
+
+
+@dataclass(frozen=True)
+class _Pivot:
+    """A pivot that is not known to be positive."""
+
+    place: int
+    certain: bool  # it is known not to be
+    hopeless: bool  # digits do not help: it is not finite
+
+
+def _undecided_pivot(rows: list[list[Any]]) -> _Pivot | None:
+    """Return the first pivot of ``L D L'`` that is not certainly positive, ``None`` when all are.
+
+    Only the upper triangle is read: a symmetric member of the matrix lies in it.
+    """
+    size = len(rows)
+    for k, pivot_row in enumerate(rows):
+        pivot = pivot_row[k]
+        if not pivot > 0:
+            return _Pivot(k + 1, bool(pivot <= 0), not pivot.is_finite())
+        for i in range(k + 1, size):
+            factor, row = pivot_row[i] / pivot, rows[i]
+            for j in range(i, size):
+                row[j] -= factor * pivot_row[j]
+    return None
+
+
+def _lower_bound(matrix: ExtendedBall) -> float:
+    """Return ``1 / trace(X^-1)``, rounded down: no more than the smallest eigenvalue of a definite member X."""
+    try:
+        trace = matrix.content.inv().trace().upper()
+    except ZeroDivisionError:
+        return float(np.nextafter(0.0, 1.0))
+    bound = float((1 / trace).lower()) if trace > 0 and trace.is_finite() else 0.0
+    return max(float(np.nextafter(bound, 0.0)), float(np.nextafter(0.0, 1.0)))
+
+
+@dataclass(frozen=True, eq=False)
+class ExtendedBall(Enclosure):
+    """All real matrices within radii of midpoints that have the digits of python-flint's current precision.
+
+    Fields: content: ``(rows, cols)``.
+    """
+
+    content: Any
+
+    @classmethod
+    def exact(cls, matrix: FloatArray) -> Self:
+        """Return the ball that holds ``matrix`` alone, whatever the precision."""
+        import flint
+
+        rows, columns = np.shape(matrix)
+        return cls(flint.arb_mat(rows, columns, [flint.arb(value) for value in np.ravel(matrix).tolist()]))
+
+    @classmethod
+    def of(cls, ball: Ball) -> Self:
+        """Return the ball with the midpoint and radius of ``ball``."""
+        import flint
+
+        rows, columns = ball.shape
+        pairs = zip(np.ravel(ball.midpoint).tolist(), np.ravel(ball.radius).tolist(), strict=True)
+        content = [flint.arb(middle, radius) if radius else flint.arb(middle) for middle, radius in pairs]
+        return cls(flint.arb_mat(rows, columns, content))
+
+    @classmethod
+    def blocks(cls, rows: Sequence[Sequence[Self]]) -> Self:
+        """Return the ball of the block matrix with the given rows of blocks."""
+        import flint
+
+        joined: list[Any] = []
+        height = 0
+        for row in rows:
+            parts = [part.entries() for part in row]
+            height += row[0].shape[0]
+            for i in range(row[0].shape[0]):
+                joined += [value for part in parts for value in part[i]]
+        return cls(flint.arb_mat(height, sum(part.shape[1] for part in rows[0]), joined))
+
+    def entries(self) -> list[list[Any]]:
+        """Return the entries as lists of ``flint.arb``."""
+        rows, columns = self.shape
+        return [[self.content[i, j] for j in range(columns)] for i in range(rows)]
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Rows and columns."""
+        return int(self.content.nrows()), int(self.content.ncols())
+
+    @property
+    def T(self) -> Self:
+        """The transpose."""
+        return type(self)(self.content.transpose())
+
+    def __add__(self, other: Self) -> Self:
+        """Return the ball of all sums of members."""
+        return type(self)(self.content + other.content)
+
+    def __neg__(self) -> Self:
+        """Return the ball of the negative members; exact."""
+        return type(self)(-self.content)
+
+    def __matmul__(self, other: Self) -> Self:
+        """Return the ball of all products of members."""
+        return type(self)(self.content * other.content)
+
+    def scaled(self, factor: float) -> Self:
+        """Return the ball of ``factor`` times every member."""
+        import flint
+
+        return type(self)(self.content * flint.arb(factor))

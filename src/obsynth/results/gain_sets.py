@@ -1,0 +1,188 @@
+"""Gain sets on disk: one JSON document with a schema version and a digest, floats bit for bit."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from obsynth.analysis.transformations import StateRecovery
+from obsynth.errors import SpecError
+from obsynth.observers.dae.observer import DAEObserver
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.plants.dae.model import DAEModel
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.results.design import Certificate, ObserverDesign
+from obsynth.results.files import write_atomically
+from obsynth.results.report import VerificationReport
+
+SCHEMA_VERSION = 1
+_KIND = "obsynth gain set"
+# Linear time-invariant designs have no tag.
+_KINDS: dict[str | None, tuple[Any, Any]] = {
+    None: (DescriptorSystem, LinearObserver), "recursive": (TimeVaryingDescriptorSystem, RecursiveObserver),
+    "dae": (DAEModel, DAEObserver),
+}  # fmt: skip
+# What JSON does not have is marked by these sets of keys; a mapping that happens to have one of them is wrapped.
+_ARRAY, _FLOAT, _MAPPING = {"shape", "data"}, {"float"}, {"mapping"}
+_MARKS = (_ARRAY, _FLOAT, _MAPPING)
+
+
+def plain(value: Any) -> Any:
+    """Return ``value`` as JSON data; arrays, NaN and infinities are marked so that `restored` finds them."""
+    if isinstance(value, np.ndarray):
+        return {"shape": list(value.shape), "data": [plain(x) for x in value.ravel().tolist()]}
+    if isinstance(value, (np.floating, np.integer, np.bool_)):
+        return plain(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return {"float": str(value)}
+    if isinstance(value, Mapping):
+        entries = {str(key): plain(item) for key, item in value.items()}
+        return {"mapping": entries} if entries.keys() in _MARKS else entries
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    raise SpecError(f"A value of type {type(value).__name__} cannot be saved: only data can.")
+
+
+def restored(value: Any) -> Any:
+    """Return what `plain` wrote, with arrays and special floats restored."""
+    if isinstance(value, dict):
+        if value.keys() == _ARRAY:
+            data = [restored(item) for item in value["data"]]
+            return np.array(data, dtype=np.float64).reshape(value["shape"])
+        if value.keys() == _FLOAT:
+            return float(value["float"])
+        if value.keys() == _MAPPING:
+            value = value["mapping"]
+        return {key: restored(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [restored(item) for item in value]
+    return value
+
+
+def digest_of(body: Mapping[str, Any]) -> str:
+    """Return the sha256 digest of the canonical JSON of ``body``."""
+    text = json.dumps(body, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def design_as_dict(design: ObserverDesign) -> dict[str, Any]:
+    """Return the whole gain set as JSON data, digest included."""
+    body = plain(
+        {
+            "name": design.name,
+            "method": design.method,
+            "plant": design.plant.as_dict(),
+            "options": design.options,
+            "gains": design.gains,
+            "observer": design.observer.as_dict(),
+            "certificate": {"matrices": design.certificate.matrices, "claims": design.certificate.claims},
+            "solver": design.solver,
+            "notes": design.notes,
+            "recovery": None if design.recovery is None else _fields_of(design.recovery),
+            "report": design.report.as_dict(),
+            **_tag(design),
+        }
+    )
+    return {"kind": _KIND, "schema_version": SCHEMA_VERSION, "sha256": digest_of(body), "design": body}
+
+
+def _tag(design: ObserverDesign) -> dict[str, str]:
+    """Return the entry that tells of which kind plant and observer are."""
+    kinds = [kind for kind, (_, observer) in _KINDS.items() if isinstance(design.observer, observer)]
+    return {"kind": kinds[0]} if kinds and kinds[0] is not None else {}
+
+
+def save(design: ObserverDesign, path: str | Path) -> Path:
+    """Write ``design`` to ``path`` atomically and return the path."""
+    return write_atomically(path, json.dumps(design_as_dict(design), indent=1, allow_nan=False) + "\n")
+
+
+def load(path: str | Path) -> ObserverDesign:
+    """Read a gain set and check its digest.
+
+    Parameters
+    ----------
+    path : str or Path
+        A file written by `ObserverDesign.save`.
+
+    Returns
+    -------
+    ObserverDesign
+        Equal to the saved one, bit for bit; its report is the saved one, run `verify` for a new one.
+
+    Raises
+    ------
+    SpecError
+        The file is missing, is no gain set, has an unknown schema version, or was changed.
+    """
+    if not isinstance(path, (str, os.PathLike)):
+        raise SpecError(f"path is {path!r}: give the name of a file that a design was saved to.", path="path")
+    source = Path(path)
+    try:
+        document = json.loads(source.read_text(encoding="utf-8"), parse_constant=_refuse_constant)
+    except OSError as error:
+        raise SpecError(f"{source} cannot be read: {error.strerror}.", path=str(source)) from error
+    except (ValueError, RecursionError) as error:
+        raise SpecError(f"{source} is no JSON document ({error}).", path=str(source)) from error
+    if not isinstance(document, dict) or document.get("kind") != _KIND:
+        raise SpecError(f"{source} is no gain set of obsynth.", path=str(source))
+    if document.get("schema_version") != SCHEMA_VERSION:
+        version = document.get("schema_version")
+        raise SpecError(
+            f"{source} has schema version {version!r}; this obsynth reads {SCHEMA_VERSION}.", path=str(source)
+        )
+    body = document.get("design")
+    try:
+        intact = isinstance(body, dict) and document.get("sha256") == digest_of(body)
+    except ValueError:  # a number too large for a float
+        intact = False
+    if not intact:
+        raise SpecError(f"{source} was changed after it was written: its digest does not match.", path=str(source))
+    try:
+        return _design_from(restored(body))
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise SpecError(f"{source} is incomplete: {error}.", path=str(source)) from error
+
+
+def _refuse_constant(name: str) -> float:
+    raise ValueError(f"{name} is not allowed in JSON")
+
+
+def _fields_of(record: StateRecovery) -> dict[str, Any]:
+    return {field.name: getattr(record, field.name) for field in fields(record)}
+
+
+def _design_from(data: dict[str, Any]) -> ObserverDesign:
+    if data.get("kind") not in _KINDS:
+        raise SpecError(f"A design of the kind {data['kind']!r} is unknown to this obsynth.", path="kind")
+    for name in ("name", "method"):
+        if not isinstance(data[name], str):
+            raise TypeError(f"{name} is {data[name]!r}, not a text")
+    plant, observer = _KINDS[data.get("kind")]
+    return ObserverDesign(
+        name=data["name"],
+        method=data["method"],
+        plant=plant(**data["plant"]),
+        options=data["options"],
+        gains=data["gains"],
+        observer=observer.from_dict(data["observer"]),
+        certificate=Certificate(**data["certificate"]),
+        solver=data["solver"],
+        notes=tuple(data["notes"]),
+        recovery=None
+        if data["recovery"] is None
+        else StateRecovery(**{**data["recovery"], "names": tuple(data["recovery"]["names"])}),
+        report=VerificationReport.from_dict(data["report"]),
+    )

@@ -1,1 +1,0 @@
-"""From a plant to gains, a realisation and a certificate."""

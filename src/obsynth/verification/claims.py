@@ -1,0 +1,122 @@
+"""The claims of a certificate as such, and the recovery of states that a design carries along."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from obsynth.analysis.transformations import StateRecovery
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.results.report import Check, upper_bound_check
+from obsynth.verification.identities import EQUALITY_TOLERANCE
+
+#: Every claim a fault-estimation filter can make.
+KNOWN_CLAIMS = ("gamma", "gamma_min", "gamma_bracket_low", "gamma_bracket_high", "state_lag")
+#: Gains are norms found in different coordinates: they may be out of order by this share of the claimed one.
+ORDER_TOLERANCE = 1e-6
+
+#: Why a variance is not known.
+UNCERTAIN = "rounding leaves no digit: two ways of computing it disagree"
+
+
+def claimed(claims: Mapping[str, Any], name: str) -> float:
+    """Return a claim as a number; NaN where it is missing or none."""
+    value = claims.get(name)
+    return float(value) if isinstance(value, (int, float)) and not isinstance(value, bool) else math.nan
+
+
+def claim_rows(plant: DescriptorSystem, claims: Mapping[str, Any]) -> Iterator[Check]:
+    """Yield the rows on what is claimed: known names, numbers, and gains in order."""
+    needed = {"state_lag"} | ({"gamma"} if plant.nd else set())
+    wrong = [name for name in claims if name not in KNOWN_CLAIMS or not math.isfinite(claimed(claims, name))]
+    wrong += sorted(needed - claims.keys())
+    # Both ends of a bracket, and what lies in it, or none of them.
+    bracket = {"gamma_bracket_low", "gamma_bracket_high"} & claims.keys()
+    wrong += (
+        sorted({"gamma", "gamma_min", "gamma_bracket_low", "gamma_bracket_high"} - claims.keys()) if bracket else []
+    )
+    if "gamma" in claims and not claimed(claims, "gamma") > 0.0 and "gamma" not in wrong:
+        wrong.append("gamma")
+    yield upper_bound_check(
+        "claims",
+        "every claim is known and a finite number, and none is missing",
+        float(len(wrong)),
+        0.0,
+        source="certificate",
+        detail=f"wrong: {', '.join(map(str, dict.fromkeys(wrong)))}" if wrong else "",
+    )
+    if "gamma_min" in claims or bracket:
+        yield upper_bound_check(
+            "claimed gains",
+            "0 <= bracket's lower end <= gamma_min <= its upper end, and gamma_min <= gamma",
+            _disorder(claims, bracketed=bool(bracket)),
+            ORDER_TOLERANCE,
+            source="certificate; that no filter reaches less is the search's finding and is not proved here",
+            detail="the largest step backwards, as a share of gamma",
+        )
+
+
+def _disorder(claims: Mapping[str, Any], *, bracketed: bool) -> float:
+    """Return by how much the claimed gains are out of order, relative to gamma; NaN when one is no number."""
+    gamma, least = claimed(claims, "gamma"), claimed(claims, "gamma_min")
+    steps = [least - gamma, -least]
+    if bracketed:
+        low, high = claimed(claims, "gamma_bracket_low"), claimed(claims, "gamma_bracket_high")
+        steps += [low - least, least - high, -low]
+    if not all(map(math.isfinite, steps)) or not gamma > 0.0:
+        return math.nan
+    return max(0.0, *steps) / gamma
+
+
+def recovery_rows(plant: DescriptorSystem, recovery: StateRecovery | None) -> Iterator[Check]:
+    """Yield the rows on the map back to the states of the plant before its transformation, where there is one."""
+    if recovery is None:
+        return
+    wrong = _misfits(plant, recovery)
+    source = "the plant; the one before its transformation is not stored"
+    yield upper_bound_check(
+        "recovery fits",
+        "the map back to the original states has unique names, the plant's signals and finite entries",
+        float(len(wrong)),
+        0.0,
+        source=source,
+        detail=f"wrong: {', '.join(wrong)}" if wrong else "",
+    )
+    if wrong:
+        return
+    kept = [name for name in recovery.names if name in plant.state_names]
+    whole = np.hstack([
+        recovery.from_state, recovery.from_input, recovery.from_fault, recovery.from_disturbance, recovery.from_noise,
+    ])  # fmt: skip
+    rows = [recovery.names.index(name) for name in kept]
+    expected = np.eye(plant.nx, whole.shape[1])[[plant.state_names.index(name) for name in kept]]
+    yield upper_bound_check(
+        "recovery of kept states",
+        "a state that the plant still has is recovered as itself",
+        float(np.max(np.abs(whole[rows] - expected), initial=0.0)),
+        EQUALITY_TOLERANCE,
+        source=source,
+        kind="equality",
+        detail=f"{len(kept)} of {len(recovery.names)} states; how the others follow from these is not checked",
+    )
+
+
+def _misfits(plant: DescriptorSystem, recovery: StateRecovery) -> list[str]:
+    names = recovery.names
+    valid = isinstance(names, tuple) and all(isinstance(name, str) and name.strip() for name in names)
+    wrong = [] if valid and len(set(names)) == len(names) else ["names"]
+    widths = {
+        "from_state": plant.nx, "from_input": plant.nu, "from_fault": plant.nf, "from_disturbance": plant.nd,
+        "from_noise": plant.nw,
+    }  # fmt: skip
+    for field, width in widths.items():
+        matrix = getattr(recovery, field)
+        if matrix.shape != (len(names), width) or not np.all(np.isfinite(matrix)):
+            wrong.append(field)
+    kept = recovery.noise_kept
+    if kept.ndim != 2 or kept.shape[1] != plant.nw or not np.all(np.isfinite(kept)):
+        wrong.append("noise_kept")
+    return wrong
