@@ -10,6 +10,8 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.numerics.threads import one_thread_if_small
 from obsynth.results.report import VerificationReport
+from obsynth.verification.closed_claims import closed_claims
+from obsynth.verification.stored_numbers import stored_number_rows
 
 if TYPE_CHECKING:
     from obsynth.results.design import ObserverDesign
@@ -54,4 +56,7 @@ def verify(design: ObserverDesign, *, printed_digits: int | None = None) -> Veri
     checker = import_module(_CHECKERS[design.method])
     # A corrupted design may overflow; what is not a number fails its check, so no warning is needed.
     with np.errstate(all="ignore"), one_thread_if_small(design.plant.nx):
-        return VerificationReport.of(tuple(checker.checks(design, printed_digits)))
+        rows = tuple(checker.checks(design, printed_digits))
+        if all(row.passed for row in rows) and hasattr(checker, "tracked_plant"):
+            rows = (*rows, *stored_number_rows(design, checker.tracked_plant(design)))
+        return VerificationReport.of((*rows, *closed_claims(design, rows)))

@@ -48,6 +48,10 @@ class Contraction:
         ball = Ball.exact(columns) if radius is None else Ball(np.asarray(columns, dtype=np.float64), radius)
         return column_norms(Ball.exact(self.Q) @ ball)
 
+    def sizes_in_sum(self, sums: FloatArray) -> FloatArray:
+        """Return upper bounds on ``sum_j |Q d_j|`` for columns with ``sum_j |d_j| <= sums (n, m)``, as ``(m,)``."""
+        return np.asarray(rounded_up(np.sum(np.abs(self.Q) @ sums, axis=0), 4 * len(sums) + 8))
+
     def seen(self, rows: FloatArray) -> float:
         """Return an upper bound on the norm of ``c Q^-1`` for rows ``c (p, n)``."""
         if not rows.size:

@@ -11,6 +11,7 @@ most its value at the left end plus d times the largest third derivative, which 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -24,49 +25,70 @@ from obsynth.proofs.exponentials import exponential
 MOST_STEPS, LEFT = 16_384, 1e-4
 #: A piece of an interval is at most this share of one over the norm of A; most pieces.
 PIECE, MOST_PIECES = 0.05, 1_024
+#: Length of an interval in units of one over the norm of A, and the largest order, for gains in continuous time.
+LENGTH, MOST_STATES = 0.4, 12
+#: Share of such a gain that the rest may have.
+LEFT_OF_GAINS = 0.05
 
 
 class PeakSums(NamedTuple):
-    """Upper bounds on partial and whole sums of norms, one column for each input.
+    """Upper bounds on partial and whole sums, one column for each input.
 
-    ``partial (steps, m)`` holds the terms ``0 .. k``, ``whole (m,)`` all of them.
+    ``partial (steps, ..., m)`` holds the terms ``0 .. k``, ``whole (..., m)`` all of them.
     """
 
     partial: FloatArray
     whole: FloatArray
 
 
-def peak_sums(matrix: Ball, rows: FloatArray, columns: Ball, contraction: Contraction, *, least: int = 0) -> PeakSums:
-    """Return bounds on the sums over j of ``|c M^j b|`` (Euclidean) of every column ``b``, for ``c (p, n)``.
+def peak_sums(
+    matrix: Ball, rows: FloatArray, columns: Ball, contraction: Contraction, *, least: int = 0, left: float = LEFT,
+    each: bool = False,
+) -> PeakSums:  # fmt: skip
+    """Return bounds on the sums over j of ``|c M^j b|`` of every column ``b``, for ``c (p, n)``.
 
-    At least ``least`` terms are summed up one by one.
+    Euclidean norms, or with ``each`` the absolute value of each row.  At least ``least`` terms are summed up one by one,
+    and more until the rest is bounded by the share ``left``.
     """
-    moving, size, n = matrix.midpoint, np.abs(matrix.midpoint), len(matrix.midpoint)
-    held, growth = columns.midpoint.copy(), gamma(n + 2)
-    shown, seen = np.abs(rows), contraction.seen(rows)
-    # What the columns themselves are off by, and every defect later, in the norm that contracts.
-    missed = contraction.sizes(np.zeros_like(held), columns.radius)
-    total, terms = np.zeros(held.shape[1]), []
-    while True:
-        product = rows @ held
-        rounding = growth * (shown @ np.abs(held)) + n * UNDERFLOW
-        terms.append(_norms(np.abs(product) + rounding))
-        total = total + terms[-1]
-        if len(terms) >= max(least, 1) and (len(terms) % 64 == 0 or len(terms) >= MOST_STEPS or not held.any()):
-            rest = seen * contraction.factor * contraction.sizes(moving @ held, growth * (size @ np.abs(held)))
-            if len(terms) >= max(MOST_STEPS, least) or np.all(rest <= LEFT * total):
-                break
-        following = moving @ held
-        defect = growth * (size @ np.abs(held)) + matrix.radius @ np.abs(held) + n * UNDERFLOW
-        missed = missed + contraction.sizes(np.zeros_like(held), rounded_up(defect, 3 * n + 6))
-        held = following
-    rest = seen * contraction.factor * contraction.sizes(
-        moving @ held, rounded_up(growth * (size @ np.abs(held)) + matrix.radius @ np.abs(held), 3 * n + 8)
+    moving, held, n = matrix.midpoint, columns.midpoint.copy(), len(matrix.midpoint)
+    growth, shown = gamma(n + 2), np.abs(rows)
+    seen = np.array([contraction.seen(rows[i : i + 1]) for i in range(len(rows))])[:, None] if each else np.array(
+        contraction.seen(rows)
     )
-    added = seen * contraction.factor * missed
-    partial = np.cumsum(np.array(terms), axis=0) + added
+
+    def rest(of: FloatArray) -> FloatArray:
+        """Return what the terms after these columns add up to, at most."""
+        sizes = contraction.sizes(moving @ of, rounded_up(_missed(matrix, np.abs(of), growth), 3 * n + 8))
+        return np.asarray(seen * contraction.factor * sizes)
+
+    terms: list[FloatArray] = []
+    gathered_columns = np.zeros_like(held)
+    total: FloatArray | float = 0.0
+    while True:
+        product = np.abs(rows @ held)
+        terms.append(product if each else _norms(product))
+        total, gathered_columns = total + terms[-1], gathered_columns + np.abs(held)
+        done = len(terms) >= max(MOST_STEPS, least)
+        if done or (len(terms) >= least and (len(terms) % 64 == 0 or not held.any())):
+            after = rest(held)
+            if done or np.all(after <= left * total):
+                break
+        held = moving @ held
     count = len(terms) + 8
-    return PeakSums(rounded_up(partial, count), rounded_up(partial[-1] + rest, count))
+    # Every defect, and what the columns are off by: sums of norms are at most the norm of the sums in the 1-norm.
+    defects = rounded_up(_missed(matrix, gathered_columns, growth) + columns.radius, 3 * n + count)
+    products = rounded_up(growth * (shown @ gathered_columns) + count * n * UNDERFLOW, 3 * n + count)
+    added = seen * contraction.factor * contraction.sizes_in_sum(defects) + (
+        products if each else np.sum(products, axis=0)
+    )
+    partial = rounded_up(np.cumsum(np.array(terms), axis=0), count + 2 * len(rows) + 10) + added
+    return PeakSums(rounded_up(partial, 4), rounded_up(partial[-1] + after, 6))
+
+
+def _missed(matrix: Ball, sizes: FloatArray, growth: float) -> FloatArray:
+    """Return what products of the midpoint with columns of these sizes miss of those of any member."""
+    n = len(sizes)
+    return np.asarray(growth * (np.abs(matrix.midpoint) @ sizes) + matrix.radius @ sizes + n * UNDERFLOW)
 
 
 def _norms(sizes: FloatArray) -> FloatArray:
@@ -131,3 +153,25 @@ def gathered(pieces: Pieces, sums: FloatArray, inputs: int) -> FloatArray:
     weighted = sums * pieces.weights
     found = np.stack([np.sum(weighted[..., pieces.inputs == i], axis=-1) for i in range(inputs)], axis=-1)
     return np.asarray(rounded_up(found, len(pieces.weights) + 4))
+
+
+def absolute_gains(a: FloatArray, rows: FloatArray, contraction: Contraction) -> FloatArray:
+    """Return upper bounds on ``sum_j |c A^j|`` (the integral of ``|c e^{A t}|``), entry by entry, for ``c (p, n)``."""
+    n = len(a)
+    loose = contraction.gain(rows, np.eye(n))
+    if not n or (not contraction.discrete and n > MOST_STATES):
+        return loose
+    if contraction.discrete:
+        moving, columns, gather = Ball.exact(a), Ball.exact(np.eye(n)), None
+        held: Contraction | None = contraction
+    else:
+        length = LENGTH / float(np.linalg.norm(a, 2))
+        gather = interval_pieces(a, np.eye(n), Ball.exact(np.eye(n)), length)
+        moving, columns = exponential(a, length), gather.columns
+        # The contraction in continuous time is one of its samples as well.
+        rate = float(rounded_up(np.exp(-contraction.rate * length), 4))
+        held = replace(contraction, rate=rate, discrete=True) if rate < 1.0 else None
+    if held is None:
+        return loose
+    whole = peak_sums(moving, rows, columns, held, left=LEFT_OF_GAINS, each=True).whole
+    return np.asarray(np.minimum(loose, whole if gather is None else gathered(gather, whole, n)))
