@@ -6,6 +6,10 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from obsynth.analysis.diagnosis.banks import StructuredResidual
+    from obsynth.analysis.diagnosis.decoupled import DecoupledPlant, decouple
+    from obsynth.analysis.diagnosis.diagnosing import diagnose
+    from obsynth.analysis.diagnosis.verdicts import Diagnosis, FaultDiagnosis
     from obsynth.analysis.identifiability import Identifiability, identifiability
     from obsynth.analysis.structure import analyse_structure
     from obsynth.analysis.transformations import discretise, eliminate_algebraic_states
@@ -78,6 +82,12 @@ __version__ = "0.1.0"
 
 # Names are imported when they are first used, so that `import obsynth` stays fast.
 _HOMES = {
+    "DecoupledPlant": "obsynth.analysis.diagnosis.decoupled",
+    "decouple": "obsynth.analysis.diagnosis.decoupled",
+    "diagnose": "obsynth.analysis.diagnosis.diagnosing",
+    "Diagnosis": "obsynth.analysis.diagnosis.verdicts",
+    "FaultDiagnosis": "obsynth.analysis.diagnosis.verdicts",
+    "StructuredResidual": "obsynth.analysis.diagnosis.banks",
     "dae_adaptive_observer": "obsynth.methods.dae_adaptive_observer.public",
     "DAETrajectory": "obsynth.simulation.dae",
     "simulate_dae": "obsynth.simulation.dae",
@@ -177,12 +187,15 @@ __all__ = [
     "DAETrajectory",
     "DataRun",
     "Decision",
+    "DecoupledPlant",
     "DeltaScan",
     "DescriptorSystem",
     "Detection",
+    "Diagnosis",
     "Drift",
     "Estimates",
     "Evaluation",
+    "FaultDiagnosis",
     "FaultModel",
     "Gaussian",
     "Identifiability",
@@ -211,6 +224,7 @@ __all__ = [
     "SpecError",
     "SteadyState",
     "Step",
+    "StructuredResidual",
     "Stuck",
     "TimeVaryingDescriptorSystem",
     "Uniform",
@@ -221,8 +235,10 @@ __all__ = [
     "apply_adaptation_gain",
     "dae_adaptive_observer",
     "decide",
+    "decouple",
     "descriptor_kalman",
     "design",
+    "diagnose",
     "discretise",
     "eliminate_algebraic_states",
     "evaluate",

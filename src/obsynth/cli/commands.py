@@ -87,14 +87,17 @@ def run_check(options: argparse.Namespace) -> int:
     from obsynth.spec import load_spec
 
     spec = load_spec(options.system)
+    from obsynth.analysis.diagnosis.diagnosing import diagnose
     from obsynth.analysis.structure import analyse_structure
     from obsynth.methods.designing import check
     from obsynth.plants.descriptor import DescriptorSystem
 
     # A pencil, its eigenvalues and its index are those of one matrix pair: a plant that changes with k has none.
-    structures = {}
+    structures, diagnosis = {}, None
     if isinstance(spec.plant, DescriptorSystem):
         structures = {"as the method sees it": analyse_structure(spec.plant)}
+        model = spec.options.get("fault_model", "step")
+        diagnosis = diagnose(spec.plant, fault_model=model)
     if spec.transformation is not None:
         structures = {"as written": analyse_structure(spec.transformation.source), **structures}
     done = "" if spec.transformation is None else spec.transformation.description
@@ -103,13 +106,16 @@ def run_check(options: argparse.Namespace) -> int:
     if options.json:
         print_json({
             "command": "check", "spec": str(spec.path), "method": spec.method, "passed": passed,
-            "transformation": done,
+            "transformation": done, "diagnosis": None if diagnosis is None else diagnosis.to_dict(),
             "structure": {name.replace(" ", "_"): _structure_as_dict(found) for name, found in structures.items()},
             "methods": {name: report.as_dict() for name, report in methods.items()},
         })  # fmt: skip
     else:
         from obsynth.report import check_report
+        from obsynth.report.diagnosis import diagnosis_report
 
+        if diagnosis is not None:
+            diagnosis_report(diagnosis, console=stdout_console())
         check_report(spec.plant, structures, methods, console=stdout_console(), transformation=done)
     return 0 if passed else PreconditionError.exit_code
 

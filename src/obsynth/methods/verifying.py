@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from obsynth.errors import SpecError
+from obsynth.methods.registry import REGISTRY, method_spec
 from obsynth.numerics.threads import one_thread_if_small
 from obsynth.results.report import VerificationReport
 from obsynth.verification.closed_claims import closed_claims
@@ -15,16 +15,6 @@ from obsynth.verification.stored_numbers import stored_number_rows
 
 if TYPE_CHECKING:
     from obsynth.results.design import ObserverDesign
-
-#: Method id -> module with ``checks(design, printed_digits)``.
-_CHECKERS = {
-    "fault-estimation-filter": "obsynth.methods.fault_estimation_filter.checks",
-    "pd-observer": "obsynth.methods.pd_observer.checks",
-    "ui-pi-observer": "obsynth.methods.ui_pi_observer.checks",
-    "descriptor-kalman": "obsynth.methods.recursive.checks",
-    "adaptive-observer": "obsynth.methods.recursive.checks",
-    "dae-adaptive-observer": "obsynth.methods.dae_adaptive_observer.checks",
-}
 
 
 def verify(design: ObserverDesign, *, printed_digits: int | None = None) -> VerificationReport:
@@ -49,14 +39,17 @@ def verify(design: ObserverDesign, *, printed_digits: int | None = None) -> Veri
     SpecError
         The design's method is unknown, or ``printed_digits`` is not between 1 and 15.
     """
-    if design.method not in _CHECKERS:
+    if design.method not in REGISTRY:
         raise SpecError(f"Designs of method {design.method!r} cannot be verified by this version.", path="method")
     if printed_digits is not None and not 1 <= printed_digits <= 15:
         raise SpecError(f"printed_digits is {printed_digits}: give 1 to 15 decimals.", path="printed_digits")
-    checker = import_module(_CHECKERS[design.method])
+    spec = method_spec(design.method)
+    checks = spec.load("checks")
     # A corrupted design may overflow; what is not a number fails its check, so no warning is needed.
     with np.errstate(all="ignore"), one_thread_if_small(design.plant.nx):
-        rows = tuple(checker.checks(design, printed_digits))
-        if all(row.passed for row in rows) and hasattr(checker, "tracked_plant"):
-            rows = (*rows, *stored_number_rows(design, checker.tracked_plant(design)))
-        return VerificationReport.of((*rows, *closed_claims(design, rows)))
+        rows = tuple(checks(design, printed_digits))
+        if spec.tracked and all(row.passed for row in rows):
+            rows = (*rows, *stored_number_rows(design, spec.load("tracked")(design)))
+        covered = {name: meaning.row for name, meaning in spec.claims.items()}
+        meanings = {name: meaning.meaning for name, meaning in spec.claims.items()}
+        return VerificationReport.of((*rows, *closed_claims(design, rows, covered, meanings, spec.witnesses)))

@@ -10,10 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
+from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.sparse import as_sparse_matrix, dense, is_sparse
 from obsynth.plants.names import checked_names
+from obsynth.plants.origin import carry_origin
 from obsynth.plants.validation import (
     Problems,
+    any_matrix,
     checked_dt,
     checked_point,
     checked_scales,
@@ -27,6 +30,8 @@ from obsynth.plants.validation import (
 )
 
 MatrixOrNames = ArrayLike | Sequence[str] | None
+#: For `expected_shapes`, where only the names of the matrices matter.
+_NO_SIGNALS = dict.fromkeys("yufdw", 0)
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -41,10 +46,11 @@ class DescriptorSystem:
 
     Parameters
     ----------
-    E : array_like or None
+    E : array_like, sparse matrix or None
         ``(nx, nx)``, may be singular; ``None`` means the identity.
-    A : array_like
-        ``(nx, nx)``.
+    A : array_like or sparse matrix
+        ``(nx, nx)``.  Sparse matrices of scipy stay sparse, here and wherever else they are given; methods get the
+        plant without its algebraic states, which is dense (see `eliminate_algebraic_states` and `dense`).
     B : array_like, optional
         Known inputs ``(nx, nu)``.
     C : array_like or list of str, optional
@@ -131,12 +137,12 @@ class DescriptorSystem:
         units: Mapping[str, str] | None = None,
     ) -> None:
         problems = Problems()
-        a = problems.collect(lambda: square(as_matrix(A, "A"), "A"))
+        a = problems.collect(lambda: square(any_matrix(A, "A"), "A"))
         problems.raise_if_any()
         nx = a.shape[0]
         states = problems.collect(lambda: checked_names(state_names, nx, prefix="x", what="state_names"))
         problems.raise_if_any()
-        given: dict[str, FloatArray | None] = {"A": a, "E": np.eye(nx) if E is None else None}
+        given: dict[str, FloatArray | None] = {"A": a, "E": _identity_like(a) if E is None else None}
         asked = {"E": E, "B": B, "C": C, "D": D, "Bf": Bf, "Df": Df, "Bd": Bd, "Dd": Dd, "Bw": Bw, "Dw": Dw}
         for name, value in asked.items():
             if value is not None:
@@ -202,6 +208,18 @@ class DescriptorSystem:
         return int(self.Bw.shape[1])
 
     @property
+    def is_sparse(self) -> bool:
+        """Whether any matrix of the plant is a sparse one."""
+        return any(is_sparse(getattr(self, name)) for name in expected_shapes(0, _NO_SIGNALS))
+
+    def dense(self) -> DescriptorSystem:
+        """Return the same plant with arrays instead of sparse matrices; a plant without any is returned as it is."""
+        if not self.is_sparse:
+            return self
+        changes = {name: dense(getattr(self, name)) for name in expected_shapes(0, _NO_SIGNALS)}
+        return self.replace(**changes)
+
+    @property
     def is_discrete(self) -> bool:
         """Whether the plant is sampled (``dt > 0``)."""
         return self.dt > 0.0
@@ -218,7 +236,7 @@ class DescriptorSystem:
         **changes
             Any argument of the constructor.
         """
-        return DescriptorSystem(**{**self.as_dict(), **changes})
+        return carry_origin(self, DescriptorSystem(**{**self.as_dict(), **changes}))
 
     def __repr__(self) -> str:
         time = f"dt={self.dt:g} s" if self.is_discrete else "continuous"
@@ -226,3 +244,12 @@ class DescriptorSystem:
             f"DescriptorSystem(nx={self.nx}, nu={self.nu}, ny={self.ny}, nf={self.nf}, nd={self.nd}, "
             f"nw={self.nw}, {time})"
         )
+
+
+def _identity_like(a: Any) -> Any:
+    """Return the identity of the size of A, sparse where A is."""
+    if not is_sparse(a):
+        return np.eye(a.shape[0])
+    from scipy.sparse import eye_array
+
+    return as_sparse_matrix(eye_array(a.shape[0], format="csr"), "E")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -21,7 +22,7 @@ def checked_names(names: Sequence[str] | None, count: int, *, prefix: str, what:
         raise SpecError(f"{what} must be a list of non-empty texts.", path=what)
     if len(given) != count:
         raise SpecError(f"{what} has {len(given)} names, but there are {count} such signals.", path=what)
-    repeated = sorted({name for name in given if given.count(name) > 1})
+    repeated = sorted(name for name, times in Counter(given).items() if times > 1)
     if repeated:
         raise SpecError(f"{what} repeats {', '.join(map(repr, repeated))}: names must be unique.", path=what)
     return given

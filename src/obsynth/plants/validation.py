@@ -9,6 +9,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, as_matrix
+from obsynth.numerics.sparse import as_sparse_matrix, is_sparse
 from obsynth.plants.names import is_name_list, rows_picking
 
 #: Matrix, signal of its rows, signal of its columns.
@@ -44,7 +45,7 @@ class Problems:
 
     def shaped(self, value: FloatArray | None, name: str, shape: tuple[int, int]) -> FloatArray:
         """Return ``value``, or zeros of ``shape`` where it is missing or empty; note a wrong shape."""
-        if value is None or (value.size == 0 and 0 in shape):
+        if value is None or (0 in value.shape and 0 in shape):
             return np.zeros(shape)
         if value.shape != shape:
             self._note(f"{name} is {_by(value.shape)}, but {_by(shape)} is needed.", name)
@@ -62,6 +63,11 @@ class Problems:
         self.first_path = self.first_path or path
 
 
+def any_matrix(value: Any, name: str) -> Any:
+    """Return a checked read-only matrix: sparse where a sparse one was given, else an array."""
+    return as_sparse_matrix(value, name) if is_sparse(value) else as_matrix(value, name)
+
+
 def square(matrix: FloatArray, name: str) -> FloatArray:
     """Return a non-empty square matrix as it is; raise `SpecError` otherwise."""
     if matrix.shape[0] == 0 or matrix.shape[0] != matrix.shape[1]:
@@ -69,10 +75,10 @@ def square(matrix: FloatArray, name: str) -> FloatArray:
     return matrix
 
 
-def matrix_or_picks(value: Any, name: str, states: Sequence[str]) -> FloatArray:
+def matrix_or_picks(value: Any, name: str, states: Sequence[str]) -> Any:
     """Return a matrix, or the selection that a list of state names stands for (rows of C, columns of inputs)."""
     if not is_name_list(value):
-        return as_matrix(value, name)
+        return any_matrix(value, name)
     rows = rows_picking(value, states, what=name)
     return rows if name == "C" else rows.T
 
@@ -87,7 +93,7 @@ def signal_counts(given: Mapping[str, FloatArray | None]) -> dict[str, int]:
 
     def columns(*names: str) -> int:
         found = (given.get(name) for name in names)
-        return next((m.shape[1] for m in found if m is not None and m.size), 0)
+        return next((m.shape[1] for m in found if m is not None and 0 not in m.shape), 0)
 
     outputs = given.get("C")
     return {

@@ -9,12 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from fractions import Fraction
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
-from flint import fmpq, fmpq_mat
 
 from obsynth.numerics.arrays import FloatArray
+
+if TYPE_CHECKING:
+    from flint import fmpq, fmpq_mat
 
 #: Decimals of so many digits survive the way into a double and back.
 LOSSLESS_DIGITS = 15
@@ -48,12 +50,16 @@ def computed_entries(matrix: FloatArray) -> int:
 
 def written_matrix(matrix: FloatArray) -> fmpq_mat:
     """Return a matrix ``(m, n)`` of doubles as the rational numbers that were written."""
+    from flint import fmpq_mat
+
     rows, columns = matrix.shape
     return fmpq_mat(rows, columns, [_as_fmpq(written_fraction(value)) for value in np.ravel(matrix).tolist()])
 
 
 def rational_matrix(rows: FractionRows, columns: int) -> fmpq_mat:
     """Return rows of fractions as a matrix ``(m, columns)``."""
+    from flint import fmpq_mat
+
     return fmpq_mat(len(rows), columns, [_as_fmpq(value) for row in rows for value in row])
 
 
@@ -70,6 +76,8 @@ def nearest_doubles(matrix: fmpq_mat) -> FloatArray:
 
 
 def _as_fmpq(value: Fraction) -> fmpq:
+    from flint import fmpq
+
     return fmpq(value.numerator, value.denominator)
 
 

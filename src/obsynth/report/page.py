@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from html import escape
 from pathlib import Path
 
-from obsynth.report.claims import source_of
+from obsynth.methods.registry import REGISTRY, method_spec
 from obsynth.report.designs import fault_estimates_table, plant_facts, promises, recovered_states
 from obsynth.report.page_style import STYLE
 from obsynth.report.page_tables import check_rows, copied_table, fact_rows, matrix_rows, value_text
@@ -132,7 +132,7 @@ def _pictures(design: ObserverDesign, scenario: Scenario | None, report: Verific
 
 
 def _gains(design: ObserverDesign) -> Iterator[str]:
-    source = source_of(design.method)
+    source = method_spec(design.method).source if design.method in REGISTRY else ""
     if not design.gains:
         return
     if source:

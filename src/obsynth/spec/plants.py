@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from obsynth.errors import SpecError
+from obsynth.numerics.sparse import dense
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.names import index_of
@@ -56,7 +57,7 @@ def _joined(prefix: str, name: str) -> str:
     return f"{prefix}.{name}" if prefix and name else prefix or name
 
 
-def read_value(value: Any, folder: Path, where: str, problems: DocumentProblems) -> Any:
+def read_value(value: Any, folder: Path, where: str, problems: DocumentProblems, *, keep_sparse: bool = False) -> Any:
     """Return rows as an array, files read, picks as lists of names, sections as mappings, all else as it is."""
     if isinstance(value, list) and any(isinstance(entry, str) for row in value for entry in _listed(row)):
         return value
@@ -67,7 +68,7 @@ def read_value(value: Any, folder: Path, where: str, problems: DocumentProblems)
         try:
             if hasattr(value, "stack"):
                 return read_matrices(path, variable=value.variable, count=value.stack, where=where)
-            return read_matrix(path, variable=value.variable, where=where)
+            return read_matrix(path, variable=value.variable, where=where, keep_sparse=keep_sparse)
         except SpecError as error:
             problems.add(where, str(error))
             return None
@@ -111,7 +112,8 @@ def _invariant_plant(section: PlantSection, source: Path, prefix: str) -> Descri
     problems = DocumentProblems(source, what="plant" if not prefix else "spec")
     arguments: dict[str, Any] = {name: getattr(section, name) for name in ("dt", *_LABELS)}
     for name in _MATRICES:
-        arguments[name] = read_value(getattr(section, name), source.parent, _joined(prefix, name), problems)
+        value, where = getattr(section, name), _joined(prefix, name)
+        arguments[name] = read_value(value, source.parent, where, problems, keep_sparse=True)
     for name in _NAME_LISTS:
         arguments[name] = _names(getattr(section, name), source.parent, _joined(prefix, name), problems)
     problems.raise_if_any()
@@ -136,8 +138,8 @@ def _noise_arguments(plant: DescriptorSystem, sensor_noise: Mapping[str, float] 
     for column, (name, deviation) in enumerate(sensor_noise.items()):
         columns[index_of(name, plant.output_names, what="sensor_noise"), column] = deviation
     return {
-        "Bw": np.hstack([plant.Bw, np.zeros((plant.nx, len(sensor_noise)))]),
-        "Dw": np.hstack([plant.Dw, columns]),
+        "Bw": np.hstack([dense(plant.Bw), np.zeros((plant.nx, len(sensor_noise)))]),
+        "Dw": np.hstack([dense(plant.Dw), columns]),
         "noise_names": (*plant.noise_names, *(f"noise {name}" for name in sensor_noise)),
     }
 

@@ -7,13 +7,16 @@ import math
 import numpy as np
 
 from obsynth.analysis.transformations.elimination import columns_of, eliminate_algebraic_states
+from obsynth.analysis.transformations.exact_elimination import MOST_STATES, sampled_origin
 from obsynth.analysis.transformations.recovery import Transformation, unchanged_states
 from obsynth.analysis.zeros import fault_zeros
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, SLOW_ZERO_RADIUS
 from obsynth.numerics.scaling import power_of_two_below
+from obsynth.numerics.sparse import dense
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.origin import with_origin
 
 
 def discretise(plant: DescriptorSystem, sample_time: float) -> Transformation:
@@ -54,7 +57,7 @@ def discretise(plant: DescriptorSystem, sample_time: float) -> Transformation:
     first = eliminate_algebraic_states(plant)
     smooth = first.plant
     direct = np.flatnonzero(np.any(smooth.Dw, axis=0))
-    process = np.flatnonzero(np.any(plant.Bw, axis=0) | np.any(smooth.Bw, axis=0))
+    process = np.flatnonzero(np.any(dense(plant.Bw), axis=0) | np.any(smooth.Bw, axis=0))
     signals = tuple(smooth.noise_names[i] for i in np.intersect1d(direct, process))
     if signals:
         raise PreconditionError(
@@ -78,6 +81,7 @@ def discretise(plant: DescriptorSystem, sample_time: float) -> Transformation:
         Bw=np.hstack([factor, np.zeros((smooth.nx, len(kept)))]),
         Dw=np.hstack([np.zeros((smooth.ny, factor.shape[1])), smooth.Dw[:, direct]]),
     )
+    sampled = with_origin(sampled, sampled_origin(smooth, sample_time)) if smooth.nx <= MOST_STATES else sampled
     noise_kept = np.hstack([np.zeros((smooth.nw, factor.shape[1])), np.eye(smooth.nw)[:, direct]])
     recovery = unchanged_states(smooth, sampled, from_state=np.eye(smooth.nx), noise_kept=noise_kept)
     description = f"sampled every {sample_time:g} s (zero-order hold)"

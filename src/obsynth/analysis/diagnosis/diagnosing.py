@@ -1,0 +1,249 @@
+"""From a plant to what can be diagnosed on it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from obsynth.analysis.diagnosis.additions import detectable, estimable, least_additions, listed, state_sensors
+from obsynth.analysis.diagnosis.banks import residual_bank
+from obsynth.analysis.diagnosis.columns import Question, decided_exactly
+from obsynth.analysis.diagnosis.hidden_motions import hidden_motion
+from obsynth.analysis.diagnosis.verdicts import Diagnosis, FaultDiagnosis
+from obsynth.errors import SpecError
+from obsynth.numerics.arguments import is_finite_number, require_kind
+from obsynth.numerics.pencils import pencil_structure
+from obsynth.numerics.threads import one_thread_if_small
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.exosystems import exosystem
+
+#: Zeros that are named in a sentence; the others are counted.
+MOST_ZEROS = 4
+
+
+def diagnose(
+    plant: DescriptorSystem,
+    *,
+    fault_model: Any = "step",
+    frequencies: Sequence[float] = (),
+    suggest: bool = True,
+    progress: Callable[[str], None] | None = None,
+) -> Diagnosis:
+    """Say for each fault whether it can be detected, told from the others, and estimated; and what forbids it.
+
+    Free of every unknown input and of the initial state, for descriptor plants of any index, continuous or sampled.
+    Small plants whose numbers are as somebody wrote them are decided over the rational numbers; all others in floating
+    point, in units that do not depend on those of the data, with the gap behind each decision.
+
+    Parameters
+    ----------
+    plant : DescriptorSystem
+        ``E, A (nx, nx)``, ``C (ny, nx)``, ``Bf (nx, nf)``, ``Bd (nx, nd)``, ``Df, Dd`` allowed.  Where ``sE - A`` is
+        not regular, the verdicts are about all trajectories that satisfy the equations, and a warning says so.
+    fault_model : str, mapping or FaultModel, optional
+        How faults run, as for `ui_pi_observer`: it decides `model_estimable`.
+    frequencies : sequence of float, optional, rad/s
+        Where to ask whether a sinusoidal fault leaves a trace.
+    suggest : bool, optional
+        Look for states that would help where a fault cannot be estimated.
+    progress : callable, optional
+        Called with a text at the start of each stage.
+
+    Returns
+    -------
+    Diagnosis
+        ``isolable (nf, nf)``, `FaultDiagnosis` per fault, and the bank of structured residuals.
+
+    Raises
+    ------
+    SpecError
+        ``plant`` is no linear time-invariant plant, the fault model is malformed, or a frequency is no number.
+
+    References
+    ----------
+    .. [Varga] A. Varga, Solving Fault Diagnosis Problems, Springer 2017: fault detectability, weak and strong, and
+       isolability.  Here all of it is read from one reduction of a pencil, and decided exactly where that can be.
+    """
+    require_kind(plant, DescriptorSystem, "plant", "an obsynth.DescriptorSystem")
+    if not all(is_finite_number(value) and value >= 0.0 for value in frequencies):
+        raise SpecError(f"frequencies is {list(frequencies)!r}: give numbers in rad/s, 0 or more.", path="frequencies")
+    model = exosystem(fault_model, plant.fault_names, plant.dt)
+    report_stage = progress or (lambda _: None)
+    exactly = decided_exactly(plant)
+    with one_thread_if_small(plant.nx):
+        report_stage("asking what shows each fault")
+        shown = [Question(plant, (), i, exactly) for i in range(plant.nf)]
+        free = [Question(plant, _others(plant, i), i, exactly) for i in range(plant.nf)]
+        faults = tuple(
+            _verdict(plant, own, alone, frequencies, _modes(model, i), suggest=suggest)
+            for i, (own, alone) in enumerate(zip(shown, free, strict=True))
+        )
+        report_stage("telling faults from each other")
+        weak, strong, pairs = _isolability(plant, shown, exactly)
+        bank = residual_bank(plant, exactly)
+    return Diagnosis(
+        faults, weak, strong, bank, plant.disturbance_names, "; ".join(dict.fromkeys(model.descriptions)), exactly,
+        _warnings(plant, [*shown, *free, *pairs]),
+    )  # fmt: skip
+
+
+def rest_point(dt: float) -> complex:
+    """Return the point at which signals are constant."""
+    return 1.0 + 0.0j if dt > 0.0 else 0.0j
+
+
+def _others(plant: DescriptorSystem, fault: int) -> tuple[int, ...]:
+    return tuple(j for j in range(plant.nf) if j != fault)
+
+
+def _modes(model: Any, fault: int) -> list[complex]:
+    """Return the eigenvalues of the part of the exosystem that a fault is made of."""
+    reached = model.Cw[fault] != 0.0
+    for _ in range(len(reached)):
+        reached = reached | np.any(model.Phi[reached] != 0.0, axis=0)
+    part = model.Phi[np.ix_(reached, reached)]
+    return [complex(value) for value in np.linalg.eigvals(part)] if part.size else []
+
+
+def _point(plant: DescriptorSystem, frequency: float) -> complex:
+    return complex(np.exp(1j * frequency * plant.dt)) if plant.dt > 0.0 else 1j * frequency
+
+
+def _verdict(
+    plant: DescriptorSystem, shown: Question, free: Question, frequencies: Sequence[float], modes: Sequence[complex],
+    *, suggest: bool,
+) -> FaultDiagnosis:  # fmt: skip
+    rest = rest_point(plant.dt)
+    step = free.visible and free.shows_at(rest)
+    arbitrary = free.visible and not free.blocking.size
+    sentences = tuple(_sentences(plant, shown, free, step=step, arbitrary=arbitrary, suggest=suggest))
+    return FaultDiagnosis(
+        name=plant.fault_names[shown.number],
+        detectable=shown.visible,
+        detectable_at_rest=shown.visible and shown.shows_at(rest),
+        detectable_at={float(w): shown.visible and shown.shows_at(_point(plant, w)) for w in frequencies},
+        estimable=arbitrary,
+        step_estimable=step,
+        model_estimable=free.visible and all(free.shows_at(mode) for mode in modes),
+        order=free.derivatives if free.visible else None,
+        residual_order=shown.residual_order if shown.visible else None,
+        filter_order=free.order,
+        zeros=free.zeros if free.visible else np.zeros(0, dtype=np.complex128),
+        blocking=free.blocking if free.visible else np.zeros(0, dtype=np.complex128),
+        sentences=sentences,
+        exact=shown.exactly,
+        gap=min(shown.gap, free.gap),
+    )
+
+
+def _sentences(
+    plant: DescriptorSystem, shown: Question, free: Question, *, step: bool, arbitrary: bool, suggest: bool
+) -> list[str]:
+    """Return what hides a fault, at which point, and what would help."""
+    name, rest = plant.fault_names[shown.number], rest_point(plant.dt)
+    letter = "z" if plant.dt > 0.0 else "s"
+    texts = []
+    if not shown.visible:
+        unknown = ", ".join(plant.disturbance_names)
+        texts.append(f"{name}: nothing shows it" + (f" free of {unknown}." if unknown else "."))
+    elif not free.visible:
+        others = ", ".join(plant.fault_names[j] for j in free.removed)
+        texts.append(f"{name}: it shows, but cannot be told from {others} and the unknown inputs together.")
+    if not step:
+        motion = hidden_motion(plant, shown.number, rest, () if not shown.visible else free.removed)
+        if motion is not None:
+            seen = (shown.visible and not shown.shows_at(rest)) or (shown.visible and free.visible)
+            then = " Not estimable; seen only while it changes." if seen else ""
+            texts.append(f"{name}: {motion} ({letter} = {_number(rest)}).{then}")
+    hiding = [zero for zero in free.blocking if abs(zero - rest) > 1e-6 and zero.imag >= 0.0] if free.visible else []
+    for zero in hiding[:MOST_ZEROS]:
+        motion = hidden_motion(plant, shown.number, complex(zero), free.removed)
+        how = (
+            f"{motion} ({letter} = {_number(zero)})" if motion is not None else f"hidden at {letter} = {_number(zero)}"
+        )
+        texts.append(f"{name}: {how}. Not estimable for every course.")
+    if len(hiding) > MOST_ZEROS:
+        texts.append(f"{name}: hidden at {len(hiding) - MOST_ZEROS} more points.")
+    if free.visible and free.derivatives:
+        texts.append(_derivatives(plant, name, free.derivatives, step=step))
+    if suggest and not (step and arbitrary):
+        texts += _suggestion(plant, name, shown, step=step)
+    return texts
+
+
+def _derivatives(plant: DescriptorSystem, name: str, count: int, *, step: bool) -> str:
+    what = "sample" if plant.dt > 0.0 else "derivative"
+    of = (
+        "s of delay"
+        if plant.dt > 0.0 and count > 1
+        else " of delay"
+        if plant.dt > 0.0
+        else ("s of the outputs" if count > 1 else " of the outputs")
+    )
+    return f"{name}: needs {count} {what}{of}{'; as a step, none' if step else ''}."
+
+
+def _suggestion(plant: DescriptorSystem, name: str, shown: Question, *, step: bool) -> list[str]:
+    """Return which states to measure, computed; and those that would only show the fault."""
+    sensors = state_sensors(plant)
+    fault = shown.number
+    full = least_additions(plant, sensors, estimable(fault, step=False))
+    constant = () if step else least_additions(plant, sensors, estimable(fault, step=True))
+    texts = []
+    if full:
+        texts.append(f"{name}: Add one of: {listed(full)}.")
+    elif constant:
+        texts.append(f"{name}: Add one of: {listed(constant)} (then it can be estimated as a step).")
+    if not shown.visible:
+        useful = {names for names in (*full, *constant)}
+        more = [names for names in least_additions(plant, sensors, detectable(fault)) if names not in useful]
+        if more:
+            texts.append(f"{name}: {listed(more)} would show it, but not its size.")
+    if not texts and plant.nx:
+        texts.append(f"{name}: no further state or pair of states makes it estimable.")
+    return texts
+
+
+def _isolability(
+    plant: DescriptorSystem, shown: Sequence[Question], exactly: bool
+) -> tuple[np.ndarray, np.ndarray, list[Question]]:
+    count, rest = plant.nf, rest_point(plant.dt)
+    weak, strong = np.zeros((count, count), dtype=bool), np.zeros((count, count), dtype=bool)
+    asked = []
+    for i, own in enumerate(shown):
+        weak[i, i] = own.visible
+        strong[i, i] = own.visible and own.shows_at(rest)
+        for j in _others(plant, i):
+            pair = Question(plant, (j,), i, exactly)
+            asked.append(pair)
+            weak[i, j] = pair.visible
+            strong[i, j] = pair.visible and pair.shows_at(rest)
+    weak.setflags(write=False)
+    strong.setflags(write=False)
+    return weak, strong, asked
+
+
+def _warnings(plant: DescriptorSystem, asked: Sequence[Question]) -> tuple[str, ...]:
+    texts = []
+    if not pencil_structure(plant.E, plant.A).regular:
+        texts.append(
+            "sE - A is not regular: the equations leave states open or bind the inputs. The verdicts are about all "
+            "trajectories that satisfy them."
+        )
+    thin = [question for question in asked if not question.clear]
+    if thin:
+        worst = min(thin, key=lambda question: question.gap)
+        texts.append(
+            f"{plant.fault_names[worst.number]}: the least clear decision has a gap of {worst.gap:.1e} only; orders, "
+            "and in the worst case a verdict, may hang on the last digits of the data."
+        )
+    return tuple(texts)
+
+
+def _number(value: complex) -> str:
+    value = complex(value)
+    if value.imag == 0.0:
+        return f"{value.real:.4g}"
+    return f"{value.real:.4g} +- {abs(value.imag):.4g}j" if value.real else f"+- {abs(value.imag):.4g}j"

@@ -1,0 +1,120 @@
+"""What hides a fault: a motion of the plant and its unknown inputs that cancels it in every output, in one sentence."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from obsynth.analysis.diagnosis.decoupled import unknowns_pencil
+from obsynth.analysis.diagnosis.reduction import PencilUnits
+from obsynth.numerics.arrays import ComplexArray
+from obsynth.numerics.ranks import RANK_TOLERANCE
+from obsynth.plants.descriptor import DescriptorSystem
+
+#: A motion is stated where it cancels the fault to this, relative to the fault's own column.
+EXACTNESS = 1e-8
+#: Signals of a motion that are named; the others are counted.
+MOST_NAMED = 6
+
+
+@dataclass(frozen=True, eq=False)
+class HiddenMotion:
+    """States, unknown inputs and other faults that, with a fault of 1, leave every output at zero.
+
+    Parameters
+    ----------
+    fault : str
+        The fault.
+    point : complex
+        All signals go like ``exp(point t)`` (``point^k`` for sampled plants).
+    values : dict of str to complex
+        The amplitudes that are not zero: unknown inputs and other faults first, then states.
+    causes : int
+        How many of them, from the first, are unknown inputs or other faults.
+    dt : float
+        Of the plant, seconds.
+    """
+
+    fault: str
+    point: complex
+    values: dict[str, complex]
+    causes: int
+    dt: float
+
+    def __str__(self) -> str:
+        named = list(self.values.items())
+        inputs = [f"{self._course} of {_amplitude(value)} in {name}" for name, value in named[: self.causes]]
+        states = [f"{name} = {_amplitude(value)}" for name, value in named[self.causes :][:MOST_NAMED]]
+        more = len(named) - self.causes - len(states)
+        rest = [*states, *([f"{more} more states"] if more else [])]
+        by = " and ".join(inputs) or "the initial state"
+        return f"{self._course} of 1 in {self.fault} is hidden by {by}" + (f" with {', '.join(rest)}" if rest else "")
+
+    @property
+    def _course(self) -> str:
+        rest = 1.0 if self.dt > 0.0 else 0.0
+        point = self.point
+        if point == rest:
+            return "a step"
+        if self.dt > 0.0:
+            return f"a course {_amplitude(point)}^k"
+        if point.real == 0.0:
+            return f"a sinusoid ({abs(point.imag):.4g} rad/s)"
+        return f"a course exp({_amplitude(point)} t)"
+
+
+def hidden_motion(plant: DescriptorSystem, fault: int, point: complex, removed: Sequence[int]) -> HiddenMotion | None:
+    """Return the motion that hides a fault at a point, least in balanced units; ``None`` where there is none."""
+    e, a = unknowns_pencil(plant, removed)
+    matrix = a - point * e
+    right = -np.concatenate([plant.Bf[:, fault], plant.Df[:, fault]])
+    found = _solved(matrix, right)
+    if found is None:
+        return None
+    x, causes = found[: plant.nx], found[plant.nx :]
+    names = (*plant.disturbance_names, *(plant.fault_names[j] for j in removed))
+    inputs = _named(names, causes)
+    return HiddenMotion(
+        plant.fault_names[fault], complex(point), {**inputs, **_named(plant.state_names, x)}, len(inputs), plant.dt
+    )
+
+
+def _solved(matrix: ComplexArray, right: ComplexArray) -> ComplexArray | None:
+    """Return the solution with few entries: least squares, then those that are not needed left out one by one."""
+    units = PencilUnits.of(np.zeros(matrix.shape), np.abs(matrix))
+    rows, columns = units.rows, units.columns
+    work, goal = rows[:, None] * matrix * columns, rows * right
+    reach = float(np.linalg.norm(goal))
+    if reach == 0.0:
+        return None
+
+    def solve(kept: list[int]) -> tuple[ComplexArray, float]:
+        part, *_ = np.linalg.lstsq(work[:, kept], goal, rcond=RANK_TOLERANCE)
+        return np.asarray(part, dtype=np.complex128), float(np.linalg.norm(work[:, kept] @ part - goal)) / reach
+
+    kept = list(range(matrix.shape[1]))
+    part, miss = solve(kept)
+    if miss > EXACTNESS:
+        return None
+    for index in sorted(kept, key=lambda j: abs(part[kept.index(j)]))[: len(kept) if len(kept) <= 40 else 0]:
+        fewer = [j for j in kept if j != index]
+        if solve(fewer)[1] <= EXACTNESS:
+            kept = fewer
+    part, _ = solve(kept)
+    whole = np.zeros(matrix.shape[1], dtype=np.complex128)
+    whole[kept] = part
+    # What is only rounding in balanced units is nothing in those of the data.
+    whole[np.abs(whole) <= RANK_TOLERANCE * float(np.max(np.abs(whole), initial=0.0))] = 0.0
+    return np.asarray(columns * whole)
+
+
+def _named(names: Sequence[str], values: ComplexArray) -> dict[str, complex]:
+    return {name: complex(value) for name, value in zip(names, values, strict=True) if value != 0.0}
+
+
+def _amplitude(value: complex) -> str:
+    if abs(value.imag) <= EXACTNESS * abs(value):
+        return f"{value.real:.4g}"
+    return f"{value.real:.4g}{value.imag:+.4g}j"

@@ -1,0 +1,145 @@
+"""The left singular part of a pencil, by orthogonal transformations, with the rows it is made of.
+
+What is left of ``A - sE`` of any shape once its finite zeros, its infinite part and its right singular part are taken
+out is ``[A_o - s E_o; C_o]`` with E_o regular and (E_o, A_o, C_o) observable: its left null space is that of the whole
+pencil.  The pencil must come balanced, and is not balanced again on the way, which would blow rounding up.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.numerics.log_balance import LogBalance
+from obsynth.numerics.ranks import RankDecision, rank_from
+
+
+@dataclass(frozen=True, eq=False)
+class PencilUnits:
+    """Powers of two by which rows ``(m,)``, columns ``(n,)`` and s are multiplied so that entries are near one."""
+
+    rows: FloatArray
+    columns: FloatArray
+    time: float
+
+    @classmethod
+    def of(cls, E: FloatArray, A: FloatArray) -> PencilUnits:
+        """Return the units of ``A - sE (m, n)``; those of the data play no role, that of time included."""
+        m, n = A.shape
+        balance = LogBalance(m + n + 1)
+        rows, columns = range(m), range(m, m + n)
+        balance.add(A, rows, columns)
+        balance.add(E, rows, columns, common=m + n)
+        exponents = np.round(balance.solve())
+        factors = np.exp2(exponents)
+        return cls(factors[:m], factors[m : m + n], float(factors[-1]))
+
+
+@dataclass(frozen=True, eq=False)
+class LeftPart:
+    """What is left of a pencil: ``left @ (A - sE) = [A_o - s E_o; C_o] @ right``.
+
+    E, A ``(k, k)``, C ``(p, k)``; left ``(k + p, m)``, right ``(k, n)``; Ez, Az the pencil of the finite zeros that
+    were taken out.
+    """
+
+    E: FloatArray
+    A: FloatArray
+    C: FloatArray
+    left: FloatArray
+    right: FloatArray
+    Ez: FloatArray
+    Az: FloatArray
+    decisions: tuple[RankDecision, ...]
+
+    @property
+    def order(self) -> int:
+        """Number of states left."""
+        return int(self.E.shape[0])
+
+
+def left_part(E: FloatArray, A: FloatArray) -> LeftPart:
+    """Return the left singular part of a balanced pencil ``(m, n)``."""
+    decisions: list[RankDecision] = []
+    size_e, size_a = _norm(E), _norm(A)
+    left = np.eye(E.shape[0])
+    right = np.eye(E.shape[1])
+    while E.shape[1]:
+        _, values, basis = _svd(E)
+        decision = rank_from(values, expected=E.shape[1], scale=size_e)
+        decisions.append(decision)
+        if decision.rank == E.shape[1]:
+            break
+        # The columns that E does not see go, with the rows that A reaches from them.
+        kernel, complement = basis[decision.rank :].T, basis[: decision.rank].T
+        reached, values, _ = _svd(A @ kernel)
+        decision = rank_from(values, expected=kernel.shape[1], scale=size_a)
+        decisions.append(decision)
+        rest = reached[:, decision.rank :].T
+        E, A, left = rest @ E @ complement, rest @ A @ complement, rest @ left
+        right = complement.T @ right
+    k = E.shape[1]
+    rows = np.linalg.svd(E)[0] if k else np.eye(E.shape[0])
+    state, output = rows[:, :k].T, rows[:, k:].T
+    e, a, c = state @ E, state @ A, output @ A
+    left = np.vstack([state @ left, output @ left])
+    return _without_zeros(e, a, c, left, right, size_a, decisions)
+
+
+def _without_zeros(
+    e: FloatArray, a: FloatArray, c: FloatArray, left: FloatArray, right: FloatArray, size: float,
+    decisions: list[RankDecision],
+) -> LeftPart:  # fmt: skip
+    """Take out the unobservable part: what stays are the states that the outputs see."""
+    k, p = e.shape[0], c.shape[0]
+    hidden = np.eye(k)
+    if c.size:
+        _, values, basis = _svd(c)
+        decision = rank_from(values, expected=min(c.shape), scale=size)
+        decisions.append(decision)
+        hidden = basis[decision.rank :].T
+    while hidden.shape[1]:
+        span = np.linalg.qr(e @ hidden)[0]
+        leaving = a @ hidden
+        leaving = leaving - span @ (span.T @ leaving)
+        _, values, basis = _svd(leaving)
+        decision = rank_from(values, expected=hidden.shape[1], scale=size)
+        decisions.append(decision)
+        if decision.rank == 0:
+            break
+        hidden = np.linalg.qr(hidden @ basis[decision.rank :].T)[0]
+    count = hidden.shape[1]
+    if count == 0:
+        nothing = np.zeros((0, 0))
+        return LeftPart(e, a, c, left, right, nothing, nothing, tuple(decisions))
+    rows = np.linalg.qr(e @ hidden, mode="complete")[0]
+    zero, kept = rows[:, :count].T, rows[:, count:].T
+    seen = np.linalg.qr(hidden, mode="complete")[0][:, count:]
+    left = np.vstack([kept @ left[:k], left[k : k + p]])
+    return LeftPart(
+        kept @ e @ seen, kept @ a @ seen, c @ seen, left, seen.T @ right, zero @ e @ hidden, zero @ a @ hidden,
+        tuple(decisions),
+    )  # fmt: skip
+
+
+def finite_values(left: LeftPart) -> ComplexArray:
+    """Return the finite zeros that were taken out, complex, conjugate pairs exact."""
+    import scipy.linalg as sl
+
+    if left.Ez.shape[0] == 0:
+        return np.zeros(0, dtype=np.complex128)
+    alpha, beta = sl.eigvals(left.Az, left.Ez, homogeneous_eigvals=True)
+    return np.asarray(alpha / beta, dtype=np.complex128)
+
+
+def _svd(matrix: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    if matrix.size == 0:
+        return np.eye(matrix.shape[0]), np.zeros(0), np.eye(matrix.shape[1])
+    left, values, right = np.linalg.svd(matrix)
+    return left, values, right
+
+
+def _norm(matrix: FloatArray) -> float:
+    return float(np.linalg.norm(matrix, 2)) if matrix.size else 0.0

@@ -1,0 +1,219 @@
+"""What is known about one fault, and the whole diagnosis of a plant, as results that print themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.analysis.diagnosis.banks import StructuredResidual
+from obsynth.numerics.arrays import ComplexArray
+
+
+@dataclass(frozen=True, eq=False)
+class FaultDiagnosis:
+    """What a plant's outputs tell about one fault, whatever the unknown inputs and the initial state are.
+
+    Parameters
+    ----------
+    name : str
+        The fault.
+    detectable : bool
+        Whether it leaves any trace.
+    detectable_at_rest : bool
+        Whether a constant fault leaves a constant trace.
+    detectable_at : dict of float to bool
+        The same for sinusoids, by frequency in rad/s.
+    estimable : bool
+        Whether its value can be told, whatever its course and that of all other faults.
+    step_estimable : bool
+        Whether it can if it is a step (the other faults are arbitrary).
+    model_estimable : bool
+        Whether it can if it follows the fault model that was asked about.
+    order : int or None
+        Derivatives of the outputs (samples of delay, for sampled plants) that an estimate of an arbitrary course needs;
+        a step needs none.  ``None`` where it cannot be told from the rest.
+    residual_order : int or None
+        Least order of a filter with one residual that shows it, blind to the unknown inputs.
+    filter_order : int
+        Order of the plant without unknown inputs and other faults; a filter that estimates the fault has one state
+        more for each of its model.
+    zeros : ComplexArray
+        ``(k,)``, 1/s (dimensionless for sampled plants): where it cannot be told from the unknown inputs and the other
+        faults.
+    blocking : ComplexArray
+        Those on or outside the boundary of stability: what forbids an estimate of an arbitrary course.
+    sentences : tuple of str
+        What hides it, and what would help.
+    exact : bool
+        Whether all this was decided over the rational numbers; orders of larger plants are not.
+    gap : float
+        How clear the least clear decision was, kept over dropped; infinite for exact ones.
+    """
+
+    name: str
+    detectable: bool
+    detectable_at_rest: bool
+    detectable_at: Mapping[float, bool]
+    estimable: bool
+    step_estimable: bool
+    model_estimable: bool
+    order: int | None
+    residual_order: int | None
+    filter_order: int
+    zeros: ComplexArray
+    blocking: ComplexArray
+    sentences: tuple[str, ...]
+    exact: bool
+    gap: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the verdicts as plain data, zeros as ``[real, imaginary]``."""
+        return {
+            "name": self.name, "detectable": self.detectable, "detectable_at_rest": self.detectable_at_rest,
+            "detectable_at": {f"{frequency:g}": found for frequency, found in self.detectable_at.items()},
+            "estimable": self.estimable, "step_estimable": self.step_estimable,
+            "model_estimable": self.model_estimable, "order": self.order, "residual_order": self.residual_order,
+            "filter_order": self.filter_order, "zeros": _pairs(self.zeros), "blocking": _pairs(self.blocking),
+            "sentences": list(self.sentences), "exact": self.exact,
+            "gap": None if np.isinf(self.gap) else self.gap,
+        }  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Diagnosis:
+    """What can be diagnosed on a plant; made by `diagnose`.
+
+    Parameters
+    ----------
+    faults : tuple of FaultDiagnosis
+        In the order of the plant.
+    isolable : NDArray
+        ``(nf, nf)`` of bool: entry (i, j) whether fault i can be told from fault j (the diagonal: whether it shows).
+    isolable_at_rest : NDArray
+        ``(nf, nf)`` of bool: the same for constant faults that leave constant traces.
+    bank : tuple of StructuredResidual
+        Every structured residual that exists, those that see least first.
+    unknown_inputs : tuple of str
+        What all this is free of.
+    model : str
+        The fault model that was asked about.
+    exact : bool
+        Whether the verdicts were decided over the rational numbers.
+    warnings : tuple of str
+        Thin decisions and what else a reader should know.
+    """
+
+    faults: tuple[FaultDiagnosis, ...]
+    isolable: NDArray[np.bool_]
+    isolable_at_rest: NDArray[np.bool_]
+    bank: tuple[StructuredResidual, ...]
+    unknown_inputs: tuple[str, ...]
+    model: str
+    exact: bool
+    warnings: tuple[str, ...]
+
+    def __getitem__(self, name: str) -> FaultDiagnosis:
+        for fault in self.faults:
+            if fault.name == name:
+                return fault
+        raise KeyError(f"no fault named {name!r}; there are: {', '.join(fault.name for fault in self.faults)}")
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """What hides faults and what would help, of all faults."""
+        return tuple(sentence for fault in self.faults for sentence in fault.sentences)
+
+    def verdict_rows(self) -> tuple[tuple[str, ...], ...]:
+        """Return the table of verdicts as texts: the header, then one row per fault."""
+        header = ("fault", "detectable", "at rest", "as a step", "any course", "derivatives", "residual", "filter")
+        rows = [
+            (
+                fault.name, _word(fault.detectable), _word(fault.detectable_at_rest), _word(fault.step_estimable),
+                _word(fault.estimable), _count(fault.order), _count(fault.residual_order), str(fault.filter_order),
+            )
+            for fault in self.faults
+        ]  # fmt: skip
+        return (header, *rows)
+
+    def isolability_rows(self) -> tuple[tuple[str, ...], ...]:
+        """Return the isolability table as texts: 'yes', 'changing' (not at rest) or 'no', row from column."""
+        names = [fault.name for fault in self.faults]
+        rows = [
+            (name, *(_isolability(bool(weak), bool(strong)) for weak, strong in zip(*both, strict=True)))
+            for name, both in zip(names, zip(self.isolable, self.isolable_at_rest, strict=True), strict=True)
+        ]
+        return (("fault", *(f"from {name}" for name in names)), *rows)
+
+    def bank_rows(self) -> tuple[tuple[str, ...], ...]:
+        """Return the bank of structured residuals as texts: what each sees, at rest, and its least order."""
+        rows = [(", ".join(r.sees), ", ".join(r.at_rest) or "none", _count(r.order)) for r in self.bank]
+        return (("a residual that sees only", "constant values of", "least order"), *rows)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the diagnosis as plain data."""
+        return {
+            "faults": [fault.to_dict() for fault in self.faults], "isolable": self.isolable.tolist(),
+            "isolable_at_rest": self.isolable_at_rest.tolist(),
+            "bank": [
+                {"sees": list(r.sees), "blind_to": list(r.blind_to), "at_rest": list(r.at_rest), "order": r.order}
+                for r in self.bank
+            ],
+            "unknown_inputs": list(self.unknown_inputs), "model": self.model, "exact": self.exact,
+            "warnings": list(self.warnings),
+        }  # fmt: skip
+
+    @property
+    def heading(self) -> str:
+        """What was asked, in one line."""
+        free = f"free of {', '.join(self.unknown_inputs)}" if self.unknown_inputs else "no unknown inputs"
+        if len(self.unknown_inputs) > 4:
+            free = f"free of {len(self.unknown_inputs)} unknown inputs"
+        way = "decided exactly" if self.exact else "decided in floating point"
+        return f"What can be diagnosed ({free}; {way})"
+
+    def __str__(self) -> str:
+        if not self.faults:
+            return "The plant has no faults to diagnose."
+        lines = [self.heading, *_aligned(self.verdict_rows())]
+        if len(self.faults) > 1:
+            lines += ["", *_aligned(self.isolability_rows())]
+        return "\n".join([*lines, *self.sentences, *(f"Warning: {text}" for text in self.warnings)])
+
+    def _repr_html_(self) -> str:
+        parts = [f"<p><b>{escape(self.heading)}</b></p>", _html_table(self.verdict_rows())]
+        if len(self.faults) > 1:
+            parts += [_html_table(self.isolability_rows()), _html_table(self.bank_rows())]
+        texts = [*self.sentences, *(f"Warning: {text}" for text in self.warnings)]
+        return "".join([*parts, *(f"<p>{escape(text)}</p>" for text in texts)])
+
+
+def _pairs(values: ComplexArray) -> list[list[float]]:
+    return [[float(value.real), float(value.imag)] for value in values]
+
+
+def _word(found: bool) -> str:
+    return "yes" if found else "no"
+
+
+def _count(number: int | None) -> str:
+    return "-" if number is None else str(number)
+
+
+def _isolability(weak: bool, strong: bool) -> str:
+    return "yes" if strong else "changing" if weak else "no"
+
+
+def _aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    widths = [max(len(row[j]) for row in rows) for j in range(len(rows[0]))]
+    return ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+
+
+def _html_table(rows: Sequence[Sequence[str]]) -> str:
+    head = "".join(f"<th>{escape(text)}</th>" for text in rows[0])
+    body = "".join("<tr>" + "".join(f"<td>{escape(text)}</td>" for text in row) + "</tr>" for row in rows[1:])
+    return f"<table><tr>{head}</tr>{body}</table>"

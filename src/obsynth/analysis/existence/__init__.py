@@ -1,0 +1,1 @@
+"""Existence decided on the numbers of a plant as written, before anything is rounded."""

@@ -1,0 +1,215 @@
+"""Elimination of algebraic states in rational arithmetic: every entry of the result is rounded once.
+
+With N a basis of ker E, L one of its left null space, and D and P unit vectors that complete them, ``x = D z + N v``,
+``L A N v = -L (A D z + B u + ...)`` and ``P E D z+ = P (A D z + A N v + B u + ...)``: index 1 is ``L A N`` nonsingular.
+Where the dynamic states are combinations of those given, ``z`` is changed to the orthogonal ones afterwards.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.origin import DECISIVE, PlantOrigin, origin_of
+
+if TYPE_CHECKING:
+    from flint import fmpq_mat
+
+#: Plants of more states are eliminated in floating point.
+MOST_STATES = 64
+#: Digits (binary) in which coordinates that are not rational are changed.
+COORDINATE_BITS = 600
+
+_SIGNALS = ("B", "Bf", "Bd", "Bw")
+_DIRECT = ("D", "Df", "Dd", "Dw")
+
+
+@dataclass(frozen=True, eq=False)
+class ExactElimination:
+    """The reduced plant and the recovery of its states, in rational coordinates.
+
+    Parameters
+    ----------
+    matrices : mapping of str to fmpq_mat
+        ``A, B, Bf, Bd, Bw, C, D, Df, Dd, Dw`` of the reduced plant.
+    recovery : mapping of str to fmpq_mat
+        ``x`` from the new states (``A``) and from the signals (``B, Bf, Bd, Bw``).
+    pivots : tuple of int
+        States that stand for the dynamic ones.
+    """
+
+    matrices: Mapping[str, fmpq_mat]
+    recovery: Mapping[str, fmpq_mat]
+    pivots: tuple[int, ...]
+
+    @property
+    def origin(self) -> PlantOrigin:
+        """What the reduced plant remembers of it."""
+        from obsynth.proofs.exact_pencils import identity
+        from obsynth.proofs.written_numbers import fractions_of
+
+        found: dict[str, fmpq_mat] = {"E": identity(len(self.pivots)), **self.matrices}
+        return PlantOrigin({name: fractions_of(found[name]) for name in DECISIVE})
+
+
+def exact_elimination(plant: DescriptorSystem) -> ExactElimination | None:
+    """Return the elimination; ``None`` for too many states, or where no state can be eliminated so."""
+    from obsynth.proofs.exact_pencils import blocks, null_basis, pivot_columns
+    from obsynth.proofs.written_numbers import computed_entries, written_matrix
+
+    if plant.nx > MOST_STATES or origin_of(plant) is not None:
+        return None
+    e, a, c = (written_matrix(matrix) for matrix in (plant.E, plant.A, plant.C))
+    pivots, rows = pivot_columns(e), pivot_columns(e.transpose())
+    if not pivots:
+        return None
+    null, left = null_basis(e), null_basis(e.transpose()).transpose()
+    signals = [written_matrix(getattr(plant, name)) for name in _SIGNALS]
+    keep, take = _units(plant.nx, pivots), _units(plant.nx, rows).transpose()
+    right = blocks([[a * keep, *signals]])
+    computed = any(computed_entries(getattr(plant, name)) for name in ("E", "A", "C", *_SIGNALS, *_DIRECT))
+    coupling = left * a * null
+    if plant.nx > len(pivots) and coupling.det() == 0:
+        return None
+    direct = blocks([[c * keep, *(written_matrix(getattr(plant, name)) for name in _DIRECT)]])
+    states = blocks([[keep, *(_zeros(plant.nx, int(signal.ncols())) for signal in signals)]])
+    moving = take * right
+    if plant.nx > len(pivots):
+        algebraic = _solved(-coupling, left * right, clean=computed)
+        moving = _sum(moving, take * (a * null), algebraic, clean=computed)
+        direct = _sum(direct, c * null, algebraic, clean=computed)
+        states = _sum(states, null, algebraic, clean=computed)
+    moving = _solved(take * e * keep, moving, clean=computed)
+    widths = [len(pivots), *(int(signal.ncols()) for signal in signals)]
+    return ExactElimination(
+        dict(zip(("A", *_SIGNALS), _split(moving, widths), strict=True))
+        | dict(zip(("C", *_DIRECT), _split(direct, widths), strict=True)),
+        dict(zip(("A", *_SIGNALS), _split(states, widths), strict=True)),
+        tuple(pivots),
+    )
+
+
+def rounded_once(
+    found: ExactElimination, plant: DescriptorSystem, dynamic: FloatArray | None
+) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
+    """Return the matrices and the recovery as doubles; states ``dynamic (nx, count)`` in place of the pivots."""
+    import flint
+
+    from obsynth.proofs.enclosed_pencils import enclosed
+    from obsynth.proofs.written_numbers import nearest_doubles, written_matrix
+
+    if dynamic is None:
+        return (
+            {name: nearest_doubles(matrix) for name, matrix in found.matrices.items()},
+            {name: nearest_doubles(matrix) for name, matrix in found.recovery.items()},
+        )
+    e = written_matrix(plant.E)
+    rows = _independent_rows(e, found.pivots)
+    with flint.ctx.workprec(COORDINATE_BITS):
+        # E dynamic z = E (unit vectors) z_rational
+        change = flint.arb_mat(enclosed(_rows(e * written_matrix(dynamic), rows))).solve(
+            flint.arb_mat(enclosed(_rows(e * _units(plant.nx, found.pivots), rows)))
+        )
+        back = change.inv()
+
+        def moved(name: str, matrix: fmpq_mat, *, recovery: bool) -> FloatArray:
+            work = flint.arb_mat(enclosed(matrix)) if matrix.nrows() and matrix.ncols() else None
+            if work is None:
+                return np.zeros((int(matrix.nrows()), int(matrix.ncols())))
+            if name in ("A", "C"):
+                work = work * back
+            if not recovery and name in ("A", *_SIGNALS):
+                work = change * work
+            return _doubles(work)
+
+        return (
+            {name: moved(name, matrix, recovery=False) for name, matrix in found.matrices.items()},
+            {name: moved(name, matrix, recovery=True) for name, matrix in found.recovery.items()},
+        )
+
+
+def _solved(matrix: fmpq_mat, right: fmpq_mat, *, clean: bool) -> fmpq_mat:
+    """Return ``matrix^-1 right``; of computed data, what their rounding may have left is zero."""
+    solution = matrix.solve(right)
+    return _cleaned(solution, _sizes(matrix.inv()) @ (_sizes(matrix) @ _sizes(solution))) if clean else solution
+
+
+def _sum(direct: fmpq_mat, factor: fmpq_mat, solution: fmpq_mat, *, clean: bool) -> fmpq_mat:
+    result = direct + factor * solution
+    return _cleaned(result, _sizes(direct) + _sizes(factor) @ _sizes(solution)) if clean else result
+
+
+def _cleaned(result: fmpq_mat, size_of_terms: FloatArray) -> fmpq_mat:
+    from flint import fmpq, fmpq_mat
+
+    rows, columns = size_of_terms.shape
+    kept = _sizes(result) > CANCELLATION_TOLERANCE * size_of_terms
+    entries = [result[i, j] if kept[i, j] else fmpq(0) for i in range(rows) for j in range(columns)]
+    return fmpq_mat(rows, columns, entries)
+
+
+def _sizes(matrix: fmpq_mat) -> FloatArray:
+    from obsynth.proofs.written_numbers import nearest_doubles
+
+    return np.abs(nearest_doubles(matrix))
+
+
+def _doubles(matrix: Any) -> FloatArray:
+    rows = [[0.0 if value.contains(0) else float(value) for value in row] for row in matrix.tolist()]
+    return np.array(rows, dtype=np.float64)
+
+
+def _independent_rows(e: fmpq_mat, pivots: tuple[int, ...]) -> list[int]:
+    from obsynth.proofs.exact_pencils import pivot_columns
+
+    return pivot_columns((e * _units(int(e.ncols()), pivots)).transpose())
+
+
+def _rows(matrix: fmpq_mat, chosen: list[int]) -> fmpq_mat:
+    from flint import fmpq_mat
+
+    columns = int(matrix.ncols())
+    return fmpq_mat(len(chosen), columns, [matrix[i, j] for i in chosen for j in range(columns)])
+
+
+def _units(order: int, chosen: list[int] | tuple[int, ...]) -> fmpq_mat:
+    from flint import fmpq_mat
+
+    return fmpq_mat(order, len(chosen), [int(i == j) for i in range(order) for j in chosen])
+
+
+def _zeros(rows: int, columns: int) -> fmpq_mat:
+    from obsynth.proofs.exact_pencils import zeros_matrix
+
+    return zeros_matrix(rows, columns)
+
+
+def _split(matrix: fmpq_mat, widths: list[int]) -> list[fmpq_mat]:
+    from flint import fmpq_mat
+
+    found, start, rows = [], 0, int(matrix.nrows())
+    for width in widths:
+        entries = [matrix[i, j] for i in range(rows) for j in range(start, start + width)]
+        found.append(fmpq_mat(rows, width, entries))
+        start += width
+    return found
+
+
+def sampled_origin(smooth: DescriptorSystem, sample_time: float) -> PlantOrigin:
+    """Return what a plant that is sampled from one with ``E = I`` remembers."""
+    from obsynth.proofs.written_numbers import fractions_of, written_fraction, written_matrix
+
+    origin = origin_of(smooth)
+    exact: Mapping[str, tuple[tuple[Fraction, ...], ...]] = (
+        origin.exact
+        if origin is not None
+        else {name: fractions_of(written_matrix(getattr(smooth, name))) for name in DECISIVE}
+    )
+    return PlantOrigin(exact, written_fraction(sample_time))

@@ -1,0 +1,52 @@
+"""What a plant was made from: exact numbers behind matrices that were rounded when they were made."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from obsynth.plants.descriptor import DescriptorSystem
+
+#: The matrices on which existence depends.
+DECISIVE = ("E", "A", "Bf", "Bd", "C", "Df", "Dd")
+
+
+@dataclass(frozen=True, eq=False)
+class PlantOrigin:
+    """Rational matrices of a plant in some coordinates of its states, or of the continuous plant that was sampled.
+
+    Parameters
+    ----------
+    exact : mapping of str to rows of Fraction
+        The `DECISIVE` matrices.
+    sample_time : Fraction or None, seconds
+        Where ``exact`` is a continuous plant and the plant itself is that one sampled with a zero-order hold.
+    """
+
+    exact: Mapping[str, tuple[tuple[Fraction, ...], ...]]
+    sample_time: Fraction | None = None
+
+
+def origin_of(plant: DescriptorSystem) -> PlantOrigin | None:
+    """Return what a plant was made from, where that is known and its matrices have not been changed since."""
+    return getattr(plant, "_origin", None)
+
+
+def with_origin(plant: DescriptorSystem, origin: PlantOrigin | None) -> DescriptorSystem:
+    """Note on a plant that was just made what it was made from, and return it."""
+    object.__setattr__(plant, "_origin", origin)
+    return plant
+
+
+def carry_origin(old: DescriptorSystem, new: DescriptorSystem) -> DescriptorSystem:
+    """Note on a changed plant what the old one was made from, if nothing has changed that matters."""
+    origin = origin_of(old)
+    same = origin is not None and old.dt == new.dt
+    if same and all(np.array_equal(getattr(old, name), getattr(new, name)) for name in DECISIVE):
+        return with_origin(new, origin)
+    return new

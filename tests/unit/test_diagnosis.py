@@ -1,0 +1,182 @@
+"""What can be diagnosed: exact truths, counterexamples to shortcuts, units, and sentences."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import obsynth
+from obsynth.analysis.diagnosis.columns import Question
+
+CASES = Path(__file__).parents[1] / "data" / "cases"
+
+
+def motor(*, two_encoders: bool) -> obsynth.DescriptorSystem:
+    """A motor, a flexible shaft and a load; torque fault, unknown load torque."""
+    measured = ["theta m", "theta l", "i"] if two_encoders else ["theta m", "i"]
+    return obsynth.DescriptorSystem(
+        np.diag([1, 0.01, 1, 0.05, 0]),
+        [[0, 1, 0, 0, 0], [-50, -0.06, 50, 0.05, 0.5], [0, 0, 0, 1, 0], [50, 0.05, -50, -0.07, 0], [0, -0.5, 0, 0, -1]],
+        [[0], [0], [0], [0], [1]],
+        measured,
+        Bf=["omega m"],
+        Bd=["omega l"],
+        state_names=["theta m", "omega m", "theta l", "omega l", "i"],
+        fault_names=["torque"],
+        disturbance_names=["load torque"],
+        input_names=["voltage"],
+    )
+
+
+def in_other_units(plant: obsynth.DescriptorSystem, seed: int) -> tuple[obsynth.DescriptorSystem, float]:
+    """The same plant with every signal, every equation and the time in other units; and the factor of s."""
+    rng = np.random.default_rng(seed)
+    x, e, u, y, f, d = (
+        10.0 ** rng.uniform(-4, 4, size=n) for n in (plant.nx, plant.nx, plant.nu, plant.ny, plant.nf, plant.nd)
+    )
+    time = 1.0 if plant.dt else 10.0 ** rng.uniform(-3, 3)
+    return plant.replace(
+        E=e[:, None] * plant.E * x * time, A=e[:, None] * plant.A * x, B=e[:, None] * plant.B * u,
+        C=y[:, None] * plant.C * x, D=y[:, None] * plant.D * u, Bf=e[:, None] * plant.Bf * f,
+        Df=y[:, None] * plant.Df * f, Bd=e[:, None] * plant.Bd * d, Dd=y[:, None] * plant.Dd * d,
+        Bw=None, Dw=None, noise_names=None,
+    ), 1.0 / time  # fmt: skip
+
+
+def test_motor_with_one_encoder_names_the_load_and_the_sensor() -> None:
+    found = obsynth.diagnose(motor(two_encoders=False))
+    torque = found["torque"]
+    assert found.exact
+    assert (torque.detectable, torque.estimable, torque.step_estimable) == (False, False, False)
+    text = str(found)
+    assert "a step of 1 in torque is hidden by a step of -1 in load torque with theta l = -0.02" in text
+    assert "Add one of: theta l." in text
+    assert "omega l would show it, but not its size." in text
+
+
+def test_motor_with_two_encoders() -> None:
+    torque = obsynth.diagnose(motor(two_encoders=True), frequencies=[0.0, 3.0])["torque"]
+    assert torque.estimable
+    assert torque.step_estimable
+    assert torque.detectable_at == {0.0: True, 3.0: True}
+    assert (torque.order, torque.residual_order, torque.filter_order) == (1, 1, 2)
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("two_encoders", [False, True])
+def test_units_decide_nothing(seed: int, two_encoders: bool) -> None:
+    plant = motor(two_encoders=two_encoders)
+    other, _ = in_other_units(plant, seed)
+    a, b = obsynth.diagnose(plant)["torque"], obsynth.diagnose(other, suggest=False)["torque"]
+    assert not b.exact
+    assert (a.detectable, a.estimable, a.step_estimable, a.order, a.filter_order, a.residual_order) == (
+        b.detectable, b.estimable, b.step_estimable, b.order, b.filter_order, b.residual_order,
+    )  # fmt: skip
+
+
+def test_a_rank_at_the_point_is_not_enough() -> None:
+    # y = s/(s+1) f: M_W loses rank at s = 0 itself, so the rank test there passes; a constant fault is hidden.
+    plant = obsynth.DescriptorSystem(
+        None, [[0, 0], [0, -1]], None, [[1, 0], [0, 1]], Bf=[[-1], [0]], Bd=[[0], [1]],
+    )  # fmt: skip
+    assert obsynth.diagnose(plant)["f1"].step_estimable
+    hidden = obsynth.DescriptorSystem(None, [[-1.0]], None, [[1.0]], Bf=[[-1.0]], Df=[[1.0]])
+    found = obsynth.diagnose(hidden)["f1"]
+    assert found.detectable
+    assert not found.detectable_at_rest
+    assert "hidden by" in found.sentences[0]
+
+
+def test_estimating_may_take_more_sensors_than_signals() -> None:
+    # Numerators (s-1)(s-2), (s-2)(s-3), (s-1)(s-3) over (s+1)^3: only all three sensors estimate one fault.
+    rows = [np.poly([1, 2]), np.poly([2, 3]), np.poly([1, 3])]
+    a = np.array([[-3.0, -3.0, -1.0], [1, 0, 0], [0, 1, 0]])
+    for kept, expected in (((0, 1), False), ((0, 2), False), ((1, 2), False), ((0, 1, 2), True)):
+        plant = obsynth.DescriptorSystem(None, a, None, [rows[i] for i in kept], Bf=[[1], [0], [0]])
+        assert obsynth.diagnose(plant, suggest=False)["f1"].estimable is expected
+
+
+def test_exact_constraints_cost_no_derivative() -> None:
+    # Index 2: x1 = 0 is exact, so its derivative x2 + f = 0 is free, and y = x2 shows f at once.
+    plant = obsynth.DescriptorSystem(
+        [[1, 0], [0, 0]], [[0, 1], [1, 0]], None, [[0, 1]], Bf=[[1], [0]],
+    )  # fmt: skip
+    found = obsynth.diagnose(plant)["f1"]
+    assert found.order == 0
+
+
+@pytest.mark.parametrize("shift", [0.0, 1e-9])
+def test_multiple_zeros_on_the_boundary_are_exact(shift: float) -> None:
+    # y = (s - shift)^4 / (s + 1)^4 f: rounding scatters the four zeros by 1e-4, the verdict must not follow.
+    numerator, denominator = np.poly([shift] * 4), np.poly([-1] * 4)
+    a = np.vstack([-denominator[1:], np.eye(3, 4)])
+    plant = obsynth.DescriptorSystem(
+        None, a, None, [numerator[1:] - denominator[1:]], Bf=[[1], [0], [0], [0]], Df=[[1.0]]
+    )
+    found = obsynth.diagnose(plant, suggest=False)["f1"]
+    assert not found.estimable
+
+
+def test_pairs_and_banks() -> None:
+    # Two faults through one path cannot be told apart; a third one can.
+    plant = obsynth.DescriptorSystem(
+        None, np.diag([-1.0, -2.0]), None, np.eye(2), Bf=[[1, 2, 0], [0, 0, 1]], fault_names=["a", "b", "c"],
+    )  # fmt: skip
+    found = obsynth.diagnose(plant, suggest=False)
+    assert found.isolable.tolist() == [[True, False, True], [False, True, True], [True, True, True]]
+    assert {residual.sees for residual in found.bank} == {("c",), ("a", "b"), ("a", "b", "c")}
+    assert found["a"].sentences[0].startswith("a: it shows, but cannot be told from b, c")
+
+
+def test_singular_pencils_are_answered_by_name() -> None:
+    plant = obsynth.DescriptorSystem(
+        [[1, 0], [0, 0]], [[-1, 0], [0, 0]], None, [[1, 0], [0, 1]], Bf=[[1], [0]],
+    )  # fmt: skip
+    found = obsynth.diagnose(plant, suggest=False)
+    assert found["f1"].estimable
+    assert any("not regular" in warning for warning in found.warnings)
+
+
+def test_decoupled_plant_is_blind_and_exact() -> None:
+    plant = motor(two_encoders=True)
+    found = obsynth.decouple(plant)
+    k = found.order
+    assert k == 2
+    equations, outputs = found.rows[:, : plant.nx], found.rows[:, plant.nx :]
+    size = np.abs(equations) @ np.abs(plant.A) + np.abs(outputs) @ np.abs(plant.C)
+    assert np.max(np.abs(equations[k:] @ plant.E)) < 1e-15
+    left = equations @ plant.A + outputs @ plant.C
+    assert np.max(np.abs(left - np.vstack([found.A, found.C]) @ found.states) / size.max(axis=1)[:, None]) < 1e-13
+    assert np.max(np.abs(equations @ plant.Bd + outputs @ plant.Dd)) < 1e-13
+    assert found.plant.input_names == ("voltage", "measured theta m", "measured theta l", "measured i")
+
+
+def test_decouple_refuses_unknown_names() -> None:
+    with pytest.raises(obsynth.SpecError, match="no such fault; there are: torque"):
+        obsynth.decouple(motor(two_encoders=True), without=["torgue"])
+    with pytest.raises(obsynth.SpecError, match="cannot be kept and removed"):
+        obsynth.decouple(motor(two_encoders=True), without=["torque"], faults=["torque"])
+
+
+def test_exact_and_rounded_agree_on_random_integer_plants() -> None:
+    rng = np.random.default_rng(18)
+    for _ in range(40):
+        n, ny, nd, nf = (int(rng.integers(low, high)) for low, high in ((1, 7), (1, 4), (1, 3), (1, 3)))
+
+        def sparse(rows: int, columns: int) -> np.ndarray:
+            return rng.integers(-2, 3, (rows, columns)) * (rng.random((rows, columns)) < 0.5)
+
+        plant = obsynth.DescriptorSystem(
+            sparse(n, n), sparse(n, n), sparse(n, 1), sparse(ny, n), Bf=sparse(n, nf), Bd=sparse(n, nd),
+            dt=float(rng.integers(0, 2)),
+        )  # fmt: skip
+        for fault in range(nf):
+            removed = tuple(j for j in range(nf) if j != fault)
+            exact, rounded = (Question(plant, removed, fault, way) for way in (True, False))
+            assert exact.visible == rounded.visible
+            if exact.visible:
+                assert (len(exact.zeros), len(exact.blocking)) == (len(rounded.zeros), len(rounded.blocking))
+                assert (exact.derivatives, exact.residual_order) == (rounded.derivatives, rounded.residual_order)
+            assert exact.order == rounded.order
