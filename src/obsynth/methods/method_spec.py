@@ -81,7 +81,9 @@ class MethodSpec:
     witnesses: frozenset[str] = frozenset()
     tracked: str = ""
 
-    def load(self, part: Literal["public", "options", "conditions", "synthesise", "checks", "tracked"]) -> Callable[..., Any]:
+    def load(
+        self, part: Literal["public", "options", "conditions", "synthesise", "checks", "tracked"]
+    ) -> Callable[..., Any]:
         """Return what a path names."""
         module, name = str(getattr(self, part)).split(":")
         found: Callable[..., Any] = getattr(import_module(module), name)

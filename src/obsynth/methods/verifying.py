@@ -49,7 +49,8 @@ def verify(design: ObserverDesign, *, printed_digits: int | None = None) -> Veri
     with np.errstate(all="ignore"), one_thread_if_small(design.plant.nx):
         rows = tuple(checks(design, printed_digits))
         if spec.tracked and all(row.passed for row in rows):
-            rows = (*rows, *stored_number_rows(design, spec.load("tracked")(design)))
+            gamma = design.certificate.claims.get("gamma") if "gamma" in spec.claims else None
+            rows = (*rows, *stored_number_rows(design, spec.load("tracked")(design), gamma))
         covered = {name: meaning.row for name, meaning in spec.claims.items()}
         meanings = {name: meaning.meaning for name, meaning in spec.claims.items()}
         return VerificationReport.of((*rows, *closed_claims(design, rows, covered, meanings, spec.witnesses)))

@@ -6,8 +6,8 @@ With P = Q'Q and a rate :math:`\rho < 1` (:math:`\alpha > 0` in continuous time)
     \rho^2 P - A^T P A > 0 \qquad (\text{continuous: } -(A + \alpha I)^T P - P (A + \alpha I) > 0)
 
 gives :math:`\|Q A^j b\| \le \rho^j \|Q b\|`, so that
-:math:`\sum_j \|c A^j b\| \le \|c Q^{-1}\| \|Q b\| / (1 - \rho)` (:math:`/ \alpha` for the integral).  Every norm below is
-rounded up.
+:math:`\sum_j \|c A^j b\| \le \|c Q^{-1}\| \|Q b\| / (1 - \rho)` (:math:`/ \alpha` for the integral).  Every norm below
+is rounded up.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class Contraction:
         product = Ball.exact(rows) @ Ball.exact(self.inverse)
         size = rounded_up(np.abs(product.midpoint) + product.radius, 2)
         # |X|^2 <= |X|_1 |X|_inf, or Frobenius: both bound the spectral norm.
-        frobenius = float(np.sqrt(rounded_up(np.sum(size**2), size.size + 2)))
+        frobenius = float(np.sqrt(rounded_up(np.asarray(np.sum(size**2)), size.size + 2)))
         mixed = float(np.sqrt(np.max(np.sum(size, axis=0)) * np.max(np.sum(size, axis=1))))
         return float(rounded_up(np.asarray(min(frobenius, mixed) / (1.0 - self.defect)), 2 * sum(size.shape) + 8))
 

@@ -33,13 +33,13 @@ def held_input(a: FloatArray, b: FloatArray, time: float) -> Ball:
 
 
 def energy(a: FloatArray, b: FloatArray, time: float) -> Ball:
-    r"""Return a ball that holds ``W = \int_0^t e^{A s} B B' e^{A' s} ds`` (Van Loan), for ``A (n, n)``, ``B (n, m)``."""
+    r"""Return a ball that holds ``\int_0^t e^{A s} B B' e^{A' s} ds`` (Van Loan), for ``A (n, n)``, ``B (n, m)``."""
     import flint
 
     n = len(a)
     with flint.ctx.workprec(2 * BITS):
         rows = [[flint.arb(0)] * (2 * n) for _ in range(2 * n)]
-        inputs = flint.arb_mat(*b.shape, [flint.arb(value) for value in np.ravel(b).tolist()])
+        inputs = flint.arb_mat(b.shape[0], b.shape[1], [flint.arb(value) for value in np.ravel(b).tolist()])
         square = inputs * inputs.transpose()
         for i in range(n):
             for j in range(n):

@@ -1,8 +1,8 @@
 r"""Sums over all time of what a system makes of its inputs, from above, every rounding accounted for.
 
-``v_{j+1} = fl(M v_j)`` misses ``M v_j`` by a defect that is known; with a proved contraction (`Contraction`) the defects
-add no more than ``|c Q^-1| sum |Q defect| / (1 - rate)`` to all later terms together, and what follows the last term
-that is computed no more than that of ``|Q v_N|``.
+``v_{j+1} = fl(M v_j)`` misses ``M v_j`` by a defect that is known; with a proved contraction (`Contraction`) the
+defects add no more than ``|c Q^-1| sum |Q defect| / (1 - rate)`` to all later terms together, and what follows the last
+term that is computed no more than that of ``|Q v_N|``.
 
 Where an input acts for an interval of length h, ``\int_0^h |g(s)| ds`` of ``g(s) = c M^j e^{A s} b`` is the trapezoidal
 sum over p pieces of length ``p d = h``, plus ``d^3 / 12`` times the largest second derivative of each piece; that is at
@@ -47,13 +47,15 @@ def peak_sums(
 ) -> PeakSums:  # fmt: skip
     """Return bounds on the sums over j of ``|c M^j b|`` of every column ``b``, for ``c (p, n)``.
 
-    Euclidean norms, or with ``each`` the absolute value of each row.  At least ``least`` terms are summed up one by one,
-    and more until the rest is bounded by the share ``left``.
+    Euclidean norms, or with ``each`` the absolute value of each row.  At least ``least`` terms are summed up one by
+    one, and more until the rest is bounded by the share ``left``.
     """
     moving, held, n = matrix.midpoint, columns.midpoint.copy(), len(matrix.midpoint)
     growth, shown = gamma(n + 2), np.abs(rows)
-    seen = np.array([contraction.seen(rows[i : i + 1]) for i in range(len(rows))])[:, None] if each else np.array(
-        contraction.seen(rows)
+    seen = (
+        np.array([contraction.seen(rows[i : i + 1]) for i in range(len(rows))])[:, None]
+        if each
+        else np.array(contraction.seen(rows))
     )
 
     def rest(of: FloatArray) -> FloatArray:
@@ -110,7 +112,7 @@ class Pieces(NamedTuple):
 
 
 def interval_pieces(a: FloatArray, b: FloatArray, into: Ball, length: float) -> Pieces:
-    """Return the pieces of ``into e^{A s} b``, s from 0 to ``length``, for ``a (n, n)``, ``b (n, m)``, ``into (k, n)``."""
+    """Return the pieces of ``into e^{A s} b``, s from 0 to ``length``: ``a (n, n)``, ``b (n, m)``, ``into (k, n)``."""
     norm = float(np.linalg.norm(a, 2)) if a.size else 0.0
     count = int(np.clip(np.ceil(length * norm / PIECE), 1, MOST_PIECES))
     step, m = length / count, b.shape[1]

@@ -54,14 +54,15 @@ class Check:
     source: str
     kind: CheckKind = "computed"
     detail: str = ""
-    status: Status = ""  # type: ignore[assignment]
+    status: Status | Literal[""] = ""
     interval: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         if not self.status:
             object.__setattr__(self, "status", "proved" if self.kind == "proved" else "computed twice")
         if self.interval is not None:
-            object.__setattr__(self, "interval", tuple(self.interval))
+            low, high = self.interval
+            object.__setattr__(self, "interval", (low, high))
 
 
 def upper_bound_check(

@@ -14,7 +14,7 @@ from obsynth.results.report import Check, information, upper_bound_check
 if TYPE_CHECKING:
     from obsynth.results.design import ObserverDesign
 
-#: In place of a row: what the search stated, which no check recomputes.  Such a claim has a row of its own that says so.
+#: In place of a row: what the search stated, which no check recomputes.  Such a claim has a row that says so.
 STATED = "stated by the search"
 
 #: Matrices that the certificate of any linear design may hold, with the rows that cover them.

@@ -1,7 +1,7 @@
 r"""The identities of a shipped observer in its stored numbers: what they miss is one more channel, driven by x and u.
 
 For the plant ``E x+ = A x + B u``, ``y = C x + D u`` (+ disturbances and faults) and the observer
-``z+ = Az z + Bu u + By y``, ``estimate = Cz z + Du u + Dy y``, the error ``eps = z - T E x`` obeys, whatever T and T0 are,
+``z+ = Az z + Bu u + By y``, ``estimate = Cz z + Du u + Dy y``, the error ``eps = z - T E x`` obeys, whatever T, T0 are,
 
 .. math::
     \varepsilon^+ = A_z \varepsilon + K x + U u + \ldots, \qquad
@@ -11,7 +11,7 @@ For the plant ``E x+ = A x + B u``, ``y = C x + D u`` (+ disturbances and faults
     J = C_z T E + D_y C + T_0 A - G, \quad L = D_u + D_y D + T_0 B
 
 (``T0 E = 0``: algebraic rows, which an estimate may use).  In exact arithmetic K, U, J and L vanish; in stored numbers
-each is a `Ball` around its rounded value.  What they drive stays within the bounds of `errors_per_unit`, for any x and u.
+each is a `Ball` around its rounded value.  What they drive stays within the bounds of `errors_per_unit`.
 Source: `robust.md`, theorem 1, with the corrections 3 and 7.
 """
 

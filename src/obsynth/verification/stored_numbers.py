@@ -39,6 +39,7 @@ NOTICED = 1e-3
 #: Tolerance of the comparison of gains found in double precision.
 GAIN_TOLERANCE = 1e-9
 
+_ON_THE_BOUNDARY = "the plant has a pole on the boundary of stability: no finite gain exists for stored numbers"
 _NAMES = ("states", "inputs", "disturbances")
 _WITNESSES = ("state_error", "input_error", "disturbance_error")
 
@@ -67,8 +68,8 @@ class StoredErrors:
         return {name: bound for name, bound in zip(_WITNESSES, self.bounds, strict=True) if bound.shape[1]}
 
 
-def stored_number_rows(design: ObserverDesign, tracked: TrackedPlant) -> Iterator[Check]:
-    """Yield the rows on stored numbers."""
+def stored_number_rows(design: ObserverDesign, tracked: TrackedPlant, gamma: float | None = None) -> Iterator[Check]:
+    """Yield the rows on stored numbers; ``gamma`` is the gain from the disturbances that is claimed, if any."""
     plant, observer = design.linear
     found = StoredErrors.of(tracked, observer)
     claimed = {name: design.certificate.matrices.get(name) for name in _WITNESSES}
@@ -88,7 +89,7 @@ def stored_number_rows(design: ObserverDesign, tracked: TrackedPlant) -> Iterato
         elif claimed[name] is not None:
             yield upper_bound_check(f"stored numbers: {kind}", "there is something to claim", 1.0, 0.0,
                                     source="certificate")  # fmt: skip
-    yield from _gain_rows(design, tracked, found.channel)
+    yield from _gain_rows(design, tracked, found.channel, gamma)
 
 
 def _per_unit(
@@ -112,22 +113,24 @@ def _per_unit(
         return upper_bound_check(name, what, np.nan, 0.0, source=source, detail="the claimed bound has another shape")
     allowed = REPEATED * claimed
     # Where nothing is claimed to be left, nothing may be.
-    ratios = np.where(bound > allowed, np.where(allowed > 0.0, bound / np.where(allowed > 0.0, allowed, 1.0), np.inf), 0.0)
-    worst = np.unravel_index(int(np.argmax(ratios)), ratios.shape)
-    if not ratios[worst] > 0.0:
-        worst = (first + int(i), int(j))
+    shares = np.where(allowed > 0.0, bound / np.where(allowed > 0.0, allowed, 1.0), np.inf)
+    ratios = np.where(bound > allowed, shares, 0.0)
+    row_found, column = divmod(int(np.argmax(ratios)), ratios.shape[1])
+    if not ratios[row_found, column] > 0.0:
+        row_found, column = first + int(i), int(j)
     return upper_bound_check(
-        name, f"{what}: at most as claimed", float(bound[worst]), float(allowed[worst]), source=source, kind="proved",
-        detail=text,
+        name, f"{what}: at most as claimed", float(bound[row_found, column]), float(allowed[row_found, column]),
+        source=source, kind="proved", detail=text,
     )  # fmt: skip
 
 
-def _gain_rows(design: ObserverDesign, tracked: TrackedPlant, channel: RemainderChannel) -> Iterator[Check]:
+def _gain_rows(
+    design: ObserverDesign, tracked: TrackedPlant, channel: RemainderChannel, gamma: float | None
+) -> Iterator[Check]:
     """Yield what plant and stored observer together make of disturbances."""
     plant, observer = design.linear
     if not plant.nd or not observer.fault_names:
         return
-    gamma = design.certificate.claims.get("gamma")
     system = _Composite(plant, observer, tracked, channel)
     unit = 1.0 if plant.dt > 0.0 else system.fastest
     frequencies = unit * np.geomspace(SLOWEST, np.pi if plant.dt > 0.0 else 10.0, POINTS)
@@ -202,7 +205,7 @@ def _when_it_matters(system: _Composite, level: float, unit: float, slow: float)
         left = max(float(np.max(np.abs(system.K), initial=0.0)), float(np.max(np.abs(system.J), initial=0.0)))
         seconds = float(np.log(max(level / max(left, 1e-300), 1.0)) / rate)
         return (
-            f"the plant has a pole outside the region of stability: no finite gain exists for stored numbers; where its "
+            "the plant has a pole outside the region of stability: no finite gain exists for stored numbers; where its "
             f"state is not held down, they matter after about {seconds:.3g} s"
         ), seconds
     last = SLOWEST
@@ -210,14 +213,11 @@ def _when_it_matters(system: _Composite, level: float, unit: float, slow: float)
         if system.gain(frequency * unit) > level:
             seconds = per_unit / frequency
             return (
-                "the plant has a pole on the boundary of stability: no finite gain exists for stored numbers; they matter "
-                f"for disturbances that last longer than about {seconds:.3g} s ({seconds / 86_400:.3g} days)"
+                f"{_ON_THE_BOUNDARY}; they matter for disturbances that last longer than about "
+                f"{seconds:.3g} s ({seconds / 86_400:.3g} days)"
             ), seconds
         last = frequency
     if slow > level:
         last = SLOWEST
     seconds = per_unit / last
-    return (
-        "the plant has a pole on the boundary of stability: no finite gain exists for stored numbers; they do not matter "
-        f"within {seconds:.3g} s"
-    ), seconds
+    return f"{_ON_THE_BOUNDARY}; they do not matter within {seconds:.3g} s", seconds

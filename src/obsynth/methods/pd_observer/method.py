@@ -11,8 +11,12 @@ CLAIMS = {
     "disk_centre": ClaimMeaning("1/s", "c of the disk |s + c| < r that holds every eigenvalue", "disk"),
     "disk_radius": ClaimMeaning("1/s", "r of that disk", "disk"),
     "gain_bound": ClaimMeaning("", "bound on the norm of the gains", "gain bound"),
-    "fault_rate_gain": ClaimMeaning("s", "bound on the l2 gain from the rate of the faults to the fault error: proved", "LMI, rate"),
-    "noise_gain": ClaimMeaning("", "bound on the l2 gain from noise and its derivative to the fault error: proved", "LMI, noise"),
+    "fault_rate_gain": ClaimMeaning(
+        "s", "bound on the l2 gain from the rate of the faults to the fault error: proved", "LMI, rate"
+    ),
+    "noise_gain": ClaimMeaning(
+        "", "bound on the l2 gain from noise and its derivative to the fault error: proved", "LMI, noise"
+    ),
     "adaptation_low": ClaimMeaning("", "stable for every adaptation gain from here, proved", "adaptation range"),
     "adaptation_high": ClaimMeaning("", "to here", "adaptation range"),
 }

@@ -114,7 +114,10 @@ def _claims_row(design: ObserverDesign, facts: GainScheduleSummary, ranks: Horiz
         "condition": ranks.condition, "residual_directions": float(ranks.directions), "contraction": facts.contraction,
         "steps": float(facts.steps),
     }  # fmt: skip
-    places = {"condition_k": (ranks.condition_k, ranks.condition), "excitation_k": (facts.excitation_k, facts.excitation)}
+    places = {
+        "condition_k": (ranks.condition_k, ranks.condition),
+        "excitation_k": (facts.excitation_k, facts.excitation),
+    }
     found |= {name: float(k) for name, (k, value) in places.items() if name in claims and not np.isnan(value)}
     if not np.isnan(facts.excitation):
         found["excitation"] = facts.excitation
