@@ -6,6 +6,8 @@ import inspect
 from collections.abc import Callable, Mapping
 from typing import Any, TypeAlias
 
+import numpy as np
+
 from obsynth.analysis.conditions import Condition
 from obsynth.analysis.transformations import StateRecovery
 from obsynth.errors import SpecError, VerificationError
