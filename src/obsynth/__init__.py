@@ -13,6 +13,10 @@ if TYPE_CHECKING:
     from obsynth.analysis.identifiability import Identifiability, identifiability
     from obsynth.analysis.structure import analyse_structure
     from obsynth.analysis.transformations import discretise, eliminate_algebraic_states
+    from obsynth.analysis.transformations.linearisation import linearise
+    from obsynth.calibration.box import CalibratedBox
+    from obsynth.calibration.calibrating import calibrate
+    from obsynth.calibration.result import Calibration
     from obsynth.data.run import DataRun, run_on_data
     from obsynth.errors import (
         InfeasibleError,
@@ -32,6 +36,12 @@ if TYPE_CHECKING:
     from obsynth.experiments.parameter_simulation import RecursiveSimulation
     from obsynth.experiments.simulation import Simulation, simulate
     from obsynth.exporting.files import export
+    from obsynth.importing.andes import from_andes
+    from obsynth.importing.fmu import from_fmu
+    from obsynth.importing.matlab import from_matlab
+    from obsynth.importing.matrices import from_pandas, from_sympy
+    from obsynth.importing.modelica import from_modelica
+    from obsynth.importing.state_space import from_control, from_scipy
     from obsynth.methods.adaptive_observer.public import adaptive_observer
     from obsynth.methods.dae_adaptive_observer.public import dae_adaptive_observer
     from obsynth.methods.descriptor_kalman.public import descriptor_kalman
@@ -40,6 +50,7 @@ if TYPE_CHECKING:
         fault_estimation_filter,
         fault_estimation_filter_from_gains,
     )
+    from obsynth.methods.functional_filter.public import functional_filter
     from obsynth.methods.pd_observer.public import (
         apply_adaptation_gain,
         pd_delta_scan,
@@ -77,11 +88,17 @@ if TYPE_CHECKING:
     from obsynth.simulation.profiles import Drift, Intermittent, Ramp, Sine, Step
     from obsynth.simulation.scenario import Scenario
     from obsynth.simulation.time_varying import simulate_time_varying
+    from obsynth.spec.loader import Spec, load_spec
 
 __version__ = "0.1.0"
 
 # Names are imported when they are first used, so that `import obsynth` stays fast.
 _HOMES = {
+    "functional_filter": "obsynth.methods.functional_filter.public",
+    "CalibratedBox": "obsynth.calibration.box",
+    "Calibration": "obsynth.calibration.result",
+    "calibrate": "obsynth.calibration.calibrating",
+    "linearise": "obsynth.analysis.transformations.linearisation",
     "DecoupledPlant": "obsynth.analysis.diagnosis.decoupled",
     "decouple": "obsynth.analysis.diagnosis.decoupled",
     "diagnose": "obsynth.analysis.diagnosis.diagnosing",
@@ -134,6 +151,7 @@ _HOMES = {
     "Simulation": "obsynth.experiments.simulation",
     "Sine": "obsynth.simulation.profiles",
     "SolverError": "obsynth.errors",
+    "Spec": "obsynth.spec.loader",
     "SpecError": "obsynth.errors",
     "SteadyState": "obsynth.methods.recursive.steady_filter",
     "Step": "obsynth.simulation.profiles",
@@ -156,8 +174,17 @@ _HOMES = {
     "fault_estimation_filter_from_gains": "obsynth.methods.fault_estimation_filter.public",
     "fault_model": "obsynth.plants.fault_models",
     "fault_response": "obsynth.methods.ui_pi_observer.checks.fault_response",
+    "from_andes": "obsynth.importing.andes",
+    "from_control": "obsynth.importing.state_space",
+    "from_fmu": "obsynth.importing.fmu",
+    "from_matlab": "obsynth.importing.matlab",
+    "from_modelica": "obsynth.importing.modelica",
+    "from_pandas": "obsynth.importing.matrices",
+    "from_scipy": "obsynth.importing.state_space",
+    "from_sympy": "obsynth.importing.matrices",
     "html_report": "obsynth.report.page",
     "load": "obsynth.results.gain_sets",
+    "load_spec": "obsynth.spec.loader",
     "monitor": "obsynth.experiments.monitors.residual_monitor",
     "online_monitor": "obsynth.experiments.monitors.online_monitor",
     "pd_delta_scan": "obsynth.methods.pd_observer.public",
@@ -178,6 +205,8 @@ __all__ = [
     "Adaptation",
     "Alarm",
     "BatchEstimates",
+    "CalibratedBox",
+    "Calibration",
     "Certificate",
     "Check",
     "DAEBatchEstimates",
@@ -221,6 +250,7 @@ __all__ = [
     "Simulation",
     "Sine",
     "SolverError",
+    "Spec",
     "SpecError",
     "SteadyState",
     "Step",
@@ -233,6 +263,7 @@ __all__ = [
     "adaptive_observer",
     "analyse_structure",
     "apply_adaptation_gain",
+    "calibrate",
     "dae_adaptive_observer",
     "decide",
     "decouple",
@@ -247,9 +278,20 @@ __all__ = [
     "fault_estimation_filter_from_gains",
     "fault_model",
     "fault_response",
+    "from_andes",
+    "from_control",
+    "from_fmu",
+    "from_matlab",
+    "from_modelica",
+    "from_pandas",
+    "from_scipy",
+    "from_sympy",
+    "functional_filter",
     "html_report",
     "identifiability",
+    "linearise",
     "load",
+    "load_spec",
     "monitor",
     "online_monitor",
     "pd_delta_scan",

@@ -10,8 +10,8 @@ from obsynth.cli.arguments import add_force, add_gains, add_json, add_quiet
 
 _RUN = "Run a design on measured data: a log, or a stream on standard input, a row in, a row out."
 _EXPORT = (
-    "Write a gain set for Simulink (.mat), numpy (.npz) or C99 (.c and .h); of a recursive design for a time-invariant "
-    "plant, its steady state."
+    "Write a gain set for Simulink (.mat), numpy (.npz), C99 (.c and .h), or as a functional mock-up unit for "
+    "co-simulation (.fmu); of a recursive design for a time-invariant plant, its steady state."
 )
 _REPORT = "Verify a gain set again and write one self-contained HTML page about it."
 _RUN_DETAILS = """\
@@ -84,10 +84,18 @@ def add_data_verbs(verbs: Any) -> None:
 
     export = verbs.add_parser("export", help=_EXPORT, description=_EXPORT)
     add_gains(export)
-    export.add_argument("--to", type=Path, required=True, metavar="FILE", help=".mat, .npz, or .c (with a header)")
     export.add_argument(
-        "--sample-time", type=float, metavar="SECONDS", help="sample a continuous-time observer (needed for C)"
+        "--to", type=Path, required=True, metavar="FILE", help=".mat, .npz, .c (with a header), or .fmu"
     )
+    export.add_argument(
+        "--sample-time", type=float, metavar="SECONDS", help="sample a continuous-time observer (needed for C and FMU)"
+    )
+    export.add_argument("--fmi", choices=("2.0", "3.0"), default="2.0", help="version of FMI for .fmu (default: 2.0)")
+    export.add_argument(
+        "--threshold", type=_pair, action="append", default=[], metavar="OUTPUT=LEVEL",
+        help="for .fmu: alarm when the absolute value of an output, such as fhat[pump], passes a level",
+    )  # fmt: skip
+    export.add_argument("--warm-up", type=float, metavar="SECONDS", help="for .fmu: no alarms in these seconds")
     add_force(export)
     add_json(export)
     export.set_defaults(verb="export")

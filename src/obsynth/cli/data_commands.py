@@ -67,7 +67,10 @@ def run_export(options: argparse.Namespace) -> int:
     design = load(options.gains)
     for file, kind in exported_files(options.to).items():
         output_file(file, kind, options, option="--to")
-    files = export(design, options.to, sample_time=options.sample_time)
+    files = export(
+        design, options.to, sample_time=options.sample_time, fmi=options.fmi,
+        thresholds=numbers_of(options.threshold) or None, warm_up=options.warm_up,
+    )  # fmt: skip
     if options.json:
         print_json({"command": "export", "gains": str(options.gains), "files": [str(file) for file in files]})
     else:

@@ -8,6 +8,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.methods.registry import REGISTRY, method_spec
+from obsynth.numerics.failures import failed_computations
 from obsynth.numerics.threads import one_thread_if_small
 from obsynth.results.report import VerificationReport
 
@@ -36,6 +37,8 @@ def verify(design: ObserverDesign, *, printed_digits: int | None = None) -> Veri
     ------
     SpecError
         The design's method is unknown, or ``printed_digits`` is not between 1 and 15.
+    SolverError
+        LAPACK fails on the numbers of the design: nothing is known.
     """
     if design.method not in REGISTRY:
         raise SpecError(f"Designs of method {design.method!r} cannot be verified by this version.", path="method")
@@ -43,5 +46,5 @@ def verify(design: ObserverDesign, *, printed_digits: int | None = None) -> Veri
         raise SpecError(f"printed_digits is {printed_digits}: give 1 to 15 decimals.", path="printed_digits")
     checks = method_spec(design.method).load("checks")
     # A corrupted design may overflow; what is not a number fails its check, so no warning is needed.
-    with np.errstate(all="ignore"), one_thread_if_small(design.plant.nx):
+    with np.errstate(all="ignore"), failed_computations(), one_thread_if_small(design.plant.nx):
         return VerificationReport.of(tuple(checks(design, printed_digits)))
