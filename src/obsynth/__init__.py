@@ -50,6 +50,7 @@ if TYPE_CHECKING:
         fault_estimation_filter,
         fault_estimation_filter_from_gains,
     )
+    from obsynth.methods.functional_filter.public import functional_filter
     from obsynth.methods.pd_observer.public import (
         apply_adaptation_gain,
         pd_delta_scan,
@@ -93,6 +94,7 @@ __version__ = "0.1.0"
 
 # Names are imported when they are first used, so that `import obsynth` stays fast.
 _HOMES = {
+    "functional_filter": "obsynth.methods.functional_filter.public",
     "CalibratedBox": "obsynth.calibration.box",
     "Calibration": "obsynth.calibration.result",
     "calibrate": "obsynth.calibration.calibrating",
@@ -284,6 +286,7 @@ __all__ = [
     "from_pandas",
     "from_scipy",
     "from_sympy",
+    "functional_filter",
     "html_report",
     "identifiability",
     "linearise",
