@@ -106,15 +106,25 @@ def uncertain_system(
             raise SpecError("plant has no matrix A.", path="plant.A") from error
         except TypeError as error:
             raise SpecError(f"plant: {error}.", path="plant") from error
+    return with_expressions(system, entries, constants, tolerance=tolerance, **options)
+
+
+def with_expressions(
+    system: DescriptorSystem, entries: Mapping[str, list[Entry]], constants: Any, *, tolerance: Any = None,
+    **options: Any,
+) -> DescriptorSystem:  # fmt: skip
+    """Return a plant with expressions in some entries, at the nominal values of the constants."""
+    names = set(constants.constants if isinstance(constants, ConstantsBox) else constants or {})
+    # What an expression puts into an entry is no number of its own, to have a tolerance of its own.
     box, more = _boxed(constants, tolerance, {}, matrices_of(system), entries, options)
-    return filled_plant(system, Uncertainty(box, _joined(entries, more)))
+    return filled_plant(system, Uncertainty(box, _joined(entries, more)), names)
 
 
-def filled_plant(system: DescriptorSystem, uncertainty: Uncertainty) -> DescriptorSystem:
+def filled_plant(system: DescriptorSystem, uncertainty: Uncertainty, stated: set[str]) -> DescriptorSystem:
     """Return a plant as written with its entries at the nominal values of the constants."""
     values = {name: item.nominal for name, item in uncertainty.box.constants.items()}
     matrices = uncertainty.filled(matrices_of(system), values)
-    unknown = sorted(name for name in uncertainty.box.constants if name not in uncertainty.used)
+    unknown = sorted(name for name in stated - uncertainty.used if name in uncertainty.box.constants)
     if unknown:
         raise SpecError(
             f"The constant {unknown[0]!r} stands in no matrix: write an entry as an expression in it, or remove it.",

@@ -13,6 +13,7 @@ from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.spec.checking import DocumentProblems
+from obsynth.spec.constants import with_constants
 from obsynth.spec.documents import read_names
 from obsynth.spec.matrices import read_matrices, read_matrix
 
@@ -119,7 +120,7 @@ def _invariant_plant(section: PlantSection, source: Path, prefix: str) -> Descri
         if isinstance(arguments[matrix], list) and arguments[names] is None:
             arguments[names] = arguments[matrix]
 
-    return _placed(lambda: DescriptorSystem(**arguments), source, prefix)
+    return _placed(lambda: with_constants(DescriptorSystem(**arguments), section), source, prefix)
 
 
 def transformed(

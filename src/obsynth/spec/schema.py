@@ -7,8 +7,9 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import Discriminator, Field, Tag
+from pydantic import Discriminator, Field, Tag, model_validator
 
+from obsynth.spec.constants import with_entries
 from obsynth.spec.schema_values import (
     EquationMatrix,
     Matrix,
@@ -42,6 +43,22 @@ class TransformSection(Section):
     sample_time: Positive | None = None
 
 
+class EntrySection(Section):
+    """One entry of a matrix as an expression in the constants: row and column by name, or by number from 1."""
+
+    row: Text | int
+    column: Text | int
+    value: Text | float
+
+
+class BoxSection(Section):
+    """Where the tolerances come from."""
+
+    source: Literal["stated", "set-membership", "calibrated"]
+    level: float | None = None
+    digest: Text | None = None
+
+
 class PlantSection(Section):
     """A plant, matrix by matrix."""
 
@@ -67,7 +84,18 @@ class PlantSection(Section):
     scales: dict[Text, float] | None = None
     units: dict[Text, str] | None = None
     sensor_noise: dict[Text, Positive] | None = None
+    constants: dict[Text, Any] | None = None
+    entries: dict[Text, list[EntrySection]] | None = None
+    tolerance: dict[Text, Text | float] | None = None
+    variation: Literal["constant", "varying"] | None = None
+    box: BoxSection | None = None
     transform: TransformSection | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _expressions(cls, data: Any) -> Any:
+        """Take expressions in the constants out of rows of numbers."""
+        return with_entries(data)
 
 
 class PlantDocument(PlantSection):
