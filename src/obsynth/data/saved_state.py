@@ -13,7 +13,7 @@ from obsynth.results.files import write_atomically
 from obsynth.results.gain_sets import design_as_dict, digest_of, plain, restored
 
 KIND = "obsynth run state"
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 
 
 def digest_of_gains(design: ObserverDesign) -> str:
