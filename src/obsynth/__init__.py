@@ -13,6 +13,10 @@ if TYPE_CHECKING:
     from obsynth.analysis.identifiability import Identifiability, identifiability
     from obsynth.analysis.structure import analyse_structure
     from obsynth.analysis.transformations import discretise, eliminate_algebraic_states
+    from obsynth.analysis.transformations.linearisation import linearise
+    from obsynth.calibration.box import CalibratedBox
+    from obsynth.calibration.calibrating import calibrate
+    from obsynth.calibration.result import Calibration
     from obsynth.data.run import DataRun, run_on_data
     from obsynth.errors import (
         InfeasibleError,
@@ -32,6 +36,12 @@ if TYPE_CHECKING:
     from obsynth.experiments.parameter_simulation import RecursiveSimulation
     from obsynth.experiments.simulation import Simulation, simulate
     from obsynth.exporting.files import export
+    from obsynth.importing.andes import from_andes
+    from obsynth.importing.fmu import from_fmu
+    from obsynth.importing.matlab import from_matlab
+    from obsynth.importing.matrices import from_pandas, from_sympy
+    from obsynth.importing.modelica import from_modelica
+    from obsynth.importing.state_space import from_control, from_scipy
     from obsynth.methods.adaptive_observer.public import adaptive_observer
     from obsynth.methods.dae_adaptive_observer.public import dae_adaptive_observer
     from obsynth.methods.descriptor_kalman.public import descriptor_kalman
@@ -40,6 +50,7 @@ if TYPE_CHECKING:
         fault_estimation_filter,
         fault_estimation_filter_from_gains,
     )
+    from obsynth.methods.functional_filter.public import functional_filter
     from obsynth.methods.pd_observer.public import (
         apply_adaptation_gain,
         pd_delta_scan,
@@ -64,10 +75,13 @@ if TYPE_CHECKING:
     from obsynth.observers.running import RunningObserver
     from obsynth.observers.running import RunningObserver as RunningDAEObserver
     from obsynth.observers.running import RunningObserver as RunningRecursiveObserver
+    from obsynth.plants.constants import Constant, ConstantsBox
     from obsynth.plants.dae.model import DAEModel
     from obsynth.plants.descriptor import DescriptorSystem
     from obsynth.plants.fault_models import FaultModel, fault_model
     from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+    from obsynth.plants.uncertain_system import uncertain_system
+    from obsynth.plants.uncertainty import Uncertainty
     from obsynth.report.page import html_report
     from obsynth.results.delta_scan import DeltaScan
     from obsynth.results.design import Certificate, ObserverDesign
@@ -78,11 +92,18 @@ if TYPE_CHECKING:
     from obsynth.simulation.profiles import Drift, Intermittent, Ramp, Sine, Step
     from obsynth.simulation.scenario import Scenario
     from obsynth.simulation.time_varying import simulate_time_varying
+    from obsynth.spec.loader import Spec, load_spec
+    from obsynth.tolerances.robustness import Robustness, robustness
 
 __version__ = "0.1.0"
 
 # Names are imported when they are first used, so that `import obsynth` stays fast; ``module:name`` is another name.
 _HOMES = {
+    "functional_filter": "obsynth.methods.functional_filter.public",
+    "CalibratedBox": "obsynth.calibration.box",
+    "Calibration": "obsynth.calibration.result",
+    "calibrate": "obsynth.calibration.calibrating",
+    "linearise": "obsynth.analysis.transformations.linearisation",
     "DecoupledPlant": "obsynth.analysis.diagnosis.decoupled",
     "decouple": "obsynth.analysis.diagnosis.decoupled",
     "diagnose": "obsynth.analysis.diagnosis.diagnosing",
@@ -91,6 +112,12 @@ _HOMES = {
     "StructuredResidual": "obsynth.analysis.diagnosis.banks",
     "dae_adaptive_observer": "obsynth.methods.dae_adaptive_observer.public",
     "DAETrajectory": "obsynth.simulation.dae",
+    "Constant": "obsynth.plants.constants",
+    "ConstantsBox": "obsynth.plants.constants",
+    "Robustness": "obsynth.tolerances.robustness",
+    "Uncertainty": "obsynth.plants.uncertainty",
+    "robustness": "obsynth.tolerances.robustness",
+    "uncertain_system": "obsynth.plants.uncertain_system",
     "simulate_dae": "obsynth.simulation.dae",
     "DAEBatchEstimates": "obsynth.observers.dae.batch",
     "DAEEstimates": "obsynth.observers.dae.estimates",
@@ -135,6 +162,7 @@ _HOMES = {
     "Simulation": "obsynth.experiments.simulation",
     "Sine": "obsynth.simulation.profiles",
     "SolverError": "obsynth.errors",
+    "Spec": "obsynth.spec.loader",
     "SpecError": "obsynth.errors",
     "SteadyState": "obsynth.methods.recursive.steady_filter",
     "Step": "obsynth.simulation.profiles",
@@ -157,8 +185,17 @@ _HOMES = {
     "fault_estimation_filter_from_gains": "obsynth.methods.fault_estimation_filter.public",
     "fault_model": "obsynth.plants.fault_models",
     "fault_response": "obsynth.methods.ui_pi_observer.checks.fault_response",
+    "from_andes": "obsynth.importing.andes",
+    "from_control": "obsynth.importing.state_space",
+    "from_fmu": "obsynth.importing.fmu",
+    "from_matlab": "obsynth.importing.matlab",
+    "from_modelica": "obsynth.importing.modelica",
+    "from_pandas": "obsynth.importing.matrices",
+    "from_scipy": "obsynth.importing.state_space",
+    "from_sympy": "obsynth.importing.matrices",
     "html_report": "obsynth.report.page",
     "load": "obsynth.results.gain_sets",
+    "load_spec": "obsynth.spec.loader",
     "monitor": "obsynth.experiments.monitors.residual_monitor",
     "online_monitor": "obsynth.experiments.monitors.online_monitor",
     "pd_delta_scan": "obsynth.methods.pd_observer.public",
@@ -179,8 +216,12 @@ __all__ = [
     "Adaptation",
     "Alarm",
     "BatchEstimates",
+    "CalibratedBox",
+    "Calibration",
     "Certificate",
     "Check",
+    "Constant",
+    "ConstantsBox",
     "DAEBatchEstimates",
     "DAEEstimates",
     "DAEModel",
@@ -215,6 +256,7 @@ __all__ = [
     "RecursiveEstimates",
     "RecursiveObserver",
     "RecursiveSimulation",
+    "Robustness",
     "RunningDAEObserver",
     "RunningObserver",
     "RunningRecursiveObserver",
@@ -222,18 +264,21 @@ __all__ = [
     "Simulation",
     "Sine",
     "SolverError",
+    "Spec",
     "SpecError",
     "SteadyState",
     "Step",
     "StructuredResidual",
     "Stuck",
     "TimeVaryingDescriptorSystem",
+    "Uncertainty",
     "Uniform",
     "VerificationError",
     "VerificationReport",
     "adaptive_observer",
     "analyse_structure",
     "apply_adaptation_gain",
+    "calibrate",
     "dae_adaptive_observer",
     "decide",
     "decouple",
@@ -248,14 +293,26 @@ __all__ = [
     "fault_estimation_filter_from_gains",
     "fault_model",
     "fault_response",
+    "from_andes",
+    "from_control",
+    "from_fmu",
+    "from_matlab",
+    "from_modelica",
+    "from_pandas",
+    "from_scipy",
+    "from_sympy",
+    "functional_filter",
     "html_report",
     "identifiability",
+    "linearise",
     "load",
+    "load_spec",
     "monitor",
     "online_monitor",
     "pd_delta_scan",
     "pd_observer",
     "pd_observer_from_gains",
+    "robustness",
     "run_batch",
     "run_on_data",
     "sample_observer",
@@ -265,6 +322,7 @@ __all__ = [
     "steady_state_filter",
     "ui_pi_observer",
     "ui_pi_observer_from_gains",
+    "uncertain_system",
     "verify",
 ]
 

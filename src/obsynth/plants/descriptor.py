@@ -4,30 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, read_only
-from obsynth.numerics.sparse import as_sparse_matrix, dense, is_sparse
-from obsynth.plants.names import checked_names
+from obsynth.numerics.sparse import dense, is_sparse
 from obsynth.plants.origin import carry_origin
-from obsynth.plants.validation import (
-    Problems,
-    any_matrix,
-    checked_dt,
-    checked_point,
-    checked_scales,
-    checked_units,
-    expected_shapes,
-    matrix_or_picks,
-    picked_names,
-    signal_counts,
-    square,
-    uncounted_signals,
-)
+from obsynth.plants.reading import plant_fields
+from obsynth.plants.uncertainty import UNCERTAIN_MATRICES, Uncertainty, uncertainty_of
+from obsynth.plants.validation import expected_shapes
 
 MatrixOrNames = ArrayLike | Sequence[str] | None
 #: For `expected_shapes`, where only the names of the matrices matter.
@@ -50,7 +38,8 @@ class DescriptorSystem:
         ``(nx, nx)``, may be singular; ``None`` means the identity.
     A : array_like or sparse matrix
         ``(nx, nx)``.  Sparse matrices of scipy stay sparse, here and wherever else they are given; methods get the
-        plant without its algebraic states, which is dense (see `eliminate_algebraic_states` and `dense`).
+        plant without its algebraic states, which is dense (see `eliminate_algebraic_states` and `dense`).  Any matrix
+        may be a labelled ``pandas.DataFrame``: its labels are the names, and rows and columns are put in one order.
     B : array_like, optional
         Known inputs ``(nx, nu)``.
     C : array_like or list of str, optional
@@ -59,9 +48,10 @@ class DescriptorSystem:
         Feedthrough of the known inputs ``(ny, nu)``.
     Bf, Df : array_like, optional
         Faults ``(nx, nf)`` and ``(ny, nf)``.  ``Bf`` may be a list of state names: the fault is then
-        added to the equation of the same number as that state.
+        added to the equation of the same number as that state.  ``Df`` may be a list of output names: each adds a
+        fault of that sensor, after those of ``Bf``.
     Bd, Dd : array_like, optional
-        Unknown inputs (disturbances) ``(nx, nd)`` and ``(ny, nd)``; ``Bd`` by name as ``Bf``.
+        Unknown inputs (disturbances) ``(nx, nd)`` and ``(ny, nd)``; by name as faults.
     Bw, Dw : array_like, optional
         Noise ``(nx, nw)`` and ``(ny, nw)``: ``w`` is white with unit covariance, so the columns hold
         standard deviations (per sample for ``dt > 0``, and always per sample in ``Dw``).
@@ -75,6 +65,11 @@ class DescriptorSystem:
         Factor of named inputs and outputs: what a log holds, times the factor, is in the signal's unit.
     units : mapping, optional
         Unit of named signals, as text.
+
+    sensor_noise : mapping, optional
+        Standard deviation of the noise of named outputs, per sample: adds a column to ``Dw`` for each.
+    uncertainty : Uncertainty, optional
+        Constants with tolerances in the matrices, see `obsynth.uncertain_system`.
 
     Raises
     ------
@@ -110,19 +105,20 @@ class DescriptorSystem:
     operating_point: Mapping[str, float]
     scales: Mapping[str, float]
     units: Mapping[str, str]
+    uncertainty: Uncertainty | None
 
     def __init__(
         self,
-        E: ArrayLike | None,
-        A: ArrayLike,
+        E: ArrayLike | None = None,
+        A: ArrayLike | None = None,
         B: ArrayLike | None = None,
         C: MatrixOrNames = None,
         *,
         D: ArrayLike | None = None,
         Bf: MatrixOrNames = None,
-        Df: ArrayLike | None = None,
+        Df: MatrixOrNames = None,
         Bd: MatrixOrNames = None,
-        Dd: ArrayLike | None = None,
+        Dd: MatrixOrNames = None,
         Bw: ArrayLike | None = None,
         Dw: ArrayLike | None = None,
         dt: float = 0.0,
@@ -135,45 +131,20 @@ class DescriptorSystem:
         operating_point: Mapping[str, float] | None = None,
         scales: Mapping[str, float] | None = None,
         units: Mapping[str, str] | None = None,
+        sensor_noise: Mapping[str, float] | None = None,
+        uncertainty: Uncertainty | Mapping[str, Any] | None = None,
     ) -> None:
-        problems = Problems()
-        a = problems.collect(lambda: square(any_matrix(A, "A"), "A"))
-        problems.raise_if_any()
-        nx = a.shape[0]
-        states = problems.collect(lambda: checked_names(state_names, nx, prefix="x", what="state_names"))
-        problems.raise_if_any()
-        given: dict[str, FloatArray | None] = {"A": a, "E": _identity_like(a) if E is None else None}
-        asked = {"E": E, "B": B, "C": C, "D": D, "Bf": Bf, "Df": Df, "Bd": Bd, "Dd": Dd, "Bw": Bw, "Dw": Dw}
-        for name, value in asked.items():
-            if value is not None:
-                given[name] = problems.collect(partial(matrix_or_picks, value, name, states))
-        sizes = signal_counts(given)
-        # What depends on a matrix that could not be read is not judged: its own message is enough.
-        broken = {name for name, value in asked.items() if value is not None and given[name] is None}
-        unknown = uncounted_signals(given, broken)
-        values: dict[str, Any] = {
-            name: problems.shaped(given.get(name), name, shape)
-            for name, shape in expected_shapes(nx, sizes, unknown).items()
-        }
-        values |= {"dt": problems.collect(lambda: checked_dt(dt)), "state_names": states}
-        named = {
-            "input_names": (input_names, "u"),
-            "output_names": (output_names or picked_names(C), "y"),
-            "fault_names": (fault_names or picked_names(Bf), "f"),
-            "disturbance_names": (disturbance_names or picked_names(Bd), "d"),
-            "noise_names": (noise_names, "w"),
-        }
-        for field, (names, signal) in named.items():
-            if signal in unknown:
-                continue
-            values[field] = problems.collect(partial(checked_names, names, sizes[signal], prefix=signal, what=field))
-        problems.raise_if_any()
-        known = {name for field in ("state_names", *named) for name in values[field]}
-        values["operating_point"] = problems.collect(lambda: checked_point(operating_point, known))
-        measured = {*values["input_names"], *values["output_names"]}
-        values["scales"] = problems.collect(lambda: checked_scales(scales, measured))
-        values["units"] = problems.collect(lambda: checked_units(units, known))
-        problems.raise_if_any()
+        if A is None:
+            raise SpecError("A is missing: give the matrix (nx, nx) of the dynamics.", path="A")
+        asked = {"E": E, "A": A, "B": B, "C": C, "D": D, "Bf": Bf, "Df": Df, "Bd": Bd, "Dd": Dd, "Bw": Bw, "Dw": Dw}
+        names = {
+            "state_names": state_names, "input_names": input_names, "output_names": output_names,
+            "fault_names": fault_names, "disturbance_names": disturbance_names, "noise_names": noise_names,
+        }  # fmt: skip
+        values = plant_fields(
+            asked, names, dt=dt, operating_point=operating_point, scales=scales, units=units, sensor_noise=sensor_noise
+        )
+        values["uncertainty"] = uncertainty_of(uncertainty)
         for field, value in values.items():
             object.__setattr__(self, field, read_only(value) if isinstance(value, np.ndarray) else value)
 
@@ -225,18 +196,28 @@ class DescriptorSystem:
         return self.dt > 0.0
 
     def as_dict(self) -> dict[str, Any]:
-        """Return every field, as the constructor takes it."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
+        """Return every field, as the constructor takes it; `uncertainty` only where there is one."""
+        found = {field.name: getattr(self, field.name) for field in fields(self)}
+        if self.uncertainty is None:
+            del found["uncertainty"]
+        else:
+            found["uncertainty"] = self.uncertainty.as_dict()
+        return found
 
     def replace(self, **changes: Any) -> DescriptorSystem:
         """Return a plant with some fields changed, checked again as a whole.
+
+        Tolerances are those of the matrices as they were: they are dropped with a change of one of these.
 
         Parameters
         ----------
         **changes
             Any argument of the constructor.
         """
-        return carry_origin(self, DescriptorSystem(**{**self.as_dict(), **changes}))
+        kept = self.as_dict()
+        if self.uncertainty is not None and changes.keys() & {*UNCERTAIN_MATRICES, "dt"}:
+            del kept["uncertainty"]
+        return carry_origin(self, DescriptorSystem(**{**kept, **changes}))
 
     def __repr__(self) -> str:
         time = f"dt={self.dt:g} s" if self.is_discrete else "continuous"
@@ -244,12 +225,3 @@ class DescriptorSystem:
             f"DescriptorSystem(nx={self.nx}, nu={self.nu}, ny={self.ny}, nf={self.nf}, nd={self.nd}, "
             f"nw={self.nw}, {time})"
         )
-
-
-def _identity_like(a: Any) -> Any:
-    """Return the identity of the size of A, sparse where A is."""
-    if not is_sparse(a):
-        return np.eye(a.shape[0])
-    from scipy.sparse import eye_array
-
-    return as_sparse_matrix(eye_array(a.shape[0], format="csr"), "E")

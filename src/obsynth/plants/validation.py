@@ -10,7 +10,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.sparse import as_sparse_matrix, is_sparse
-from obsynth.plants.names import is_name_list, rows_picking
+from obsynth.plants.names import is_name_list, require_known, rows_picking
 
 #: Matrix, signal of its rows, signal of its columns.
 MATRIX_LAYOUT = (
@@ -48,7 +48,8 @@ class Problems:
         if value is None or (0 in value.shape and 0 in shape):
             return np.zeros(shape)
         if value.shape != shape:
-            self._note(f"{name} is {_by(value.shape)}, but {_by(shape)} is needed.", name)
+            hint = " Is it transposed?" if value.shape == shape[::-1] else ""
+            self._note(f"{name} is {_by(value.shape)}, but {_by(shape)} is needed.{hint}", name)
         return value
 
     def raise_if_any(self) -> None:
@@ -141,9 +142,8 @@ def checked_dt(dt: Any) -> float:
 def checked_point(point: Mapping[str, float] | None, known: set[str]) -> dict[str, float]:
     """Return an operating point whose signals all exist."""
     checked: dict[str, float] = {}
+    require_known(point or {}, known, what="operating_point", kind="signal")
     for name, value in (point or {}).items():
-        if name not in known:
-            raise SpecError(f"operating_point names {name!r}, which is no signal of the plant.", path="operating_point")
         checked[name] = float(as_matrix(value, f"operating_point[{name!r}]")[0, 0])
     return checked
 
@@ -151,9 +151,8 @@ def checked_point(point: Mapping[str, float] | None, known: set[str]) -> dict[st
 def checked_scales(scales: Mapping[str, float] | None, known: set[str]) -> dict[str, float]:
     """Return factors of measured signals, which all exist."""
     checked: dict[str, float] = {}
+    require_known(scales or {}, known, what="scales", kind="input or output")
     for name, value in (scales or {}).items():
-        if name not in known:
-            raise SpecError(f"scales names {name!r}, which is no input or output of the plant.", path="scales")
         factor = float(as_matrix(value, f"scales[{name!r}]")[0, 0])
         if factor == 0.0:
             raise SpecError(f"The scale of {name!r} is 0: give a factor that is not zero.", path="scales")
@@ -165,9 +164,8 @@ def checked_units(units: Mapping[str, str] | None, known: set[str]) -> dict[str,
     """Return units whose signals all exist."""
     if units is not None and not isinstance(units, Mapping):
         raise SpecError(f"units is a {type(units).__name__}: give signal names and their units.", path="units")
+    require_known(units or {}, known, what="units", kind="signal")
     for name, value in (units or {}).items():
-        if name not in known:
-            raise SpecError(f"units names {name!r}, which is no signal of the plant.", path="units")
         if not isinstance(value, str):
             raise SpecError(f"The unit of {name!r} must be a text.", path="units")
     return dict(units or {})

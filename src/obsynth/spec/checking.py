@@ -134,6 +134,8 @@ def _explained(item: Any, model: type[BaseModel], prefix: str) -> tuple[str, str
         text = f"unknown key.{_suggestion(key, known)}"
     elif kind == "missing":
         text = "this key is missing."
+        if key == "dt":
+            text = "this key is missing: give the seconds between samples, or 0 for a plant in continuous time."
     elif kind == "invalid_key" or "[key]" in location:
         text, numbers = f"a key must be a non-empty text, not {described(value)}.", []
     elif kind == "entry_of_k":
@@ -193,7 +195,7 @@ def _known_keys(location: Sequence[str | int]) -> list[str]:
         "scenario": schema.ScenarioSection,
     }
     if "<pick>" in location:
-        return ["outputs" if "C" in location else "states", "file"]
+        return ["outputs" if {"C", "Df", "Dd"} & set(location) else "states", "file"]
     if "<list>" in location and location[0] == "scenario":
         return list(schema.ProfileSection.model_fields)
     around = location[-2]

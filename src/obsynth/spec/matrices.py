@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
+from obsynth.files.inputs import input_file
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.sparse import as_sparse_matrix, is_sparse
-from obsynth.spec.documents import existing_file
 
 #: Larger matrices are refused; of sparse ones, the entries that are stored count.
 MAXIMUM_ENTRIES = 50_000_000
@@ -76,7 +76,7 @@ def _read_array(path: Path, *, variable: str | None, where: str, keep_sparse: bo
         raise SpecError(f"{path.name} has an unknown suffix: matrices are read from {known} files.", path=where)
     if variable is not None and suffix in readers:
         raise SpecError(f"{path.name} holds one matrix only: remove 'variable'.", path=where)
-    existing_file(path, where=where)
+    input_file(path, where=where)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", UserWarning)
