@@ -95,13 +95,13 @@ def load_spec(path: str | Path) -> Spec:
     plant, transformation = built_plant(section, plant_source, prefix), None
     if isinstance(plant, DescriptorSystem):
         # A plant may serve several methods: the spec's own transform takes the place of the plant's.
-        own = reference is not None and reference.transform is not None
-        wanted = (
-            (reference.transform, plant, source, "plant") if own else (section.transform, plant, plant_source, prefix)
-        )
-        if wanted[0] is not None:
+        wanted: TransformSection | None = getattr(reference, "transform", None)
+        document, where = source, "plant"
+        if wanted is None:
+            wanted, document, where = getattr(section, "transform", None), plant_source, prefix
+        if wanted is not None:
             with one_thread_if_small(plant.nx):
-                transformation = transformed(*wanted)
+                transformation = transformed(wanted, plant, document, where)
         plant = plant if transformation is None else transformation.plant
     elif reference is not None and reference.transform is not None:
         raise SpecError(
