@@ -13,6 +13,10 @@ if TYPE_CHECKING:
     from obsynth.analysis.identifiability import Identifiability, identifiability
     from obsynth.analysis.structure import analyse_structure
     from obsynth.analysis.transformations import discretise, eliminate_algebraic_states
+    from obsynth.analysis.transformations.linearisation import linearise
+    from obsynth.calibration.box import CalibratedBox
+    from obsynth.calibration.calibrating import calibrate
+    from obsynth.calibration.result import Calibration
     from obsynth.data.run import DataRun, run_on_data
     from obsynth.errors import (
         InfeasibleError,
@@ -46,6 +50,7 @@ if TYPE_CHECKING:
         fault_estimation_filter,
         fault_estimation_filter_from_gains,
     )
+    from obsynth.methods.functional_filter.public import functional_filter
     from obsynth.methods.pd_observer.public import (
         apply_adaptation_gain,
         pd_delta_scan,
@@ -69,10 +74,13 @@ if TYPE_CHECKING:
     from obsynth.observers.recursive.gain_schedule import BatchEstimates
     from obsynth.observers.recursive.observer import Adaptation, RecursiveObserver
     from obsynth.observers.recursive.running import RunningRecursiveObserver
+    from obsynth.plants.constants import Constant, ConstantsBox
     from obsynth.plants.dae.model import DAEModel
     from obsynth.plants.descriptor import DescriptorSystem
     from obsynth.plants.fault_models import FaultModel, fault_model
     from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+    from obsynth.plants.uncertain_system import uncertain_system
+    from obsynth.plants.uncertainty import Uncertainty
     from obsynth.report.page import html_report
     from obsynth.results.delta_scan import DeltaScan
     from obsynth.results.design import Certificate, ObserverDesign
@@ -84,11 +92,17 @@ if TYPE_CHECKING:
     from obsynth.simulation.scenario import Scenario
     from obsynth.simulation.time_varying import simulate_time_varying
     from obsynth.spec.loader import Spec, load_spec
+    from obsynth.tolerances.robustness import Robustness, robustness
 
 __version__ = "0.1.0"
 
 # Names are imported when they are first used, so that `import obsynth` stays fast.
 _HOMES = {
+    "functional_filter": "obsynth.methods.functional_filter.public",
+    "CalibratedBox": "obsynth.calibration.box",
+    "Calibration": "obsynth.calibration.result",
+    "calibrate": "obsynth.calibration.calibrating",
+    "linearise": "obsynth.analysis.transformations.linearisation",
     "DecoupledPlant": "obsynth.analysis.diagnosis.decoupled",
     "decouple": "obsynth.analysis.diagnosis.decoupled",
     "diagnose": "obsynth.analysis.diagnosis.diagnosing",
@@ -97,6 +111,12 @@ _HOMES = {
     "StructuredResidual": "obsynth.analysis.diagnosis.banks",
     "dae_adaptive_observer": "obsynth.methods.dae_adaptive_observer.public",
     "DAETrajectory": "obsynth.simulation.dae",
+    "Constant": "obsynth.plants.constants",
+    "ConstantsBox": "obsynth.plants.constants",
+    "Robustness": "obsynth.tolerances.robustness",
+    "Uncertainty": "obsynth.plants.uncertainty",
+    "robustness": "obsynth.tolerances.robustness",
+    "uncertain_system": "obsynth.plants.uncertain_system",
     "simulate_dae": "obsynth.simulation.dae",
     "DAEBatchEstimates": "obsynth.observers.dae.batch",
     "DAEEstimates": "obsynth.observers.dae.estimates",
@@ -195,8 +215,12 @@ __all__ = [
     "Adaptation",
     "Alarm",
     "BatchEstimates",
+    "CalibratedBox",
+    "Calibration",
     "Certificate",
     "Check",
+    "Constant",
+    "ConstantsBox",
     "DAEBatchEstimates",
     "DAEEstimates",
     "DAEModel",
@@ -231,6 +255,7 @@ __all__ = [
     "RecursiveEstimates",
     "RecursiveObserver",
     "RecursiveSimulation",
+    "Robustness",
     "RunningDAEObserver",
     "RunningObserver",
     "RunningRecursiveObserver",
@@ -245,12 +270,14 @@ __all__ = [
     "StructuredResidual",
     "Stuck",
     "TimeVaryingDescriptorSystem",
+    "Uncertainty",
     "Uniform",
     "VerificationError",
     "VerificationReport",
     "adaptive_observer",
     "analyse_structure",
     "apply_adaptation_gain",
+    "calibrate",
     "dae_adaptive_observer",
     "decide",
     "decouple",
@@ -273,8 +300,10 @@ __all__ = [
     "from_pandas",
     "from_scipy",
     "from_sympy",
+    "functional_filter",
     "html_report",
     "identifiability",
+    "linearise",
     "load",
     "load_spec",
     "monitor",
@@ -282,6 +311,7 @@ __all__ = [
     "pd_delta_scan",
     "pd_observer",
     "pd_observer_from_gains",
+    "robustness",
     "run_batch",
     "run_on_data",
     "sample_observer",
@@ -291,6 +321,7 @@ __all__ = [
     "steady_state_filter",
     "ui_pi_observer",
     "ui_pi_observer_from_gains",
+    "uncertain_system",
     "verify",
 ]
 

@@ -15,13 +15,7 @@ from obsynth.cli.arguments import add_force, add_json, add_quiet, add_system, ad
 from obsynth.cli.data_arguments import add_data_verbs
 from obsynth.cli.evaluate import add_evaluate_verb
 from obsynth.cli.output import print_error, print_json
-from obsynth.cli.process import (
-    computation_failures,
-    failed_computation,
-    missing_library,
-    unwritable_output,
-    usable_streams,
-)
+from obsynth.cli.process import told_error, unwritable_output, usable_streams
 from obsynth.errors import ObsynthError
 from obsynth.files.inputs import protected_inputs
 
@@ -156,12 +150,12 @@ def _outcome(options: argparse.Namespace) -> int:
         return _verb(options.verb)(options)
     except ObsynthError as error:
         told = error
-    except ImportError as error:
-        if (error.name or "").startswith("obsynth"):
+    except (ImportError, MemoryError, RecursionError, ArithmeticError, ValueError) as error:
+        # LAPACK's errors are among the last.
+        found = told_error(error)
+        if found is None:
             raise
-        told = missing_library(error)
-    except computation_failures() as error:
-        told = failed_computation(error)
+        told = found
     if options.json:
         print_json(told.as_dict())
     print_error(told)

@@ -39,25 +39,16 @@ def unwritable_output(error: OSError) -> int:
     return SpecError.exit_code
 
 
-def computation_failures() -> tuple[type[Exception], ...]:
-    """Return the errors by which libraries say that a computation has failed; loads numpy."""
-    from numpy.linalg import LinAlgError
-
-    return (LinAlgError, ArithmeticError, MemoryError, RecursionError)
-
-
-def failed_computation(error: Exception) -> ObsynthError:
-    """Return what a failed computation is for the user."""
+def told_error(error: Exception) -> ObsynthError | None:
+    """Return what an error of Python or of a library is for the user; `None` if it is a mistake of obsynth."""
     if isinstance(error, MemoryError):
         return SolverError("The computation does not fit into the memory: nothing is known.")
     if isinstance(error, RecursionError):
         return SpecError("An expression or a document is nested too deeply.")
-    return SolverError(
-        f"A computation failed ({str(error).rstrip('.')}): nothing is known. Numbers of very different sizes do this: "
-        "use other units."
-    )
+    if isinstance(error, ImportError):
+        is_ours = (error.name or "").startswith("obsynth")
+        text = f"This needs the library {error.name or error}, which cannot be loaded: install it with pip."
+        return None if is_ours else SpecError(text)
+    from obsynth.numerics.failures import failure_of
 
-
-def missing_library(error: ImportError) -> ObsynthError:
-    """Return what a missing library is for the user."""
-    return SpecError(f"This needs the library {error.name or error}, which is not installed: pip install it.")
+    return failure_of(error)

@@ -10,18 +10,20 @@ import numpy as np
 
 from obsynth.analysis.conditions import Condition
 from obsynth.analysis.transformations import StateRecovery
-from obsynth.errors import SolverError, SpecError, VerificationError
+from obsynth.errors import SpecError, VerificationError
 from obsynth.methods.method_spec import MethodSpec, PlantKind
 from obsynth.methods.registry import REGISTRY, method_spec, methods_for
 from obsynth.methods.synthesis_result import Synthesis
 from obsynth.methods.verifying import verify
+from obsynth.numerics.failures import failed_computations
 from obsynth.numerics.threads import one_thread_if_small
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
-from obsynth.results.design import ObserverDesign
+from obsynth.results.design import Certificate, ObserverDesign
 from obsynth.results.report import VerificationReport
 from obsynth.verification.plant import condition_rows
+from obsynth.verification.stored_numbers import StoredErrors
 
 Plant: TypeAlias = DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel
 
@@ -85,29 +87,28 @@ def design(
     asked = spec.read_options(options)
     for condition in _kind_conditions(plant, spec):
         condition.require()
-    try:
-        with one_thread_if_small(plant.nx):
-            found = spec.load("synthesise")(plant, asked, progress=report_stage)
-            report_stage("verifying the shipped realisation")
-            return verified(plant, method, found, name=name, recovery=recovery)
-    except np.linalg.LinAlgError as error:
-        raise SolverError(
-            f"LAPACK gave up ({error}): the numbers are beyond double precision. Nothing is known; look at the units "
-            "of the plant and at the options."
-        ) from error
+    with failed_computations(), one_thread_if_small(plant.nx):
+        found = spec.load("synthesise")(plant, asked, progress=report_stage)
+        report_stage("verifying the shipped realisation")
+        return verified(plant, method, found, name=name, recovery=recovery)
 
 
 def check(plant: Plant, options: Mapping[str, Mapping[str, Any]] | None = None) -> dict[str, VerificationReport]:
-    """Return, for every method, the report of its existence conditions; nothing is designed or raised."""
+    """Return, for every method, the report of its existence conditions; nothing is designed, and what fails is a row.
+
+    Malformed options are a `SpecError`, numbers beyond double precision a `SolverError`.
+    """
     found = {}
     for method in REGISTRY:
         spec = method_spec(method)
+        asked = {} if method not in (options or {}) else spec.read_options((options or {})[method]).as_given()
         conditions = _kind_conditions(plant, spec)
         if not conditions:
             judge = spec.load("conditions")
             known = set(inspect.signature(judge).parameters)
-            given = {name: value for name, value in (options or {}).get(method, {}).items() if name in known}
-            conditions = judge(plant, **given)
+            given = {name: value for name, value in asked.items() if name in known}
+            with failed_computations():
+                conditions = judge(plant, **given)
         found[method] = VerificationReport.of(condition_rows(conditions))
     return found
 
@@ -170,7 +171,7 @@ def verified(
     plant: Plant, method: str, found: Synthesis, *, name: str, recovery: StateRecovery | None = None
 ) -> ObserverDesign:
     """Return the design with its report."""
-    draft = draft_of(plant, method, found, name=name, recovery=recovery)
+    draft = with_stored_errors(draft_of(plant, method, found, name=name, recovery=recovery))
     report = verify(draft)
     if not report.passed:
         failed = "; ".join(f"{row.name} ({row.value:.3g} against {row.bound:.3g})" for row in report.failures)
@@ -181,3 +182,16 @@ def verified(
             report=report,
         )
     return draft.replace(report=report)
+
+
+def with_stored_errors(draft: ObserverDesign) -> ObserverDesign:
+    """Return a linear design whose certificate claims what rounding of its stored numbers adds to the errors."""
+    spec = method_spec(draft.method)
+    if not spec.tracked:
+        return draft
+    with np.errstate(all="ignore"):
+        found = StoredErrors.of(spec.load("tracked")(draft), draft.linear[1])
+    if found is None:
+        return draft
+    old = draft.certificate
+    return draft.replace(certificate=Certificate({**old.matrices, **found.witnesses()}, old.claims))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import unicodedata
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -11,6 +12,9 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray
+
+#: Control characters, halves of pairs, separators of lines and paragraphs: no table can hold them in a name.
+_UNWRITABLE = frozenset({"Cc", "Cs", "Zl", "Zp"})
 
 
 def checked_names(names: Sequence[str] | None, count: int, *, prefix: str, what: str) -> tuple[str, ...]:
@@ -22,6 +26,10 @@ def checked_names(names: Sequence[str] | None, count: int, *, prefix: str, what:
         raise SpecError(f"{what} must be a list of non-empty texts.", path=what)
     if len(given) != count:
         raise SpecError(f"{what} has {len(given)} names, but there are {count} such signals.", path=what)
+    unwritable = [name for name in given if any(unicodedata.category(sign) in _UNWRITABLE for sign in name)]
+    if unwritable:
+        raise SpecError(f"{what} has the name {unwritable[0]!r}: use no line ends and no control characters.",
+                        path=what)  # fmt: skip
     repeated = sorted(name for name, times in Counter(given).items() if times > 1)
     if repeated:
         raise SpecError(f"{what} repeats {', '.join(map(repr, repeated))}: names must be unique.", path=what)

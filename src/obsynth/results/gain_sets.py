@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import math
@@ -18,6 +19,7 @@ from obsynth.analysis.transformations import StateRecovery
 from obsynth.errors import SpecError
 from obsynth.files.inputs import read_json
 from obsynth.files.outputs import FileKind, write_atomically
+from obsynth.numerics.arguments import is_number
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
@@ -66,6 +68,8 @@ def restored(value: Any) -> Any:
     if isinstance(value, dict):
         if value.keys() == _ARRAY:
             data = [restored(item) for item in value["data"]]
+            if not {type(item) for item in data} <= {float, int}:
+                raise TypeError("an array holds something that is no number")
             return np.array(data, dtype=np.float64).reshape(value["shape"])
         if value.keys() == _FLOAT:
             return float(value["float"])
@@ -159,7 +163,8 @@ def load(path: str | Path) -> ObserverDesign:
         raise SpecError(f"path is {path!r}: give the name of a file that a design was saved to.", path="path")
     source = Path(path)
     if source.is_dir() or not source.exists():
-        raise SpecError(f"{source} cannot be read: there is no such file.", path=str(source))
+        why = os.strerror(errno.EISDIR if source.is_dir() else errno.ENOENT)
+        raise SpecError(f"{source} cannot be read: {why}.", path=str(source))
     document = read_json(source, most=MAXIMUM_CHARACTERS)
     if not isinstance(document, dict) or document.get("kind") != _KIND:
         raise SpecError(f"{source} is no gain set of obsynth.", path=str(source))
@@ -191,6 +196,13 @@ def _design_from(data: dict[str, Any]) -> ObserverDesign:
     for name in ("name", "method"):
         if not isinstance(data[name], str):
             raise TypeError(f"{name} is {data[name]!r}, not a text")
+    claims, gains = data["certificate"]["claims"], data["gains"]
+    if not all(is_number(value) for value in claims.values()):
+        raise TypeError("a claim is no number")
+    if not all(
+        isinstance(matrix, np.ndarray) for matrix in [*gains.values(), *data["certificate"]["matrices"].values()]
+    ):
+        raise TypeError("a gain or a matrix of the certificate is no array of numbers")
     plant, observer = _KINDS[data.get("kind")]
     return ObserverDesign(
         name=data["name"],
