@@ -228,8 +228,8 @@ def _warnings(design: ObserverDesign, gains: FaultGains | None) -> Iterator[str]
                        "fault.")  # fmt: skip
         followed = float(gains.steady[i])
         if abs(followed - 1.0) > FOLLOWS:
-            yield (f"the estimate of {fault} does not follow a step: in the end it shows {number(100.0 * followed, digits=3)} % "
-                   "of it.")  # fmt: skip
+            share = number(100.0 * followed, digits=3)
+            yield f"the estimate of {fault} does not follow a step: in the end it shows {share} % of it."
     for check in design.report.checks:
         if check.name.startswith("limit at "):
             yield f"{check.name}: {check.claim}."
