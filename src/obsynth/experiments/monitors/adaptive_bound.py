@@ -55,6 +55,7 @@ class AdaptiveBound:
     solved: FloatArray
     tail: FloatArray
     nominal: FloatArray
+    more: FloatArray
     rounding: FloatArray
     start: FloatArray
     start_later: tuple[float, FloatArray]
@@ -168,6 +169,7 @@ def adaptive_bound(
     return AdaptiveBound(
         structure, responses, varying, drive, np.vstack([rows @ structure.Cx, structure.Co]), kernels,
         np.ascontiguousarray(same.T), solved, tail, outward @ _nominal(structure, responses),
+        _nominal(structure, responses, center=False)[m:],
         outward @ _rounding(structure, responses, observer, start.state), table @ outward.T * OUTWARD,
         (theta, outward @ settled * OUTWARD), 1.0 + np.abs(structure.offsets), tuple(driven.tolist()),
     )  # fmt: skip
@@ -205,12 +207,12 @@ def _start_table(
     return np.array(found), (theta, np.concatenate([structure.seen(channels), outputs]) * factor)
 
 
-def _nominal(structure: ErrorStructure, responses: Responses) -> FloatArray:
-    """Return what disturbances and noise add to channels and outputs, over the whole box."""
+def _nominal(structure: ErrorStructure, responses: Responses, *, center: bool = True) -> FloatArray:
+    """Return what disturbances and noise add to channels and outputs, over the whole box (or the tolerances alone)."""
     given, (inner, state, outputs) = structure.disturbances, structure.rows
 
     def total(left: FloatArray, direct: AffineMatrix) -> FloatArray:
-        found = responses.gain(left, given.center[inner], direct.center)
+        found = responses.gain(left, given.center[inner], direct.center) * float(center)
         for part, at_once in zip(given.parts, direct.parts, strict=True):
             if part.any():
                 found = found + responses.gain(left, part[inner], at_once)

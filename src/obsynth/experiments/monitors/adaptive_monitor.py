@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from obsynth.analysis.transformations.uncertain_plant import affine_plant
+from obsynth.analysis.transformations.uncertain_plant import AffinePlant, affine_plant
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.experiments.monitors.adaptive_bound import Start, adaptive_bound
 from obsynth.experiments.monitors.adaptive_rule import AdaptivePlan
@@ -38,12 +38,12 @@ def adaptive_plan(
     noise = noise_bound if plant.nw else 0.0
     sizes = np.where(np.isfinite(bounds), bounds, 0.0)
     structure = structure_of(design, affine, tracking, bounds=sizes, noise_bound=noise)
-    reached = np.abs(structure.disturbances.magnitude).any(axis=0)[: plant.nd]
+    reached = structure.disturbances.magnitude.max(axis=0, initial=0.0)[: plant.nd] > 0.0
     if np.any(reached & ~np.isfinite(bounds)):
         raise SpecError("A disturbance has no bound: give disturbance_bounds (--disturbance).",
                         path="disturbance_bounds")  # fmt: skip
     z = np.zeros(observer.order) if observer_state is None else observer_state
-    start = _start(plant, tracking, affine.E.after(tracking.T).magnitude, initial_error, initial_set, affine, z)
+    start = _start(plant, tracking, initial_error, initial_set, affine, z)
     later = Start(observer.order, norm=initial_error, state=z)
     reason, faults, same = "", None, False
     try:
@@ -57,15 +57,15 @@ def adaptive_plan(
         return AdaptivePlan(
             adaptive_bound(structure, observer, begin, varying=varying),
             None if faults is None else adaptive_bound(faults, observer, begin, varying=varying), same, reason,
-            affine.box.names, observer.fault_names, observer.residual_names,
+            begin.norm is None, affine.box.names, observer.fault_names, observer.residual_names,
         )  # fmt: skip
 
     return plan(start), plan(later)
 
 
 def _start(
-    plant: DescriptorSystem, tracking: Tracking, spread: FloatArray, initial_error: float | None,
-    initial_set: Mapping[str, Any] | None, affine: Any, z: FloatArray,
+    plant: DescriptorSystem, tracking: Tracking, initial_error: float | None, initial_set: Mapping[str, Any] | None,
+    affine: AffinePlant, z: FloatArray,
 ) -> Start:  # fmt: skip
     """Return what is known of eps at the start, ``z - T E(q) x`` for x in a box."""
     if initial_set is None:
@@ -73,7 +73,6 @@ def _start(
     center, radius = initial_box(plant, initial_set)
     back = 2.0 * np.eye(plant.nx) - affine.coordinates
     followed = affine.E.after(tracking.T) @ back
-    del spread
     offset = followed.center @ center
     size = np.abs(followed.center) @ radius + (followed.spread + followed.radius) @ (np.abs(center) + radius)
     return Start(len(z), center=z - offset, radius=size * (1.0 + 1e-12), state=z)
@@ -86,7 +85,7 @@ def initial_box(plant: DescriptorSystem, given: Mapping[str, Any]) -> tuple[Floa
     """
     require_mapping(given, "initial_set")
     center, radius = np.zeros(plant.nx), np.zeros(plant.nx)
-    needed = plant.E.any(axis=0)
+    needed = np.abs(plant.E).max(axis=0, initial=0.0) > 0.0
     unknown = sorted(set(given) - set(plant.state_names))
     if unknown:
         raise SpecError(f"initial_set has the unknown state {unknown[0]!r}; there are {', '.join(plant.state_names)}.",
@@ -103,7 +102,7 @@ def initial_box(plant: DescriptorSystem, given: Mapping[str, Any]) -> tuple[Floa
 
 
 def _ends(name: str, value: Any) -> tuple[float, float]:
-    ends: Sequence[Any] = value if isinstance(value, (list, tuple, np.ndarray)) else (value,)
+    ends = list(value) if isinstance(value, (list, tuple, np.ndarray)) else [value]
     if is_finite_number(value) and value >= 0.0:
         return -float(value), float(value)
     if len(ends) == 2 and all(map(is_finite_number, ends)) and ends[0] <= ends[1]:

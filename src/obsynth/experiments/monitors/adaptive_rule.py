@@ -5,23 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from obsynth.experiments.monitors.adaptive_bound import AdaptiveBound
+from obsynth.experiments.monitors.adaptive_bound import THRESHOLD_ROUNDING, AdaptiveBound
 from obsynth.experiments.monitors.adaptive_record import thresholds_of_records
 from obsynth.experiments.monitors.adaptive_step import AdaptiveState, AdaptiveStep, adaptive_step
+from obsynth.experiments.monitors.online import LinearSample
 from obsynth.experiments.monitors.residual_rules import NormRule, require_same
 from obsynth.numerics.arrays import FloatArray
-
-
-class LinearSample(NamedTuple):
-    """What a linear observer took and gave at one row: its own rows, known inputs, outputs; deviations."""
-
-    rows: FloatArray
-    inputs: FloatArray
-    outputs: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +29,7 @@ class AdaptivePlan:
     faults: AdaptiveBound | None
     same: bool
     reason: str
+    start_beyond_nominal: bool
     names: tuple[str, ...]
     fault_names: tuple[str, ...]
     residual_names: tuple[str, ...]
@@ -64,17 +58,18 @@ class AdaptivePlan:
 def norm_beyond_nominal(plan: AdaptivePlan, found: AdaptiveStep) -> float:
     """Return what box, start and rounding add to the norm of the residual."""
     rows = plan.residuals
-    parts = [found.shift[rows], found.rest[rows], found.start[rows], *found.first[:, rows]]
+    parts = [found.shift[rows], found.rest[rows], plan.bound.more[rows], *found.first[:, rows]]
+    if plan.start_beyond_nominal:
+        parts.append(found.start[rows])
     return math.fsum(math.hypot(*part) for part in parts)
 
 
 class AdaptiveRule:
     """The norm of the residual against the nominal bound and what the box adds; rows and fault estimates beside it."""
 
-    def __init__(
-        self, plan: AdaptivePlan, nominal: NormRule, *, starts: tuple[AdaptiveBound, AdaptiveBound | None]
-    ) -> None:
-        self.plan, self._nominal, self._restarted = plan, nominal, starts
+    def __init__(self, plan: AdaptivePlan, later: AdaptivePlan, nominal: NormRule) -> None:
+        self.plan, self._nominal = plan, nominal
+        self._restarted = later.bound, later.faults
         self._bound, self._faults = plan.bound, plan.faults
         self._state = AdaptiveState.of(self._bound)
         self._fault_state = None if self._faults is None else AdaptiveState.of(self._faults)
@@ -95,7 +90,7 @@ class AdaptiveRule:
             estimates = self._faults.structure.reading @ evidence.rows
             error = adaptive_step(self._faults, self._fault_state, estimates, evidence.inputs, evidence.outputs)
         statistic, nominal, _ = self._nominal.take(time, residuals, None, deciding=deciding)
-        threshold = nominal + norm_beyond_nominal(self.plan, found)
+        threshold = (nominal + norm_beyond_nominal(self.plan, found)) * THRESHOLD_ROUNDING
         nf = len(self.plan.fault_names)
         values = evidence.rows[len(evidence.rows) - len(found.total) :]
         self.cells = self._cells(values[:nf], found, error)
