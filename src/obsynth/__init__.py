@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from obsynth.calibration.box import CalibratedBox
     from obsynth.calibration.calibrating import calibrate
     from obsynth.calibration.result import Calibration
+    from obsynth.calibration.validating import validate
+    from obsynth.calibration.validation import Validation
+    from obsynth.calibration.validity import Validity, validity
     from obsynth.data.run import DataRun, run_on_data
     from obsynth.errors import (
         InfeasibleError,
@@ -93,6 +96,10 @@ __version__ = "0.1.0"
 
 # Names are imported when they are first used, so that `import obsynth` stays fast.
 _HOMES = {
+    "Validation": "obsynth.calibration.validation",
+    "Validity": "obsynth.calibration.validity",
+    "validate": "obsynth.calibration.validating",
+    "validity": "obsynth.calibration.validity",
     "CalibratedBox": "obsynth.calibration.box",
     "Calibration": "obsynth.calibration.result",
     "calibrate": "obsynth.calibration.calibrating",
@@ -256,6 +263,8 @@ __all__ = [
     "Stuck",
     "TimeVaryingDescriptorSystem",
     "Uniform",
+    "Validation",
+    "Validity",
     "VerificationError",
     "VerificationReport",
     "adaptive_observer",
@@ -303,6 +312,8 @@ __all__ = [
     "steady_state_filter",
     "ui_pi_observer",
     "ui_pi_observer_from_gains",
+    "validate",
+    "validity",
     "verify",
 ]
 
