@@ -53,6 +53,7 @@ if TYPE_CHECKING:
         fault_estimation_filter,
         fault_estimation_filter_from_gains,
     )
+    from obsynth.methods.functional_filter.public import functional_filter
     from obsynth.methods.pd_observer.public import (
         apply_adaptation_gain,
         pd_delta_scan,
@@ -76,10 +77,13 @@ if TYPE_CHECKING:
     from obsynth.observers.recursive.gain_schedule import BatchEstimates
     from obsynth.observers.recursive.observer import Adaptation, RecursiveObserver
     from obsynth.observers.recursive.running import RunningRecursiveObserver
+    from obsynth.plants.constants import Constant, ConstantsBox
     from obsynth.plants.dae.model import DAEModel
     from obsynth.plants.descriptor import DescriptorSystem
     from obsynth.plants.fault_models import FaultModel, fault_model
     from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+    from obsynth.plants.uncertain_system import uncertain_system
+    from obsynth.plants.uncertainty import Uncertainty
     from obsynth.report.page import html_report
     from obsynth.results.delta_scan import DeltaScan
     from obsynth.results.design import Certificate, ObserverDesign
@@ -91,6 +95,7 @@ if TYPE_CHECKING:
     from obsynth.simulation.scenario import Scenario
     from obsynth.simulation.time_varying import simulate_time_varying
     from obsynth.spec.loader import Spec, load_spec
+    from obsynth.tolerances.robustness import Robustness, robustness
 
 __version__ = "0.1.0"
 
@@ -100,6 +105,7 @@ _HOMES = {
     "Validity": "obsynth.calibration.validity",
     "validate": "obsynth.calibration.validating",
     "validity": "obsynth.calibration.validity",
+    "functional_filter": "obsynth.methods.functional_filter.public",
     "CalibratedBox": "obsynth.calibration.box",
     "Calibration": "obsynth.calibration.result",
     "calibrate": "obsynth.calibration.calibrating",
@@ -112,6 +118,12 @@ _HOMES = {
     "StructuredResidual": "obsynth.analysis.diagnosis.banks",
     "dae_adaptive_observer": "obsynth.methods.dae_adaptive_observer.public",
     "DAETrajectory": "obsynth.simulation.dae",
+    "Constant": "obsynth.plants.constants",
+    "ConstantsBox": "obsynth.plants.constants",
+    "Robustness": "obsynth.tolerances.robustness",
+    "Uncertainty": "obsynth.plants.uncertainty",
+    "robustness": "obsynth.tolerances.robustness",
+    "uncertain_system": "obsynth.plants.uncertain_system",
     "simulate_dae": "obsynth.simulation.dae",
     "DAEBatchEstimates": "obsynth.observers.dae.batch",
     "DAEEstimates": "obsynth.observers.dae.estimates",
@@ -214,6 +226,8 @@ __all__ = [
     "Calibration",
     "Certificate",
     "Check",
+    "Constant",
+    "ConstantsBox",
     "DAEBatchEstimates",
     "DAEEstimates",
     "DAEModel",
@@ -248,6 +262,7 @@ __all__ = [
     "RecursiveEstimates",
     "RecursiveObserver",
     "RecursiveSimulation",
+    "Robustness",
     "RunningDAEObserver",
     "RunningObserver",
     "RunningRecursiveObserver",
@@ -262,6 +277,7 @@ __all__ = [
     "StructuredResidual",
     "Stuck",
     "TimeVaryingDescriptorSystem",
+    "Uncertainty",
     "Uniform",
     "Validation",
     "Validity",
@@ -293,6 +309,7 @@ __all__ = [
     "from_pandas",
     "from_scipy",
     "from_sympy",
+    "functional_filter",
     "html_report",
     "identifiability",
     "linearise",
@@ -303,6 +320,7 @@ __all__ = [
     "pd_delta_scan",
     "pd_observer",
     "pd_observer_from_gains",
+    "robustness",
     "run_batch",
     "run_on_data",
     "sample_observer",
@@ -312,6 +330,7 @@ __all__ = [
     "steady_state_filter",
     "ui_pi_observer",
     "ui_pi_observer_from_gains",
+    "uncertain_system",
     "validate",
     "validity",
     "verify",

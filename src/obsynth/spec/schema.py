@@ -35,9 +35,22 @@ def _kind_of_plant(value: Any) -> str:
     return _FILE if isinstance(value, dict) and "file" in value else _INLINE
 
 
+class LineariseSection(Section):
+    """Where a nonlinear plant is linearised: arguments of `obsynth.linearise`."""
+
+    at: Literal["equilibrium", "point"] | None = None
+    given: dict[Text, float] | None = None
+    free: list[Text] | dict[Text, Annotated[list[float], Field(min_length=2, max_length=2)]] | None = None
+    faults: list[Text] | None = None
+    disturbances: list[Text] | None = None
+    start: dict[Text, float] | None = None
+    drift: bool | None = None
+
+
 class TransformSection(Section):
     """What is done to the plant before a method sees it, in this order."""
 
+    linearise: LineariseSection | None = None
     eliminate_algebraic_states: bool = False
     sample_time: Positive | None = None
 
@@ -116,6 +129,7 @@ class DAESection(Section):
     parameters: dict[Text, float] | None = None
     constants: dict[Text, float] | None = None
     definitions: dict[Text, Text] | None = None
+    transform: TransformSection | None = None
 
 
 class DAEDocument(DAESection):
