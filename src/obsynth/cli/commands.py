@@ -78,9 +78,11 @@ def designed(spec: Spec, report_stage: Any) -> ObserverDesign:
     from obsynth.methods.designing import design
 
     recovery = None if spec.transformation is None else spec.transformation.recovery
-    return design(
+    found = design(
         spec.plant, spec.method, name=spec.name, recovery=recovery, progress=report_stage, **dict(spec.options)
     )
+    noted = () if spec.transformation is None else spec.transformation.notes
+    return found.replace(notes=(*noted, *found.notes)) if noted else found
 
 
 def designed_or_loaded(spec: Spec, gains: Path | None, report_stage: Any) -> ObserverDesign:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from obsynth.errors import SpecError
+from obsynth.numerics.threads import one_thread_if_small
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
@@ -19,6 +20,7 @@ from obsynth.spec.scenarios import built_scenario
 if TYPE_CHECKING:
     from obsynth.analysis.transformations import Transformation
     from obsynth.simulation.scenario import Scenario
+    from obsynth.spec.schema import TransformSection
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +115,7 @@ def load_spec(path: str | Path) -> Spec:
     problems.raise_if_any()
     plant, transformation = built_plant(section, plant_source, prefix), None
     # A plant may serve several methods: the spec's own transform takes the place of the plant's.
-    asked = (getattr(section, "transform", None), plant_source, prefix)
+    asked: tuple[TransformSection | None, Path, str] = (getattr(section, "transform", None), plant_source, prefix)
     if reference is not None and reference.transform is not None:
         asked = (reference.transform, source, "plant")
     model = plant if isinstance(plant, DAEModel) else None
@@ -124,8 +126,10 @@ def load_spec(path: str | Path) -> Spec:
         raise SpecError(f"{asked[1]}: transform.linearise is for nonlinear plants (kind: dae): remove it.",
                         path="plant.transform.linearise")  # fmt: skip
     if isinstance(plant, DescriptorSystem):
-        transformation = transformed(asked[0], plant, *asked[1:])
-        plant = plant.dense() if transformation is None else transformation.plant
+        if asked[0] is not None:
+            with one_thread_if_small(plant.nx):
+                transformation = transformed(asked[0], plant, *asked[1:])
+        plant = plant if transformation is None else transformation.plant
     elif model is None and reference is not None and reference.transform is not None:
         raise SpecError(
             f"{source}: plant.transform is for linear plants with constant matrices, which {plant_source.name} is not: "
