@@ -74,10 +74,13 @@ if TYPE_CHECKING:
     from obsynth.observers.recursive.gain_schedule import BatchEstimates
     from obsynth.observers.recursive.observer import Adaptation, RecursiveObserver
     from obsynth.observers.recursive.running import RunningRecursiveObserver
+    from obsynth.plants.constants import Constant, ConstantsBox
     from obsynth.plants.dae.model import DAEModel
     from obsynth.plants.descriptor import DescriptorSystem
     from obsynth.plants.fault_models import FaultModel, fault_model
     from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+    from obsynth.plants.uncertain_system import uncertain_system
+    from obsynth.plants.uncertainty import Uncertainty
     from obsynth.report.page import html_report
     from obsynth.results.delta_scan import DeltaScan
     from obsynth.results.design import Certificate, ObserverDesign
@@ -89,6 +92,7 @@ if TYPE_CHECKING:
     from obsynth.simulation.scenario import Scenario
     from obsynth.simulation.time_varying import simulate_time_varying
     from obsynth.spec.loader import Spec, load_spec
+    from obsynth.tolerances.robustness import Robustness, robustness
 
 __version__ = "0.1.0"
 
@@ -107,6 +111,12 @@ _HOMES = {
     "StructuredResidual": "obsynth.analysis.diagnosis.banks",
     "dae_adaptive_observer": "obsynth.methods.dae_adaptive_observer.public",
     "DAETrajectory": "obsynth.simulation.dae",
+    "Constant": "obsynth.plants.constants",
+    "ConstantsBox": "obsynth.plants.constants",
+    "Robustness": "obsynth.tolerances.robustness",
+    "Uncertainty": "obsynth.plants.uncertainty",
+    "robustness": "obsynth.tolerances.robustness",
+    "uncertain_system": "obsynth.plants.uncertain_system",
     "simulate_dae": "obsynth.simulation.dae",
     "DAEBatchEstimates": "obsynth.observers.dae.batch",
     "DAEEstimates": "obsynth.observers.dae.estimates",
@@ -209,6 +219,8 @@ __all__ = [
     "Calibration",
     "Certificate",
     "Check",
+    "Constant",
+    "ConstantsBox",
     "DAEBatchEstimates",
     "DAEEstimates",
     "DAEModel",
@@ -243,6 +255,7 @@ __all__ = [
     "RecursiveEstimates",
     "RecursiveObserver",
     "RecursiveSimulation",
+    "Robustness",
     "RunningDAEObserver",
     "RunningObserver",
     "RunningRecursiveObserver",
@@ -257,6 +270,7 @@ __all__ = [
     "StructuredResidual",
     "Stuck",
     "TimeVaryingDescriptorSystem",
+    "Uncertainty",
     "Uniform",
     "VerificationError",
     "VerificationReport",
@@ -297,6 +311,7 @@ __all__ = [
     "pd_delta_scan",
     "pd_observer",
     "pd_observer_from_gains",
+    "robustness",
     "run_batch",
     "run_on_data",
     "sample_observer",
@@ -306,6 +321,7 @@ __all__ = [
     "steady_state_filter",
     "ui_pi_observer",
     "ui_pi_observer_from_gains",
+    "uncertain_system",
     "verify",
 ]
 
