@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from obsynth.calibration.box import CalibratedBox
     from obsynth.calibration.calibrating import calibrate
     from obsynth.calibration.result import Calibration
+    from obsynth.compare.sensor_sets import SensorSet, SensorSets, sensor_sets
     from obsynth.data.run import DataRun, run_on_data
     from obsynth.errors import (
         InfeasibleError,
@@ -98,6 +99,9 @@ __version__ = "0.1.0"
 
 # Names are imported when they are first used, so that `import obsynth` stays fast.
 _HOMES = {
+    "SensorSet": "obsynth.compare.sensor_sets",
+    "SensorSets": "obsynth.compare.sensor_sets",
+    "sensor_sets": "obsynth.compare.sensor_sets",
     "functional_filter": "obsynth.methods.functional_filter.public",
     "CalibratedBox": "obsynth.calibration.box",
     "Calibration": "obsynth.calibration.result",
@@ -260,6 +264,8 @@ __all__ = [
     "RunningObserver",
     "RunningRecursiveObserver",
     "Scenario",
+    "SensorSet",
+    "SensorSets",
     "Simulation",
     "Sine",
     "SolverError",
@@ -315,6 +321,7 @@ __all__ = [
     "run_batch",
     "run_on_data",
     "sample_observer",
+    "sensor_sets",
     "simulate",
     "simulate_dae",
     "simulate_time_varying",

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from uncertain_plants import drive, wang
 
 import obsynth
 from obsynth.analysis.transformations.uncertain_plant import affine_plant
 from obsynth.errors import PreconditionError
 from obsynth.tolerances.index_one import index_one_on_box
-from uncertain_plants import drive, wang
 
 
 def test_largest_tolerances_are_those_of_the_audit() -> None:

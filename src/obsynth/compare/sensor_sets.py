@@ -237,9 +237,7 @@ def _require_positive(given: Mapping[str, Any], names: Sequence[str], what: str,
     missing = [name for name in names if name not in given] if whole else []
     wrong = [name for name, value in given.items() if not (is_finite_number(value) and value > 0.0)]
     if unknown or missing or wrong:
-        raise SpecError(
-            f"{what}: unknown {unknown}, missing {missing}, not a positive number {wrong}.", path=what
-        )
+        raise SpecError(f"{what}: unknown {unknown}, missing {missing}, not a positive number {wrong}.", path=what)
 
 
 def _note(search: SensorSearch, exact: bool, bound: int, most: int, count: int) -> str:

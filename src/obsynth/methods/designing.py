@@ -10,7 +10,8 @@ import numpy as np
 
 from obsynth.analysis.conditions import Condition
 from obsynth.analysis.transformations import StateRecovery
-from obsynth.errors import SpecError, VerificationError
+from obsynth.errors import PreconditionError, SpecError, VerificationError
+from obsynth.methods.advice import with_advice
 from obsynth.methods.method_spec import MethodSpec, PlantKind
 from obsynth.methods.registry import REGISTRY, method_spec, methods_for
 from obsynth.methods.synthesis_result import Synthesis
@@ -74,7 +75,8 @@ def design(
     SpecError
         Unknown method or option, or an option out of range.
     PreconditionError
-        No such observer exists for this plant; the failing condition, mode and signals are named.
+        No such observer exists for this plant; the failing condition, mode and signals are named, and what to measure
+        (or to leave out) so that one does.
     InfeasibleError
         A checked certificate proves that what was asked cannot be reached.
     SolverError
@@ -88,7 +90,13 @@ def design(
     for condition in _kind_conditions(plant, spec):
         condition.require()
     with failed_computations(), one_thread_if_small(plant.nx):
-        found = spec.load("synthesise")(plant, asked, progress=report_stage)
+        try:
+            found = spec.load("synthesise")(plant, asked, progress=report_stage)
+        except PreconditionError as error:
+            if not isinstance(plant, DescriptorSystem):
+                raise
+            report_stage("looking for what would make it possible")
+            raise with_advice(error, plant, spec, asked.as_given()) from None
         report_stage("verifying the shipped realisation")
         return verified(plant, method, found, name=name, recovery=recovery)
 

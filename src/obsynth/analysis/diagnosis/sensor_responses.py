@@ -58,9 +58,7 @@ class SensorResponses:
             tables.append(table)
         return cls(np.array(tables, dtype=np.complex128), plant.ny, plant.nd)
 
-    def shows(
-        self, sets: NDArray[np.int64], fault: int, beside: Sequence[int]
-    ) -> NDArray[np.float64]:
+    def shows(self, sets: NDArray[np.int64], fault: int, beside: Sequence[int]) -> NDArray[np.float64]:
         """Return how much of a fault shows free of d and the faults ``beside``, for each set of candidates ``(N, k)``.
 
         The part of its column outside the span of theirs, relative to it, the larger of all points; zero for nothing.
@@ -83,9 +81,9 @@ class SensorResponses:
 def _outside(span: ComplexArray, vector: ComplexArray) -> NDArray[np.float64]:
     """Return the norm of the part of each vector ``(N, m)`` outside the span of columns ``(N, m, c)``."""
     if span.shape[2] == 0:
-        return np.linalg.norm(vector, axis=1)
+        return np.asarray(np.linalg.norm(vector, axis=1))
     left, values, _ = np.linalg.svd(span, full_matrices=False)
     kept = left * (values > RANK_TOLERANCE * np.maximum(values[:, :1], 1e-300))[:, None, :]
     for _ in range(2):
         vector = vector - np.einsum("nij,nj->ni", kept, np.einsum("nij,ni->nj", kept.conj(), vector))
-    return np.linalg.norm(vector, axis=1)
+    return np.asarray(np.linalg.norm(vector, axis=1))

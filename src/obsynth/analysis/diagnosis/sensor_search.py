@@ -8,7 +8,7 @@ takes three), so what is found then is inclusion-minimal, and said to be that on
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from math import comb
 
@@ -73,8 +73,7 @@ class SensorSearch:
             names.append(name)
             again = names.count(name)
             label = name if again == 1 else f"{name} ({again})"
-            picked.append(Sensor(label, *(getattr(self.sensors[index], part) for part in ("C", "D", "Dd", "Df")),
-                                 self.sensors[index].deviation))  # fmt: skip
+            picked.append(replace(self.sensors[index], name=label))
         plant = with_sensors(self.plant, picked)
         if not self.may_fail or not picked:
             return plant
@@ -106,9 +105,7 @@ class SensorSearch:
                 return found, False
             sets = [s for s in self._sets(size) if not any(_within(f, s) for f in found)]
             new: list[tuple[int, ...]] = []
-            tried = 0
-            for chosen in self._promising(sets, wanted, responses):
-                tried += 1
+            for tried, chosen in enumerate(self._promising(sets, wanted, responses), start=1):
                 if self.feasible(chosen, wanted):
                     new.append(chosen)
                 if len(found) + len(new) >= most or tried >= MOST_CONFIRMED:
