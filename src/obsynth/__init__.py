@@ -67,14 +67,15 @@ if TYPE_CHECKING:
     from obsynth.observers.dae.batch import DAEBatchEstimates
     from obsynth.observers.dae.estimates import DAEEstimates
     from obsynth.observers.dae.observer import DAEObserver
-    from obsynth.observers.dae.running import RunningDAEObserver
     from obsynth.observers.decisions import decide
-    from obsynth.observers.linear.observer import Estimates, LinearObserver, RunningObserver
+    from obsynth.observers.linear.observer import Estimates, LinearObserver
     from obsynth.observers.linear.sampling import sample_observer
     from obsynth.observers.recursive.estimates import RecursiveEstimates
     from obsynth.observers.recursive.gain_schedule import BatchEstimates
     from obsynth.observers.recursive.observer import Adaptation, RecursiveObserver
-    from obsynth.observers.recursive.running import RunningRecursiveObserver
+    from obsynth.observers.running import RunningObserver
+    from obsynth.observers.running import RunningObserver as RunningDAEObserver
+    from obsynth.observers.running import RunningObserver as RunningRecursiveObserver
     from obsynth.plants.constants import Constant, ConstantsBox
     from obsynth.plants.dae.model import DAEModel
     from obsynth.plants.descriptor import DescriptorSystem
@@ -97,7 +98,7 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-# Names are imported when they are first used, so that `import obsynth` stays fast.
+# Names are imported when they are first used, so that `import obsynth` stays fast; ``module:name`` is another name.
 _HOMES = {
     "SensorSet": "obsynth.compare.sensor_sets",
     "SensorSets": "obsynth.compare.sensor_sets",
@@ -124,7 +125,7 @@ _HOMES = {
     "simulate_dae": "obsynth.simulation.dae",
     "DAEBatchEstimates": "obsynth.observers.dae.batch",
     "DAEEstimates": "obsynth.observers.dae.estimates",
-    "RunningDAEObserver": "obsynth.observers.dae.running",
+    "RunningDAEObserver": "obsynth.observers.running:RunningObserver",
     "DAEObserver": "obsynth.observers.dae.observer",
     "Identifiability": "obsynth.analysis.identifiability",
     "identifiability": "obsynth.analysis.identifiability",
@@ -159,8 +160,8 @@ _HOMES = {
     "RecursiveEstimates": "obsynth.observers.recursive.estimates",
     "RecursiveObserver": "obsynth.observers.recursive.observer",
     "RecursiveSimulation": "obsynth.experiments.parameter_simulation",
-    "RunningObserver": "obsynth.observers.linear.observer",
-    "RunningRecursiveObserver": "obsynth.observers.recursive.running",
+    "RunningObserver": "obsynth.observers.running",
+    "RunningRecursiveObserver": "obsynth.observers.running:RunningObserver",
     "Scenario": "obsynth.simulation.scenario",
     "Simulation": "obsynth.experiments.simulation",
     "Sine": "obsynth.simulation.profiles",
@@ -335,7 +336,8 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     if name in _HOMES:
-        return getattr(import_module(_HOMES[name]), name)
+        module, _, other_name = _HOMES[name].partition(":")
+        return getattr(import_module(module), other_name or name)
     raise AttributeError(f"module 'obsynth' has no attribute {name!r}")
 
 
