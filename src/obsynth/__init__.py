@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from obsynth.calibration.validating import validate
     from obsynth.calibration.validation import Validation
     from obsynth.calibration.validity import Validity, validity
+    from obsynth.compare.sensor_sets import SensorSet, SensorSets, sensor_sets
     from obsynth.data.run import DataRun, run_on_data
     from obsynth.errors import (
         InfeasibleError,
@@ -106,6 +107,9 @@ _HOMES = {
     "Validity": "obsynth.calibration.validity",
     "validate": "obsynth.calibration.validating",
     "validity": "obsynth.calibration.validity",
+    "SensorSet": "obsynth.compare.sensor_sets",
+    "SensorSets": "obsynth.compare.sensor_sets",
+    "sensor_sets": "obsynth.compare.sensor_sets",
     "functional_filter": "obsynth.methods.functional_filter.public",
     "CalibratedBox": "obsynth.calibration.box",
     "Calibration": "obsynth.calibration.result",
@@ -268,6 +272,8 @@ __all__ = [
     "RunningObserver",
     "RunningRecursiveObserver",
     "Scenario",
+    "SensorSet",
+    "SensorSets",
     "Simulation",
     "Sine",
     "SolverError",
@@ -325,6 +331,7 @@ __all__ = [
     "run_batch",
     "run_on_data",
     "sample_observer",
+    "sensor_sets",
     "simulate",
     "simulate_dae",
     "simulate_time_varying",
