@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from obsynth.calibration.box import CalibratedBox
     from obsynth.calibration.calibrating import calibrate
     from obsynth.calibration.result import Calibration
+    from obsynth.compare.sensor_sets import SensorSet, SensorSets, sensor_sets
     from obsynth.data.run import DataRun, run_on_data
     from obsynth.errors import (
         InfeasibleError,
@@ -99,6 +100,9 @@ __version__ = "0.1.0"
 
 # Names are imported when they are first used, so that `import obsynth` stays fast; ``module:name`` is another name.
 _HOMES = {
+    "SensorSet": "obsynth.compare.sensor_sets",
+    "SensorSets": "obsynth.compare.sensor_sets",
+    "sensor_sets": "obsynth.compare.sensor_sets",
     "functional_filter": "obsynth.methods.functional_filter.public",
     "CalibratedBox": "obsynth.calibration.box",
     "Calibration": "obsynth.calibration.result",
@@ -261,6 +265,8 @@ __all__ = [
     "RunningObserver",
     "RunningRecursiveObserver",
     "Scenario",
+    "SensorSet",
+    "SensorSets",
     "Simulation",
     "Sine",
     "SolverError",
@@ -316,6 +322,7 @@ __all__ = [
     "run_batch",
     "run_on_data",
     "sample_observer",
+    "sensor_sets",
     "simulate",
     "simulate_dae",
     "simulate_time_varying",
