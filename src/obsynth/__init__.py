@@ -17,6 +17,10 @@ if TYPE_CHECKING:
     from obsynth.calibration.box import CalibratedBox
     from obsynth.calibration.calibrating import calibrate
     from obsynth.calibration.result import Calibration
+    from obsynth.calibration.validating import validate
+    from obsynth.calibration.validation import Validation
+    from obsynth.calibration.validity import Validity, validity
+    from obsynth.compare.sensor_sets import SensorSet, SensorSets, sensor_sets
     from obsynth.data.run import DataRun, run_on_data
     from obsynth.errors import (
         InfeasibleError,
@@ -99,6 +103,13 @@ __version__ = "0.1.0"
 
 # Names are imported when they are first used, so that `import obsynth` stays fast; ``module:name`` is another name.
 _HOMES = {
+    "Validation": "obsynth.calibration.validation",
+    "Validity": "obsynth.calibration.validity",
+    "validate": "obsynth.calibration.validating",
+    "validity": "obsynth.calibration.validity",
+    "SensorSet": "obsynth.compare.sensor_sets",
+    "SensorSets": "obsynth.compare.sensor_sets",
+    "sensor_sets": "obsynth.compare.sensor_sets",
     "functional_filter": "obsynth.methods.functional_filter.public",
     "CalibratedBox": "obsynth.calibration.box",
     "Calibration": "obsynth.calibration.result",
@@ -261,6 +272,8 @@ __all__ = [
     "RunningObserver",
     "RunningRecursiveObserver",
     "Scenario",
+    "SensorSet",
+    "SensorSets",
     "Simulation",
     "Sine",
     "SolverError",
@@ -273,6 +286,8 @@ __all__ = [
     "TimeVaryingDescriptorSystem",
     "Uncertainty",
     "Uniform",
+    "Validation",
+    "Validity",
     "VerificationError",
     "VerificationReport",
     "adaptive_observer",
@@ -316,6 +331,7 @@ __all__ = [
     "run_batch",
     "run_on_data",
     "sample_observer",
+    "sensor_sets",
     "simulate",
     "simulate_dae",
     "simulate_time_varying",
@@ -323,6 +339,8 @@ __all__ = [
     "ui_pi_observer",
     "ui_pi_observer_from_gains",
     "uncertain_system",
+    "validate",
+    "validity",
     "verify",
 ]
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from obsynth import __version__
 from obsynth.cli.arguments import add_force, add_json, add_quiet, add_system, add_verbose
+from obsynth.cli.calibration import add_calibration_verbs
 from obsynth.cli.data_arguments import add_data_verbs
 from obsynth.cli.evaluate import add_evaluate_verb
 from obsynth.cli.output import print_error, print_json
@@ -87,6 +88,7 @@ def _parser() -> argparse.ArgumentParser:
     simulate.set_defaults(verb="simulate")
     add_evaluate_verb(verbs)
     add_data_verbs(verbs)
+    add_calibration_verbs(verbs)
     return parser
 
 
@@ -115,7 +117,7 @@ def _digits(text: str) -> int:
 
 
 def _verb(name: str) -> Callable[[argparse.Namespace], int]:
-    from obsynth.cli import commands, data_commands, evaluate, simulate
+    from obsynth.cli import calibration, commands, data_commands, evaluate, simulate
 
     return {
         "design": commands.run_design,
@@ -126,6 +128,9 @@ def _verb(name: str) -> Callable[[argparse.Namespace], int]:
         "run": data_commands.run_run,
         "export": data_commands.run_export,
         "report": data_commands.run_report,
+        "linearise": calibration.run_linearise,
+        "calibrate": calibration.run_calibrate,
+        "validate": calibration.run_validate,
     }[name]
 
 

@@ -36,9 +36,22 @@ def _kind_of_plant(value: Any) -> str:
     return _FILE if isinstance(value, dict) and "file" in value else _INLINE
 
 
+class LineariseSection(Section):
+    """Where a nonlinear plant is linearised: arguments of `obsynth.linearise`."""
+
+    at: Literal["equilibrium", "point"] | None = None
+    given: dict[Text, float] | None = None
+    free: list[Text] | dict[Text, Annotated[list[float], Field(min_length=2, max_length=2)]] | None = None
+    faults: list[Text] | None = None
+    disturbances: list[Text] | None = None
+    start: dict[Text, float] | None = None
+    drift: bool | None = None
+
+
 class TransformSection(Section):
     """What is done to the plant before a method sees it, in this order."""
 
+    linearise: LineariseSection | None = None
     eliminate_algebraic_states: bool = False
     sample_time: Positive | None = None
 
@@ -144,6 +157,7 @@ class DAESection(Section):
     parameters: dict[Text, float] | None = None
     constants: dict[Text, float] | None = None
     definitions: dict[Text, Text] | None = None
+    transform: TransformSection | None = None
 
 
 class DAEDocument(DAESection):
@@ -215,6 +229,34 @@ class ScenarioSection(Section):
     stabilise: bool = False
 
 
+Range = Annotated[list[float], Field(min_length=2, max_length=2)]
+
+
+class CalibrateSection(Section):
+    """The log, and what of the plant it is to find: arguments of `obsynth.calibrate`."""
+
+    log: Text | None = None
+    rows: Text | Annotated[list[int], Field(min_length=2, max_length=2)] | None = None
+    columns: dict[Text, Text] | None = None
+    scales: dict[Text, float] | None = None
+    dt: Positive | None = None
+    unknown: dict[Text, Range] = Field(min_length=1)
+    priors: dict[Text, Range] | None = None
+    noisy: Names | None = None
+    Q: dict[Text, Positive] | None = None
+    R: dict[Text, Positive] | None = None
+    initial_state: dict[Text, float] | None = None
+    initial_covariance: Positive | dict[Text, Annotated[float, Field(ge=0.0)]] | None = None
+    input_delay: int | Literal["auto"] | None = None
+    method: Literal["innovations", "simulation"] | None = None
+    integration: Literal["auto", "backward-euler", "radau"] | None = None
+    substeps: Annotated[int, Field(ge=1)] | None = None
+    level: Annotated[float, Field(gt=0.0, lt=1.0)] | None = None
+    starts: Annotated[int, Field(ge=1)] | None = None
+    seed: Annotated[int, Field(ge=0)] | None = None
+    digest: Text | None = None
+
+
 class SpecDocument(Section):
     """A whole spec."""
 
@@ -230,3 +272,4 @@ class SpecDocument(Section):
     ]
     method: MethodSection
     scenario: ScenarioSection | None = None
+    calibrate: CalibrateSection | None = None
