@@ -75,6 +75,11 @@ def add_data_verbs(verbs: Any) -> None:
     run.add_argument("--gap", type=float, metavar="SECONDS", help="continuous designs: longer intervals are gaps")
     run.add_argument("--warm-up", type=float, metavar="SECONDS", help="how long to mark the start, and after gaps")
     run.add_argument(
+        "--outliers", choices=("gate", "huber", "none"),
+        help="recursive and nonlinear designs: leave out samples that their prediction excludes (default), pull them "
+        "to its limit, or take them as they are",
+    )  # fmt: skip
+    run.add_argument(
         "--state", type=Path, metavar="FILE", help="go on from this saved state if it exists, and save the new one"
     )
     add_json(run)

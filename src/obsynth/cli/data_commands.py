@@ -39,7 +39,8 @@ def run_run(options: argparse.Namespace) -> int:
         found = run_on_data(
             design, sys.stdin if options.data == STREAM else Path(options.data), out,
             columns=dict(options.map), scales=numbers_of(options.scale), thresholds=numbers_of(options.threshold),
-            monitor=watched, gap=options.gap, warm_up=options.warm_up, state=options.state, progress=progress,
+            monitor=watched, gap=options.gap, warm_up=options.warm_up,
+            outliers=options.outliers, state=options.state, progress=progress,
         )  # fmt: skip
     for text in found.warnings:
         print(f"Warning: {text}", file=sys.stderr)
@@ -172,6 +173,9 @@ def _summary(found: DataRun, watched: OnlineMonitor | None) -> str:
         kinds = Counter(found.recovered.values())
         told = ", ".join(f"{count} {kind.replace('needs', 'with')}" for kind, count in kinds.items())
         lines.append(f"{len(found.recovered)} states as written recovered: {told}.")
+    if found.outliers:
+        told = ", ".join(f"{count} of {name}" for name, count in found.outliers.items())
+        lines.append(f"{sum(found.outliers.values())} outliers: {told}.")
     for name, time in found.alarms.items():
         fault = f"; {found.isolated} stands out" if watched and name == watched.kind and found.isolated else ""
         lines.append(f"Alarm: {name} first above its threshold at {time:g} s{fault}.")

@@ -14,6 +14,7 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.covariances import covariance_factor, is_definite
 from obsynth.numerics.value_types import Count, ForgettingFactor, Positive, checked_value
+from obsynth.observers.outliers import Outliers, checked_limit
 from obsynth.observers.recursive.records import measured_record
 from obsynth.observers.running import RunningObserver
 from obsynth.plants.dae.checks import checked_inputs, finite_vector, require_known, step_length
@@ -73,6 +74,11 @@ class DAEObserver:
         In nominal sizes of the states; see `obsynth.plants.dae.step.ImplicitStep`.
     window : int
         Samples over which excitation is watched.
+    outliers : {"none", "gate", "huber"}
+        What is done with a sample that its prediction excludes: taken as it is; left out, at most three times in a row
+        of one sensor; or taken at the limit.
+    outlier_limit : float or None
+        In standard deviations of the prediction: 6 for ``gate`` and 3 for ``huber`` by default.
 
     Raises
     ------
@@ -98,11 +104,14 @@ class DAEObserver:
     integration: str = "backward-euler"
     largest_move: float | None = None
     window: int = 50
+    outliers: Outliers = "none"
+    outlier_limit: float | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "dt", step_length(self.dt))
         for name, kind in _KINDS.items():
             checked_value(getattr(self, name), name, kind)
+        checked_limit(self.outliers, self.outlier_limit)
         self._check_arrays()
 
     def __getstate__(self) -> dict[str, Any]:

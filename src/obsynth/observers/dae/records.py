@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from obsynth.errors import SolverError
+from obsynth.errors import SolverError, SpecError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.estimates import DAEEstimates, DAERow, GatheredRows
 from obsynth.observers.dae.observer import DAEObserver
@@ -28,12 +28,14 @@ def run_record(
 
     Shapes: ``y (samples, ny)``, ``u (samples, nu)``.
     """
+    if compiled and observer.outliers != "none":
+        raise SpecError("The C knows no outliers: leave compiled=True out, or take outliers='none'.", path="compiled")
     found = GatheredRows(observer)
     found.add(_nothing(observer))
     with shown_progress(progress, len(y), "samples") as note:
         if compiled:
             _in_c(observer, y, u, found.add_regular, note)
-        elif compiled is None:
+        elif compiled is None and observer.outliers == "none":
             advanced(observer, y, u, found.add_regular, note)
         else:
             running = RunningObserver(observer)

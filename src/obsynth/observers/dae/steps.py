@@ -13,6 +13,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.estimates import DAERow
 from obsynth.observers.dae.memory_layout import initial_memory
 from obsynth.observers.dae.observer import DAEObserver
+from obsynth.observers.outliers import checked_limit, no_refusals, robust_advance
 from obsynth.plants.dae.functions import Compiled, DAEFunctions
 from obsynth.plants.dae.step import ImplicitStep
 
@@ -26,13 +27,15 @@ class DAEState(NamedTuple):
     """The state of an observer of a DAE.
 
     Fields: memory: Laid out as `memory_layout` says; k: The next sample; u: ``(nu,)``: the inputs of
-    the sample before; informations: ``(nq, nq)`` each: on the parameters, of the latest samples.
+    the sample before; informations: ``(nq, nq)`` each: on the parameters, of the latest samples; refused: ``(2, ny)``:
+    outliers in a row, and at all.
     """
 
     memory: FloatArray
     k: int
     u: FloatArray
     informations: tuple[FloatArray, ...]
+    refused: FloatArray
 
 
 class Steps:
@@ -41,7 +44,9 @@ class Steps:
     def __init__(self, observer: DAEObserver) -> None:
         self.observer, self.graph = observer, observer.graph
         self.implicit = ImplicitStep(self.graph.functions, observer.dt, largest_move=observer.largest_move)
-        self.first = DAEState(initial_memory(observer, observer.initial_state), 0, np.zeros(observer.model.nu), ())
+        self.first = DAEState(initial_memory(observer, observer.initial_state), 0, np.zeros(observer.model.nu), (),
+                              no_refusals(observer.model.ny))  # fmt: skip
+        self.limit = checked_limit(observer.outliers, observer.outlier_limit)
 
     def part(self, state: DAEState, name: str) -> FloatArray:
         """Return a part of what is remembered, by its name in `memory_layout`."""
@@ -52,6 +57,25 @@ class Steps:
 
         Shapes: ``y (ny,)`` with NaN for what is missing, ``u (nu,)``.
         """
+        if self.observer.outliers == "none":
+            return self.plain(state, y, u)
+        return robust_advance(self.observer.outliers, self.limit, self.plain, self.predicted, state, y, u)
+
+    def predicted(self, state: DAEState, heard: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return mean and deviation of each output ``(ny,)`` from what is heard of the next sample."""
+        observer = self.observer
+        after, row = self.plain(state, heard, u)
+        y, H, L = self.graph.functions.outputs(row.x, row.theta)
+        spread = row.parameter_covariance
+        cross = (
+            self.part(after, "cross") if observer.form == "augmented-kalman" else self.part(after, "Upsilon") @ spread
+        )
+        both = H @ cross @ L.T
+        whole = H @ row.covariance @ H.T + both + both.T + L @ spread @ L.T + observer.R
+        return y, np.sqrt(np.diag(whole))
+
+    def plain(self, state: DAEState, y: FloatArray, u: FloatArray) -> tuple[DAEState, DAERow]:
+        """Take a sample as it is."""
         seen = ~np.isnan(y)
         heard, moved = np.where(seen, y, 0.0), np.zeros(self.observer.model.nx)
         if state.k == 0:
@@ -68,7 +92,7 @@ class Steps:
             )  # fmt: skip
         row = DAERow(self.graph, state.k, after[:, 0], said[:, 0], seen, moved)
         informations = (*state.informations, row.part("information"))[-self.observer.window :]
-        return DAEState(after[:, 0], state.k + 1, u, informations), row
+        return DAEState(after[:, 0], state.k + 1, u, informations, state.refused), row
 
     def stretch(
         self, state: DAEState, y: FloatArray, u: FloatArray, run: Callable[..., tuple[FloatArray, ...]]
@@ -86,7 +110,7 @@ class Steps:
         if taken:
             latest = tuple(rows.part("information")[-self.observer.window :])
             informations = (*state.informations, *latest)[-self.observer.window :]
-            state = DAEState(after[taken - 1].copy(), state.k + taken, u[taken - 1], informations)
+            state = DAEState(after[taken - 1].copy(), state.k + taken, u[taken - 1], informations, state.refused)
         return state, rows
 
     def projected(self, state: DAEState, u: FloatArray) -> tuple[FloatArray, FloatArray]:

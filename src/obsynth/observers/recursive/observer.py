@@ -15,6 +15,7 @@ from obsynth.numerics.arguments import real_array, real_vector, truth
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.covariances import covariance_factor
 from obsynth.numerics.value_types import Count, ForgettingFactor, Probability, checked_value
+from obsynth.observers.outliers import Outliers, checked_limit
 from obsynth.observers.recursive.records import measured_record, require_horizon, whole_record
 from obsynth.observers.running import RunningObserver
 from obsynth.plants.sequences import MatrixSequence
@@ -105,6 +106,11 @@ class RecursiveObserver:
         ``None`` for a Kalman filter.
     early_constraints : bool
         Whether equations without x(k+1) are used one step earlier, with u(k+1).
+    outliers : {"none", "gate", "huber"}
+        What is done with a sample that its prediction excludes: taken as it is; left out, at most three times in a row
+        of one sensor; or taken at the limit.
+    outlier_limit : float or None
+        In standard deviations of the prediction: 6 for ``gate`` and 3 for ``huber`` by default.
 
     Raises
     ------
@@ -119,8 +125,11 @@ class RecursiveObserver:
     initial_covariance: FloatArray
     adaptation: Adaptation | None
     early_constraints: bool = False
+    outliers: Outliers = "none"
+    outlier_limit: float | None = None
 
     def __post_init__(self) -> None:
+        checked_limit(self.outliers, self.outlier_limit)
         plant = self.plant
         for name, size in (("Q", plant.ne), ("R", plant.ny)):
             shape = getattr(self, name).shape
@@ -172,7 +181,8 @@ class RecursiveObserver:
             "plant": self.plant.as_dict(), "Q": self.Q.as_data(), "R": self.R.as_data(),
             "noise_constants": {**(self.Q.constants or {}), **(self.R.constants or {})},
             "initial_state": self.initial_state, "initial_covariance": self.initial_covariance,
-            "adaptation": adaptation, "early_constraints": self.early_constraints,
+            "adaptation": adaptation, "early_constraints": self.early_constraints, "outliers": self.outliers,
+            "outlier_limit": self.outlier_limit,
         }  # fmt: skip
 
     @classmethod
@@ -191,6 +201,7 @@ class RecursiveObserver:
             MatrixSequence.of(data["R"], "R", constants=constants),
             data["initial_state"], data["initial_covariance"],
             None if data["adaptation"] is None else Adaptation(**data["adaptation"]), data["early_constraints"],
+            data.get("outliers", "none"), data.get("outlier_limit"),
         )  # fmt: skip
 
     def __getstate__(self) -> dict[str, Any]:
