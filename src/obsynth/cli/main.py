@@ -115,7 +115,7 @@ def _digits(text: str) -> int:
 
 
 def _verb(name: str) -> Callable[[argparse.Namespace], int]:
-    from obsynth.cli import commands, data_commands, evaluate, simulate
+    from obsynth.cli import commands, data_commands, evaluate, plot, simulate
 
     return {
         "design": commands.run_design,
@@ -125,6 +125,7 @@ def _verb(name: str) -> Callable[[argparse.Namespace], int]:
         "evaluate": evaluate.run_evaluate,
         "run": data_commands.run_run,
         "export": data_commands.run_export,
+        "plot": plot.run_plot,
         "report": data_commands.run_report,
     }[name]
 
