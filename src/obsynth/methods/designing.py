@@ -6,6 +6,8 @@ import inspect
 from collections.abc import Callable, Mapping
 from typing import Any, TypeAlias
 
+import numpy as np
+
 from obsynth.analysis.conditions import Condition
 from obsynth.analysis.transformations import StateRecovery
 from obsynth.errors import SpecError, VerificationError
@@ -18,9 +20,10 @@ from obsynth.numerics.threads import one_thread_if_small
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
-from obsynth.results.design import ObserverDesign
+from obsynth.results.design import Certificate, ObserverDesign
 from obsynth.results.report import VerificationReport
 from obsynth.verification.plant import condition_rows
+from obsynth.verification.stored_numbers import StoredErrors
 
 Plant: TypeAlias = DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel
 
@@ -168,7 +171,7 @@ def verified(
     plant: Plant, method: str, found: Synthesis, *, name: str, recovery: StateRecovery | None = None
 ) -> ObserverDesign:
     """Return the design with its report."""
-    draft = draft_of(plant, method, found, name=name, recovery=recovery)
+    draft = with_stored_errors(draft_of(plant, method, found, name=name, recovery=recovery))
     report = verify(draft)
     if not report.passed:
         failed = "; ".join(f"{row.name} ({row.value:.3g} against {row.bound:.3g})" for row in report.failures)
@@ -179,3 +182,16 @@ def verified(
             report=report,
         )
     return draft.replace(report=report)
+
+
+def with_stored_errors(draft: ObserverDesign) -> ObserverDesign:
+    """Return a linear design whose certificate claims what rounding of its stored numbers adds to the errors."""
+    spec = method_spec(draft.method)
+    if not spec.tracked:
+        return draft
+    with np.errstate(all="ignore"):
+        found = StoredErrors.of(spec.load("tracked")(draft), draft.linear[1])
+    if found is None:
+        return draft
+    old = draft.certificate
+    return draft.replace(certificate=Certificate({**old.matrices, **found.witnesses()}, old.claims))

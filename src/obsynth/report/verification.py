@@ -18,6 +18,8 @@ WIDE_ENOUGH = 110
 
 _HEADINGS = ("check", "claim", "value", "bound", "margin", "verdict", "kind")
 _NUMBER_WIDTH = 10
+#: As wide as "computed twice".
+_KIND_WIDTH = 14
 
 
 def checks_table(checks: Sequence[Check], *, width: int) -> RenderableType:
@@ -44,7 +46,7 @@ def _stacked(checks: Sequence[Check], width: int) -> Iterable[RenderableType]:
 
 def _grid(width: int, *, with_claim: bool) -> Table:
     grid = Table.grid(padding=(0, 1, 0, 0))
-    others = 3 * (_NUMBER_WIDTH + 1) + 8 + 9
+    others = 3 * (_NUMBER_WIDTH + 1) + 8 + _KIND_WIDTH
     if with_claim:
         grid.add_column(width=26, overflow="fold")
         grid.add_column(width=max(width - others - 28, 20), overflow="fold")
@@ -53,7 +55,7 @@ def _grid(width: int, *, with_claim: bool) -> Table:
     for _ in range(3):
         grid.add_column(width=_NUMBER_WIDTH, justify="right", no_wrap=True)
     grid.add_column(width=7, no_wrap=True)
-    grid.add_column(width=9, no_wrap=True)
+    grid.add_column(width=_KIND_WIDTH, no_wrap=True)
     return grid
 
 
@@ -63,10 +65,8 @@ def _claim(check: Check) -> Text:
 
 
 def _numbers_and_verdict(check: Check) -> list[Text]:
-    # The verdict of information is its kind already.
-    kind = "" if check.kind == "information" and check.passed else check.kind
     numbers = [Text(number(value)) for value in (check.value, check.bound, check.margin)]
-    return [*numbers, verdict(check), Text(kind, style="dim")]
+    return [*numbers, verdict(check), Text(check.status, style="dim")]
 
 
 def verdict_line(report: VerificationReport) -> Text:

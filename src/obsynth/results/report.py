@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 CheckKind = Literal["proved", "equality", "computed", "condition", "information"]
+Status = Literal["proved", "computed twice", "estimated", "assumed"]
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,12 @@ class Check:
         ``condition`` (an existence condition) or ``information`` (never fails).
     detail : str, optional
         One more sentence for the reader.
+    status : str, optional
+        What the row is worth: ``proved`` (outward rounding, on the stored numbers), ``computed twice`` (double
+        precision, by a route that shares no intermediate result with the design), ``estimated`` (statistics: see
+        ``interval``) or ``assumed`` (stated by whoever made the design, and not checked).  That of the kind by default.
+    interval : tuple of float, optional
+        Of an estimate: where it lies by chance alone, with the probability that ``detail`` says.
     """
 
     name: str
@@ -47,6 +54,15 @@ class Check:
     source: str
     kind: CheckKind = "computed"
     detail: str = ""
+    status: Status | Literal[""] = ""
+    interval: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        if not self.status:
+            object.__setattr__(self, "status", "proved" if self.kind == "proved" else "computed twice")
+        if self.interval is not None:
+            low, high = self.interval
+            object.__setattr__(self, "interval", (low, high))
 
 
 def upper_bound_check(
@@ -65,9 +81,11 @@ def lower_bound_check(
     return Check(name, claim, float(value), float(bound), float(value - bound), passed, source, kind, detail)
 
 
-def information(name: str, claim: str, value: float, *, source: str, detail: str = "") -> Check:
+def information(
+    name: str, claim: str, value: float, *, source: str, detail: str = "", status: Status = "computed twice"
+) -> Check:
     """Return a row that informs and cannot fail."""
-    return Check(name, claim, float(value), math.nan, math.nan, True, source, "information", detail)
+    return Check(name, claim, float(value), math.nan, math.nan, True, source, "information", detail, status)
 
 
 @dataclass(frozen=True)

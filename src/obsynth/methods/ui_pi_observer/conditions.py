@@ -22,7 +22,7 @@ import numpy as np
 from obsynth.analysis.conditions import Condition
 from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.transformations import Transformation
-from obsynth.analysis.zeros import Zero, are_outside, invariant_zeros, leading_names
+from obsynth.analysis.zeros import Zero, leading_names, zeros_of_system
 from obsynth.methods.ui_pi_observer.augmented_plant import AugmentedPlant
 from obsynth.methods.ui_pi_observer.decoupling_condition import (
     SOURCE,
@@ -110,14 +110,11 @@ def _zero_condition(plant: DescriptorSystem, units: PlantUnits) -> Condition:
     claim = "rank [sE - A, -Bd; C, Dd] = nx + rank [Bd; Dd] on and outside the boundary of stability"
     source = "Share Pasand, Lemma 4 (9.2)"
     inputs, direct = independent_disturbances(plant)
-    wide_e, wide_a = system_pencil(plant.E, plant.A, inputs, plant.C, direct)
-    found = finite_zeros(wide_e, wide_a)
-    full = wide_e.shape[1]
+    found, zeros, outside = zeros_of_system(plant.E, plant.A, inputs, plant.C, direct, dt=plant.dt)
+    full = plant.nx + inputs.shape[1]
     if found.normal_rank < full:
         detail = f"normal rank {found.normal_rank} of {full}: the plant hides whole trajectories from its outputs."
         return Condition("(D2) zeros", claim, False, float(found.normal_rank), float(full), source, detail)
-    zeros = invariant_zeros(plant.E, plant.A, inputs, plant.C, direct)
-    outside = [zero for zero, out in zip(zeros, are_outside(wide_e, wide_a, found, plant.dt), strict=True) if out]
     if outside:
         worst = max(outside, key=lambda zero: instability(zero.value, plant.dt))
         return _zero_failure(plant, units, worst, inputs, direct, claim, source)
