@@ -51,36 +51,40 @@ def contents(folder: Path) -> dict[str, str]:
     return found
 
 
-def run(folder: Path, words: Sequence[str], *, may_change: Sequence[str] = (), feed: str | None = None) -> Ran:
+def run(
+    folder: Path, words: Sequence[str], *, may_change: Sequence[str] = (), changes_anyway: Sequence[str] = (),
+    feed: str | None = None,
+) -> Ran:  # fmt: skip
     """Run ``obsynth`` in a folder; only the files in ``may_change`` may be new or other afterwards, if it succeeds."""
     before = contents(folder)
     printed, errors = _Reconfigurable(), _Reconfigurable()
     wrong = ""
     with chdir(folder), redirect_stdout(printed), redirect_stderr(errors), _standard_input(feed):
         try:
-            # A warning that reaches the user is no answer, and no crash either: they are errors in the tests only.
-            with warnings.catch_warnings(record=True) as warned:
-                warnings.simplefilter("always")
+            # The command line tells warnings in a line: they are errors in the tests only.
+            with warnings.catch_warnings():
+                warnings.simplefilter("default")
                 code = main(list(words))
         except SystemExit as error:
-            code, warned = error.code if isinstance(error.code, int) else 1, []
+            code = error.code if isinstance(error.code, int) else 1
         except Exception as error:  # noqa: BLE001 - what leaves the command line is a traceback for the user
-            code, warned = 1, []
+            code = 1
             places = [place for place in traceback.extract_tb(error.__traceback__) if "obsynth" in place.filename]
             place = places[-1]
             wrong = f"traceback: {type(error).__name__}: {str(error)[:80]} ({Path(place.filename).name}:{place.lineno})"
     told = errors.getvalue()
     if not wrong:
-        wrong = _mistake(code, told) or (f"warning: {str(warned[0].message)[:90]}" if warned else "")
+        wrong = _mistake(code, told, printed.getvalue())
     if not wrong:
-        wrong = _losses(before, contents(folder), may_change if code in (0, 6) else ())
+        wrong = _losses(before, contents(folder), [*(may_change if code in (0, 6) else ()), *changes_anyway])
     return Ran(code, wrong, told)
 
 
-def _mistake(code: int, told: str) -> str:
+def _mistake(code: int, told: str, printed: str) -> str:
     if code not in KNOWN_CODES:
         return f"exit code {code}: {told[:120]}"
-    if code and not told.strip():
+    # That a condition or a check fails is told by the report.
+    if code and not (told + (printed if code in (3, 6) else "")).strip():
         return f"exit code {code} without a word"
     hit = _UNTOLD.search(told)
     return f"words of Python: {' '.join(told.split())[:200]}" if hit else ""

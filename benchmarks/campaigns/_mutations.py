@@ -110,7 +110,7 @@ def _method(holder: Any, key: Any, rng: random.Random) -> None:
 
 
 def _wrap(holder: Any, key: Any, rng: random.Random) -> None:
-    for _ in range(rng.choice((1, 2, 60, 500))):
+    for _ in range(rng.choice((1, 2, 60, 150))):
         holder[key] = [holder[key]]
 
 

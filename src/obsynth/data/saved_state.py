@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from obsynth.data.job import Job
 from obsynth.errors import SpecError
 from obsynth.files.inputs import read_json
 from obsynth.files.outputs import FileKind, write_atomically
+from obsynth.numerics.arguments import is_number
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import design_as_dict, digest_of, plain, restored
 
@@ -46,6 +51,35 @@ def resume_state(path: Path, job: Job, digest: str) -> None:
     if body.get("gains") != digest:
         raise SpecError(f"{path} is the state of a run with another gain set.", path=str(path))
     try:
-        job.resume(restored(body["state"]))
-    except (AttributeError, LookupError, TypeError, ValueError, ArithmeticError) as error:
-        raise SpecError(f"{path} is incomplete: {error}.", path=str(path)) from error
+        state = restored(body.get("state"))
+        fits = _fits(job.as_dict(), state)
+    except (AttributeError, LookupError, TypeError, ValueError, ArithmeticError):
+        fits = False
+    if not fits:
+        raise SpecError(f"{path} is damaged: it is no state of this design and these options.", path=str(path))
+    job.resume(state)
+
+
+def _fits(own: Any, saved: Any) -> bool:
+    """Whether a saved state has the parts of a run's own one, with arrays of the same shapes.
+
+    What has no value yet, and windows that fill up, may hold any number of numbers and arrays.
+    """
+    if isinstance(own, np.ndarray):
+        is_window = own.shape[:1] == (0,)
+        return (
+            isinstance(saved, np.ndarray)
+            and saved.ndim == own.ndim
+            and (own.shape[1:] == saved.shape[1:] if is_window else own.shape == saved.shape)
+        )
+    if isinstance(own, Mapping):
+        return (
+            isinstance(saved, dict) and saved.keys() == own.keys() and all(_fits(own[key], saved[key]) for key in own)
+        )
+    if isinstance(own, (bool, np.bool_)):
+        return isinstance(saved, bool)
+    if isinstance(own, str):
+        return isinstance(saved, str)
+    if isinstance(own, (list, tuple)):
+        return isinstance(saved, list)
+    return saved is None or is_number(saved) or (own is None and isinstance(saved, (np.ndarray, dict, list)))
