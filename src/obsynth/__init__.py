@@ -66,18 +66,22 @@ if TYPE_CHECKING:
     from obsynth.observers.dae.batch import DAEBatchEstimates
     from obsynth.observers.dae.estimates import DAEEstimates
     from obsynth.observers.dae.observer import DAEObserver
-    from obsynth.observers.dae.running import RunningDAEObserver
     from obsynth.observers.decisions import decide
-    from obsynth.observers.linear.observer import Estimates, LinearObserver, RunningObserver
+    from obsynth.observers.linear.observer import Estimates, LinearObserver
     from obsynth.observers.linear.sampling import sample_observer
     from obsynth.observers.recursive.estimates import RecursiveEstimates
     from obsynth.observers.recursive.gain_schedule import BatchEstimates
     from obsynth.observers.recursive.observer import Adaptation, RecursiveObserver
-    from obsynth.observers.recursive.running import RunningRecursiveObserver
+    from obsynth.observers.running import RunningObserver
+    from obsynth.observers.running import RunningObserver as RunningDAEObserver
+    from obsynth.observers.running import RunningObserver as RunningRecursiveObserver
+    from obsynth.plants.constants import Constant, ConstantsBox
     from obsynth.plants.dae.model import DAEModel
     from obsynth.plants.descriptor import DescriptorSystem
     from obsynth.plants.fault_models import FaultModel, fault_model
     from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+    from obsynth.plants.uncertain_system import uncertain_system
+    from obsynth.plants.uncertainty import Uncertainty
     from obsynth.report.page import html_report
     from obsynth.results.delta_scan import DeltaScan
     from obsynth.results.design import Certificate, ObserverDesign
@@ -89,10 +93,11 @@ if TYPE_CHECKING:
     from obsynth.simulation.scenario import Scenario
     from obsynth.simulation.time_varying import simulate_time_varying
     from obsynth.spec.loader import Spec, load_spec
+    from obsynth.tolerances.robustness import Robustness, robustness
 
 __version__ = "0.1.0"
 
-# Names are imported when they are first used, so that `import obsynth` stays fast.
+# Names are imported when they are first used, so that `import obsynth` stays fast; ``module:name`` is another name.
 _HOMES = {
     "functional_filter": "obsynth.methods.functional_filter.public",
     "CalibratedBox": "obsynth.calibration.box",
@@ -107,10 +112,16 @@ _HOMES = {
     "StructuredResidual": "obsynth.analysis.diagnosis.banks",
     "dae_adaptive_observer": "obsynth.methods.dae_adaptive_observer.public",
     "DAETrajectory": "obsynth.simulation.dae",
+    "Constant": "obsynth.plants.constants",
+    "ConstantsBox": "obsynth.plants.constants",
+    "Robustness": "obsynth.tolerances.robustness",
+    "Uncertainty": "obsynth.plants.uncertainty",
+    "robustness": "obsynth.tolerances.robustness",
+    "uncertain_system": "obsynth.plants.uncertain_system",
     "simulate_dae": "obsynth.simulation.dae",
     "DAEBatchEstimates": "obsynth.observers.dae.batch",
     "DAEEstimates": "obsynth.observers.dae.estimates",
-    "RunningDAEObserver": "obsynth.observers.dae.running",
+    "RunningDAEObserver": "obsynth.observers.running:RunningObserver",
     "DAEObserver": "obsynth.observers.dae.observer",
     "Identifiability": "obsynth.analysis.identifiability",
     "identifiability": "obsynth.analysis.identifiability",
@@ -145,8 +156,8 @@ _HOMES = {
     "RecursiveEstimates": "obsynth.observers.recursive.estimates",
     "RecursiveObserver": "obsynth.observers.recursive.observer",
     "RecursiveSimulation": "obsynth.experiments.parameter_simulation",
-    "RunningObserver": "obsynth.observers.linear.observer",
-    "RunningRecursiveObserver": "obsynth.observers.recursive.running",
+    "RunningObserver": "obsynth.observers.running",
+    "RunningRecursiveObserver": "obsynth.observers.running:RunningObserver",
     "Scenario": "obsynth.simulation.scenario",
     "Simulation": "obsynth.experiments.simulation",
     "Sine": "obsynth.simulation.profiles",
@@ -209,6 +220,8 @@ __all__ = [
     "Calibration",
     "Certificate",
     "Check",
+    "Constant",
+    "ConstantsBox",
     "DAEBatchEstimates",
     "DAEEstimates",
     "DAEModel",
@@ -243,6 +256,7 @@ __all__ = [
     "RecursiveEstimates",
     "RecursiveObserver",
     "RecursiveSimulation",
+    "Robustness",
     "RunningDAEObserver",
     "RunningObserver",
     "RunningRecursiveObserver",
@@ -257,6 +271,7 @@ __all__ = [
     "StructuredResidual",
     "Stuck",
     "TimeVaryingDescriptorSystem",
+    "Uncertainty",
     "Uniform",
     "VerificationError",
     "VerificationReport",
@@ -297,6 +312,7 @@ __all__ = [
     "pd_delta_scan",
     "pd_observer",
     "pd_observer_from_gains",
+    "robustness",
     "run_batch",
     "run_on_data",
     "sample_observer",
@@ -306,13 +322,15 @@ __all__ = [
     "steady_state_filter",
     "ui_pi_observer",
     "ui_pi_observer_from_gains",
+    "uncertain_system",
     "verify",
 ]
 
 
 def __getattr__(name: str) -> Any:
     if name in _HOMES:
-        return getattr(import_module(_HOMES[name]), name)
+        module, _, other_name = _HOMES[name].partition(":")
+        return getattr(import_module(module), other_name or name)
     raise AttributeError(f"module 'obsynth' has no attribute {name!r}")
 
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from obsynth import __version__
-from obsynth.cli.arguments import add_force, add_json, add_quiet, add_system
+from obsynth.cli.arguments import add_force, add_json, add_quiet, add_system, add_verbose
 from obsynth.cli.data_arguments import add_data_verbs
 from obsynth.cli.evaluate import add_evaluate_verb
 from obsynth.cli.output import print_error, print_json
@@ -62,6 +62,7 @@ def _parser() -> argparse.ArgumentParser:
 
     check = verbs.add_parser("check", help=_CHECK, description=_CHECK)
     add_system(check)
+    add_verbose(check, "the structure of the plant and every condition")
     add_json(check)
     check.set_defaults(verb="check")
 
@@ -95,6 +96,7 @@ def _add_design_arguments(parser: argparse.ArgumentParser) -> None:
         "--output", type=Path, metavar="FILE",
         help="where to write the gain set (default: <name of the spec>.gains.json in the current folder)",
     )  # fmt: skip
+    add_verbose(parser, "every claim and every check")
     add_json(parser)
     add_force(parser)
     add_quiet(parser)

@@ -17,7 +17,7 @@ from obsynth.data.observer_holds import KeptHolds
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray
-from obsynth.observers.linear.sampling import first_order_hold
+from obsynth.numerics.holds import first_order_hold
 from obsynth.observers.linear.warm_up import checked_warm_up, transient
 from obsynth.results.design import ObserverDesign
 

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any, TypeAlias
 
 import numpy as np
 
 from obsynth.analysis.conditions import Condition
-from obsynth.analysis.transformations import StateRecovery
-from obsynth.errors import SpecError, VerificationError
+from obsynth.analysis.transformations import StateRecovery, eliminate_algebraic_states
+from obsynth.analysis.transformations.elimination import MANY_VARIABLES
+from obsynth.errors import PreconditionError, SpecError, VerificationError
 from obsynth.methods.method_spec import MethodSpec, PlantKind
 from obsynth.methods.registry import REGISTRY, method_spec, methods_for
 from obsynth.methods.synthesis_result import Synthesis
@@ -52,7 +54,7 @@ def design(
     Parameters
     ----------
     plant : DescriptorSystem, TimeVaryingDescriptorSystem or DAEModel
-        The plant.
+        The plant.  Of one with sparse matrices and 500 states or more the algebraic states are eliminated first.
     method : str, optional
         Method id; for its options see the function of the same name, such as `fault_estimation_filter`.
     name : str, optional
@@ -88,9 +90,26 @@ def design(
     for condition in _kind_conditions(plant, spec):
         condition.require()
     with failed_computations(), one_thread_if_small(plant.nx):
+        plant, recovery, notes = _with_arrays(plant, recovery, report_stage)
         found = spec.load("synthesise")(plant, asked, progress=report_stage)
+        if notes:
+            found = replace(found, notes=(*notes, *found.notes))
         report_stage("verifying the shipped realisation")
         return verified(plant, method, found, name=name, recovery=recovery)
+
+
+def _with_arrays(
+    plant: Plant, recovery: StateRecovery | None, progress: Callable[[str], None]
+) -> tuple[Plant, StateRecovery | None, tuple[str, ...]]:
+    """Return the plant that methods work on, the way back from it, and what a user should know about it."""
+    if not isinstance(plant, DescriptorSystem) or not plant.is_sparse:
+        return plant, recovery, ()
+    if plant.nx < MANY_VARIABLES:
+        return plant.dense(), recovery, ()
+    progress("eliminating the algebraic states")
+    found = eliminate_algebraic_states(plant)
+    through = found.recovery if recovery is None else recovery.then(found.recovery)
+    return found.plant, through, found.notes
 
 
 def check(plant: Plant, options: Mapping[str, Mapping[str, Any]] | None = None) -> dict[str, VerificationReport]:
@@ -98,17 +117,30 @@ def check(plant: Plant, options: Mapping[str, Mapping[str, Any]] | None = None) 
 
     Malformed options are a `SpecError`, numbers beyond double precision a `SolverError`.
     """
+    kind_of(plant)
+    try:
+        with failed_computations(), one_thread_if_small(plant.nx):
+            return _checked(_with_arrays(plant, None, _silent)[0], options or {})
+    except PreconditionError as error:
+        # The sparse plant as written has no reduced form for any method.
+        row = Condition(
+            error.condition, "algebraic states that can be eliminated", False, np.nan, np.nan, "plant", str(error),
+            signals=error.signals,
+        )  # fmt: skip
+        return {method: VerificationReport.of(condition_rows((row,))) for method in REGISTRY}
+
+
+def _checked(plant: Plant, options: Mapping[str, Mapping[str, Any]]) -> dict[str, VerificationReport]:
     found = {}
     for method in REGISTRY:
         spec = method_spec(method)
-        asked = {} if method not in (options or {}) else spec.read_options((options or {})[method]).as_given()
+        asked = {} if method not in options else spec.read_options(options[method]).as_given()
         conditions = _kind_conditions(plant, spec)
         if not conditions:
             judge = spec.load("conditions")
             known = set(inspect.signature(judge).parameters)
             given = {name: value for name, value in asked.items() if name in known}
-            with failed_computations():
-                conditions = judge(plant, **given)
+            conditions = judge(plant, **given)
         found[method] = VerificationReport.of(condition_rows(conditions))
     return found
 

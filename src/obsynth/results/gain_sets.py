@@ -7,6 +7,7 @@ import hashlib
 import json
 import math
 import os
+import re
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
@@ -32,6 +33,7 @@ SCHEMA_VERSION = 1
 #: Larger gain sets are refused before they fill the memory.
 MAXIMUM_CHARACTERS = 2_000_000_000
 _KIND = "obsynth gain set"
+_PLACE_DIGITS, _HEAD_BYTES = 16, 256
 GAIN_SET = FileKind("a gain set", rb'\A\s*\{\s*"kind":\s*"obsynth gain set"', ending=".gains.json")
 # Linear time-invariant designs have no tag.
 _KINDS: dict[str | None, tuple[Any, Any]] = {
@@ -114,7 +116,29 @@ def _tag(design: ObserverDesign) -> dict[str, str]:
 
 def save(design: ObserverDesign, path: str | Path) -> Path:
     """Write ``design`` to ``path`` atomically and return the path."""
-    return write_atomically(path, json.dumps(design_as_dict(design), indent=1, allow_nan=False) + "\n")
+    return save_document(design_as_dict(design), path)
+
+
+def save_document(document: Mapping[str, Any], path: str | Path) -> Path:
+    """Write what `design_as_dict` returns."""
+    return write_atomically(path, json.dumps(document, indent=1, allow_nan=False) + "\n")
+
+
+def written_by_spec(document: Mapping[str, Any], spec: Path) -> dict[str, Any]:
+    """Return a gain set that remembers the place of its spec, by a digest."""
+    return {"kind": document["kind"], "written_for": place_of(spec), **document}
+
+
+def place_of(spec: Path) -> str:
+    """Return a short digest of where a spec is, which tells two specs of one name apart."""
+    return hashlib.sha256(os.fsencode(spec.resolve())).hexdigest()[:_PLACE_DIGITS]
+
+
+def written_for(gains: Path) -> str | None:
+    """Return the digest of the place of the spec for which a gain set was written, `None` where it is not known."""
+    with gains.open("rb") as stream:
+        found = re.search(rb'"written_for":\s*"([0-9a-f]+)"', stream.read(_HEAD_BYTES))
+    return None if found is None else found.group(1).decode()
 
 
 def load(path: str | Path) -> ObserverDesign:

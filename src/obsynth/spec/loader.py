@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from obsynth.errors import SpecError
+from obsynth.numerics.threads import one_thread_if_small
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
@@ -19,6 +20,7 @@ from obsynth.spec.scenarios import built_scenario
 if TYPE_CHECKING:
     from obsynth.analysis.transformations import Transformation
     from obsynth.simulation.scenario import Scenario
+    from obsynth.spec.schema import TransformSection
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,12 +94,15 @@ def load_spec(path: str | Path) -> Spec:
     problems.raise_if_any()
     plant, transformation = built_plant(section, plant_source, prefix), None
     if isinstance(plant, DescriptorSystem):
-        if reference is not None and reference.transform is not None:
-            # A plant may serve several methods: the spec's own transform takes the place of the plant's.
-            transformation = transformed(reference.transform, plant, source, "plant")
-        else:
-            transformation = transformed(section.transform, plant, plant_source, prefix)
-        plant = plant.dense() if transformation is None else transformation.plant
+        # A plant may serve several methods: the spec's own transform takes the place of the plant's.
+        wanted: TransformSection | None = getattr(reference, "transform", None)
+        document, where = source, "plant"
+        if wanted is None:
+            wanted, document, where = getattr(section, "transform", None), plant_source, prefix
+        if wanted is not None:
+            with one_thread_if_small(plant.nx):
+                transformation = transformed(wanted, plant, document, where)
+        plant = plant if transformation is None else transformation.plant
     elif reference is not None and reference.transform is not None:
         raise SpecError(
             f"{source}: plant.transform is for linear plants with constant matrices, which {plant_source.name} is not: "

@@ -18,8 +18,8 @@ from obsynth.experiments.monitors.unlimited_horizon import samples_of, unlimited
 from obsynth.experiments.monitors.whitening import cusum_whitener, steady_mean, whitener_of, window_covariance
 from obsynth.numerics.arguments import is_finite_number, require_kind, require_mapping
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.holds import first_order_hold
 from obsynth.observers.dae.observer import DAEObserver
-from obsynth.observers.linear.sampling import first_order_hold
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.plants.names import index_of
 from obsynth.results.design import ObserverDesign
