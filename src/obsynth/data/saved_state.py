@@ -51,14 +51,15 @@ def resume_state(path: Path, job: Job, digest: str) -> None:
         raise SpecError(f"{path} was changed after it was written: its digest does not match.", path=str(path))
     if body.get("gains") != digest:
         raise SpecError(f"{path} is the state of a run with another gain set.", path=str(path))
+    own = job.as_dict()
     try:
         state = restored(body.get("state"))
-        fits = _fits(job.as_dict(), state)
+        job.resume(state)
+        fits = _fits(own, state)
     except (AttributeError, LookupError, TypeError, ValueError, ArithmeticError):
         fits = False
     if not fits:
         raise SpecError(f"{path} is damaged: it is no state of this design and these options.", path=str(path))
-    job.resume(state)
 
 
 def _fits(own: Any, saved: Any) -> bool:
