@@ -25,8 +25,6 @@ FAILED = {"impossible": "x", "infeasible": "+", "unknown": "1", "unverified": "2
 MOST_LINES = 8
 
 
-
-
 class _Results(Protocol):
     @property
     def results(self) -> Sequence[Any]: ...

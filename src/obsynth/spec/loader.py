@@ -102,12 +102,12 @@ def spec_of(document: Mapping[str, Any], source: Path, *, plant_changes: Mapping
     if isinstance(plant, DescriptorSystem):
         # A plant may serve several methods: the spec's own transform takes the place of the plant's.
         wanted: TransformSection | None = getattr(reference, "transform", None)
-        document, where = source, "plant"
+        place, where = source, "plant"
         if wanted is None:
-            wanted, document, where = getattr(section, "transform", None), plant_source, prefix
+            wanted, place, where = getattr(section, "transform", None), plant_source, prefix
         if wanted is not None:
             with one_thread_if_small(plant.nx):
-                transformation = transformed(wanted, plant, document, where)
+                transformation = transformed(wanted, plant, place, where)
         plant = plant if transformation is None else transformation.plant
     elif reference is not None and reference.transform is not None:
         raise SpecError(

@@ -6,7 +6,7 @@ import hashlib
 import itertools
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from obsynth.errors import SpecError
 from obsynth.files.inputs import input_file
 from obsynth.methods.designing import Plant
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.names import index_of
 from obsynth.results.gain_sets import plain
 from obsynth.spec.documents import read_yaml
 from obsynth.spec.loader import changed_document
@@ -75,12 +76,28 @@ def plant_cases(
             }
             if changes and not isinstance(plant, DescriptorSystem):
                 raise SpecError(f"Fields of a {type(plant).__name__} cannot be varied in a sweep.", path="parameters")
-            varied = plant.replace(**changes) if changes and isinstance(plant, DescriptorSystem) else plant
+            varied = _varied(plant, changes) if changes and isinstance(plant, DescriptorSystem) else plant
             written = varied.dense() if isinstance(varied, DescriptorSystem) else varied
             body = json.dumps(plain([version, method, options, written.as_dict()]), sort_keys=True)
             digest = hashlib.sha256(body.encode()).hexdigest()
             cases.append(SweepCase(_named(name, chosen), chosen, digest, plant=varied, method=method, options=options))
     return _distinct(cases)
+
+
+def _varied(plant: DescriptorSystem, changes: Mapping[str, Any]) -> DescriptorSystem:
+    """Return a plant with some fields changed; ``outputs`` picks some of its own by name."""
+    changes = dict(changes)
+    if "outputs" in changes:
+        picked = changes.pop("outputs")
+        names = [picked] if isinstance(picked, str) else list(picked)
+        rows = [index_of(name, plant.output_names, what="The plant") for name in names]
+        for name in ("C", "D", "Df", "Dd", "Dw"):
+            changes.setdefault(name, getattr(plant, name)[rows])
+        changes.setdefault("output_names", names)
+    unknown = sorted(set(changes) - {item.name for item in fields(plant)})
+    if unknown:
+        raise SpecError(f"A plant has no field {', '.join(map(repr, unknown))}.", path=f"parameters.plant.{unknown[0]}")
+    return plant.replace(**changes)
 
 
 def _combinations(parameters: Mapping[str, Sequence[Any]], sources: int) -> Iterator[dict[str, Any]]:

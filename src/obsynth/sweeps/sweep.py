@@ -23,8 +23,8 @@ from obsynth.methods.designing import Plant, design
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
-from obsynth.results.gain_sets import gain_set_bytes, load, plain, restored
 from obsynth.results.design import ObserverDesign
+from obsynth.results.gain_sets import gain_set_bytes, load, loaded, plain, restored
 from obsynth.spec.loader import spec_of
 from obsynth.sweeps.cases import SweepCase, plant_cases, spec_cases
 
@@ -97,7 +97,7 @@ class SweepResult:
             return load(self.file)
         if self.content is None:
             raise SpecError(f"The case {self.name!r} has no design: {self.message or self.status}", path="design")
-        return load(io.BytesIO(self.content))
+        return loaded(self.content, self.name)
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,7 +191,8 @@ def sweep(
     parameters : mapping of str to sequence, optional
         Values by name; all combinations are taken.  Of a spec, the dotted path of an entry, such as
         ``plant.transform.sample_time``, ``plant.C.outputs`` or ``plant.file`` (a plant in a file of its own is changed
-        as well); of a plant in memory ``plant.C`` and the like.  Any other name is an option of the method.
+        as well); of a plant in memory ``plant.A`` and the like, or ``plant.outputs`` (names of its outputs).  Any
+        other name is an option of the method.
     method : str, optional
         For plants in memory.
     executor : concurrent.futures.Executor, optional
@@ -362,5 +363,3 @@ def _cell(value: Any) -> Any:
     if isinstance(value, (bool, str)) or value is None:
         return str(value)
     return value if isinstance(value, (int, float, np.number)) else json.dumps(plain(value))
-
-
