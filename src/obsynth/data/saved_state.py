@@ -13,7 +13,7 @@ from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import digest_of, gain_set_digest, plain, restored
 
 KIND = "obsynth run state"
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 STATE = FileKind("a saved state of obsynth", rb'\A\s*\{\s*"kind":\s*"obsynth run state"')
 
 
