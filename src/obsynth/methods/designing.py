@@ -13,6 +13,7 @@ from obsynth.analysis.conditions import Condition
 from obsynth.analysis.transformations import StateRecovery, eliminate_algebraic_states
 from obsynth.analysis.transformations.elimination import MANY_VARIABLES
 from obsynth.errors import PreconditionError, SpecError, VerificationError
+from obsynth.methods.advice import with_advice
 from obsynth.methods.method_spec import MethodSpec, PlantKind
 from obsynth.methods.registry import REGISTRY, method_spec, methods_for
 from obsynth.methods.synthesis_result import Synthesis
@@ -76,7 +77,8 @@ def design(
     SpecError
         Unknown method or option, or an option out of range.
     PreconditionError
-        No such observer exists for this plant; the failing condition, mode and signals are named.
+        No such observer exists for this plant; the failing condition, mode and signals are named, and what to measure
+        (or to leave out) so that one does.
     InfeasibleError
         A checked certificate proves that what was asked cannot be reached.
     SolverError
@@ -91,7 +93,13 @@ def design(
         condition.require()
     with failed_computations(), one_thread_if_small(plant.nx):
         plant, recovery, notes = _with_arrays(plant, recovery, report_stage)
-        found = spec.load("synthesise")(plant, asked, progress=report_stage)
+        try:
+            found = spec.load("synthesise")(plant, asked, progress=report_stage)
+        except PreconditionError as error:
+            if not isinstance(plant, DescriptorSystem):
+                raise
+            report_stage("looking for what would make it possible")
+            raise with_advice(error, plant, spec, asked.as_given()) from None
         if notes:
             found = replace(found, notes=(*notes, *found.notes))
         report_stage("verifying the shipped realisation")

@@ -22,6 +22,7 @@ from obsynth.results.report import Check, lower_bound_check, upper_bound_check
 from obsynth.verification.identities import Identity, equality, relative_tolerance
 from obsynth.verification.lyapunov import prove_stable
 from obsynth.verification.plant import condition_rows, plant_information
+from obsynth.verification.remainder_channel import TrackedPlant
 
 _MATRICES = ("T", "T0", "Phi", "Cw", "walks", "stability", "tracking", "deviations")
 #: A claimed rate may be missed by this share.
@@ -59,6 +60,16 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
         yield equality(name, claim, identity.residual(), "regulator equation, ours", bound=max(tolerance, 1e-8))
     yield from leak_rows(design)
     yield from noise_rows(design)
+
+
+def tracked_plant(design: ObserverDesign) -> TrackedPlant:
+    """Return the plant as the shipped filter tracks it: without a fault every row is to be zero."""
+    (plant, observer), matrices = design.linear, design.certificate.matrices
+    goal = np.zeros((len(observer.Cz), plant.nx))
+    return TrackedPlant(
+        plant.E, plant.A, plant.B, plant.C, plant.D, matrices["T"], goal, plant.state_names, -matrices["T0"], plant.Bd,
+        plant.Dd,
+    )  # fmt: skip
 
 
 def _model(plant: DescriptorSystem, matrices: Mapping[str, FloatArray]) -> Exosystem:
