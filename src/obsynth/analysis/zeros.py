@@ -111,13 +111,13 @@ def invariant_zeros(
 
     Shapes: ``E (nx, nx)``, ``A (nx, nx)``, ``B (nx, nu)``, ``C (ny, nx)``, ``D (ny, nu)``.
     """
-    wide_e, wide_a = _system_pencil(E, A, B, C, D)
+    wide_e, wide_a = system_pencil(E, A, B, C, D)
     return _with_directions(wide_e, wide_a, system_zeros(wide_e, wide_a, nx=E.shape[0]), nx=E.shape[0])
 
 
 def fault_zeros(plant: DescriptorSystem) -> FaultZeros:
     """Return the invariant zeros from the faults of ``plant`` to its outputs."""
-    e, a = _system_pencil(plant.E, plant.A, plant.Bf, plant.C, plant.Df)
+    e, a = system_pencil(plant.E, plant.A, plant.Bf, plant.C, plant.Df)
     found = system_zeros(e, a, nx=plant.nx)
     zeros = _with_directions(e, a, found, nx=plant.nx)
     outside = tuple(zero for zero, out in zip(zeros, are_outside(e, a, found, plant.dt), strict=True) if out)
@@ -126,9 +126,25 @@ def fault_zeros(plant: DescriptorSystem) -> FaultZeros:
     return FaultZeros(zeros, outside, missing == 0, direction, names, found.decisions)
 
 
-def _system_pencil(
+def zero_at(E: FloatArray, A: FloatArray, value: complex, B: FloatArray, C: FloatArray, D: FloatArray) -> Zero:
+    """Return the zero of ``[A - z E, B; C, D]`` that is known to be at a point, with its direction there."""
+    wide_e, wide_a = system_pencil(E, A, B, C, D)
+    nx = E.shape[0]
+    pencil = equilibrated_at(wide_e, wide_a, value, nx=nx)
+    basis = _smallest_part_first(_kernel(pencil, value, least=1), slice(nx, None))
+    return _zero_along(basis[:, 0], value, pencil.columns, nx=nx)
+
+
+def hidden_direction(plant: DescriptorSystem, *, missing: int) -> tuple[FloatArray, tuple[str, ...]]:
+    """Return the faults that never show, for a pencil from faults to outputs of which ``missing`` ranks are lost."""
+    e, a = system_pencil(plant.E, plant.A, plant.Bf, plant.C, plant.Df)
+    return _hidden(e, a, plant, missing=missing)
+
+
+def system_pencil(
     E: FloatArray, A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray | None
 ) -> tuple[FloatArray, FloatArray]:
+    """Return ``[A - z E, B; C, D]`` as its two matrices."""
     feedthrough = np.zeros((C.shape[0], B.shape[1])) if D is None else D
     padded = np.zeros((E.shape[0] + C.shape[0], E.shape[1] + B.shape[1]))
     padded[: E.shape[0], : E.shape[1]] = E

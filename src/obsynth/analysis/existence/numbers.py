@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any
-
-import numpy as np
 
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.origin import DECISIVE, origin_of
@@ -84,6 +82,23 @@ class PlantNumbers(ABC):
     def system(self, inputs: Any, direct: Any) -> SystemFacts:
         """Return facts on ``[A - s E, inputs; C, direct]``."""
 
+    @property
+    @abstractmethod
+    def regular_rank(self) -> int:
+        """Normal rank of ``A - s E``."""
+
+    @abstractmethod
+    def with_matrices(self, changes: Mapping[str, Any]) -> PlantNumbers:
+        """Return the same with some matrices replaced."""
+
+    @abstractmethod
+    def as_own(self, matrix: fmpq_mat) -> Any:
+        """Return a rational matrix as one of these numbers."""
+
+    @abstractmethod
+    def width(self, matrix: Any) -> int:
+        """Return the number of columns."""
+
     def is_zero(self, matrix: Any) -> bool:
         """Whether all entries are zero."""
         return self.rank(matrix) == 0
@@ -108,6 +123,32 @@ class WrittenNumbers(PlantNumbers):
     def matrix(self, name: str) -> fmpq_mat:
         """Return a matrix by its name."""
         return self.matrices[name]
+
+    @property
+    def regular_rank(self) -> int:
+        """Normal rank of ``A - s E``."""
+        from obsynth.proofs.exact_pencils import ExactPencil
+
+        return ExactPencil(self.matrices["E"], self.matrices["A"]).normal_rank
+
+    @property
+    def index(self) -> int | None:
+        """Index of ``A - s E``; ``None`` where it is not regular."""
+        from obsynth.proofs.exact_pencils import ExactPencil
+
+        return ExactPencil(self.matrices["E"], self.matrices["A"]).index
+
+    def with_matrices(self, changes: Mapping[str, fmpq_mat]) -> WrittenNumbers:
+        """Return the same with some matrices replaced."""
+        return replace(self, matrices={**self.matrices, **changes})
+
+    def as_own(self, matrix: fmpq_mat) -> fmpq_mat:
+        """Return a rational matrix as one of these numbers."""
+        return matrix
+
+    def width(self, matrix: fmpq_mat) -> int:
+        """Return the number of columns."""
+        return int(matrix.ncols())
 
     def zeros(self, rows: int, columns: int) -> fmpq_mat:
         """Return a zero matrix."""
@@ -153,9 +194,10 @@ class WrittenNumbers(PlantNumbers):
 
 @dataclass(frozen=True, eq=False)
 class SampledNumbers(PlantNumbers):
-    """Enclosures of the matrices of a continuous plant with ``E = I``, sampled with a zero-order hold."""
+    """Enclosures of the matrices of a sampled plant; those that sampling leaves (``E, C, Df, Dd``) are rational too."""
 
     matrices: Mapping[str, Rows]
+    rational: Mapping[str, fmpq_mat]
     bits: int
     discrete: bool = True
     exact: bool = False
@@ -168,6 +210,28 @@ class SampledNumbers(PlantNumbers):
     def matrix(self, name: str) -> Rows:
         """Return a matrix by its name."""
         return self.matrices[name]
+
+    @property
+    def regular_rank(self) -> int:
+        """Normal rank of ``A - s E``."""
+        return self.states
+
+    def with_matrices(self, changes: Mapping[str, Rows]) -> SampledNumbers:
+        """Return the same with some matrices replaced."""
+        return replace(self, matrices={**self.matrices, **changes})
+
+    def as_own(self, matrix: fmpq_mat) -> Rows:
+        """Return a rational matrix as one of these numbers."""
+        import flint
+
+        from obsynth.proofs.enclosed_pencils import enclosed
+
+        with flint.ctx.workprec(self.bits):
+            return enclosed(matrix)
+
+    def width(self, matrix: Rows) -> int:
+        """Return the number of columns."""
+        return len(matrix[0]) if matrix else 0
 
     def zeros(self, rows: int, columns: int) -> Rows:
         """Return a zero matrix."""
@@ -208,12 +272,12 @@ class SampledNumbers(PlantNumbers):
     def pencil(self, inputs: Rows, direct: Rows) -> EnclosedPencil:
         """Return ``[A - z, inputs; C, direct]``."""
         from obsynth.proofs.enclosed_pencils import EnclosedPencil
-        from obsynth.proofs.written_numbers import written_matrix
+        from obsynth.proofs.exact_pencils import blocks, zeros_matrix
 
         whole = self.blocks([[self.matrices["A"], inputs], [self.matrices["C"], direct]])
-        derivative = np.zeros((len(whole), len(whole[0])))
-        derivative[: self.states, : self.states] = np.eye(self.states)
-        return EnclosedPencil(written_matrix(derivative), whole, self.bits)
+        outputs, extra = len(whole) - self.states, len(whole[0]) - self.states
+        rest = zeros_matrix(self.states, extra), zeros_matrix(outputs, self.states), zeros_matrix(outputs, extra)
+        return EnclosedPencil(blocks([[self.rational["E"], rest[0]], [rest[1], rest[2]]]), whole, self.bits)
 
     def system(self, inputs: Rows, direct: Rows) -> SystemFacts:
         """Return facts on ``[A - z, inputs; C, direct]``; zeros only where the normal rank is full."""
@@ -264,4 +328,4 @@ def sampled_numbers(exact: Mapping[str, fmpq_mat], sample_time: Any) -> SampledN
         held = {"A": (0, states), "Bf": (states, states + faults), "Bd": (states + faults, states + width)}
         matrices = {name: [row[start:end] for row in rows] for name, (start, end) in held.items()}
         matrices |= {name: enclosed(exact[name]) for name in ("E", "C", "Df", "Dd")}
-    return SampledNumbers(matrices, bits)
+    return SampledNumbers(matrices, {name: exact[name] for name in ("E", "C", "Df", "Dd")}, bits)

@@ -20,6 +20,7 @@ from obsynth.methods.fault_estimation_filter.detectability_indexes import (
     FaultDetectability,
     fault_detectability,
 )
+from obsynth.methods.fault_estimation_filter.exact_indexes import exact_indexes
 from obsynth.methods.fault_estimation_filter.restricted_equivalent import (
     restricted_equivalent,
     restricted_equivalent_from,
@@ -81,6 +82,7 @@ def prepare(plant: DescriptorSystem, s: FloatArray | None = None) -> PreparedPla
         direct = scaling.scale_feedthrough(d)
         return t @ scaling.scale_input(b) - ta @ (n @ direct), shown @ direct
 
+    found = fault_detectability(ta, c, tf, exact=exact_indexes(plant))
     bd, dd = error_input(work.Bd, work.Dd)
     bw, dw = error_input(work.Bw, work.Dw)
-    return PreparedPlant(work, scaling, t, n, ta, c, tf, bd, dd, bw, dw, fault_detectability(ta, c, tf))
+    return PreparedPlant(work, scaling, t, n, ta, c, tf, bd, dd, bw, dw, found)
