@@ -14,6 +14,7 @@ import numpy as np
 from obsynth.analysis.conditions import Condition, rank_condition
 from obsynth.analysis.existence.numbers import numbers_of
 from obsynth.analysis.existence.verdicts import described_distance, settled_rank, unclear_detail, zero_verdict
+from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.zeros import Zero, fault_zeros, hidden_direction, leading_names, system_pencil, zero_at
 from obsynth.errors import PreconditionError
 from obsynth.methods.fault_estimation_filter.detectability_indexes import detectability_conditions
@@ -120,8 +121,9 @@ def _rank_conditions(plant: DescriptorSystem) -> list[Condition]:
         signals=() if plant.nf <= plant.ny else plant.fault_names,
     )
     numbers = numbers_with_fault_states(plant)
+    natural = PlantUnits.of(plant).rounded().scaled_plant(plant)
     faults = settled_rank(
-        decide_rank(np.vstack([plant.Bf, plant.Df]), expected=plant.nf),
+        decide_rank(np.vstack([natural.Bf, natural.Df]), expected=plant.nf),
         # Faults that act on the outputs are columns of Bf too, once they are states.
         None if numbers is None else numbers.rank(numbers.blocks([[numbers.matrix("Bf")]])),
     )
@@ -153,8 +155,9 @@ def _rank_conditions(plant: DescriptorSystem) -> list[Condition]:
                 signals=error.signals,
             ),
         ]
-    stacked = np.vstack([work.E, work.C])
-    outputs, states = decide_rank(work.C, expected=work.ny), decide_rank(stacked, expected=work.nx)
+    natural = PlantUnits.of(work).rounded().scaled_plant(work)
+    stacked = np.vstack([natural.E, natural.C])
+    outputs, states = decide_rank(natural.C, expected=work.ny), decide_rank(stacked, expected=work.nx)
     if numbers is not None:
         c = numbers.matrix("C")
         outputs = settled_rank(outputs, numbers.rank(c))
@@ -191,7 +194,8 @@ def _zero_conditions(plant: DescriptorSystem) -> list[Condition]:
     if not facts.full:
         return [_never_shown(hidden_direction(plant, missing=facts.columns - facts.normal_rank)[1])]
     wide_e, wide_a = system_pencil(plant.E, plant.A, plant.Bf, plant.C, plant.Df)
-    verdict = zero_verdict(facts, wide_e, wide_a, nx=plant.nx, discrete=True)
+    units = PlantUnits.of(plant).rounded()
+    verdict = zero_verdict(facts, *units.scaled_pencil(wide_e, wide_a, units.faults), nx=plant.nx, discrete=True)
     if facts.outside:
         return [_zero_failure(plant, zero_at(plant.E, plant.A, facts.outside[0], plant.Bf, plant.C, plant.Df))]
     largest = max((abs(value) for value in facts.zeros), default=0.0)

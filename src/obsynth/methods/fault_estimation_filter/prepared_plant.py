@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from obsynth.analysis.plant_units import FAR_UNITS, PlantUnits
 from obsynth.analysis.transformations import augment_faults
 from obsynth.methods.fault_estimation_filter.detectability_indexes import (
     FaultDetectability,
@@ -67,7 +68,12 @@ def prepare(plant: DescriptorSystem, s: FloatArray | None = None) -> PreparedPla
     Shapes: ``s (na, na + ny)``.
     """
     work = with_sensor_faults_as_states(plant)
-    scaling = balance_system(work.E, work.A, inputs=[work.Bf], outputs=[work.C])
+    units = PlantUnits.of(work).rounded()
+    scaling = (
+        Scaling(units.equations, units.states, units.outputs)
+        if units.spread > FAR_UNITS
+        else balance_system(work.E, work.A, inputs=[work.Bf], outputs=[work.C])
+    )
     a, c = scaling.scale_dynamics(work.A), scaling.scale_output(work.C)
     if s is None:
         t, n = restricted_equivalent(scaling.scale_dynamics(work.E), c)
