@@ -53,6 +53,7 @@ class PlantNumbers(ABC):
 
     exact: bool
     discrete: bool
+    rational: Mapping[str, fmpq_mat]
 
     @abstractmethod
     def matrix(self, name: str) -> Any:
@@ -88,8 +89,8 @@ class PlantNumbers(ABC):
         """Normal rank of ``A - s E``."""
 
     @abstractmethod
-    def with_matrices(self, changes: Mapping[str, Any]) -> PlantNumbers:
-        """Return the same with some matrices replaced."""
+    def with_matrices(self, changes: Mapping[str, Any], *, rational: Mapping[str, fmpq_mat]) -> PlantNumbers:
+        """Return the same with some matrices replaced, and what is rational of those of a sampled plant."""
 
     @abstractmethod
     def as_own(self, matrix: fmpq_mat) -> Any:
@@ -120,6 +121,11 @@ class WrittenNumbers(PlantNumbers):
     discrete: bool
     exact: bool = True
 
+    @property
+    def rational(self) -> Mapping[str, fmpq_mat]:  # type: ignore[override]
+        """All matrices."""
+        return self.matrices
+
     def matrix(self, name: str) -> fmpq_mat:
         """Return a matrix by its name."""
         return self.matrices[name]
@@ -138,7 +144,7 @@ class WrittenNumbers(PlantNumbers):
 
         return ExactPencil(self.matrices["E"], self.matrices["A"]).index
 
-    def with_matrices(self, changes: Mapping[str, fmpq_mat]) -> WrittenNumbers:
+    def with_matrices(self, changes: Mapping[str, fmpq_mat], *, rational: Mapping[str, fmpq_mat]) -> WrittenNumbers:
         """Return the same with some matrices replaced."""
         return replace(self, matrices={**self.matrices, **changes})
 
@@ -216,9 +222,9 @@ class SampledNumbers(PlantNumbers):
         """Normal rank of ``A - s E``."""
         return self.states
 
-    def with_matrices(self, changes: Mapping[str, Rows]) -> SampledNumbers:
+    def with_matrices(self, changes: Mapping[str, Rows], *, rational: Mapping[str, fmpq_mat]) -> SampledNumbers:
         """Return the same with some matrices replaced."""
-        return replace(self, matrices={**self.matrices, **changes})
+        return replace(self, matrices={**self.matrices, **changes}, rational={**self.rational, **rational})
 
     def as_own(self, matrix: fmpq_mat) -> Rows:
         """Return a rational matrix as one of these numbers."""

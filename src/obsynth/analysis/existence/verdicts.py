@@ -59,6 +59,12 @@ def zero_verdict(facts: SystemFacts, E: FloatArray, A: FloatArray, *, nx: int, d
     return ZeroVerdict("yes" if distance.value > DROWNED else "unclear", facts, distance)
 
 
+def in_own_time(verdict: ZeroVerdict, rate: float) -> ZeroVerdict:
+    """Return a verdict on a plant in scaled time with its point in the time of the plant."""
+    found = verdict.distance
+    return verdict if found is None else replace(verdict, distance=Distance(found.value, found.point / rate))
+
+
 def described_distance(verdict: ZeroVerdict) -> str:
     """Return the least singular value and where it is, for a condition that holds or is unclear."""
     found = verdict.distance

@@ -6,13 +6,13 @@ They are the same for every nonsingular T with ``T E + N C = I``: a rational one
 from __future__ import annotations
 
 import random
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from obsynth.analysis.existence.numbers import PlantNumbers, SampledNumbers, WrittenNumbers, numbers_of
+from obsynth.analysis.existence.numbers import PlantNumbers, numbers_of
 from obsynth.plants.descriptor import DescriptorSystem
 
 if TYPE_CHECKING:
@@ -54,12 +54,9 @@ def numbers_with_fault_states(plant: DescriptorSystem) -> PlantNumbers | None:
         "C": numbers.blocks([[numbers.matrix("C"), numbers.product(numbers.matrix("Df"), own(shown))]]),
         "Df": numbers.product(numbers.matrix("Df"), own(kept)),
     }
-    found = numbers.with_matrices(changed)
-    if isinstance(found, SampledNumbers):
-        e, c, df = (found.rational[name] for name in ("E", "C", "Df"))
-        rational = {"E": blocks([[e, across], [down, square]]), "C": blocks([[c, df * shown]]), "Df": df * kept}
-        return replace(found, rational={**found.rational, **rational})
-    return found
+    e, c, df = (numbers.rational[name] for name in ("E", "C", "Df"))
+    rational = {"E": blocks([[e, across], [down, square]]), "C": blocks([[c, df * shown]]), "Df": df * kept}
+    return numbers.with_matrices(changed, rational=rational)
 
 
 @lru_cache(maxsize=4)
@@ -95,12 +92,7 @@ def _nonsingular_t(numbers: PlantNumbers) -> fmpq_mat | None:
 
     from obsynth.proofs.exact_pencils import blocks, null_basis
 
-    if isinstance(numbers, WrittenNumbers):
-        e, c = numbers.matrix("E"), numbers.matrix("C")
-    elif isinstance(numbers, SampledNumbers):
-        e, c = numbers.rational["E"], numbers.rational["C"]
-    else:
-        return None
+    e, c = numbers.rational["E"], numbers.rational["C"]
     stacked, order = blocks([[e], [c]]), int(e.ncols())
     if stacked.rank() < order:
         return None
