@@ -32,6 +32,12 @@ if TYPE_CHECKING:
     from obsynth.experiments.parameter_simulation import RecursiveSimulation
     from obsynth.experiments.simulation import Simulation, simulate
     from obsynth.exporting.files import export
+    from obsynth.importing.andes import from_andes
+    from obsynth.importing.fmu import from_fmu
+    from obsynth.importing.matlab import from_matlab
+    from obsynth.importing.matrices import from_pandas, from_sympy
+    from obsynth.importing.modelica import from_modelica
+    from obsynth.importing.state_space import from_control, from_scipy
     from obsynth.methods.adaptive_observer.public import adaptive_observer
     from obsynth.methods.dae_adaptive_observer.public import dae_adaptive_observer
     from obsynth.methods.descriptor_kalman.public import descriptor_kalman
@@ -77,6 +83,7 @@ if TYPE_CHECKING:
     from obsynth.simulation.profiles import Drift, Intermittent, Ramp, Sine, Step
     from obsynth.simulation.scenario import Scenario
     from obsynth.simulation.time_varying import simulate_time_varying
+    from obsynth.spec.loader import Spec, load_spec
 
 __version__ = "0.1.0"
 
@@ -134,6 +141,7 @@ _HOMES = {
     "Simulation": "obsynth.experiments.simulation",
     "Sine": "obsynth.simulation.profiles",
     "SolverError": "obsynth.errors",
+    "Spec": "obsynth.spec.loader",
     "SpecError": "obsynth.errors",
     "SteadyState": "obsynth.methods.recursive.steady_filter",
     "Step": "obsynth.simulation.profiles",
@@ -156,8 +164,17 @@ _HOMES = {
     "fault_estimation_filter_from_gains": "obsynth.methods.fault_estimation_filter.public",
     "fault_model": "obsynth.plants.fault_models",
     "fault_response": "obsynth.methods.ui_pi_observer.checks.fault_response",
+    "from_andes": "obsynth.importing.andes",
+    "from_control": "obsynth.importing.state_space",
+    "from_fmu": "obsynth.importing.fmu",
+    "from_matlab": "obsynth.importing.matlab",
+    "from_modelica": "obsynth.importing.modelica",
+    "from_pandas": "obsynth.importing.matrices",
+    "from_scipy": "obsynth.importing.state_space",
+    "from_sympy": "obsynth.importing.matrices",
     "html_report": "obsynth.report.page",
     "load": "obsynth.results.gain_sets",
+    "load_spec": "obsynth.spec.loader",
     "monitor": "obsynth.experiments.monitors.residual_monitor",
     "online_monitor": "obsynth.experiments.monitors.online_monitor",
     "pd_delta_scan": "obsynth.methods.pd_observer.public",
@@ -221,6 +238,7 @@ __all__ = [
     "Simulation",
     "Sine",
     "SolverError",
+    "Spec",
     "SpecError",
     "SteadyState",
     "Step",
@@ -247,9 +265,18 @@ __all__ = [
     "fault_estimation_filter_from_gains",
     "fault_model",
     "fault_response",
+    "from_andes",
+    "from_control",
+    "from_fmu",
+    "from_matlab",
+    "from_modelica",
+    "from_pandas",
+    "from_scipy",
+    "from_sympy",
     "html_report",
     "identifiability",
     "load",
+    "load_spec",
     "monitor",
     "online_monitor",
     "pd_delta_scan",

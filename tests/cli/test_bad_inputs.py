@@ -236,7 +236,7 @@ SCHEMA = [
     Case(
         "margin negative",
         put("method", "options", "gamma_margin", -0.1),
-        "method.options.gamma_margin: must be greater than 0",
+        "method.options.gamma_margin: must be at least 0.01",
     ),
     Case(
         "unknown solver",

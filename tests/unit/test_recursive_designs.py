@@ -135,7 +135,7 @@ class TestRefusals:
     def test_options(self) -> None:
         plant = varying(horizon=20)
         for options, part in (
-            ({"forgetting": 1.5}, r"lambda in \(0, 1\]"),
+            ({"forgetting": 1.5}, "above 0 and at most 1"),
             ({"form": "random-walk"}, "needs random_walk"),
             ({"random_walk": 1.0}, "belongs to form 'random-walk'"),
             ({"Q": [[1, 2, 0], [2, 1, 0], [0, 0, 1]]}, "not positive semidefinite"),

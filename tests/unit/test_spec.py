@@ -17,7 +17,7 @@ from obsynth.methods.designing import public_function
 from obsynth.methods.registry import REGISTRY
 from obsynth.spec import load_spec
 from obsynth.spec.matrices import read_matrix
-from obsynth.spec.options import METHOD_OPTIONS
+from obsynth.spec.options import method_options
 
 DESIGNS = Path(__file__).parents[2] / "designs"
 
@@ -352,11 +352,11 @@ class TestShippedDesigns:
 
 class TestMethods:
     def test_the_schema_knows_every_method(self) -> None:
-        assert set(METHOD_OPTIONS) == set(REGISTRY)
+        assert set(method_options()) == set(REGISTRY)
 
-    @pytest.mark.parametrize("method", METHOD_OPTIONS)
+    @pytest.mark.parametrize("method", REGISTRY)
     def test_the_schema_has_the_options_and_defaults_of_the_function(self, method: str) -> None:
         parameters = inspect.signature(public_function(method)).parameters
         of_function = {name: p.default for name, p in parameters.items() if name not in ("plant", "name")}
-        fields = METHOD_OPTIONS[method].model_fields
+        fields = method_options()[method].model_fields
         assert {name: field.default for name, field in fields.items()} == of_function

@@ -16,6 +16,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 import obsynth
 from obsynth.methods import designing
 from obsynth.methods.pd_observer import synthesis as method
+from obsynth.methods.pd_observer.options import PdOptions
 from obsynth.numerics.threads import STATES_WORTH_THREADS, one_thread_if_small
 
 PLANT = obsynth.DescriptorSystem(None, [[0.5, 1.0], [0.0, -1.0]], C=[[1.0, 0.0]], Bf=[[0.0], [1.0]])
@@ -150,7 +151,7 @@ def test_verification_alone_runs_on_one_thread(monkeypatch: pytest.MonkeyPatch) 
 
 def test_the_method_itself_leaves_the_threads_alone() -> None:
     """The setting is in `design`, once for every method."""
-    method.synthesise(PLANT, progress=lambda _: None)
+    method.synthesise(PLANT, PdOptions(), progress=lambda _: None)
     assert blas_threads() == {2}
 
 

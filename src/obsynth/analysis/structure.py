@@ -80,6 +80,7 @@ def analyse_structure(plant: DescriptorSystem) -> Structure:
     ----------
     .. [Dai1989] L. Dai, "Singular Control Systems", 1989, chapters 1 and 2.
     """
+    plant = plant.dense()
     E, A, C = plant.E, plant.A, plant.C
     pencil = pencil_structure(E, A)
     poles = FiniteZeros(pencil.finite_eigenvalues, pencil.normal_rank, pencil.decisions)

@@ -117,6 +117,7 @@ def invariant_zeros(
 
 def fault_zeros(plant: DescriptorSystem) -> FaultZeros:
     """Return the invariant zeros from the faults of ``plant`` to its outputs."""
+    plant = plant.dense()
     e, a = system_pencil(plant.E, plant.A, plant.Bf, plant.C, plant.Df)
     found = system_zeros(e, a, nx=plant.nx)
     zeros = _with_directions(e, a, found, nx=plant.nx)

@@ -9,25 +9,28 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from obsynth.cli.arguments import output_file
 from obsynth.cli.output import print_json, progress, stdout_console
 from obsynth.errors import PreconditionError, SpecError, VerificationError
 
 if TYPE_CHECKING:
     from obsynth.analysis.structure import Structure
+    from obsynth.files.outputs import FileKind
     from obsynth.results.design import ObserverDesign
     from obsynth.spec import Spec
 
 
 def run_design(options: argparse.Namespace) -> int:
     """Run ``design``: spec in, report and gain set out."""
-    from obsynth.results.gain_sets import design_as_dict
+    from obsynth.results.gain_sets import GAIN_SET, design_as_dict
 
     with progress(quiet=options.quiet) as report_stage:
         report_stage(f"reading {options.system}")
         from obsynth.spec import load_spec
 
         spec = load_spec(options.system)
-        target = output_file(options.output, spec)
+        wanted = Path(f"{spec.name}.gains.json") if options.output is None else options.output
+        target = spec_output(wanted, GAIN_SET, spec, options, option="--output")
         design = designed(spec, report_stage)
         file = design.save(target)
     if options.json:
@@ -70,16 +73,11 @@ def require_same_signals(design: ObserverDesign, gains: Path, spec: Spec) -> Non
         raise SpecError(f"{gains} is for a plant with other signals than that of {spec.path}.", path=str(gains))
 
 
-def output_file(wanted: Path | None, spec: Spec, *, option: str = "--output") -> Path:
-    """Return where to write; refuse a hopeless place before any work is done."""
-    target = wanted if wanted is not None else Path(f"{spec.name}.gains.json")
-    if target.is_dir():
-        raise SpecError(f"{target} is a folder: give the name of a file to {option}.", path=str(target))
-    if not target.parent.is_dir():
-        raise SpecError(f"The folder {target.parent} does not exist: {target} cannot be written.", path=str(target))
-    if target.exists() and target.samefile(spec.path):
-        raise SpecError(f"{target} is the spec itself: give another file to {option}.", path=str(target))
-    return target
+def spec_output(wanted: Path, kind: FileKind, spec: Spec, options: argparse.Namespace, *, option: str) -> Path:
+    """Return where to write what a spec asks for; refuse a hopeless place before any work is done."""
+    if wanted.exists() and wanted.samefile(spec.path):
+        raise SpecError(f"{wanted} is the spec itself: give another file to {option}.", path=str(wanted))
+    return output_file(wanted, kind, options, option=option)
 
 
 def run_check(options: argparse.Namespace) -> int:

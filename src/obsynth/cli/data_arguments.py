@@ -6,10 +6,12 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from obsynth.cli.arguments import add_force, add_gains, add_json, add_quiet
+
 _RUN = "Run a design on measured data: a log, or a stream on standard input, a row in, a row out."
 _EXPORT = (
-    "Write a gain set for Simulink (.mat), numpy (.npz) or C99 (.c and .h); of a recursive design for a time-invariant "
-    "plant, its steady state."
+    "Write a gain set for Simulink (.mat), numpy (.npz), C99 (.c and .h), or as a functional mock-up unit for "
+    "co-simulation (.fmu); of a recursive design for a time-invariant plant, its steady state."
 )
 _REPORT = "Verify a gain set again and write one self-contained HTML page about it."
 _RUN_DETAILS = """\
@@ -39,7 +41,7 @@ def add_data_verbs(verbs: Any) -> None:
     run = verbs.add_parser(
         "run", help=_RUN, description=_RUN, epilog=_RUN_DETAILS, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    _add_gains(run)
+    add_gains(run)
     run.add_argument("--data", required=True, metavar="FILE", help="CSV or Parquet file; - for CSV on standard input")
     run.add_argument(
         "--out", default="-", metavar="FILE", help="CSV or Parquet file for the estimates (default: - for stdout)"
@@ -75,24 +77,35 @@ def add_data_verbs(verbs: Any) -> None:
     run.add_argument(
         "--state", type=Path, metavar="FILE", help="go on from this saved state if it exists, and save the new one"
     )
-    _add_json(run)
-    run.add_argument("--quiet", action="store_true", help="print no progress and no summary")
+    add_json(run)
+    add_force(run)
+    add_quiet(run, "no progress and no summary")
     run.set_defaults(verb="run")
 
     export = verbs.add_parser("export", help=_EXPORT, description=_EXPORT)
-    _add_gains(export)
-    export.add_argument("--to", type=Path, required=True, metavar="FILE", help=".mat, .npz, or .c (with a header)")
+    add_gains(export)
     export.add_argument(
-        "--sample-time", type=float, metavar="SECONDS", help="sample a continuous-time observer (needed for C)"
+        "--to", type=Path, required=True, metavar="FILE", help=".mat, .npz, .c (with a header), or .fmu"
     )
-    _add_json(export)
+    export.add_argument(
+        "--sample-time", type=float, metavar="SECONDS", help="sample a continuous-time observer (needed for C and FMU)"
+    )
+    export.add_argument("--fmi", choices=("2.0", "3.0"), default="2.0", help="version of FMI for .fmu (default: 2.0)")
+    export.add_argument(
+        "--threshold", type=_pair, action="append", default=[], metavar="OUTPUT=LEVEL",
+        help="for .fmu: alarm when the absolute value of an output, such as fhat[pump], passes a level",
+    )  # fmt: skip
+    export.add_argument("--warm-up", type=float, metavar="SECONDS", help="for .fmu: no alarms in these seconds")
+    add_force(export)
+    add_json(export)
     export.set_defaults(verb="export")
 
     report = verbs.add_parser("report", help=_REPORT, description=_REPORT)
-    _add_gains(report)
+    add_gains(report)
     report.add_argument("--out", type=Path, required=True, metavar="FILE", help="the page (HTML)")
     report.add_argument("--system", type=Path, metavar="SPEC", help="show the design on the scenario of this spec")
-    _add_json(report)
+    add_force(report)
+    add_json(report)
     report.set_defaults(verb="report")
 
 
@@ -115,14 +128,6 @@ def add_monitor_arguments(parser: argparse.ArgumentParser) -> None:
         "--change", type=float, default=1.0, metavar="X",
         help="cusum: change to be found, in deviations of the residual, or in parameter units (default: 1)",
     )  # fmt: skip
-
-
-def _add_gains(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--gains", type=Path, required=True, metavar="FILE", help="a gain set (JSON) that design wrote")
-
-
-def _add_json(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--json", action="store_true", help="print JSON on stdout, for programs; errors too")
 
 
 def _pair(text: str) -> tuple[str, str]:

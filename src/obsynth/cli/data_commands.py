@@ -10,8 +10,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
+from obsynth.cli.arguments import output_file
 from obsynth.cli.output import print_json
 from obsynth.errors import SpecError, VerificationError
+from obsynth.files.inputs import protect, protect_stream
+from obsynth.files.outputs import require_distinct
 
 if TYPE_CHECKING:
     from obsynth.data.run import DataRun
@@ -25,9 +28,9 @@ def run_run(options: argparse.Namespace) -> int:
     """Run ``run``: gain set and data in, estimates out."""
     from obsynth.results.gain_sets import load
 
-    out = _target(options)
-    if options.json and out is sys.stdout:
+    if options.json and options.out == STREAM:
         raise SpecError("--json and the estimates cannot both go to stdout: give --out a file.", path="--json")
+    out = _target(options)
     design = load(options.gains)
     watched = _monitor(design, options)
     from obsynth.data.run import run_on_data
@@ -58,11 +61,16 @@ def run_run(options: argparse.Namespace) -> int:
 
 def run_export(options: argparse.Namespace) -> int:
     """Run ``export``: gain set in, file for another program out."""
-    from obsynth.exporting.files import export
+    from obsynth.exporting.files import export, exported_files
     from obsynth.results.gain_sets import load
 
     design = load(options.gains)
-    files = export(design, options.to, sample_time=options.sample_time)
+    for file, kind in exported_files(options.to).items():
+        output_file(file, kind, options, option="--to")
+    files = export(
+        design, options.to, sample_time=options.sample_time, fmi=options.fmi,
+        thresholds=numbers_of(options.threshold) or None, warm_up=options.warm_up,
+    )  # fmt: skip
     if options.json:
         print_json({"command": "export", "gains": str(options.gains), "files": [str(file) for file in files]})
     else:
@@ -75,16 +83,16 @@ def run_report(options: argparse.Namespace) -> int:
     from obsynth.methods.verifying import verify
     from obsynth.results.gain_sets import load
 
-    if options.out.resolve() == options.gains.resolve():
-        raise SpecError(f"--out and --gains are the same file {options.out}: give another one.", path=str(options.out))
+    require_distinct({"--gains": options.gains, "--system": options.system, "--out": options.out})
     design = load(options.gains)
-    report = verify(design)
     from obsynth.cli.simulate import required_scenario
-    from obsynth.report.page import html_report
+    from obsynth.report.page import PAGE, html_report
     from obsynth.spec import load_spec
 
     scenario = None if options.system is None else required_scenario(load_spec(options.system))
     system = None if options.system is None else str(options.system)
+    output_file(options.out, PAGE, options)
+    report = verify(design)
     file = html_report(
         design, options.out, report=report, gains_file=options.gains.name, scenario=scenario, system_file=system
     )
@@ -96,17 +104,26 @@ def run_report(options: argparse.Namespace) -> int:
 
 
 def _target(options: argparse.Namespace) -> Path | TextIO:
-    wanted: str = options.out
-    if wanted == STREAM:
+    """Return where estimates go; refuse a hopeless place before any work is done."""
+    from obsynth.data.saved_state import STATE
+    from obsynth.data.sinks import ESTIMATES
+    from obsynth.data.sources import check_suffix
+
+    named = {"--gains": options.gains, "--system": options.system, "--state": options.state}
+    streams = {"--data": options.data, "--out": options.out}
+    require_distinct({**named, **{name: file for name, file in streams.items() if file != STREAM}})
+    for file in (options.gains, options.system, None if options.data == STREAM else Path(options.data)):
+        if file is not None:
+            protect(file)
+    if options.data == STREAM:
+        protect_stream(sys.stdin)
+    if options.state is not None:
+        output_file(options.state, STATE, options, option="--state")
+    if options.out == STREAM:
         return sys.stdout
-    target = Path(wanted)
-    for name in ("data", "gains", "state"):
-        other = getattr(options, name)
-        if other is None or other == STREAM:
-            continue
-        if target.resolve() == Path(other).resolve():
-            raise SpecError(f"--out and --{name} are the same file {target}: give another one.", path=str(target))
-    return target
+    target = Path(options.out)
+    check_suffix(target)
+    return output_file(target, ESTIMATES, options)
 
 
 def numbers_of(pairs: list[tuple[str, str]]) -> Mapping[str, float]:

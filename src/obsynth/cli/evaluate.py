@@ -10,6 +10,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from obsynth.cli.arguments import add_json, add_quiet, add_system
 from obsynth.cli.data_arguments import add_monitor_arguments
 from obsynth.cli.output import print_json, progress, stdout_console
 from obsynth.cli.simulate import required_scenario
@@ -25,7 +26,7 @@ _EVALUATE = "Design an observer from a spec, run the spec's scenario many times,
 def add_evaluate_verb(verbs: Any) -> None:
     """Add the parser."""
     evaluate = verbs.add_parser("evaluate", help=_EVALUATE, description=_EVALUATE)
-    evaluate.add_argument("--system", type=Path, required=True, metavar="FILE", help="the spec (YAML), with a scenario")
+    add_system(evaluate)
     evaluate.add_argument(
         "--gains", type=Path, metavar="FILE", help="a gain set for the spec's plant: nothing is designed"
     )
@@ -37,8 +38,8 @@ def add_evaluate_verb(verbs: Any) -> None:
     )
     evaluate.add_argument("--jobs", type=int, default=1, metavar="N", help="processes (default: 1)")
     add_monitor_arguments(evaluate)
-    evaluate.add_argument("--json", action="store_true", help="print JSON on stdout, for programs; errors too")
-    evaluate.add_argument("--quiet", action="store_true", help="print no progress")
+    add_json(evaluate)
+    add_quiet(evaluate)
     evaluate.set_defaults(verb="evaluate")
 
 
@@ -94,4 +95,8 @@ def _executor(jobs: int) -> Iterator[Executor | None]:
         yield None
         return
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as executor:
-        yield executor
+        try:
+            yield executor
+        except BaseException:
+            executor.shutdown(wait=False, cancel_futures=True)
+            raise

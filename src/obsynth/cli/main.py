@@ -6,16 +6,18 @@ Nothing heavy is imported here, so that ``--help`` answers at once.
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from obsynth import __version__
+from obsynth.cli.arguments import add_force, add_json, add_quiet, add_system
 from obsynth.cli.data_arguments import add_data_verbs
 from obsynth.cli.evaluate import add_evaluate_verb
 from obsynth.cli.output import print_error, print_json
+from obsynth.cli.process import told_error, unwritable_output, usable_streams
 from obsynth.errors import ObsynthError
+from obsynth.files.inputs import protected_inputs
 
 _EXIT_CODES = """\
 exit codes:
@@ -59,8 +61,8 @@ def _parser() -> argparse.ArgumentParser:
     _add_design_arguments(verbs.add_parser("design", help=_DESIGN, description=_DESIGN))
 
     check = verbs.add_parser("check", help=_CHECK, description=_CHECK)
-    _add_system(check)
-    _add_json(check)
+    add_system(check)
+    add_json(check)
     check.set_defaults(verb="check")
 
     verify = verbs.add_parser("verify", help=_VERIFY, description=_VERIFY)
@@ -69,17 +71,18 @@ def _parser() -> argparse.ArgumentParser:
         "--printed-digits", type=_digits, metavar="N",
         help="judge the gains as numbers that were printed with N decimals",
     )  # fmt: skip
-    _add_json(verify)
+    add_json(verify)
     verify.set_defaults(verb="verify")
 
     simulate = verbs.add_parser("simulate", help=_SIMULATE, description=_SIMULATE)
-    _add_system(simulate)
+    add_system(simulate)
     simulate.add_argument(
         "--gains", type=Path, metavar="FILE", help="a gain set for the spec's plant: nothing is designed"
     )
     simulate.add_argument("--out", type=Path, metavar="FILE", help="write every signal to this file (CSV)")
-    _add_json(simulate)
-    simulate.add_argument("--quiet", action="store_true", help="print no progress")
+    add_json(simulate)
+    add_force(simulate)
+    add_quiet(simulate)
     simulate.set_defaults(verb="simulate")
     add_evaluate_verb(verbs)
     add_data_verbs(verbs)
@@ -87,22 +90,15 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _add_design_arguments(parser: argparse.ArgumentParser) -> None:
-    _add_system(parser)
+    add_system(parser)
     parser.add_argument(
         "--output", type=Path, metavar="FILE",
         help="where to write the gain set (default: <name of the spec>.gains.json in the current folder)",
     )  # fmt: skip
-    _add_json(parser)
-    parser.add_argument("--quiet", action="store_true", help="print no progress")
+    add_json(parser)
+    add_force(parser)
+    add_quiet(parser)
     parser.set_defaults(verb="design")
-
-
-def _add_system(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--system", type=Path, required=True, metavar="FILE", help="the spec (YAML)")
-
-
-def _add_json(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--json", action="store_true", help="print JSON on stdout, for programs; errors too")
 
 
 def _add_version(parser: argparse.ArgumentParser) -> None:
@@ -132,24 +128,33 @@ def _verb(name: str) -> Callable[[argparse.Namespace], int]:
 
 
 def _run(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> int:
-    options = parser.parse_args(arguments)
-    for stream in (sys.stdout, sys.stderr):
-        # A name that the terminal's encoding lacks must not end a run that has succeeded.
-        if hasattr(stream, "reconfigure"):
-            stream.reconfigure(errors="backslashreplace")
+    with usable_streams(), protected_inputs():
+        try:
+            try:
+                return _outcome(parser.parse_args(arguments))
+            finally:
+                sys.stdout.flush()
+        except KeyboardInterrupt:
+            print("Interrupted.", file=sys.stderr)
+            return 130
+        except OSError as error:
+            # Files are read and written elsewhere, with errors of their own: this is standard output.
+            return unwritable_output(error)
+
+
+def _outcome(options: argparse.Namespace) -> int:
+    """Run the verb; return its exit code, or that of its error after telling it."""
     try:
-        code = _verb(options.verb)(options)
-        sys.stdout.flush()
-        return code
+        return _verb(options.verb)(options)
     except ObsynthError as error:
-        if options.json:
-            print_json(error.as_dict())
-        print_error(error)
-        return error.exit_code
-    except KeyboardInterrupt:
-        print("Interrupted.", file=sys.stderr)
-        return 130
-    except BrokenPipeError:
-        # Whoever read our output has left; the interpreter's own flush at exit must not complain.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 141
+        told = error
+    except (ImportError, MemoryError, RecursionError, ArithmeticError, ValueError) as error:
+        # LAPACK's errors are among the last.
+        found = told_error(error)
+        if found is None:
+            raise
+        told = found
+    if options.json:
+        print_json(told.as_dict())
+    print_error(told)
+    return told.exit_code

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from obsynth.cli.output import print_json, progress, stdout_console
 from obsynth.errors import SpecError
+from obsynth.files.inputs import protect
 
 if TYPE_CHECKING:
     from obsynth.simulation.scenario import Scenario
@@ -24,14 +25,17 @@ def required_scenario(spec: Spec) -> Scenario:
 
 def run_simulate(options: argparse.Namespace) -> int:
     """Run ``simulate``: spec in, table of errors out, and every signal in a file if asked."""
-    from obsynth.cli.commands import designed_or_loaded, output_file
+    from obsynth.cli.commands import designed_or_loaded, spec_output
+    from obsynth.experiments.columns import SIGNALS
     from obsynth.spec import load_spec
 
     with progress(quiet=options.quiet) as report_stage:
         report_stage(f"reading {options.system}")
         spec = load_spec(options.system)
         scenario = required_scenario(spec)
-        target = None if options.out is None else output_file(options.out, spec, option="--out")
+        if options.gains is not None:
+            protect(options.gains)
+        target = None if options.out is None else spec_output(options.out, SIGNALS, spec, options, option="--out")
         design = designed_or_loaded(spec, options.gains, report_stage)
         report_stage("simulating")
         from obsynth.experiments.simulation import simulate

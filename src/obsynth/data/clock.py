@@ -11,6 +11,9 @@ FITTING_SHARE = 0.01
 #: Without another word, an interval is a gap when it is longer than this many times the longest one before.
 GAP_FACTOR = 10.0
 
+#: A gap of more samples than this cannot be counted in double precision.
+MOST_SAMPLES = 2.0**53
+
 
 class Clock:
     """Checks one time stamp after the other.
@@ -37,14 +40,14 @@ class Clock:
         if time < last:
             raise SpecError(f"Row {row}: the time falls from {last:.17g} to {time:.17g} s.", path=f"row {row}")
         step = interval(last, time)
-        missing = self._sampled(step, row) if self.dt > 0.0 else self._continuous(step)
+        missing = self._sampled(step, row) if self.dt > 0.0 else self._continuous(step, row)
         self.last = time
         if not missing:
             self.longest = max(self.longest, step)
         return step, missing
 
     def _sampled(self, step: float, row: int) -> int:
-        count = round(step / self.dt)
+        count = _counted(step / self.dt, step, row)
         if count < 1 or abs(step - count * self.dt) > FITTING_SHARE * self.dt:
             raise SpecError(
                 f"Row {row} comes {step:.10g} s after the row before, but the design has dt = {self.dt:.10g} s: "
@@ -57,12 +60,23 @@ class Clock:
             )  # fmt: skip
         return count - 1
 
-    def _continuous(self, step: float) -> int:
+    def _continuous(self, step: float, row: int) -> int:
         typical = self.longest or step
         if step <= (GAP_FACTOR * typical if self.gap is None else self.gap):
             return 0
         unit = typical if self.longest else min(step, self.gap or step)
+        _counted(step / unit, step, row)
         return max(math.ceil(step / unit * (1.0 - FITTING_SHARE)) - 1, 1)
+
+
+def _counted(samples: float, step: float, row: int) -> int:
+    """Return a whole number of samples; more than can be counted are no gap but a mistake."""
+    if not samples < MOST_SAMPLES:
+        raise SpecError(
+            f"Row {row} comes {step:.10g} s after the row before, {samples:.3g} samples: are the times in seconds?",
+            path=f"row {row}",
+        )
+    return round(samples)
 
 
 def interval(before: float, after: float) -> float:

@@ -6,13 +6,13 @@ import math
 
 import numpy as np
 
-from obsynth.data.observer_holds import FORGOTTEN, checked_warm_up
 from obsynth.data.step_log import SteppingEngine
 from obsynth.errors import SolverError, SpecError
 from obsynth.experiments.monitors.online import Evidence
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.estimates import DAEEstimates
 from obsynth.observers.dae.running import RunningDAEObserver
+from obsynth.observers.linear.warm_up import FORGOTTEN, checked_warm_up
 from obsynth.results.design import ObserverDesign
 
 

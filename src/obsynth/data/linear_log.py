@@ -13,11 +13,12 @@ from obsynth.data.clock import Clock
 from obsynth.data.gap_model import GapModel
 from obsynth.data.linear_signals import LinearSignalNames
 from obsynth.data.log_estimator import GAP, LONGEST_BRIDGE, OK, RECOVERING, WARM_UP, Row, estimate_columns
-from obsynth.data.observer_holds import KeptHolds, checked_warm_up, transient
+from obsynth.data.observer_holds import KeptHolds
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.sampling import first_order_hold
+from obsynth.observers.linear.warm_up import checked_warm_up, transient
 from obsynth.results.design import ObserverDesign
 
 _Part = TypeVar("_Part")

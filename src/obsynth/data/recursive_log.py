@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 
-from obsynth.data.observer_holds import FORGOTTEN, checked_warm_up
 from obsynth.data.step_log import SteppingEngine
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.experiments.monitors.online import Evidence
 from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.linear.warm_up import FORGOTTEN, checked_warm_up
 from obsynth.observers.recursive.estimates import deviations_of
 from obsynth.observers.recursive.records import require_horizon
 from obsynth.observers.recursive.running import RawEstimate, RunningRecursiveObserver

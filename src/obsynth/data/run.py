@@ -17,7 +17,10 @@ from obsynth.data.sources import Data, chunks
 from obsynth.data.start import engine_of
 from obsynth.errors import SpecError
 from obsynth.experiments.monitors.online import OnlineMonitor
+from obsynth.files.outputs import check_output, require_distinct
+from obsynth.files.signals import HeldSignals, ending_signals
 from obsynth.numerics.arguments import require_kind, require_mapping
+from obsynth.numerics.arrays import FloatArray
 from obsynth.results.design import ObserverDesign
 
 if TYPE_CHECKING:
@@ -161,6 +164,12 @@ def run_on_data(
         require_kind(out, (str, Path), "out", "the name of a file, or a text stream")
     if isinstance(chunk_rows, bool) or not isinstance(chunk_rows, int) or chunk_rows < 1:
         raise SpecError(f"chunk_rows is {chunk_rows!r}: give a whole number, 1 or more.", path="chunk_rows")
+    require_distinct({
+        "state": state, "data": data if isinstance(data, str | Path) else None,
+        "out": out if isinstance(out, str | Path) else None,
+    })  # fmt: skip
+    if state is not None:
+        check_output(state)
     engine = engine_of(design, gap=gap, warm_up=warm_up)
     # The monitor is not used up: a second run may begin with it.
     watched = None if monitor is None else copy.deepcopy(monitor)
@@ -168,16 +177,12 @@ def run_on_data(
     digest = digest_of_gains(design)
     if state is not None and Path(state).exists():
         resume_state(Path(state), job, digest)
+    rows = chunks(data, job.signals, chunk_rows)
     with _sink(out, job.header) as sink:
-        try:
-            for chunk in chunks(data, job.signals, chunk_rows):
-                sink.write(job.take(chunk))
-                if progress is not None:
-                    progress(job.rows)
-        finally:
-            # What has left on a stream cannot be taken back, so the state goes with it.
-            if state is not None and isinstance(sink, TextSink) and not isinstance(out, str | Path) and job.rows:
-                save_state(Path(state), job, digest)
+        if state is None or out is None or isinstance(out, str | Path):
+            _run_rows(job, rows, sink, progress)
+        else:
+            _run_stream(job, rows, sink, progress, lambda: save_state(Path(state), job, digest))
     if state is not None:
         save_state(Path(state), job, digest)
     table = sink.frame() if isinstance(sink, FrameSink) else None
@@ -186,6 +191,38 @@ def run_on_data(
         job.rows, dict(job.statuses), dict(job.alarms), job.isolated, recovered,
         (*engine.notes, *job.first.warnings()), digest, table,
     )  # fmt: skip
+
+
+def _run_rows(job: Job, rows: Iterator[FloatArray], sink: Sink, progress: Callable[[int], None] | None) -> None:
+    for chunk in rows:
+        sink.write(job.take(chunk))
+        if progress is not None:
+            progress(job.rows)
+
+
+def _run_stream(
+    job: Job, rows: Iterator[FloatArray], sink: Sink, progress: Callable[[int], None] | None, save: Callable[[], None]
+) -> None:
+    """Take rows one by one; what has left cannot be taken back, so the state is saved however the run ends."""
+    held, is_whole = HeldSignals(), True
+    with ending_signals(), held.installed():
+        try:
+            for chunk in rows:
+                for row in chunk:
+                    with held:
+                        is_whole = False
+                        found = job.take(row[None])
+                        is_whole = True
+                        sink.write(found)
+                if progress is not None:
+                    progress(job.rows)
+        except SpecError:
+            # A refused row has changed nothing.
+            is_whole = True
+            raise
+        finally:
+            if is_whole and job.rows:
+                save()
 
 
 @contextmanager

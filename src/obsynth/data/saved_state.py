@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 from obsynth.data.job import Job
 from obsynth.errors import SpecError
+from obsynth.files.inputs import read_json
+from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.results.design import ObserverDesign
-from obsynth.results.files import write_atomically
 from obsynth.results.gain_sets import design_as_dict, digest_of, plain, restored
 
 KIND = "obsynth run state"
 SCHEMA_VERSION = 3
+STATE = FileKind("a saved state of obsynth", rb'\A\s*\{\s*"kind":\s*"obsynth run state"')
 
 
 def digest_of_gains(design: ObserverDesign) -> str:
@@ -30,18 +31,21 @@ def save_state(path: Path, job: Job, digest: str) -> None:
 
 def resume_state(path: Path, job: Job, digest: str) -> None:
     """Let a run go on from a saved state."""
-    try:
-        document: Any = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise SpecError(f"{path} cannot be read: {error.strerror}.", path=str(path)) from error
-    except (ValueError, RecursionError) as error:
-        raise SpecError(f"{path} is no JSON document ({error}).", path=str(path)) from error
+    # The state is written again at the end, so it is no input that has to be kept.
+    document = read_json(path, is_protected=False)
     known = isinstance(document, dict) and document.get("kind") == KIND
     if not known or document.get("schema_version") != SCHEMA_VERSION:
         raise SpecError(f"{path} is no saved state of a run.", path=str(path))
     body = document.get("run")
-    if not isinstance(body, dict) or document.get("sha256") != digest_of(body):
+    try:
+        intact = isinstance(body, dict) and document.get("sha256") == digest_of(body)
+    except (ValueError, RecursionError):  # a number too large for a float
+        intact = False
+    if not intact:
         raise SpecError(f"{path} was changed after it was written: its digest does not match.", path=str(path))
     if body.get("gains") != digest:
         raise SpecError(f"{path} is the state of a run with another gain set.", path=str(path))
-    job.resume(restored(body["state"]))
+    try:
+        job.resume(restored(body["state"]))
+    except (AttributeError, LookupError, TypeError, ValueError, ArithmeticError) as error:
+        raise SpecError(f"{path} is incomplete: {error}.", path=str(path)) from error

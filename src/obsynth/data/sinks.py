@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -10,7 +9,11 @@ from pathlib import Path
 from typing import Any, Protocol, TextIO
 
 from obsynth.data.sources import check_suffix
-from obsynth.results.files import replacement_of
+from obsynth.files.outputs import FileKind, replacement_of
+from obsynth.files.tables import TableWriter
+
+#: A table that a run on measured data has written, as CSV or as Parquet.
+ESTIMATES = FileKind("a table of estimates of obsynth", rb"\Atime,status,|\APAR1(?s:.*)status(?s:.*)hat\[")
 
 
 class Sink(Protocol):
@@ -28,13 +31,11 @@ class TextSink:
     """
 
     def __init__(self, stream: TextIO, header: Sequence[str]) -> None:
-        self._stream = stream
-        self._writer = csv.writer(stream, lineterminator="\n")
-        self._writer.writerow(header)
+        self._stream, self._writer = stream, TableWriter(stream, header)
 
     def write(self, rows: Sequence[Sequence[Any]]) -> None:
         """Write rows; floats so that they are read back bit for bit."""
-        self._writer.writerows([["" if cell != cell else cell for cell in row] for row in rows])
+        self._writer.write(rows)
         self._stream.flush()
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import itertools
+import re
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,6 +15,8 @@ import numpy as np
 
 from obsynth.data.signals import Signals
 from obsynth.errors import SpecError
+from obsynth.files.inputs import input_file
+from obsynth.files.tables import as_meant
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray
 
@@ -23,6 +27,8 @@ if TYPE_CHECKING:
 #: What a missing sample may look like in a stream; data frames know more words.
 MISSING = frozenset({"", "nan", "na", "n/a", "null", "none"})
 SUFFIXES = (".csv", ".parquet")
+#: Lines that may end with CR alone.
+_OLD_LINES = re.compile(r"[^\r]*\r\n?|[^\r]+")
 
 Data: TypeAlias = "str | Path | TextIO | pd.DataFrame"
 
@@ -65,9 +71,9 @@ def check_suffix(path: Path) -> None:
 @contextmanager
 def _readable(path: Path) -> Iterator[None]:
     """Turn what can be wrong with a file into errors that name it."""
-    if path.is_dir():
-        raise SpecError(f"{path} is a folder: give the name of a file.", path=str(path))
     try:
+        if path.exists():
+            input_file(path)
         yield
     except SpecError:
         raise
@@ -84,7 +90,7 @@ def _csv(path: Path, rows: int) -> Iterator[pd.DataFrame]:
 
     # The header is read as data, since pandas would rename a repeated column.
     header = pd.read_csv(path, header=None, nrows=1, dtype=str, keep_default_na=False, encoding="utf-8-sig")
-    names = [str(name).strip() for name in header.iloc[0]]
+    names = [as_meant(str(name).strip()) for name in header.iloc[0]]
     if not _has_rows(path):
         return
     with warnings.catch_warnings():
@@ -153,8 +159,8 @@ def _number(text: str | None, row: int, column: str) -> float:
 
 def _stream(stream: TextIO, signals: Signals) -> Iterator[FloatArray]:
     # Line by line: a reader of its own would wait for more than one.
-    lines = csv.reader(iter(stream.readline, ""))
-    header = tuple(name.strip() for name in next(lines, []))
+    lines = _cells(stream)
+    header = tuple(as_meant(name.strip()) for name in next(lines, []))
     places = signals.positions(header)
     row = 0
     for cells in lines:
@@ -167,3 +173,28 @@ def _stream(stream: TextIO, signals: Signals) -> Iterator[FloatArray]:
         yield np.array([[_number(cells[place], row, header[place]) for place in places]])
     if row == 0:
         raise SpecError("The data have no rows.", path="data")
+
+
+def _cells(stream: TextIO) -> Iterator[list[str]]:
+    """Yield the cells of each line; what is no text, or no table, is a `SpecError`."""
+    lines = csv.reader(_text_lines(stream))
+    for row in itertools.count():
+        try:
+            cells = next(lines, None)
+        except csv.Error as error:
+            raise SpecError(f"Row {row} of the data cannot be read: {error}.", path=f"row {row}") from error
+        except UnicodeDecodeError as error:
+            raise SpecError(f"The data are no UTF-8 text after row {row}.", path=f"row {row}") from error
+        if cells is None:
+            return
+        yield cells
+
+
+def _text_lines(stream: TextIO) -> Iterator[str]:
+    """Yield lines as they come; lines that end with CR alone, as of old, come together where a stream keeps these."""
+    is_first = True
+    for block in iter(stream.readline, ""):
+        for line in _OLD_LINES.findall(block):
+            # A byte order mark is no part of the first name.
+            yield line.removeprefix("\ufeff") if is_first else line
+            is_first = False

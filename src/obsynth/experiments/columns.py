@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import io
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
@@ -11,8 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
+from obsynth.files.outputs import FileKind, write_atomically
+from obsynth.files.tables import TableWriter
 from obsynth.numerics.arrays import FloatArray, read_only
-from obsynth.results.files import write_atomically
+
+#: A table that `SignalTable.write_csv` has written: signals of the plant beside time, and no status of rows.
+SIGNALS = FileKind("a table of simulated signals", rb"\Atime,(?!status,)[^\n]*x(hat)?\[")
 
 
 def named_columns(time: FloatArray, groups: Iterable[tuple[str, Sequence[str], FloatArray]]) -> dict[str, FloatArray]:
@@ -34,10 +37,7 @@ def write_columns(table: Mapping[str, FloatArray], path: str | Path) -> Path:
     Shapes: ``table (steps,)``.
     """
     text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(table)
-    for row in zip(*(column.tolist() for column in table.values()), strict=True):
-        writer.writerow(["" if value != value else value for value in row])
+    TableWriter(text, table).write(zip(*(column.tolist() for column in table.values()), strict=True))
     return write_atomically(path, text.getvalue())
 
 

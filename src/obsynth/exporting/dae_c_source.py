@@ -11,10 +11,10 @@ from pathlib import Path
 
 from obsynth.errors import SpecError
 from obsynth.exporting.c_words import c_identifier, comment, included, quoted
+from obsynth.files.outputs import write_together
 from obsynth.observers.dae.c_code import observer_code
 from obsynth.plants.dae.model import DAEModel
 from obsynth.results.design import ObserverDesign
-from obsynth.results.files import write_atomically
 from obsynth.results.gain_sets import design_as_dict
 
 _STEP = r"""
@@ -55,19 +55,30 @@ def write_dae_c(design: ObserverDesign, target: Path, sample_time: float | None)
     if target.suffix.lower() != ".c":
         raise SpecError(f"{target}: the observer of a nonlinear plant is no matrices; it is exported as C (.c).",
                         path=str(target))  # fmt: skip
-    _, observer = design.nonlinear
+    require_no_sample_time(design, sample_time)
+    prefix, header = c_identifier(target.stem), target.with_suffix(".h")
+    source, declarations, _ = dae_c_texts(design, prefix, header.name)
+    return write_together({target: source, header: declarations})
+
+
+def require_no_sample_time(design: ObserverDesign, sample_time: float | None) -> None:
+    """Raise `SpecError` where a sample time is given for an observer that is sampled."""
     if sample_time is not None:
-        raise SpecError(f"The design is sampled already (dt = {observer.dt:g} s): leave the sample time out.",
+        dt = design.nonlinear[1].dt
+        raise SpecError(f"The design is sampled already (dt = {dt:g} s): leave the sample time out.",
                         path="sample_time")  # fmt: skip
-    digest, prefix, header = str(design_as_dict(design)["sha256"]), c_identifier(target.stem), target.with_suffix(".h")
+
+
+def dae_c_texts(design: ObserverDesign, prefix: str, header: str) -> tuple[str, str, str]:
+    """Return source, header and the digest of the gain set."""
+    _, observer = design.nonlinear
+    digest = str(design_as_dict(design)["sha256"])
     source = "\n".join([
-        comment(f"sha256 of the gain set: {digest}"), f'#include "{included(header.name)}"', "",
+        comment(f"sha256 of the gain set: {digest}"), f'#include "{included(header)}"', "",
         "#define OBSERVER_IS_DECLARED", f"#define observer {prefix}_observer", "", observer_code(observer),
         _step_text(prefix, design.nonlinear[0]),
     ])  # fmt: skip
-    # The source is refused first if it cannot be written, so that no header stays behind alone.
-    written = write_atomically(target, source)
-    return written, write_atomically(header, "\n".join(_header(design, prefix, digest)) + "\n")
+    return source, "\n".join(_header(design, prefix, digest)) + "\n", digest
 
 
 def _step_text(prefix: str, model: DAEModel) -> str:
@@ -100,8 +111,9 @@ def _header(design: ObserverDesign, prefix: str, digest: str) -> Iterator[str]:
     yield comment("state and estimates are left as they were then.")
     for array, names in (("u", model.input_names), ("y", model.output_names), ("states", model.state_names),
                          ("parameters", model.parameter_names)):  # fmt: skip
-        yield from (comment(f"{array}[{i}]: {quoted(name)}, {quoted(model.units[name])}") for i, name in
-                    enumerate(names))  # fmt: skip
+        for i, name in enumerate(names):
+            unit = model.units.get(name)
+            yield comment(f"{array}[{i}]: {quoted(name)}" + (f", {quoted(unit)}" if unit else ""))
     taken = [f"{prefix}_state *state", f"const double y[{model.ny}]", f"{prefix}_estimates *estimates"]
     taken[1:1] = [f"const double u[{model.nu}]"] if model.nu else []
     yield f"int {prefix}_step({', '.join(taken)});"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -12,16 +13,33 @@ from obsynth.exporting.c_source import header_text, source_text
 from obsynth.exporting.c_words import c_identifier
 from obsynth.exporting.dae_c_source import write_dae_c
 from obsynth.exporting.realisation import Realisation
+from obsynth.files.outputs import FileKind, write_atomically, write_together
 from obsynth.numerics.arguments import require_kind
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.results.design import ObserverDesign
-from obsynth.results.files import write_atomically
 
-SUFFIXES = (".mat", ".npz", ".c")
+SUFFIXES = (".mat", ".npz", ".c", ".fmu")
+#: What an existing file has to be for another export to take its place.
+_C_FILE = FileKind("C code that obsynth has exported", rb"sha256 of the gain set")
+EXPORTED = {
+    ".mat": FileKind("an observer that obsynth has exported", rb"\AMATLAB 5.0 MAT-file(?s:.*)sha256"),
+    ".npz": FileKind("an observer that obsynth has exported", rb"\APK(?s:.*)sha256\.npy"),
+    ".c": _C_FILE,
+    ".h": _C_FILE,
+    ".fmu": FileKind("an observer that obsynth has exported", rb"\APK(?s:.*)sources/observer\.c"),
+}
 
 
-def export(design: ObserverDesign, path: str | Path, *, sample_time: float | None = None) -> tuple[Path, ...]:
-    """Write the observer of a design for MATLAB and Simulink, for numpy, or as C99.
+def export(
+    design: ObserverDesign,
+    path: str | Path,
+    *,
+    sample_time: float | None = None,
+    fmi: str = "2.0",
+    thresholds: Mapping[str, float] | None = None,
+    warm_up: float | None = None,
+) -> tuple[Path, ...]:
+    """Write the observer of a design for MATLAB and Simulink, for numpy, as C99, or as a functional mock-up unit.
 
     Parameters
     ----------
@@ -34,9 +52,19 @@ def export(design: ObserverDesign, path: str | Path, *, sample_time: float | Non
         ``[xhat; fhat; r]``, as a State-Space block takes them, with ``input_names``, ``output_names``, ``delays``
         (samples, of states and faults), ``input_point``, ``output_point``, ``name``, ``method`` and ``sha256``.
         ``.c``: a source file and the header beside it, with functions ``<stem>_reset`` and ``<stem>_step``; the only
-        one for an observer of a nonlinear DAE, which holds the implicit step with its homotopy.
+        one besides ``.fmu`` for an observer of a nonlinear DAE, which holds the implicit step with its homotopy.
+        ``.fmu``: a functional mock-up unit for co-simulation with that C inside, and a binary for this machine where
+        a compiler is: inputs by the names of the signals, outputs ``xhat[...]``, ``fhat[...]``, ``r[...]`` and
+        ``alarm[...]``, parameters ``operating_point[...]``, ``threshold[...]`` and ``warm_up``, with units.
     sample_time : float, optional, seconds
-        Samples a continuous-time observer by a first-order hold; needed for C.
+        Samples a continuous-time observer by a first-order hold; needed for C and an FMU.
+    fmi : str
+        Version of FMI, ``"2.0"`` or ``"3.0"``; for ``.fmu`` only.
+    thresholds : mapping, optional
+        Level of the absolute value by output, such as ``fhat[actuator]`` or ``r[speed]`` (of faults with an operating
+        point, of the deviation), above which its alarm is raised; for ``.fmu`` only, where they can be changed.
+    warm_up : float, optional, seconds
+        Without alarms after the start; by default until the slowest mode has shrunk to 2 %.  For ``.fmu`` only.
 
     Returns
     -------
@@ -53,13 +81,24 @@ def export(design: ObserverDesign, path: str | Path, *, sample_time: float | Non
 
     Notes
     -----
-    Every file holds the sha256 digest of the gain set.  Signals are deviations from the operating point.
+    Every file holds the sha256 digest of the gain set.  Signals are deviations from the operating point,
+    except in an FMU, whose signals are absolute: it subtracts the operating point and adds it back.  An FMU takes its
+    inputs at the beginning of a communication step, which is a multiple of ``dt``, and shows the estimates of that
+    sample at its end.
     """
     require_kind(path, (str, Path), "path", "the name of a file")
     target = Path(path)
     suffix = target.suffix.lower()
     if suffix not in SUFFIXES:
         raise SpecError(f"{target} has an unknown suffix: use one of {', '.join(SUFFIXES)}.", path=str(target))
+    if suffix == ".fmu":
+        from obsynth.exporting.fmu.archive import write_fmu
+
+        require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
+        return (write_fmu(design, target, version=fmi, sample_time=sample_time, thresholds=thresholds,
+                          warm_up=warm_up),)  # fmt: skip
+    if thresholds or warm_up is not None:
+        raise SpecError("Thresholds and warm-up are for an FMU (.fmu): other files hold no alarms.", path="thresholds")
     if isinstance(design, ObserverDesign) and isinstance(design.observer, DAEObserver):
         return write_dae_c(design, target, sample_time)
     found = Realisation.of(design, sample_time)
@@ -80,13 +119,17 @@ def export(design: ObserverDesign, path: str | Path, *, sample_time: float | Non
     return (write_atomically(target, buffer.getvalue()),)
 
 
+def exported_files(target: Path) -> dict[Path, FileKind | None]:
+    """Return the files that an export to ``target`` writes, with their kinds: a C source comes with its header."""
+    suffix = target.suffix.lower()
+    header = {target.with_suffix(".h"): EXPORTED[".h"]} if suffix == ".c" else {}
+    return {target: EXPORTED.get(suffix), **header}
+
+
 def _write_c(found: Realisation, target: Path) -> tuple[Path, ...]:
     if found.observer.dt == 0.0:
         raise SpecError("The observer is continuous in time: give the sample time, in seconds, for C.",
                         path="sample_time")  # fmt: skip
     prefix = c_identifier(target.stem)
     header = target.with_suffix(".h")
-    source = source_text(found, prefix, header.name)
-    # The source is refused first if it cannot be written, so that no header stays behind alone.
-    written = write_atomically(target, source)
-    return written, write_atomically(header, header_text(found, prefix))
+    return write_together({target: source_text(found, prefix, header.name), header: header_text(found, prefix)})

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping
-from importlib import import_module
 from typing import Any, TypeAlias
-
-import numpy as np
 
 from obsynth.analysis.conditions import Condition
 from obsynth.analysis.transformations import StateRecovery
-from obsynth.errors import SolverError, SpecError, VerificationError
-from obsynth.methods.registry import NONLINEAR, REGISTRY, TIME_VARYING, method_module
+from obsynth.errors import SpecError, VerificationError
+from obsynth.methods.method_spec import MethodSpec, PlantKind
+from obsynth.methods.registry import REGISTRY, method_spec, methods_for
 from obsynth.methods.synthesis_result import Synthesis
 from obsynth.methods.verifying import verify
+from obsynth.numerics.failures import failed_computations
 from obsynth.numerics.threads import one_thread_if_small
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
@@ -24,6 +23,12 @@ from obsynth.results.report import VerificationReport
 from obsynth.verification.plant import condition_rows
 
 Plant: TypeAlias = DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel
+
+_KINDS: Mapping[PlantKind, tuple[type, str]] = {
+    "time-invariant": (DescriptorSystem, "a linear plant with constant matrices"),
+    "time-varying": (TimeVaryingDescriptorSystem, "a linear plant whose matrices change with k"),
+    "nonlinear": (DAEModel, "a nonlinear DAEModel"),
+}
 
 
 def _silent(_: str) -> None:
@@ -75,78 +80,65 @@ def design(
         Gains were found, but the shipped realisation fails a check.
     """
     report_stage = progress or _silent
-    options = _checked_options(method, options)
-    for condition in _kind_conditions(plant, method):
+    spec = method_spec(method)
+    asked = spec.read_options(options)
+    for condition in _kind_conditions(plant, spec):
         condition.require()
-    try:
-        with one_thread_if_small(plant.nx):
-            found = method_module(method).synthesise(plant, progress=report_stage, **options)
-            report_stage("verifying the shipped realisation")
-            return verified(plant, method, found, name=name, recovery=recovery)
-    except np.linalg.LinAlgError as error:
-        raise SolverError(
-            f"LAPACK gave up ({error}): the numbers are beyond double precision. Nothing is known; look at the units "
-            "of the plant and at the options."
-        ) from error
+    with failed_computations(), one_thread_if_small(plant.nx):
+        found = spec.load("synthesise")(plant, asked, progress=report_stage)
+        report_stage("verifying the shipped realisation")
+        return verified(plant, method, found, name=name, recovery=recovery)
 
 
 def check(plant: Plant, options: Mapping[str, Mapping[str, Any]] | None = None) -> dict[str, VerificationReport]:
-    """Return, for every method, the report of its existence conditions; nothing is designed or raised."""
+    """Return, for every method, the report of its existence conditions; nothing is designed, and what fails is a row.
+
+    Malformed options are a `SpecError`, numbers beyond double precision a `SolverError`.
+    """
     found = {}
     for method in REGISTRY:
-        conditions = _kind_conditions(plant, method)
+        spec = method_spec(method)
+        asked = {} if method not in (options or {}) else spec.read_options((options or {})[method]).as_given()
+        conditions = _kind_conditions(plant, spec)
         if not conditions:
-            judge = method_module(method).conditions
+            judge = spec.load("conditions")
             known = set(inspect.signature(judge).parameters)
-            given = {name: value for name, value in (options or {}).get(method, {}).items() if name in known}
-            conditions = judge(plant, **given)
+            given = {name: value for name, value in asked.items() if name in known}
+            with failed_computations():
+                conditions = judge(plant, **given)
         found[method] = VerificationReport.of(condition_rows(conditions))
     return found
 
 
-def _kind_conditions(plant: Plant, method: str) -> tuple[Condition, ...]:
+def kind_of(plant: Any) -> PlantKind:
+    """Return the kind of a plant; raise `SpecError` for anything else."""
+    for kind, (plant_type, _) in _KINDS.items():
+        if isinstance(plant, plant_type):
+            return kind
+    raise SpecError(
+        f"The plant is a {type(plant).__name__}: give an obsynth.DescriptorSystem, TimeVaryingDescriptorSystem or "
+        "DAEModel.",
+        path="plant",
+    )
+
+
+def _kind_conditions(plant: Plant, method: MethodSpec) -> tuple[Condition, ...]:
     """Return the failing condition where a method does not take plants of this kind, else nothing."""
-    if not isinstance(plant, (DescriptorSystem, TimeVaryingDescriptorSystem, DAEModel)):
-        raise SpecError(
-            f"The plant is a {type(plant).__name__}: give an obsynth.DescriptorSystem, TimeVaryingDescriptorSystem or "
-            "DAEModel.",
-            path="plant",
-        )
-    if method in NONLINEAR:
-        return () if isinstance(plant, DAEModel) else (_other_kind(method, "a nonlinear DAEModel"),)
-    if isinstance(plant, DAEModel):
-        return (_other_kind(method, f"a linear plant; methods for nonlinear ones are: {', '.join(NONLINEAR)}"),)
-    if isinstance(plant, DescriptorSystem) or method in TIME_VARYING:
+    kind = kind_of(plant)
+    if kind in method.plants:
         return ()
+    wanted = " or ".join(_KINDS[taken][1] for taken in method.plants)
     return (
         Condition(
-            "time-invariant plant", "constant matrices, given as a DescriptorSystem", False, 0.0, 1.0, method,
-            f"the matrices change with k; methods for such plants are: {', '.join(TIME_VARYING)}",
+            "kind of plant", f"{method.id} needs {wanted}", False, 0.0, 1.0, method.id,
+            f"{_KINDS[kind][1]}; methods for such plants are: {', '.join(methods_for(kind))}.",
         ),
     )  # fmt: skip
 
 
-def _other_kind(method: str, wanted: str) -> Condition:
-    return Condition("kind of plant", f"{method} needs {wanted}", False, 0.0, 1.0, method, "a plant of another kind.")
-
-
 def public_function(method: str) -> Callable[..., ObserverDesign]:
-    """Return the public function of a method: of the same name, in a module of the same name."""
-    name = method.replace("-", "_")
-    function: Callable[..., ObserverDesign] = getattr(import_module(f"obsynth.methods.{name}.public"), name)
-    return function
-
-
-def _checked_options(method: str, options: dict[str, Any]) -> dict[str, Any]:
-    method_module(method)
-    allowed = set(inspect.signature(public_function(method)).parameters) - {"plant", "name"}
-    unknown = sorted(set(options) - allowed)
-    if unknown:
-        raise SpecError(
-            f"{method} has no option {', '.join(map(repr, unknown))}; there are: {', '.join(sorted(allowed))}.",
-            path="method.options",
-        )
-    return options
+    """Return the public function of a method."""
+    return method_spec(method).load("public")
 
 
 def draft_of(

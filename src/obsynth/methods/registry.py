@@ -1,29 +1,31 @@
-"""The methods: one file per paper, and a registry of one line each."""
+"""The registry of methods: one line each."""
 
 from __future__ import annotations
 
 from importlib import import_module
-from typing import Any
 
-#: Method id -> module; each module offers ``conditions(plant)`` and ``synthesise(plant, **options)``.
-REGISTRY = {
-    "fault-estimation-filter": "obsynth.methods.fault_estimation_filter.synthesis",
-    "pd-observer": "obsynth.methods.pd_observer.synthesis",
-    "ui-pi-observer": "obsynth.methods.ui_pi_observer.synthesis",
-    "descriptor-kalman": "obsynth.methods.descriptor_kalman.synthesis",
-    "adaptive-observer": "obsynth.methods.adaptive_observer.synthesis",
-    "dae-adaptive-observer": "obsynth.methods.dae_adaptive_observer.synthesis",
+from obsynth.errors import SpecError
+from obsynth.methods.method_spec import MethodSpec, PlantKind
+
+#: Method id -> where its declaration is; a method is its own folder and a line here.
+REGISTRY: dict[str, str] = {
+    "fault-estimation-filter": "obsynth.methods.fault_estimation_filter.method",
+    "pd-observer": "obsynth.methods.pd_observer.method",
+    "ui-pi-observer": "obsynth.methods.ui_pi_observer.method",
+    "descriptor-kalman": "obsynth.methods.descriptor_kalman.method",
+    "adaptive-observer": "obsynth.methods.adaptive_observer.method",
+    "dae-adaptive-observer": "obsynth.methods.dae_adaptive_observer.method",
 }
-#: Methods that take plants whose matrices change with k.
-TIME_VARYING = ("descriptor-kalman", "adaptive-observer")
-#: Methods for nonlinear plants, and for no others.
-NONLINEAR = ("dae-adaptive-observer",)
 
 
-def method_module(method: str) -> Any:
-    """Return the module of a method."""
-    from obsynth.errors import SpecError
-
+def method_spec(method: str) -> MethodSpec:
+    """Return the declaration of a method; raise `SpecError` listing the known ones where there is none."""
     if method not in REGISTRY:
         raise SpecError(f"There is no method {method!r}; there are: {', '.join(REGISTRY)}.", path="method")
-    return import_module(REGISTRY[method])
+    found: MethodSpec = import_module(REGISTRY[method]).METHOD
+    return found
+
+
+def methods_for(kind: PlantKind) -> tuple[str, ...]:
+    """Return the ids of the methods that take plants of a kind."""
+    return tuple(method for method in REGISTRY if kind in method_spec(method).plants)

@@ -2,27 +2,18 @@
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from obsynth.errors import SpecError
+from obsynth.methods.registry import REGISTRY, method_spec
+from obsynth.numerics.failures import failed_computations
 from obsynth.numerics.threads import one_thread_if_small
 from obsynth.results.report import VerificationReport
 
 if TYPE_CHECKING:
     from obsynth.results.design import ObserverDesign
-
-#: Method id -> module with ``checks(design, printed_digits)``.
-_CHECKERS = {
-    "fault-estimation-filter": "obsynth.methods.fault_estimation_filter.checks",
-    "pd-observer": "obsynth.methods.pd_observer.checks",
-    "ui-pi-observer": "obsynth.methods.ui_pi_observer.checks",
-    "descriptor-kalman": "obsynth.methods.recursive.checks",
-    "adaptive-observer": "obsynth.methods.recursive.checks",
-    "dae-adaptive-observer": "obsynth.methods.dae_adaptive_observer.checks",
-}
 
 
 def verify(design: ObserverDesign, *, printed_digits: int | None = None) -> VerificationReport:
@@ -46,12 +37,14 @@ def verify(design: ObserverDesign, *, printed_digits: int | None = None) -> Veri
     ------
     SpecError
         The design's method is unknown, or ``printed_digits`` is not between 1 and 15.
+    SolverError
+        LAPACK fails on the numbers of the design: nothing is known.
     """
-    if design.method not in _CHECKERS:
+    if design.method not in REGISTRY:
         raise SpecError(f"Designs of method {design.method!r} cannot be verified by this version.", path="method")
     if printed_digits is not None and not 1 <= printed_digits <= 15:
         raise SpecError(f"printed_digits is {printed_digits}: give 1 to 15 decimals.", path="printed_digits")
-    checker = import_module(_CHECKERS[design.method])
+    checks = method_spec(design.method).load("checks")
     # A corrupted design may overflow; what is not a number fails its check, so no warning is needed.
-    with np.errstate(all="ignore"), one_thread_if_small(design.plant.nx):
-        return VerificationReport.of(tuple(checker.checks(design, printed_digits)))
+    with np.errstate(all="ignore"), failed_computations(), one_thread_if_small(design.plant.nx):
+        return VerificationReport.of(tuple(checks(design, printed_digits)))

@@ -14,21 +14,21 @@ from obsynth.numerics.arrays import FloatArray, unmasked
 def real_number(value: Any, name: str, what: str = "a number") -> float:
     """Return a finite real number; raise `SpecError` naming the argument and ``what`` it should be."""
     if not is_number(value) or not np.isfinite(value):
-        raise SpecError(f"{name} is {_shown(value)}: give {what}.", path=name)
+        raise SpecError(f"{name} is {shown(value)}: give {what}.", path=name)
     return float(value)
 
 
 def whole_number(value: Any, name: str, what: str = "a whole number", *, least: int = 1) -> int:
     """Return an integer that is ``least`` or more; raise `SpecError` naming the argument and ``what`` it should be."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
-        raise SpecError(f"{name} is {_shown(value)}: give {what}, at least {least}.", path=name)
+        raise SpecError(f"{name} is {shown(value)}: give {what}, at least {least}.", path=name)
     return int(value)
 
 
 def truth(value: Any, name: str) -> bool:
     """Return True or False; raise `SpecError` for anything else."""
     if not isinstance(value, (bool, np.bool_)):
-        raise SpecError(f"{name} is {_shown(value)}: give True or False.", path=name)
+        raise SpecError(f"{name} is {shown(value)}: give True or False.", path=name)
     return bool(value)
 
 
@@ -54,14 +54,14 @@ def real_array(value: Any, name: str) -> FloatArray:
     except (TypeError, ValueError):
         raise SpecError(f"{name} has rows of different lengths.", path=name) from None
     if raw.dtype.kind not in "fiu" and raw.size:
-        raise SpecError(f"{name} is {_shown(value)}: give real numbers.", path=name)
+        raise SpecError(f"{name} is {shown(value)}: give real numbers.", path=name)
     return np.asarray(raw, dtype=np.float64) if raw.size else np.zeros(raw.shape)
 
 
 def chosen(value: Any, name: str, choices: tuple[str, ...]) -> str:
     """Return a text that is one of ``choices``; raise `SpecError` listing them."""
     if not isinstance(value, str) or value not in choices:
-        raise SpecError(f"{name} is {_shown(value)}: use one of {', '.join(choices)}.", path=name)
+        raise SpecError(f"{name} is {shown(value)}: use one of {', '.join(choices)}.", path=name)
     return value
 
 
@@ -87,7 +87,8 @@ def is_finite_number(value: Any) -> bool:
     return is_number(value) and bool(np.isfinite(value))
 
 
-def _shown(value: Any) -> str:
+def shown(value: Any) -> str:
+    """Return a value as it may stand in a message: short, and on one line."""
     if value is None:
         return "missing"
     text = repr(value.item() if isinstance(value, np.generic) else value)

@@ -7,7 +7,7 @@ a > b and d elsewhere; in equations of a DAE also ``der(...)``, the derivative w
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
@@ -127,16 +127,16 @@ class _Parser:
         )
 
     def sum(self) -> Evaluator:
-        left = self.term()
+        first, rest = self.term(), []
         while operator := self.take("+", "-"):
-            left = _binary(np.add if operator == "+" else np.subtract, left, self.term())
-        return left
+            rest.append((np.add if operator == "+" else np.subtract, self.term()))
+        return _chain(first, rest)
 
     def term(self) -> Evaluator:
-        left = self.signed()
+        first, rest = self.signed(), []
         while operator := self.take("*", "/"):
-            left = _binary(np.multiply if operator == "*" else np.divide, left, self.signed())
-        return left
+            rest.append((np.multiply if operator == "*" else np.divide, self.signed()))
+        return _chain(first, rest)
 
     def signed(self) -> Evaluator:
         self.depth += 1
@@ -239,6 +239,20 @@ def _unary(operation: Callable[[Any], Any], inner: Evaluator) -> Evaluator:
 
 def _binary(operation: Callable[[Any, Any], Any], left: Evaluator, right: Evaluator) -> Evaluator:
     return lambda values, translate: translate(operation)(left(values, translate), right(values, translate))
+
+
+def _chain(first: Evaluator, rest: Sequence[tuple[Callable[[Any, Any], Any], Evaluator]]) -> Evaluator:
+    """Return operations from left to right, in a loop: a long sum is no deep one."""
+    if not rest:
+        return first
+
+    def evaluated(values: Mapping[str, Any], translate: Translation) -> Any:
+        found = first(values, translate)
+        for operation, operand in rest:
+            found = translate(operation)(found, operand(values, translate))
+        return found
+
+    return evaluated
 
 
 def _chosen(condition: Evaluator, first: Evaluator, second: Evaluator) -> Evaluator:

@@ -4,30 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
-from obsynth.plants.names import checked_names
+from obsynth.errors import SpecError
+from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.sparse import dense, is_sparse
 from obsynth.plants.origin import carry_origin
-from obsynth.plants.validation import (
-    Problems,
-    checked_dt,
-    checked_point,
-    checked_scales,
-    checked_units,
-    expected_shapes,
-    matrix_or_picks,
-    picked_names,
-    signal_counts,
-    square,
-    uncounted_signals,
-)
+from obsynth.plants.reading import plant_fields
+from obsynth.plants.validation import expected_shapes
 
 MatrixOrNames = ArrayLike | Sequence[str] | None
+#: For `expected_shapes`, where only the names of the matrices matter.
+_NO_SIGNALS = dict.fromkeys("yufdw", 0)
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -42,10 +33,12 @@ class DescriptorSystem:
 
     Parameters
     ----------
-    E : array_like or None
+    E : array_like, sparse matrix or None
         ``(nx, nx)``, may be singular; ``None`` means the identity.
-    A : array_like
-        ``(nx, nx)``.
+    A : array_like or sparse matrix
+        ``(nx, nx)``.  Sparse matrices of scipy stay sparse, here and wherever else they are given; methods get the
+        plant without its algebraic states, which is dense (see `eliminate_algebraic_states` and `dense`).  Any matrix
+        may be a labelled ``pandas.DataFrame``: its labels are the names, and rows and columns are put in one order.
     B : array_like, optional
         Known inputs ``(nx, nu)``.
     C : array_like or list of str, optional
@@ -54,9 +47,10 @@ class DescriptorSystem:
         Feedthrough of the known inputs ``(ny, nu)``.
     Bf, Df : array_like, optional
         Faults ``(nx, nf)`` and ``(ny, nf)``.  ``Bf`` may be a list of state names: the fault is then
-        added to the equation of the same number as that state.
+        added to the equation of the same number as that state.  ``Df`` may be a list of output names: each adds a
+        fault of that sensor, after those of ``Bf``.
     Bd, Dd : array_like, optional
-        Unknown inputs (disturbances) ``(nx, nd)`` and ``(ny, nd)``; ``Bd`` by name as ``Bf``.
+        Unknown inputs (disturbances) ``(nx, nd)`` and ``(ny, nd)``; by name as faults.
     Bw, Dw : array_like, optional
         Noise ``(nx, nw)`` and ``(ny, nw)``: ``w`` is white with unit covariance, so the columns hold
         standard deviations (per sample for ``dt > 0``, and always per sample in ``Dw``).
@@ -70,6 +64,9 @@ class DescriptorSystem:
         Factor of named inputs and outputs: what a log holds, times the factor, is in the signal's unit.
     units : mapping, optional
         Unit of named signals, as text.
+
+    sensor_noise : mapping, optional
+        Standard deviation of the noise of named outputs, per sample: adds a column to ``Dw`` for each.
 
     Raises
     ------
@@ -108,16 +105,16 @@ class DescriptorSystem:
 
     def __init__(
         self,
-        E: ArrayLike | None,
-        A: ArrayLike,
+        E: ArrayLike | None = None,
+        A: ArrayLike | None = None,
         B: ArrayLike | None = None,
         C: MatrixOrNames = None,
         *,
         D: ArrayLike | None = None,
         Bf: MatrixOrNames = None,
-        Df: ArrayLike | None = None,
+        Df: MatrixOrNames = None,
         Bd: MatrixOrNames = None,
-        Dd: ArrayLike | None = None,
+        Dd: MatrixOrNames = None,
         Bw: ArrayLike | None = None,
         Dw: ArrayLike | None = None,
         dt: float = 0.0,
@@ -130,45 +127,18 @@ class DescriptorSystem:
         operating_point: Mapping[str, float] | None = None,
         scales: Mapping[str, float] | None = None,
         units: Mapping[str, str] | None = None,
+        sensor_noise: Mapping[str, float] | None = None,
     ) -> None:
-        problems = Problems()
-        a = problems.collect(lambda: square(as_matrix(A, "A"), "A"))
-        problems.raise_if_any()
-        nx = a.shape[0]
-        states = problems.collect(lambda: checked_names(state_names, nx, prefix="x", what="state_names"))
-        problems.raise_if_any()
-        given: dict[str, FloatArray | None] = {"A": a, "E": np.eye(nx) if E is None else None}
-        asked = {"E": E, "B": B, "C": C, "D": D, "Bf": Bf, "Df": Df, "Bd": Bd, "Dd": Dd, "Bw": Bw, "Dw": Dw}
-        for name, value in asked.items():
-            if value is not None:
-                given[name] = problems.collect(partial(matrix_or_picks, value, name, states))
-        sizes = signal_counts(given)
-        # What depends on a matrix that could not be read is not judged: its own message is enough.
-        broken = {name for name, value in asked.items() if value is not None and given[name] is None}
-        unknown = uncounted_signals(given, broken)
-        values: dict[str, Any] = {
-            name: problems.shaped(given.get(name), name, shape)
-            for name, shape in expected_shapes(nx, sizes, unknown).items()
-        }
-        values |= {"dt": problems.collect(lambda: checked_dt(dt)), "state_names": states}
-        named = {
-            "input_names": (input_names, "u"),
-            "output_names": (output_names or picked_names(C), "y"),
-            "fault_names": (fault_names or picked_names(Bf), "f"),
-            "disturbance_names": (disturbance_names or picked_names(Bd), "d"),
-            "noise_names": (noise_names, "w"),
-        }
-        for field, (names, signal) in named.items():
-            if signal in unknown:
-                continue
-            values[field] = problems.collect(partial(checked_names, names, sizes[signal], prefix=signal, what=field))
-        problems.raise_if_any()
-        known = {name for field in ("state_names", *named) for name in values[field]}
-        values["operating_point"] = problems.collect(lambda: checked_point(operating_point, known))
-        measured = {*values["input_names"], *values["output_names"]}
-        values["scales"] = problems.collect(lambda: checked_scales(scales, measured))
-        values["units"] = problems.collect(lambda: checked_units(units, known))
-        problems.raise_if_any()
+        if A is None:
+            raise SpecError("A is missing: give the matrix (nx, nx) of the dynamics.", path="A")
+        asked = {"E": E, "A": A, "B": B, "C": C, "D": D, "Bf": Bf, "Df": Df, "Bd": Bd, "Dd": Dd, "Bw": Bw, "Dw": Dw}
+        names = {
+            "state_names": state_names, "input_names": input_names, "output_names": output_names,
+            "fault_names": fault_names, "disturbance_names": disturbance_names, "noise_names": noise_names,
+        }  # fmt: skip
+        values = plant_fields(
+            asked, names, dt=dt, operating_point=operating_point, scales=scales, units=units, sensor_noise=sensor_noise
+        )
         for field, value in values.items():
             object.__setattr__(self, field, read_only(value) if isinstance(value, np.ndarray) else value)
 
@@ -201,6 +171,18 @@ class DescriptorSystem:
     def nw(self) -> int:
         """Number of noise inputs."""
         return int(self.Bw.shape[1])
+
+    @property
+    def is_sparse(self) -> bool:
+        """Whether any matrix of the plant is a sparse one."""
+        return any(is_sparse(getattr(self, name)) for name in expected_shapes(0, _NO_SIGNALS))
+
+    def dense(self) -> DescriptorSystem:
+        """Return the same plant with arrays instead of sparse matrices; a plant without any is returned as it is."""
+        if not self.is_sparse:
+            return self
+        changes = {name: dense(getattr(self, name)) for name in expected_shapes(0, _NO_SIGNALS)}
+        return self.replace(**changes)
 
     @property
     def is_discrete(self) -> bool:

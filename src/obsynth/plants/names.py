@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import difflib
+import unicodedata
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -10,6 +12,9 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray
+
+#: Control characters, halves of pairs, separators of lines and paragraphs: no table can hold them in a name.
+_UNWRITABLE = frozenset({"Cc", "Cs", "Zl", "Zp"})
 
 
 def checked_names(names: Sequence[str] | None, count: int, *, prefix: str, what: str) -> tuple[str, ...]:
@@ -21,7 +26,11 @@ def checked_names(names: Sequence[str] | None, count: int, *, prefix: str, what:
         raise SpecError(f"{what} must be a list of non-empty texts.", path=what)
     if len(given) != count:
         raise SpecError(f"{what} has {len(given)} names, but there are {count} such signals.", path=what)
-    repeated = sorted({name for name in given if given.count(name) > 1})
+    unwritable = [name for name in given if any(unicodedata.category(sign) in _UNWRITABLE for sign in name)]
+    if unwritable:
+        raise SpecError(f"{what} has the name {unwritable[0]!r}: use no line ends and no control characters.",
+                        path=what)  # fmt: skip
+    repeated = sorted(name for name, times in Counter(given).items() if times > 1)
     if repeated:
         raise SpecError(f"{what} repeats {', '.join(map(repr, repeated))}: names must be unique.", path=what)
     return given
@@ -31,9 +40,32 @@ def index_of(name: str, names: Sequence[str], *, what: str) -> int:
     """Return the position of ``name``; the error suggests the closest names."""
     if name in names:
         return list(names).index(name)
-    close = difflib.get_close_matches(name, list(names), n=3)
-    hint = f" Did you mean {' or '.join(map(repr, close))}?" if close else ""
-    raise SpecError(f"{what} has no signal named {name!r}.{hint}", path=what)
+    raise SpecError(f"{what} has no signal named {name!r}.{suggestion(name, names)}", path=what)
+
+
+#: So many names are listed where none is close to a wrong one.
+_FEW = 8
+
+
+def suggestion(name: str, names: Iterable[str]) -> str:
+    """Return a question with the names closest to a wrong one, beginning with a space; empty where none is close."""
+    listed = list(names)
+    close = difflib.get_close_matches(name, listed, n=3)
+    if close:
+        return f" Did you mean {' or '.join(map(repr, close))}?"
+    return f" There are {', '.join(listed)}." if 0 < len(listed) <= _FEW else ""
+
+
+def require_known(given: Iterable[Any], known: Iterable[str], *, what: str, kind: str) -> None:
+    """Raise one `SpecError` that names every text which is no signal of ``kind``, each with what may be meant."""
+    listed = sorted(known)
+    wrong = [name for name in given if name not in listed]
+    if not wrong:
+        return
+    told = [f"{name!r}, which is no {kind} of the plant.{suggestion(str(name), listed)}" for name in wrong]
+    if len(wrong) == 1:
+        raise SpecError(f"{what} names {told[0]}", path=what)
+    raise SpecError(f"{what} names {len(wrong)} that are no {kind} of the plant:", path=what, problems=told)
 
 
 def is_name_list(value: Any) -> bool:
@@ -48,6 +80,9 @@ def is_name_list(value: Any) -> bool:
 
 def rows_picking(picked: Sequence[str], names: Sequence[str], *, what: str) -> FloatArray:
     """Return the selection matrix ``(len(picked), len(names))`` with a one for each picked name."""
+    wrong = [f"{what} has no signal named {name!r}.{suggestion(name, names)}" for name in picked if name not in names]
+    if len(wrong) > 1:
+        raise SpecError(f"{what} picks {len(wrong)} signals that do not exist:", path=what, problems=wrong)
     selection = np.zeros((len(picked), len(names)))
     for row, name in enumerate(picked):
         selection[row, index_of(name, names, what=what)] = 1.0

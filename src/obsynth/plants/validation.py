@@ -9,7 +9,8 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, as_matrix
-from obsynth.plants.names import is_name_list, rows_picking
+from obsynth.numerics.sparse import as_sparse_matrix, is_sparse
+from obsynth.plants.names import is_name_list, require_known, rows_picking
 
 #: Matrix, signal of its rows, signal of its columns.
 MATRIX_LAYOUT = (
@@ -44,10 +45,11 @@ class Problems:
 
     def shaped(self, value: FloatArray | None, name: str, shape: tuple[int, int]) -> FloatArray:
         """Return ``value``, or zeros of ``shape`` where it is missing or empty; note a wrong shape."""
-        if value is None or (value.size == 0 and 0 in shape):
+        if value is None or (0 in value.shape and 0 in shape):
             return np.zeros(shape)
         if value.shape != shape:
-            self._note(f"{name} is {_by(value.shape)}, but {_by(shape)} is needed.", name)
+            hint = " Is it transposed?" if value.shape == shape[::-1] else ""
+            self._note(f"{name} is {_by(value.shape)}, but {_by(shape)} is needed.{hint}", name)
         return value
 
     def raise_if_any(self) -> None:
@@ -62,6 +64,11 @@ class Problems:
         self.first_path = self.first_path or path
 
 
+def any_matrix(value: Any, name: str) -> Any:
+    """Return a checked read-only matrix: sparse where a sparse one was given, else an array."""
+    return as_sparse_matrix(value, name) if is_sparse(value) else as_matrix(value, name)
+
+
 def square(matrix: FloatArray, name: str) -> FloatArray:
     """Return a non-empty square matrix as it is; raise `SpecError` otherwise."""
     if matrix.shape[0] == 0 or matrix.shape[0] != matrix.shape[1]:
@@ -69,10 +76,10 @@ def square(matrix: FloatArray, name: str) -> FloatArray:
     return matrix
 
 
-def matrix_or_picks(value: Any, name: str, states: Sequence[str]) -> FloatArray:
+def matrix_or_picks(value: Any, name: str, states: Sequence[str]) -> Any:
     """Return a matrix, or the selection that a list of state names stands for (rows of C, columns of inputs)."""
     if not is_name_list(value):
-        return as_matrix(value, name)
+        return any_matrix(value, name)
     rows = rows_picking(value, states, what=name)
     return rows if name == "C" else rows.T
 
@@ -87,7 +94,7 @@ def signal_counts(given: Mapping[str, FloatArray | None]) -> dict[str, int]:
 
     def columns(*names: str) -> int:
         found = (given.get(name) for name in names)
-        return next((m.shape[1] for m in found if m is not None and m.size), 0)
+        return next((m.shape[1] for m in found if m is not None and 0 not in m.shape), 0)
 
     outputs = given.get("C")
     return {
@@ -135,9 +142,8 @@ def checked_dt(dt: Any) -> float:
 def checked_point(point: Mapping[str, float] | None, known: set[str]) -> dict[str, float]:
     """Return an operating point whose signals all exist."""
     checked: dict[str, float] = {}
+    require_known(point or {}, known, what="operating_point", kind="signal")
     for name, value in (point or {}).items():
-        if name not in known:
-            raise SpecError(f"operating_point names {name!r}, which is no signal of the plant.", path="operating_point")
         checked[name] = float(as_matrix(value, f"operating_point[{name!r}]")[0, 0])
     return checked
 
@@ -145,9 +151,8 @@ def checked_point(point: Mapping[str, float] | None, known: set[str]) -> dict[st
 def checked_scales(scales: Mapping[str, float] | None, known: set[str]) -> dict[str, float]:
     """Return factors of measured signals, which all exist."""
     checked: dict[str, float] = {}
+    require_known(scales or {}, known, what="scales", kind="input or output")
     for name, value in (scales or {}).items():
-        if name not in known:
-            raise SpecError(f"scales names {name!r}, which is no input or output of the plant.", path="scales")
         factor = float(as_matrix(value, f"scales[{name!r}]")[0, 0])
         if factor == 0.0:
             raise SpecError(f"The scale of {name!r} is 0: give a factor that is not zero.", path="scales")
@@ -159,9 +164,8 @@ def checked_units(units: Mapping[str, str] | None, known: set[str]) -> dict[str,
     """Return units whose signals all exist."""
     if units is not None and not isinstance(units, Mapping):
         raise SpecError(f"units is a {type(units).__name__}: give signal names and their units.", path="units")
+    require_known(units or {}, known, what="units", kind="signal")
     for name, value in (units or {}).items():
-        if name not in known:
-            raise SpecError(f"units names {name!r}, which is no signal of the plant.", path="units")
         if not isinstance(value, str):
             raise SpecError(f"The unit of {name!r} must be a text.", path="units")
     return dict(units or {})

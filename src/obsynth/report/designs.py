@@ -10,12 +10,12 @@ from rich.table import Table
 from rich.text import Text
 
 from obsynth.analysis.transformations import StateRecovery
+from obsynth.methods.registry import REGISTRY, method_spec
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
-from obsynth.report.claims import meaning_of
 from obsynth.report.layout import facts_table, headed_table, name_list, number, print_section
 from obsynth.report.verification import verification_report
 from obsynth.results.delta_scan import DeltaScan
@@ -113,8 +113,11 @@ def recovered_states(recovery: StateRecovery) -> Iterator[tuple[str, str]]:
 
 def promises(design: ObserverDesign) -> Iterator[tuple[str, str, str]]:
     """Yield name, value and meaning of what a design claims."""
+    known = method_spec(design.method).claims if design.method in REGISTRY else {}
     for name, value in design.certificate.claims.items():
-        yield name, number(value, digits=7), meaning_of(design.method, name)
+        claim = known.get(name)
+        unit, meaning = (claim.unit, claim.meaning) if claim else ("", "unknown to this version")
+        yield name, f"{number(value, digits=7)} {unit}".strip(), meaning
     for check in design.report.checks:
         if check.name == "H-infinity norm":
             yield "norm", number(check.value, digits=7), "the same gain recomputed by a second route"

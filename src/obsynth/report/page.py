@@ -6,20 +6,22 @@ from collections.abc import Iterator, Sequence
 from html import escape
 from pathlib import Path
 
-from obsynth.report.claims import source_of
+from obsynth.files.outputs import FileKind, write_atomically
+from obsynth.methods.registry import REGISTRY, method_spec
 from obsynth.report.designs import fault_estimates_table, plant_facts, promises, recovered_states
 from obsynth.report.page_style import STYLE
 from obsynth.report.page_tables import check_rows, copied_table, fact_rows, matrix_rows, value_text
 from obsynth.report.pictures import pictures_of
 from obsynth.report.verification import verdict_line
 from obsynth.results.design import ObserverDesign
-from obsynth.results.files import write_atomically
 from obsynth.results.gain_sets import design_as_dict
 from obsynth.results.report import VerificationReport
 from obsynth.simulation.scenario import Scenario
 
 #: The check without which observer and plant cannot be run together.
 FITS = "fits the plant"
+#: A page that `html_report` has written; the second mark is that of its first pages.
+PAGE = FileKind("a report of obsynth", rb'name="generator" content="obsynth|<p class="verdict (holds|fails)">')
 #: Gains with more entries are not printed: the gain set has them.
 MOST_ENTRIES = 900
 
@@ -81,6 +83,7 @@ def _page_text(
     links = "".join(f'<a href="#{_anchor(heading)}">{heading}</a>' for heading in shown)
     parts = [
         "<!DOCTYPE html>", '<html lang="en">', "<head>", '<meta charset="utf-8">',
+        '<meta name="generator" content="obsynth">',
         '<meta name="viewport" content="width=device-width, initial-scale=1">', f"<title>{title}</title>",
         f"<style>{STYLE}</style>", "</head>", "<body>", f"<h1>{title}</h1>",
         f'<p class="verdict {state}">{escape(verdict_line(report).plain)}</p>',
@@ -132,7 +135,7 @@ def _pictures(design: ObserverDesign, scenario: Scenario | None, report: Verific
 
 
 def _gains(design: ObserverDesign) -> Iterator[str]:
-    source = source_of(design.method)
+    source = method_spec(design.method).source if design.method in REGISTRY else ""
     if not design.gains:
         return
     if source:

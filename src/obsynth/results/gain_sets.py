@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import math
@@ -15,6 +16,9 @@ import numpy as np
 
 from obsynth.analysis.transformations import StateRecovery
 from obsynth.errors import SpecError
+from obsynth.files.inputs import read_json
+from obsynth.files.outputs import FileKind, write_atomically
+from obsynth.numerics.arguments import is_number
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
@@ -22,11 +26,13 @@ from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.results.design import Certificate, ObserverDesign
-from obsynth.results.files import write_atomically
 from obsynth.results.report import VerificationReport
 
 SCHEMA_VERSION = 1
+#: Larger gain sets are refused before they fill the memory.
+MAXIMUM_CHARACTERS = 2_000_000_000
 _KIND = "obsynth gain set"
+GAIN_SET = FileKind("a gain set", rb'\A\s*\{\s*"kind":\s*"obsynth gain set"', ending=".gains.json")
 # Linear time-invariant designs have no tag.
 _KINDS: dict[str | None, tuple[Any, Any]] = {
     None: (DescriptorSystem, LinearObserver), "recursive": (TimeVaryingDescriptorSystem, RecursiveObserver),
@@ -60,6 +66,8 @@ def restored(value: Any) -> Any:
     if isinstance(value, dict):
         if value.keys() == _ARRAY:
             data = [restored(item) for item in value["data"]]
+            if not {type(item) for item in data} <= {float, int}:
+                raise TypeError("an array holds something that is no number")
             return np.array(data, dtype=np.float64).reshape(value["shape"])
         if value.keys() == _FLOAT:
             return float(value["float"])
@@ -130,12 +138,10 @@ def load(path: str | Path) -> ObserverDesign:
     if not isinstance(path, (str, os.PathLike)):
         raise SpecError(f"path is {path!r}: give the name of a file that a design was saved to.", path="path")
     source = Path(path)
-    try:
-        document = json.loads(source.read_text(encoding="utf-8"), parse_constant=_refuse_constant)
-    except OSError as error:
-        raise SpecError(f"{source} cannot be read: {error.strerror}.", path=str(source)) from error
-    except (ValueError, RecursionError) as error:
-        raise SpecError(f"{source} is no JSON document ({error}).", path=str(source)) from error
+    if source.is_dir() or not source.exists():
+        why = os.strerror(errno.EISDIR if source.is_dir() else errno.ENOENT)
+        raise SpecError(f"{source} cannot be read: {why}.", path=str(source))
+    document = read_json(source, most=MAXIMUM_CHARACTERS)
     if not isinstance(document, dict) or document.get("kind") != _KIND:
         raise SpecError(f"{source} is no gain set of obsynth.", path=str(source))
     if document.get("schema_version") != SCHEMA_VERSION:
@@ -146,18 +152,14 @@ def load(path: str | Path) -> ObserverDesign:
     body = document.get("design")
     try:
         intact = isinstance(body, dict) and document.get("sha256") == digest_of(body)
-    except ValueError:  # a number too large for a float
+    except (ValueError, RecursionError):  # a number too large for a float
         intact = False
     if not intact:
         raise SpecError(f"{source} was changed after it was written: its digest does not match.", path=str(source))
     try:
         return _design_from(restored(body))
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
+    except (AttributeError, LookupError, TypeError, ValueError, ArithmeticError, RecursionError) as error:
         raise SpecError(f"{source} is incomplete: {error}.", path=str(source)) from error
-
-
-def _refuse_constant(name: str) -> float:
-    raise ValueError(f"{name} is not allowed in JSON")
 
 
 def _fields_of(record: StateRecovery) -> dict[str, Any]:
@@ -170,6 +172,13 @@ def _design_from(data: dict[str, Any]) -> ObserverDesign:
     for name in ("name", "method"):
         if not isinstance(data[name], str):
             raise TypeError(f"{name} is {data[name]!r}, not a text")
+    claims, gains = data["certificate"]["claims"], data["gains"]
+    if not all(is_number(value) for value in claims.values()):
+        raise TypeError("a claim is no number")
+    if not all(
+        isinstance(matrix, np.ndarray) for matrix in [*gains.values(), *data["certificate"]["matrices"].values()]
+    ):
+        raise TypeError("a gain or a matrix of the certificate is no array of numbers")
     plant, observer = _KINDS[data.get("kind")]
     return ObserverDesign(
         name=data["name"],

@@ -53,7 +53,8 @@ class DocumentProblems:
 
 def checked_spec(document: Mapping[str, Any], source: Path) -> tuple[SpecDocument, dict[str, Any]]:
     """Check a whole spec, and the options of its method."""
-    from obsynth.spec.options import METHOD_OPTIONS
+    from obsynth.methods.registry import REGISTRY
+    from obsynth.spec.options import options_schema
     from obsynth.spec.schema import SpecDocument
 
     problems = DocumentProblems(source, what="spec")
@@ -65,12 +66,12 @@ def checked_spec(document: Mapping[str, Any], source: Path) -> tuple[SpecDocumen
     if isinstance(method, dict):
         identifier, raw_options = method.get("id"), method.get("options", {})
     options = None
-    if isinstance(identifier, str) and identifier not in METHOD_OPTIONS:
-        close = _suggestion(identifier, list(METHOD_OPTIONS))
-        known = ", ".join(sorted(METHOD_OPTIONS))
+    if isinstance(identifier, str) and identifier not in REGISTRY:
+        close = _suggestion(identifier, list(REGISTRY))
+        known = ", ".join(sorted(REGISTRY))
         problems.add("method.id", f"unknown method {identifier!r}; the known methods are: {known}.{close}")
     elif isinstance(identifier, str) and isinstance(raw_options, dict):
-        options = _validated(METHOD_OPTIONS[identifier], raw_options, problems, prefix="method.options")
+        options = _validated(options_schema(identifier), raw_options, problems, prefix="method.options")
     problems.raise_if_any()
     if checked is None or options is None:
         raise SpecError(f"{source} is no valid spec.", path=str(source))
@@ -133,6 +134,8 @@ def _explained(item: Any, model: type[BaseModel], prefix: str) -> tuple[str, str
         text = f"unknown key.{_suggestion(key, known)}"
     elif kind == "missing":
         text = "this key is missing."
+        if key == "dt":
+            text = "this key is missing: give the seconds between samples, or 0 for a plant in continuous time."
     elif kind == "invalid_key" or "[key]" in location:
         text, numbers = f"a key must be a non-empty text, not {described(value)}.", []
     elif kind == "entry_of_k":
@@ -192,7 +195,7 @@ def _known_keys(location: Sequence[str | int]) -> list[str]:
         "scenario": schema.ScenarioSection,
     }
     if "<pick>" in location:
-        return ["outputs" if "C" in location else "states", "file"]
+        return ["outputs" if {"C", "Df", "Dd"} & set(location) else "states", "file"]
     if "<list>" in location and location[0] == "scenario":
         return list(schema.ProfileSection.model_fields)
     around = location[-2]

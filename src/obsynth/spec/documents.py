@@ -2,44 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import re
 import warnings
 from pathlib import Path
 from typing import Any
 
 from obsynth.errors import SpecError
-
-#: Documents larger than this are refused: matrices of that size belong in matrix files.
-MAXIMUM_CHARACTERS = 32_000_000
-
-
-def existing_file(path: Path, *, where: str) -> Path:
-    """Return ``path`` if it is a file."""
-    try:
-        if path.is_dir():
-            raise SpecError(f"{path} is a folder: give the name of a file.", path=where)
-        if not path.exists():
-            raise SpecError(f"{path} does not exist.", path=where)
-    except (OSError, ValueError) as error:
-        raise SpecError(f"{path} cannot be read: {error}.", path=where) from error
-    return path
-
-
-def read_text(path: Path, *, where: str | None = None) -> str:
-    """Return the text of a UTF-8 file."""
-    place = where or str(path)
-    existing_file(path, where=place)
-    try:
-        with path.open(encoding="utf-8-sig") as stream:
-            text = stream.read(MAXIMUM_CHARACTERS + 1)
-    except UnicodeDecodeError as error:
-        raise SpecError(f"{path} is no UTF-8 text (byte {error.start}).", path=place) from error
-    except OSError as error:
-        raise SpecError(f"{path} cannot be read: {error.strerror}.", path=place) from error
-    if len(text) > MAXIMUM_CHARACTERS:
-        raise SpecError(f"{path} is too large for a document: put large matrices in .mtx or .npz files.", path=place)
-    return text
+from obsynth.files.inputs import read_json, read_text
 
 
 def read_yaml(path: Path, *, where: str | None = None) -> dict[str, Any]:
@@ -74,10 +43,7 @@ def read_names(path: Path, *, where: str) -> list[str]:
     """Return the names in a JSON file: a list, or a mapping of lists that are concatenated in order."""
     if path.suffix.lower() != ".json":
         raise SpecError(f"{path.name} has an unknown suffix: names are read from .json files.", path=where)
-    try:
-        document = json.loads(read_text(path, where=where))
-    except (ValueError, RecursionError) as error:
-        raise SpecError(f"{path} is no JSON document ({error}).", path=where) from error
+    document = read_json(path, where=where)
     lists = list(document.values()) if isinstance(document, dict) else [document]
     if not lists or not all(isinstance(part, list) for part in lists):
         raise SpecError(f"{path} must hold a list of names, or a mapping of such lists.", path=where)

@@ -97,7 +97,7 @@ def load_spec(path: str | Path) -> Spec:
             transformation = transformed(reference.transform, plant, source, "plant")
         else:
             transformation = transformed(section.transform, plant, plant_source, prefix)
-        plant = plant if transformation is None else transformation.plant
+        plant = plant.dense() if transformation is None else transformation.plant
     elif reference is not None and reference.transform is not None:
         raise SpecError(
             f"{source}: plant.transform is for linear plants with constant matrices, which {plant_source.name} is not: "

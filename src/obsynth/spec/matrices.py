@@ -8,16 +8,18 @@ import warnings
 import zipfile
 import zlib
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from obsynth.errors import SpecError
+from obsynth.files.inputs import input_file
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
-from obsynth.spec.documents import existing_file
+from obsynth.numerics.sparse import as_sparse_matrix, is_sparse
 
-#: Larger matrices are refused: every computation here is dense.
+#: Larger matrices are refused; of sparse ones, the entries that are stored count.
 MAXIMUM_ENTRIES = 50_000_000
 
 # What the readers of numpy and scipy raise for a damaged file.
@@ -27,17 +29,17 @@ _READING_ERRORS = (
 )  # fmt: skip
 
 
-def read_matrix(path: Path, *, variable: str | None = None, where: str) -> FloatArray:
-    """Return the matrix in a file."""
-    return _checked(_read_array(path, variable=variable, where=where), path.name, where)
+def read_matrix(path: Path, *, variable: str | None = None, where: str, keep_sparse: bool = False) -> Any:
+    """Return the matrix in a file; a CSR array where it is stored by coordinates and may stay sparse."""
+    return _checked(_read_array(path, variable=variable, where=where, keep_sparse=keep_sparse), path.name, where)
 
 
-def _checked(dense: Any, name: str, where: str) -> FloatArray:
+def _checked(given: Any, name: str, where: str) -> Any:
     try:
-        matrix = as_matrix(dense, name)
+        matrix = as_sparse_matrix(given, name) if is_sparse(given) else as_matrix(given, name)
     except SpecError as error:
         raise SpecError(str(error), path=where) from error
-    if matrix.size == 0:
+    if 0 in matrix.shape:
         raise SpecError(f"{name} holds an empty matrix.", path=where)
     return matrix
 
@@ -46,7 +48,7 @@ def read_matrices(path: Path, *, variable: str | None = None, count: int | None 
     """Return the matrix in a file, or a stack of matrices ``(entries, rows, columns)``."""
     array = _read_array(path, variable=variable, where=where)
     if np.ndim(array) != 3:
-        matrix = _checked(array, path.name, where)
+        matrix: FloatArray = _checked(array, path.name, where)
         if count is None:
             return matrix
         rows, columns = matrix.shape
@@ -63,9 +65,10 @@ def read_matrices(path: Path, *, variable: str | None = None, count: int | None 
     return read_only(np.array([_checked(matrix, name, where) for name, matrix in named]))
 
 
-def _read_array(path: Path, *, variable: str | None, where: str) -> Any:
-    """Return what a file holds as a dense array of any kind."""
-    readers: dict[str, Callable[[Path], Any]] = {".mtx": _matrix_market, ".csv": _comma_separated}
+def _read_array(path: Path, *, variable: str | None, where: str, keep_sparse: bool = False) -> Any:
+    """Return what a file holds as an array of any kind, or as a sparse one."""
+    market = partial(_matrix_market, keep_sparse=keep_sparse)
+    readers: dict[str, Callable[[Path], Any]] = {".mtx": market, ".csv": _comma_separated}
     archives: dict[str, Callable[[Path], Mapping[str, Any]]] = {".npz": _numpy_archive, ".mat": _matlab_archive}
     suffix = path.suffix.lower()
     if suffix not in readers and suffix not in archives:
@@ -73,21 +76,21 @@ def _read_array(path: Path, *, variable: str | None, where: str) -> Any:
         raise SpecError(f"{path.name} has an unknown suffix: matrices are read from {known} files.", path=where)
     if variable is not None and suffix in readers:
         raise SpecError(f"{path.name} holds one matrix only: remove 'variable'.", path=where)
-    existing_file(path, where=where)
+    input_file(path, where=where)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", UserWarning)
             content = readers[suffix](path) if suffix in readers else archives[suffix](path)
             raw = content if suffix in readers else _selected(content, variable, path, where)
-            return _as_dense(raw)
+            return raw if keep_sparse and is_sparse(raw) and suffix == ".mtx" else _as_dense(raw)
     except _READING_ERRORS as error:
         raise SpecError(f"{path} cannot be read as a matrix: {_reason(error)}", path=where) from error
 
 
-def _matrix_market(path: Path) -> FloatArray:
+def _matrix_market(path: Path, *, keep_sparse: bool) -> Any:
     from obsynth.spec.matrix_market import read_matrix_market
 
-    return read_matrix_market(path, maximum_entries=MAXIMUM_ENTRIES)
+    return read_matrix_market(path, maximum_entries=MAXIMUM_ENTRIES, keep_sparse=keep_sparse)
 
 
 def _comma_separated(path: Path) -> Any:

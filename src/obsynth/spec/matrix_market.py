@@ -6,14 +6,20 @@ The one of scipy (1.17) crashes the interpreter on some truncated numbers and da
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
 
+#: Smaller matrices become arrays: nothing is gained by sparsity.
+SPARSE_FROM = 300
+#: A sparse matrix needs memory for each row and column as well: this many entries' worth, generously.
+ENTRIES_PER_LINE = 1000
 
-def read_matrix_market(path: Path, *, maximum_entries: int) -> FloatArray:
-    """Return the matrix in a Matrix Market file, dense."""
+
+def read_matrix_market(path: Path, *, maximum_entries: int, keep_sparse: bool = False) -> Any:
+    """Return the matrix in a Matrix Market file: an array, or a CSR array of a large one that may stay sparse."""
     with path.open(encoding="utf-8") as stream:
         layout, field, symmetry = _checked_header(stream.readline(200))
         lines = (line for line in stream if line.strip() and not line.startswith("%"))
@@ -23,13 +29,15 @@ def read_matrix_market(path: Path, *, maximum_entries: int) -> FloatArray:
     if len(counts) != (3 if layout == "coordinate" else 2) or min(counts) < 0:
         raise ValueError("the line with the sizes is damaged")
     rows, columns = counts[:2]
-    if max(rows * columns, *counts) > maximum_entries:
+    sparse = keep_sparse and layout == "coordinate" and max(rows, columns) >= SPARSE_FROM
+    entries = max(rows, columns) * ENTRIES_PER_LINE if sparse else rows * columns
+    if max(entries, *counts) > maximum_entries:
         raise ValueError(f"it is too large ({max(rows * columns, *counts):.1e} entries)")
     if symmetry != "general" and rows != columns:
         raise ValueError(f"it is {symmetry}, but {rows} by {columns}")
     if layout == "array":
         return _from_array(tokens, rows, columns, symmetry)
-    return _from_coordinates(tokens, (rows, columns, counts[2]), field, symmetry)
+    return _from_coordinates(tokens, (rows, columns, counts[2]), field, symmetry, sparse=sparse)
 
 
 def _checked_header(line: str) -> tuple[str, str, str]:
@@ -63,11 +71,10 @@ def _from_array(tokens: list[str], rows: int, columns: int, symmetry: str) -> Fl
     return _mirrored(matrix, symmetry)
 
 
-def _from_coordinates(tokens: list[str], size: tuple[int, int, int], field: str, symmetry: str) -> FloatArray:
+def _from_coordinates(tokens: list[str], size: tuple[int, int, int], field: str, symmetry: str, *, sparse: bool) -> Any:
     rows, columns, stored = size
     width = 2 if field == "pattern" else 3
     _require_count(len(tokens), width * stored)
-    matrix = np.zeros((rows, columns))
     positions = [
         np.array([_whole(token, "an index") for token in tokens[k::width]], dtype=np.int64) - 1 for k in (0, 1)
     ]
@@ -75,9 +82,26 @@ def _from_coordinates(tokens: list[str], size: tuple[int, int, int], field: str,
         if np.any(position < 0) or np.any(position >= limit):
             raise ValueError("an index is outside the matrix")
     values = np.ones(stored) if field == "pattern" else _numbers(tokens[2::width])
+    if symmetry != "general":
+        positions, values = _both_triangles(positions, values, symmetry)
     # Entries that are given twice are added, as the format says.
+    if sparse:
+        from scipy.sparse import coo_array
+
+        return coo_array((values, (positions[0], positions[1])), shape=(rows, columns)).tocsr()
+    matrix = np.zeros((rows, columns))
     np.add.at(matrix, (positions[0], positions[1]), values)
-    return matrix if symmetry == "general" else _mirrored(matrix, symmetry)
+    return matrix
+
+
+def _both_triangles(positions: list[Any], values: FloatArray, symmetry: str) -> tuple[list[Any], FloatArray]:
+    """Return the coordinates of a lower triangle and of what it stands for above the diagonal."""
+    row, column = positions
+    if np.any(column[values != 0.0] > row[values != 0.0]):
+        raise ValueError(f"it is {symmetry}, but has entries above the diagonal")
+    sign, below = (-1.0 if symmetry == "skew-symmetric" else 1.0), row > column
+    mirrored = [np.concatenate([row, column[below]]), np.concatenate([column, row[below]])]
+    return mirrored, np.concatenate([values, sign * values[below]])
 
 
 def _mirrored(lower: FloatArray, symmetry: str) -> FloatArray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -11,7 +11,6 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.names import index_of
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.spec.checking import DocumentProblems
 from obsynth.spec.documents import read_names
@@ -56,7 +55,7 @@ def _joined(prefix: str, name: str) -> str:
     return f"{prefix}.{name}" if prefix and name else prefix or name
 
 
-def read_value(value: Any, folder: Path, where: str, problems: DocumentProblems) -> Any:
+def read_value(value: Any, folder: Path, where: str, problems: DocumentProblems, *, keep_sparse: bool = False) -> Any:
     """Return rows as an array, files read, picks as lists of names, sections as mappings, all else as it is."""
     if isinstance(value, list) and any(isinstance(entry, str) for row in value for entry in _listed(row)):
         return value
@@ -67,7 +66,7 @@ def read_value(value: Any, folder: Path, where: str, problems: DocumentProblems)
         try:
             if hasattr(value, "stack"):
                 return read_matrices(path, variable=value.variable, count=value.stack, where=where)
-            return read_matrix(path, variable=value.variable, where=where)
+            return read_matrix(path, variable=value.variable, where=where, keep_sparse=keep_sparse)
         except SpecError as error:
             problems.add(where, str(error))
             return None
@@ -109,9 +108,10 @@ def _nonlinear_plant(section: DAESection, source: Path, prefix: str) -> DAEModel
 
 def _invariant_plant(section: PlantSection, source: Path, prefix: str) -> DescriptorSystem:
     problems = DocumentProblems(source, what="plant" if not prefix else "spec")
-    arguments: dict[str, Any] = {name: getattr(section, name) for name in ("dt", *_LABELS)}
+    arguments: dict[str, Any] = {name: getattr(section, name) for name in ("dt", "sensor_noise", *_LABELS)}
     for name in _MATRICES:
-        arguments[name] = read_value(getattr(section, name), source.parent, _joined(prefix, name), problems)
+        value, where = getattr(section, name), _joined(prefix, name)
+        arguments[name] = read_value(value, source.parent, where, problems, keep_sparse=True)
     for name in _NAME_LISTS:
         arguments[name] = _names(getattr(section, name), source.parent, _joined(prefix, name), problems)
     problems.raise_if_any()
@@ -119,27 +119,7 @@ def _invariant_plant(section: PlantSection, source: Path, prefix: str) -> Descri
         if isinstance(arguments[matrix], list) and arguments[names] is None:
             arguments[names] = arguments[matrix]
 
-    def whole() -> DescriptorSystem:
-        # The operating point may name noise that is appended below, so it is checked with the whole plant.
-        bare = DescriptorSystem(**{**arguments, **dict.fromkeys(_LABELS)})
-        noisy = _noise_arguments(bare, section.sensor_noise)
-        return DescriptorSystem(**{**bare.as_dict(), **noisy, **{name: arguments[name] for name in _LABELS}})
-
-    return _placed(whole, source, prefix)
-
-
-def _noise_arguments(plant: DescriptorSystem, sensor_noise: Mapping[str, float] | None) -> dict[str, Any]:
-    """Return the noise matrices with one column appended for each noisy sensor."""
-    if not sensor_noise:
-        return {}
-    columns = np.zeros((plant.ny, len(sensor_noise)))
-    for column, (name, deviation) in enumerate(sensor_noise.items()):
-        columns[index_of(name, plant.output_names, what="sensor_noise"), column] = deviation
-    return {
-        "Bw": np.hstack([plant.Bw, np.zeros((plant.nx, len(sensor_noise)))]),
-        "Dw": np.hstack([plant.Dw, columns]),
-        "noise_names": (*plant.noise_names, *(f"noise {name}" for name in sensor_noise)),
-    }
+    return _placed(lambda: DescriptorSystem(**arguments), source, prefix)
 
 
 def transformed(

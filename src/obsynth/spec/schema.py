@@ -16,6 +16,7 @@ from obsynth.spec.schema_values import (
     OutputMatrix,
     Positive,
     Section,
+    SensorMatrix,
     Text,
     VaryingMatrix,
 )
@@ -51,9 +52,9 @@ class PlantSection(Section):
     C: OutputMatrix
     D: Matrix | None = None
     Bf: EquationMatrix | None = None
-    Df: Matrix | None = None
+    Df: SensorMatrix | None = None
     Bd: EquationMatrix | None = None
-    Dd: Matrix | None = None
+    Dd: SensorMatrix | None = None
     Bw: EquationMatrix | None = None
     Dw: Matrix | None = None
     state_names: Names | None = None
@@ -110,7 +111,7 @@ class DAESection(Section):
     equations: dict[Text, Text]
     outputs: dict[Text, Text]
     states: dict[Text, float]
-    units: dict[Text, str]
+    units: dict[Text, str] | None = None
     inputs: dict[Text, float] | None = None
     parameters: dict[Text, float] | None = None
     constants: dict[Text, float] | None = None

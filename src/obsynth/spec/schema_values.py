@@ -107,6 +107,8 @@ EquationMatrix = Annotated[
 OutputMatrix = Annotated[
     Rows | Annotated[MatrixFile, Tag(_FILE)] | Annotated[OutputPick, Tag(_PICK)], Discriminator(_kind_of_matrix)
 ]
+#: A fault, or an unknown input, on each sensor that is named.
+SensorMatrix = OutputMatrix
 Names = Annotated[Annotated[list[Text], Tag(_LIST)] | Annotated[NamesFile, Tag(_FILE)], Discriminator(_kind_of_names)]
 
 

@@ -28,6 +28,7 @@ class HiddenModes:
 
 def hidden_modes(plant: DescriptorSystem) -> HiddenModes:
     """Return the modes that no output shows, decided exactly where the plant is small enough."""
+    plant = plant.dense()
     tall_e, tall_a = np.vstack([plant.E, np.zeros_like(plant.C)]), np.vstack([plant.A, plant.C])
     hidden = finite_zeros(tall_e, tall_a)
     found = [complex(value) for value in hidden.values]

@@ -311,6 +311,7 @@ def numbers_of(plant: DescriptorSystem) -> PlantNumbers | None:
         return sampled_numbers(exact, origin.sample_time) if states <= SAMPLED_STATES else None
     if plant.nx > EXACT_STATES:
         return None
+    plant = plant.dense()
     return WrittenNumbers({name: written_matrix(getattr(plant, name)) for name in DECISIVE}, plant.is_discrete)
 
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
-from obsynth.analysis.transformations.exact_elimination import exact_elimination, rounded_once
+from obsynth.analysis.transformations.exact_elimination import MOST_STATES, exact_elimination, rounded_once
 from obsynth.analysis.transformations.recovery import (
     StateRecovery,
     Transformation,
@@ -19,9 +21,14 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
 from obsynth.numerics.scaling import equilibrate_pencil, power_of_two_below
+from obsynth.numerics.sparse import is_sparse
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.origin import with_origin
 from obsynth.proofs.written_numbers import computed_entries
+
+#: Arrays of plants from this size on, with at most this share of entries that are not zero, are treated as sparse.
+MANY_VARIABLES = 500
+SPARSE_SHARE = 0.05
 
 
 def eliminate_algebraic_states(plant: DescriptorSystem) -> Transformation:
@@ -30,19 +37,20 @@ def eliminate_algebraic_states(plant: DescriptorSystem) -> Transformation:
     Parameters
     ----------
     plant : DescriptorSystem
-        Regular, index 0 or 1, either time.
+        Regular, index 0 or 1, either time, but for variables that act on no state and no output.
 
     Returns
     -------
     Transformation
         Signals in algebraic equations end up in ``D, Df, Dd, Dw``.  Dynamic states keep their names when
         the null space of ``E`` is spanned by whole states; otherwise the new states ``xi 1, xi 2, ...``
-        are orthogonal combinations (after scaling by powers of two).
+        are orthogonal combinations (after scaling by powers of two).  ``dropped`` names variables that act on
+        nothing and have no value without differentiating: they were left out, exactly, and are not recovered.
 
     Raises
     ------
     PreconditionError
-        Not regular, index 2 or more, or no dynamic state at all.
+        Not regular, index 2 or more (equations and variables are named), or no dynamic state at all.
 
     Notes
     -----
@@ -50,9 +58,68 @@ def eliminate_algebraic_states(plant: DescriptorSystem) -> Transformation:
     where data were computed, results so small beside the terms they come from that they are only rounding are set to
     zero: the flags of the recovery depend on what is exactly zero.
     """
-    if np.array_equal(plant.E, np.eye(plant.nx)):
-        return Transformation(plant, plant, "", unchanged_states(plant, plant, from_state=np.eye(plant.nx)))
-    return eliminated_exactly(plant) or _eliminated_in_floating_point(plant)
+    if _is_identity(plant.E):
+        same = plant.dense()
+        return Transformation(plant, same, "", unchanged_states(plant, same, from_state=np.eye(plant.nx)))
+    if plant.nx > MOST_STATES and (plant.is_sparse or _has_few_entries(plant)):
+        return eliminated_by_sparsity(plant)
+    arrays = plant.dense()
+    found = eliminated_exactly(arrays) or _eliminated_in_floating_point(arrays)
+    return found if arrays is plant else replace(found, source=plant)
+
+
+def _is_identity(e: Any) -> bool:
+    if not is_sparse(e):
+        return bool(np.array_equal(e, np.eye(e.shape[0])))
+    return bool(e.nnz == e.shape[0] and np.all(e.diagonal() == 1.0))
+
+
+def _has_few_entries(plant: DescriptorSystem) -> bool:
+    """Whether a plant given as arrays is solved better by its sparsity."""
+    stored = np.count_nonzero(plant.A) + np.count_nonzero(plant.E) if plant.nx >= MANY_VARIABLES else plant.nx**2
+    return bool(stored <= SPARSE_SHARE * plant.nx**2)
+
+
+def eliminated_by_sparsity(plant: DescriptorSystem) -> Transformation:
+    """Leave out what acts on nothing, and solve the algebraic equations by a sparse factor."""
+    from obsynth.analysis.transformations.idle_variables import active_part, active_variables
+    from obsynth.analysis.transformations.sparse_elimination import reduced_by_sparsity
+
+    active = active_variables(plant)
+    part = active_part(plant, active)
+    found = reduced_by_sparsity(part)
+    new = with_states(part, found.names, E=None, **found.matrices)
+    recovery = StateRecovery.from_operator(part.state_names, found.operator, np.eye(plant.nw), state_point(part))
+    return Transformation(
+        plant, new, _description(part, len(found.names), active.dropped), recovery, active.dropped,
+        (active.note(),) if active.dropped else (), found.bounds,
+    )  # fmt: skip
+
+
+def _without_idle_variables(plant: DescriptorSystem, refusal: PreconditionError) -> Transformation:
+    """Leave out what acts on nothing where that helps; else say which equations and variables are at fault."""
+    from obsynth.analysis.transformations.idle_variables import active_part, active_variables
+    from obsynth.analysis.transformations.sparse_elimination import culprits
+
+    active = active_variables(plant)
+    if not active.dropped:
+        equations, variables = culprits(plant)
+        said = f" Equations {equations} do not determine {', '.join(map(repr, variables))}." if variables else ""
+        raise PreconditionError(f"{refusal}{said}", condition=refusal.condition, signals=variables) from refusal
+    part = active_part(plant, active)
+    found = eliminated_exactly(part) or _eliminated_densely(part, _dynamic_count(part))
+    return replace(
+        found, source=plant, description=_description(part, found.plant.nx, active.dropped), dropped=active.dropped,
+        notes=(active.note(),),
+    )  # fmt: skip
+
+
+def _description(plant: DescriptorSystem, count: int, dropped: Sequence[str] = ()) -> str:
+    """Return what was done to a plant of which ``count`` states are left, in words."""
+    done = f"eliminated {plant.nx - count} algebraic states" if count < plant.nx else "multiplied by the inverse of E"
+    if not dropped:
+        return done
+    return f"left out {len(dropped)} variable(s) that act on nothing ({', '.join(dropped)}); {done}"
 
 
 def eliminated_exactly(plant: DescriptorSystem, basis: FloatArray | None = None) -> Transformation | None:
@@ -76,7 +143,7 @@ def eliminated_exactly(plant: DescriptorSystem, basis: FloatArray | None = None)
         plant.state_names, states["A"], states["B"], states["Bf"], states["Bd"], states["Bw"], np.eye(plant.nw),
         state_point(plant),
     )  # fmt: skip
-    return Transformation(plant, with_origin(new, exact.origin), _done(plant, count), recovery)
+    return Transformation(plant, with_origin(new, exact.origin), _description(plant, count), recovery)
 
 
 def dynamic_coordinates(plant: DescriptorSystem) -> FloatArray | None:
@@ -85,12 +152,18 @@ def dynamic_coordinates(plant: DescriptorSystem) -> FloatArray | None:
     return None if int(np.sum(plant.E.any(axis=0))) == count else _coordinates(plant, count)[1]
 
 
-def _done(plant: DescriptorSystem, count: int) -> str:
-    return f"eliminated {plant.nx - count} algebraic states" if count < plant.nx else "multiplied by the inverse of E"
-
-
 def _eliminated_in_floating_point(plant: DescriptorSystem) -> Transformation:
-    count = _dynamic_count(plant)
+    try:
+        count = _dynamic_count(plant)
+    except PreconditionError as error:
+        if error.condition == "dynamic states":
+            raise
+        return _without_idle_variables(plant, error)
+    return _eliminated_densely(plant, count)
+
+
+def _eliminated_densely(plant: DescriptorSystem, count: int) -> Transformation:
+    """Solve the algebraic equations of a plant with ``count`` dynamic states by LAPACK."""
     rows, dynamic, algebraic, names = _coordinates(plant, count)
     sizes = (count, plant.nu, plant.nf, plant.nd, plant.nw)
     signals = np.hstack([plant.B, plant.Bf, plant.Bd, plant.Bw])
@@ -111,7 +184,7 @@ def _eliminated_in_floating_point(plant: DescriptorSystem) -> Transformation:
         plant.state_names, from_state, from_input, from_fault, from_disturbance, from_noise, np.eye(plant.nw),
         state_point(plant),
     )  # fmt: skip
-    return Transformation(plant, new, _done(plant, count), recovery)
+    return Transformation(plant, new, _description(plant, count), recovery)
 
 
 def _dynamic_count(plant: DescriptorSystem) -> int:

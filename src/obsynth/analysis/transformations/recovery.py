@@ -4,14 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.plants.descriptor import DescriptorSystem
 
+if TYPE_CHECKING:
+    from obsynth.analysis.transformations.recovery_operator import RecoveryOperator
+    from obsynth.numerics.sparse_factor import SolutionBounds
+
 _Value = TypeVar("_Value")
+#: Map of a recovery -> the signal that it maps.
+_MAPS = {
+    "from_state": "state", "from_input": "input", "from_fault": "fault", "from_disturbance": "disturbance",
+    "from_noise": "noise",
+}  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +50,31 @@ class StateRecovery:
             object.__setattr__(self, item.name, read_only(getattr(self, item.name)))
         object.__setattr__(self, "operating_point", dict(self.operating_point))
 
+    @classmethod
+    def from_operator(
+        cls, names: Sequence[str], operator: RecoveryOperator, noise_kept: FloatArray, point: Mapping[str, float]
+    ) -> StateRecovery:
+        """Return a recovery by sparse solutions: a dense map is formed only where one is asked for."""
+        made = object.__new__(cls)
+        parts = {"names": tuple(names), "operator": operator, "noise_kept": read_only(noise_kept)}
+        for name, value in {**parts, "operating_point": dict(point)}.items():
+            object.__setattr__(made, name, value)
+        return made
+
+    def __getattr__(self, name: str) -> FloatArray:
+        """Form a map of a recovery by sparse solutions when it is first asked for."""
+        operator = self.__dict__.get("operator")
+        if operator is None or name not in _MAPS:
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+        matrix = read_only(operator.matrix(_MAPS[name]))
+        object.__setattr__(self, name, matrix)
+        return matrix
+
+    @property
+    def by_operator(self) -> RecoveryOperator | None:
+        """The sparse operator behind the maps of a large plant, or ``None``."""
+        return self.__dict__.get("operator")
+
     def flags(self) -> tuple[str, ...]:
         """Return per source state what an estimate from state and input alone is.
 
@@ -53,6 +87,10 @@ class StateRecovery:
 
     def then(self, later: StateRecovery) -> StateRecovery:
         """Return the recovery through two transformations, this one first."""
+        if (operator := self.by_operator) is not None:
+            through = operator.then({signal: getattr(later, name) for name, signal in _MAPS.items()}, later.noise_kept)
+            kept = self.noise_kept @ later.noise_kept
+            return StateRecovery.from_operator(self.names, through, kept, self.operating_point)
         step = self.from_state
         return StateRecovery(
             names=self.names,
@@ -71,18 +109,26 @@ class Transformation:
     """A plant made from another one.
 
     Fields: source, plant: The plant before and after; description: What was done, in words; recovery: The states of
-    ``source`` from the signals of ``plant``.
+    ``source`` from the signals of ``plant``; dropped: names of the states of ``source`` that act on nothing and were
+    left out: they are not recovered; notes: what a user should know; bounds: how well the algebraic equations were
+    solved, where that was done by sparsity.
     """
 
     source: DescriptorSystem
     plant: DescriptorSystem
     description: str
     recovery: StateRecovery
+    dropped: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    bounds: SolutionBounds | None = None
 
     def then(self, later: Transformation) -> Transformation:
         """Return both steps as one, for a ``later`` that starts from this one's plant."""
         description = "; ".join(text for text in (self.description, later.description) if text)
-        return Transformation(self.source, later.plant, description, self.recovery.then(later.recovery))
+        return Transformation(
+            self.source, later.plant, description, self.recovery.then(later.recovery), self.dropped + later.dropped,
+            self.notes + later.notes, self.bounds or later.bounds,
+        )  # fmt: skip
 
 
 def unchanged_states(

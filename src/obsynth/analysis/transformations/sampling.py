@@ -14,6 +14,7 @@ from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, SLOW_ZERO_RADIUS
 from obsynth.numerics.scaling import power_of_two_below
+from obsynth.numerics.sparse import dense
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.origin import with_origin
 
@@ -56,7 +57,7 @@ def discretise(plant: DescriptorSystem, sample_time: float) -> Transformation:
     first = eliminate_algebraic_states(plant)
     smooth = first.plant
     direct = np.flatnonzero(np.any(smooth.Dw, axis=0))
-    process = np.flatnonzero(np.any(plant.Bw, axis=0) | np.any(smooth.Bw, axis=0))
+    process = np.flatnonzero(np.any(dense(plant.Bw), axis=0) | np.any(smooth.Bw, axis=0))
     signals = tuple(smooth.noise_names[i] for i in np.intersect1d(direct, process))
     if signals:
         raise PreconditionError(

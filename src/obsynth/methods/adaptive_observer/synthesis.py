@@ -17,16 +17,13 @@ Deviations:
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 from obsynth.analysis.conditions import Condition, require_all
 from obsynth.analysis.time_varying import as_time_varying
-from obsynth.errors import SpecError
+from obsynth.methods.adaptive_observer.options import AdaptiveObserverOptions
 from obsynth.methods.recursive.conditions import recursive_conditions
 from obsynth.methods.recursive.synthesis_parts import recursive_synthesis, with_stated_noise
 from obsynth.methods.synthesis_result import Synthesis
-from obsynth.numerics.arguments import chosen, truth
-from obsynth.observers.recursive.observer import FORMS
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 
@@ -40,38 +37,14 @@ def conditions(
 
 def synthesise(
     plant: DescriptorSystem | TimeVaryingDescriptorSystem,
+    asked: AdaptiveObserverOptions,
     *,
     progress: Callable[[str], None],
-    Q: Any = None,
-    R: Any = None,
-    forgetting: float = 0.98,
-    form: str = "innovation",
-    guard: str | None = None,
-    random_walk: Any = None,
-    initial_parameters: Any = None,
-    initial_parameter_covariance: Any = None,
-    initial_state: Any = None,
-    initial_covariance: Any = None,
-    early_constraints: bool = False,
-    window: int = 50,
-    reset: float = 0.0,
 ) -> Synthesis:
     """Put the observer together; see `obsynth.adaptive_observer` for the options, results and errors."""
-    literal = chosen(form, "form", FORMS) == "literal"
-    if form == "random-walk" and random_walk is None:
-        raise SpecError("form 'random-walk' needs random_walk, the variance of one step of each parameter.",
-                        path="method.options.random_walk")  # fmt: skip
-    if form != "random-walk" and random_walk is not None:
-        raise SpecError("random_walk belongs to form 'random-walk': the other forms forget instead.",
-                        path="method.options.random_walk")  # fmt: skip
     progress("checking the existence conditions along the horizon")
-    require_all(conditions(plant, form=form, early_constraints=truth(early_constraints, "early_constraints")))
-    options = with_stated_noise(plant, {
-        "Q": Q, "R": R, "initial_state": initial_state, "initial_covariance": initial_covariance,
-        "early_constraints": early_constraints, "form": form, "forgetting": forgetting,
-        "guard": ("none" if literal else "regularise") if guard is None else guard,
-        "initial_parameters": initial_parameters, "initial_parameter_covariance": initial_parameter_covariance,
-        "random_walk": random_walk, "window": window, "reset": reset,
-    })  # fmt: skip
+    require_all(conditions(plant, form=asked.form, early_constraints=asked.early_constraints))
+    default_guard = "none" if asked.form == "literal" else "regularise"
+    options = {**asked.as_given(), "guard": default_guard if asked.guard is None else asked.guard}
     progress("computing the gains")
-    return recursive_synthesis(as_time_varying(plant), options)
+    return recursive_synthesis(as_time_varying(plant), with_stated_noise(plant, options))

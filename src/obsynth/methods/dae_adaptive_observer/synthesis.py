@@ -19,13 +19,12 @@ Deviations:
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import numpy as np
 
 from obsynth.analysis.conditions import Condition, require_all
-from obsynth.errors import SpecError
 from obsynth.methods.dae_adaptive_observer.conditions import dae_conditions
+from obsynth.methods.dae_adaptive_observer.options import DaeAdaptiveObserverOptions
 from obsynth.methods.synthesis_result import Synthesis
 from obsynth.observers.dae.building import dae_observer_from_options, resolved_options
 from obsynth.observers.dae.nominal_run import NOMINAL_STEPS, DAEFacts, dae_facts
@@ -40,15 +39,9 @@ def conditions(plant: object, *, dt: float = 1.0) -> tuple[Condition, ...]:
     return tuple(dae_conditions(plant, dt))
 
 
-def synthesise(plant: DAEModel, *, progress: Callable[[str], None], **options: Any) -> Synthesis:
+def synthesise(plant: DAEModel, asked: DaeAdaptiveObserverOptions, *, progress: Callable[[str], None]) -> Synthesis:
     """Put the observer together; see `obsynth.dae_adaptive_observer` for the options, results and errors."""
-    given = {**DEFAULTS, **options}
-    if given["dt"] is None:
-        raise SpecError("dt is missing: give the seconds between samples.", path="method.options.dt")
-    if given["form"] == "forgetting" and given["random_walk"] is not None:
-        raise SpecError("random_walk belongs to the forms 'random-walk' and 'augmented-kalman': form 'forgetting' "
-                        "forgets instead.", path="method.options.random_walk")  # fmt: skip
-    observer = dae_observer_from_options(plant, given)
+    observer = dae_observer_from_options(plant, asked.as_given())
     progress("checking index and parameters")
     require_all(conditions(plant, dt=observer.dt))
     progress("running the observer on its own model")
@@ -61,15 +54,6 @@ def synthesise(plant: DAEModel, *, progress: Callable[[str], None], **options: A
         resolved_options(observer), {"K": facts.K, "Upsilon": facts.Upsilon}, observer, Certificate({}, claims),
         notes=tuple(_notes(observer, facts)),
     )  # fmt: skip
-
-
-#: Defaults of all options; Q, R and dt must be given.
-DEFAULTS: dict[str, Any] = {
-    "dt": None, "Q": None, "R": None, "form": "forgetting", "forgetting": 0.98, "guard": "regularise",
-    "weight": "innovation", "integration": "backward-euler", "random_walk": None, "initial_state": None,
-    "initial_covariance": None, "initial_parameters": None, "initial_parameter_covariance": None, "bounds": None,
-    "largest_move": None, "window": 50,
-}  # fmt: skip
 
 
 def _notes(observer: DAEObserver, facts: DAEFacts) -> Iterator[str]:

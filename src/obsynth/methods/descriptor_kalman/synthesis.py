@@ -16,14 +16,13 @@ Deviations:
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 from obsynth.analysis.conditions import Condition, require_all
 from obsynth.analysis.time_varying import as_time_varying
+from obsynth.methods.descriptor_kalman.options import DescriptorKalmanOptions
 from obsynth.methods.recursive.conditions import recursive_conditions
 from obsynth.methods.recursive.synthesis_parts import recursive_synthesis, with_stated_noise
 from obsynth.methods.synthesis_result import Synthesis
-from obsynth.numerics.arguments import truth
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 
@@ -37,20 +36,13 @@ def conditions(
 
 def synthesise(
     plant: DescriptorSystem | TimeVaryingDescriptorSystem,
+    asked: DescriptorKalmanOptions,
     *,
     progress: Callable[[str], None],
-    Q: Any = None,
-    R: Any = None,
-    initial_state: Any = None,
-    initial_covariance: Any = None,
-    early_constraints: bool = False,
 ) -> Synthesis:
     """Put the filter together; see `obsynth.descriptor_kalman` for the options, results and errors."""
     progress("checking the existence conditions along the horizon")
-    require_all(conditions(plant, early_constraints=truth(early_constraints, "early_constraints")))
-    options = with_stated_noise(plant, {
-        "Q": Q, "R": R, "initial_state": initial_state, "initial_covariance": initial_covariance,
-        "early_constraints": early_constraints,
-    })  # fmt: skip
+    require_all(conditions(plant, early_constraints=asked.early_constraints))
+    options = with_stated_noise(plant, asked.as_given())
     progress("computing the gains")
     return recursive_synthesis(as_time_varying(plant), options)

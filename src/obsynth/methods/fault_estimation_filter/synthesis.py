@@ -48,9 +48,8 @@ def conditions(plant: DescriptorSystem) -> tuple[Condition, ...]:
     return fault_filter_conditions(plant)
 
 
-def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **options: Any) -> Synthesis:
+def synthesise(plant: DescriptorSystem, asked: FilterOptions, *, progress: Callable[[str], None]) -> Synthesis:
     """Design the filter; see `obsynth.fault_estimation_filter` for the options, results and errors."""
-    asked = FilterOptions(**options)
     progress("checking the existence conditions")
     held, prepared = examine_fault_filter(plant)
     require_all(held)

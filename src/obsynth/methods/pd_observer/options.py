@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.methods.conic.lmi import SOLVER_SETTINGS
+from obsynth.methods.method_spec import MethodOptions
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.ranks import decide_rank
+from obsynth.numerics.value_types import NonNegative, Positive, WrittenAs
 
-#: How gains are found: from the whole inequality, from the smaller one without the gains, or in closed form.
-ENGINES = ("auto", "lmi", "reduced-lmi", "riccati")
+#: Engines for stability and a decay rate alone.
 ENGINES_OF_STABILITY = ("reduced-lmi", "riccati")
 #: Up to so many unknown states "auto" takes the first (a second or two); up to so many it tries the second where the
 #: third does not serve.
@@ -22,77 +23,51 @@ MOST_STATES_FOR_REDUCED_LMI = 50
 
 
 @dataclass(frozen=True)
-class PdOptions:
+class PdOptions(MethodOptions):
     """Options of the method as asked for; see `obsynth.pd_observer`."""
 
-    theorem: int = 1
-    delta: float | None = None
-    decay: float | None = None
-    disk: Any = None
-    gain_bound: float | None = None
-    fault_rate_gain: float | None = None
-    noise_gain: float | None = None
-    adaptation_gain: Any = None
-    adaptation_range: Any = None
-    delta_scan: Any = None
-    engine: str = "auto"
-    solver: str = "CLARABEL"
-    problems: list[str] = field(default_factory=list, init=False, repr=False, compare=False)
+    METHOD: ClassVar[str] = "pd-observer"
 
-    def __post_init__(self) -> None:
-        if self.theorem not in (1, 2) or isinstance(self.theorem, bool):
-            self.problems.append(f"theorem is {self.theorem!r}: use 1 or 2.")
-        for name in ("delta", "gain_bound", "fault_rate_gain", "noise_gain"):
-            self._require_positive(name)
-        if self.decay is not None and not (_is_number(self.decay) and self.decay >= 0.0):
-            self.problems.append(f"decay is {self.decay}: give 0 or a positive number in 1/seconds.")
-        if self.solver not in SOLVER_SETTINGS:
-            self.problems.append(f"solver is {self.solver!r}: use one of {', '.join(SOLVER_SETTINGS)}.")
-        if self.engine not in ENGINES:
-            self.problems.append(f"engine is {self.engine!r}: use one of {', '.join(ENGINES)}.")
-        elif self.engine in ENGINES_OF_STABILITY and self.further:
-            self.problems.append(
+    theorem: Literal[1, 2] = 1
+    delta: Positive | None = None
+    decay: NonNegative | None = None
+    disk: Annotated[Any, WrittenAs("pair")] = None
+    gain_bound: Positive | None = None
+    fault_rate_gain: Positive | None = None
+    noise_gain: Positive | None = None
+    adaptation_gain: Annotated[Any, WrittenAs("matrix")] = None
+    adaptation_range: Annotated[Any, WrittenAs("pair")] = None
+    delta_scan: Annotated[Any, WrittenAs("positive numbers")] = None
+    engine: Literal["auto", "lmi", "reduced-lmi", "riccati"] = "auto"
+    solver: Literal["CLARABEL", "SCS"] = "CLARABEL"
+
+    def conflicts(self) -> Iterator[str]:
+        """Yield a sentence for each rule across options, or for lists of numbers, that is broken."""
+        if self.engine in ENGINES_OF_STABILITY and self.further:
+            yield (
                 f"engine {self.engine!r} gives stability and a decay rate alone: take engine 'lmi', or leave out "
                 f"{', '.join(self.further)}."
             )
-        disk = self._numbers("disk", 2)
-        if disk is not None and not disk[1] > max(-disk[0], 0.0):
-            self.problems.append(
-                f"disk is {disk}: give [c, r] for |s + c| < r, with r > 0 and part of the disk left of the axis."
-            )
-        low_high = self._numbers("adaptation_range", 2)
-        if low_high is not None and not 0.0 < low_high[0] < low_high[1]:
-            self.problems.append(f"adaptation_range is {low_high}: give [low, high] with 0 < low < high.")
-        scanned = self._numbers("delta_scan", None)
-        if scanned is not None and not all(value > 0.0 for value in scanned):
-            self.problems.append(f"delta_scan is {scanned}: give positive numbers of seconds.")
+        yield from self._broken_lists()
         others = ("disk", "gain_bound", "fault_rate_gain", "noise_gain", "adaptation_gain")
         clash = [name for name in others if getattr(self, name) is not None]
-        if low_high is not None and clash:
-            self.problems.append(f"adaptation_range cannot be combined with {', '.join(clash)}.")
-        if self.problems:
-            raise SpecError("Options of pd-observer:", path="method.options", problems=self.problems)
+        if self.adaptation_range is not None and clash:
+            yield f"adaptation_range cannot be combined with {', '.join(clash)}."
 
-    def _require_positive(self, name: str) -> None:
-        value = getattr(self, name)
-        if value is not None and not (_is_number(value) and value > 0.0):
-            self.problems.append(f"{name} is {value}: give a positive number.")
-
-    def _numbers(self, name: str, count: int | None) -> tuple[float, ...] | None:
-        """Return an option that is a list of numbers; note what is wrong with it."""
-        value = getattr(self, name)
-        if value is None:
-            return None
-        wanted = f"{count} numbers" if count else "one number or more"
-        try:
-            row = as_matrix(np.atleast_2d(np.asarray(value)), name)
-        except (SpecError, ValueError):
-            self.problems.append(f"{name} is {value!r}: give a list of {wanted}.")
-            return None
-        if row.shape[0] != 1 or row.size == 0 or (count is not None and row.size != count):
-            self.problems.append(f"{name} is {value!r}: give a list of {wanted}.")
-            return None
-        return tuple(map(float, row[0]))
+    def _broken_lists(self) -> Iterator[str]:
+        wanted = {"disk": 2, "adaptation_range": 2, "delta_scan": None}
+        found = {name: _numbers(getattr(self, name), count) for name, count in wanted.items()}
+        for name, numbers in found.items():
+            if getattr(self, name) is not None and numbers is None:
+                count = wanted[name] or "one number or more"
+                yield f"{name} is {getattr(self, name)!r}: give a list of {count}{' numbers' if wanted[name] else ''}."
+        disk, low_high, scanned = found["disk"], found["adaptation_range"], found["delta_scan"]
+        if disk is not None and not disk[1] > max(-disk[0], 0.0):
+            yield f"disk is {disk}: give [c, r] for |s + c| < r, with r > 0 and part of the disk left of the axis."
+        if low_high is not None and not 0.0 < low_high[0] < low_high[1]:
+            yield f"adaptation_range is {low_high}: give [low, high] with 0 < low < high."
+        if scanned is not None and not all(value > 0.0 for value in scanned):
+            yield f"delta_scan is {scanned}: give positive numbers of seconds."
 
     @property
     def further(self) -> tuple[str, ...]:
@@ -125,8 +100,16 @@ class PdOptions:
         return None if self.adaptation_gain is None else checked_adaptation_gain(self.adaptation_gain, nf)
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float, np.floating, np.integer)) and bool(np.isfinite(value))
+def _numbers(value: Any, count: int | None) -> tuple[float, ...] | None:
+    """Return a list of numbers as floats; ``None`` where it is none, or not of this length."""
+    if value is None:
+        return None
+    try:
+        row = as_matrix(np.atleast_2d(np.asarray(value)), "option")
+    except (SpecError, ValueError):
+        return None
+    fits = row.shape[0] == 1 and row.size > 0 and (count is None or row.size == count)
+    return tuple(map(float, row[0])) if fits else None
 
 
 def checked_adaptation_gain(value: Any, nf: int) -> FloatArray:

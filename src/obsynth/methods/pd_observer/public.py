@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -260,7 +262,8 @@ def pd_delta_scan(
     from obsynth.methods.pd_observer.delta_scan import scan_delta
     from obsynth.methods.pd_observer.options import PdOptions
 
-    asked = PdOptions(theorem=theorem, decay=decay, delta_scan=delta, solver=solver)
+    given: dict[str, Any] = {"theorem": theorem, "decay": decay, "delta_scan": delta, "solver": solver}
+    asked = PdOptions(**given)
     require_all(pd_observer_conditions(plant))
     form = explicit_form(plant)
     return scan_delta(plant if form is None else form.plant, asked, np.ravel(np.asarray(delta)), decay=float(decay))

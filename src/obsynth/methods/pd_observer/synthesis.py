@@ -51,9 +51,8 @@ def conditions(plant: DescriptorSystem) -> tuple[Condition, ...]:
     return pd_observer_conditions(plant)
 
 
-def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **options: Any) -> Synthesis:
+def synthesise(plant: DescriptorSystem, asked: PdOptions, *, progress: Callable[[str], None]) -> Synthesis:
     """Design the observer; see `obsynth.pd_observer` for the options, results and errors."""
-    asked = PdOptions(**options)
     progress("checking the existence conditions")
     require_all(conditions(plant))
     form = explicit_form(plant)

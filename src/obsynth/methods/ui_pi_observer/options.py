@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.methods.conic.lmi import SOLVER_SETTINGS
-from obsynth.methods.placement.eigenstructure import OBJECTIVES
+from obsynth.methods.method_spec import MethodOptions
 from obsynth.methods.placement.region import Region
 from obsynth.methods.ui_pi_observer.noise import NoiseWeights
 from obsynth.numerics.arrays import ComplexArray
 from obsynth.numerics.spectra import decay_rates
+from obsynth.numerics.value_types import NonNegative, Positive, WrittenAs, problem_with
 from obsynth.plants.exosystems import Exosystem
 from obsynth.plants.fault_models import FaultModel
 
@@ -24,41 +24,35 @@ _PATH = "method.options"
 
 
 @dataclass(frozen=True)
-class UiPiOptions:
+class UiPiOptions(MethodOptions):
     """Options of the method as asked for; see `obsynth.ui_pi_observer`."""
 
-    fault_model: Any = "step"
-    poles: Any = None
-    decay: float | None = None
-    region: Any = None
-    noise: Any = None
-    objective: str = "conditioning"
-    joint: bool = False
-    E_sharp: Any = None
-    C_sharp: Any = None
-    G: Any = None
-    solver: str = "CLARABEL"
+    METHOD: ClassVar[str] = "ui-pi-observer"
 
-    def __post_init__(self) -> None:
-        problems = []
+    fault_model: Annotated[Any, WrittenAs("fault model")] = "step"
+    poles: Annotated[Any, WrittenAs("poles")] = None
+    decay: NonNegative | None = None
+    region: Annotated[Any, WrittenAs("pole region")] = None
+    noise: Annotated[Any, WrittenAs("noise weights")] = None
+    objective: Literal["conditioning", "gain"] = "conditioning"
+    joint: bool = False
+    E_sharp: Annotated[Any, WrittenAs("matrix")] = None
+    C_sharp: Annotated[Any, WrittenAs("matrix")] = None
+    G: Annotated[Any, WrittenAs("matrix")] = None
+    solver: Literal["CLARABEL", "SCS"] = "CLARABEL"
+
+    def conflicts(self) -> Iterator[str]:
+        """Yield a sentence for each rule across options that is broken."""
         ways = [name for name in ("poles", "decay", "region") if getattr(self, name) is not None]
         if len(ways) > 1:
-            problems.append(f"{' and '.join(ways)} are given: use one of them.")
+            yield f"{' and '.join(ways)} are given: use one of them."
         if self.poles is not None and self.noise is not None:
-            problems.append("noise weights do not act on given poles: leave one of the two out.")
-        if self.decay is not None and not (_is_number(self.decay) and self.decay >= 0.0):
-            problems.append(f"decay is {self.decay!r}: give a rate in 1/s, 0 or more.")
-        if self.objective not in OBJECTIVES:
-            problems.append(f"objective is {self.objective!r}: use one of {', '.join(OBJECTIVES)}.")
-        if self.solver not in SOLVER_SETTINGS:
-            problems.append(f"solver is {self.solver!r}: use one of {', '.join(SOLVER_SETTINGS)}.")
+            yield "noise weights do not act on given poles: leave one of the two out."
         given = [getattr(self, name) is not None for name in ("E_sharp", "C_sharp", "G")]
         if any(given) and not all(given):
-            problems.append("E_sharp, C_sharp and G come together: give all three, or none.")
+            yield "E_sharp, C_sharp and G come together: give all three, or none."
         if any(given) and self.joint:
-            problems.append("joint designs what E_sharp, C_sharp and G would fix: leave one of the two out.")
-        if problems:
-            raise SpecError("Options of ui-pi-observer:", path=_PATH, problems=problems)
+            yield "joint designs what E_sharp, C_sharp and G would fix: leave one of the two out."
 
     def given_decoupling(self) -> dict[str, Any] | None:
         """Return the paper's matrices, or ``None`` for our own decoupling."""
@@ -83,9 +77,8 @@ class UiPiOptions:
             raise SpecError(message, path=f"{_PATH}.noise")
         given = {key: value for key, value in self.noise.items() if value is not None}
         problems = [f"unknown key {key!r}." for key in given if key not in ("measurement", "process", "fault")]
-        for key in ("process", "fault"):
-            if key in given and not (_is_number(given[key]) and given[key] > 0.0):
-                problems.append(f"{key} is {given[key]!r}: give a positive number.")
+        sizes = {key: given[key] for key in ("process", "fault") if key in given}
+        problems += [text for key, size in sizes.items() if (text := problem_with(size, key, Positive))]
         measurement = given.get("measurement")
         if isinstance(measurement, (list, tuple, np.ndarray)):
             if np.shape(measurement) != (len(output_names),):
@@ -101,7 +94,7 @@ class UiPiOptions:
             values = list(measurement.values())
         else:
             values = [] if measurement is None else [measurement]
-        if not all(_is_number(value) and value > 0.0 for value in values):
+        if any(problem_with(value, "measurement", Positive) for value in values):
             problems.append("measurement must be positive standard deviations: one number, a list, or by output.")
         if problems:
             raise SpecError("Option noise of ui-pi-observer:", path=f"{_PATH}.noise", problems=problems)
@@ -188,11 +181,3 @@ def _as_complex(pole: Any) -> complex:
     if isinstance(pole, (bool, str)) or not np.isfinite(value):
         raise SpecError(f"{pole!r} is no pole: give a finite number, or [re, im].", path=f"{_PATH}.poles")
     return value
-
-
-def _is_number(value: Any) -> bool:
-    return (
-        isinstance(value, (int, float, np.integer, np.floating))
-        and not isinstance(value, bool)
-        and bool(np.isfinite(value))
-    )

@@ -54,9 +54,8 @@ def conditions(plant: DescriptorSystem, *, fault_model: Any = "step") -> tuple[C
     return existence(plant, exosystem(fault_model, plant.fault_names, plant.dt)).conditions
 
 
-def synthesise(plant: DescriptorSystem, *, progress: Callable[[str], None], **options: Any) -> Synthesis:
+def synthesise(plant: DescriptorSystem, asked: UiPiOptions, *, progress: Callable[[str], None]) -> Synthesis:
     """Design the observer; see `obsynth.ui_pi_observer` for the options, results and errors."""
-    asked = UiPiOptions(**options)
     model = exosystem(asked.fault_model, plant.fault_names, plant.dt)
     region = asked.checked_region(plant.dt)
     weights = asked.checked_noise(plant.output_names)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.covariances import covariance_factor, is_definite
+from obsynth.numerics.value_types import Count, ForgettingFactor, Positive, checked_value
 from obsynth.observers.recursive.records import measured_record
 from obsynth.plants.dae.checks import checked_inputs, finite_vector, step_length
-from obsynth.plants.dae.functions import BUTCHER
 from obsynth.plants.dae.model import DAEModel
 
 if TYPE_CHECKING:
@@ -24,10 +24,14 @@ if TYPE_CHECKING:
     from obsynth.observers.dae.running import RunningDAEObserver
     from obsynth.observers.dae.step_graph import ObserverGraph
 
-FORMS = ("forgetting", "random-walk", "augmented-kalman")
-GUARDS = ("regularise", "none")
-WEIGHTS = ("innovation", "paper")
-_CHOICES = {"form": FORMS, "guard": GUARDS, "weight": WEIGHTS, "integration": tuple(BUTCHER)}
+Form: TypeAlias = Literal["forgetting", "random-walk", "augmented-kalman"]
+Guard: TypeAlias = Literal["regularise", "none"]
+Weight: TypeAlias = Literal["innovation", "paper"]
+Integration: TypeAlias = Literal["backward-euler", "radau"]
+_KINDS = {
+    "form": Form, "guard": Guard, "weight": Weight, "integration": Integration, "forgetting": ForgettingFactor,
+    "window": Count, "largest_move": Positive | None,
+}  # fmt: skip
 _DEFINITE = ("R", "initial_parameter_covariance")
 
 
@@ -96,19 +100,8 @@ class DAEObserver:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "dt", step_length(self.dt))
-        for name, allowed in _CHOICES.items():
-            if getattr(self, name) not in allowed:
-                raise SpecError(f"{name} is {getattr(self, name)!r}: use one of {', '.join(allowed)}.", path=name)
-        for name in ("forgetting", "largest_move"):
-            value = getattr(self, name)
-            if value is not None and not (isinstance(value, (int, float, np.number)) and not isinstance(value, bool)):
-                raise SpecError(f"{name} is {value!r}: give a number.", path=name)
-        if not 0.0 < self.forgetting <= 1.0:
-            raise SpecError(f"forgetting is {self.forgetting}: give lambda in (0, 1], such as 0.98.", path="forgetting")
-        if not isinstance(self.window, (int, np.integer)) or isinstance(self.window, bool) or self.window < 1:
-            raise SpecError(f"window is {self.window!r}: give a number of samples, at least 1.", path="window")
-        if self.largest_move is not None and not self.largest_move > 0.0:
-            raise SpecError(f"largest_move is {self.largest_move}: give a positive number.", path="largest_move")
+        for name, kind in _KINDS.items():
+            checked_value(getattr(self, name), name, kind)
         self._check_arrays()
 
     def __getstate__(self) -> dict[str, Any]:

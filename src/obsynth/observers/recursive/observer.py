@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import chosen, real_number, real_vector, truth, whole_number
+from obsynth.numerics.arguments import real_vector, truth
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.covariances import covariance_factor
+from obsynth.numerics.value_types import Count, ForgettingFactor, Probability, checked_value
 from obsynth.observers.recursive.records import require_horizon, whole_record
 from obsynth.plants.sequences import MatrixSequence
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
@@ -21,8 +22,11 @@ if TYPE_CHECKING:
     from obsynth.observers.recursive.estimates import RecursiveEstimates
     from obsynth.observers.recursive.running import RunningRecursiveObserver
 
-FORMS = ("innovation", "literal", "random-walk")
-GUARDS = ("regularise", "directional", "none")
+Form: TypeAlias = Literal["innovation", "literal", "random-walk"]
+Guard: TypeAlias = Literal["regularise", "directional", "none"]
+
+
+_KINDS = {"form": Form, "guard": Guard, "forgetting": ForgettingFactor, "window": Count, "reset": Probability}
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,17 +69,8 @@ class Adaptation:
     reset: float = 0.0
 
     def __post_init__(self) -> None:
-        chosen(self.form, "form", FORMS)
-        chosen(self.guard, "guard", GUARDS)
-        wanted = "lambda in (0, 1], such as 0.98; 1 forgets nothing"
-        object.__setattr__(self, "forgetting", real_number(self.forgetting, "forgetting", wanted))
-        if not 0.0 < self.forgetting <= 1.0:
-            raise SpecError(f"forgetting is {self.forgetting}: give {wanted}.", path="forgetting")
-        object.__setattr__(self, "window", whole_number(self.window, "window", "a number of samples"))
-        wanted = "a probability per sample, such as 1e-6; 0 never resets"
-        object.__setattr__(self, "reset", real_number(self.reset, "reset", wanted))
-        if not 0.0 <= self.reset < 1.0:
-            raise SpecError(f"reset is {self.reset}: give {wanted}.", path="reset")
+        for name, kind in _KINDS.items():
+            object.__setattr__(self, name, checked_value(getattr(self, name), name, kind))
         if self.reset and self.form == "random-walk":
             raise SpecError("reset belongs to the forms that forget: the random walk follows by itself.", path="reset")
         q = len(self.initial_parameters)

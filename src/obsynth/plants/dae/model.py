@@ -50,8 +50,8 @@ class DAEModel:
         Known inputs: name -> nominal value.
     parameters : mapping of str to float, optional
         Name -> nominal value.
-    units : mapping of str to str
-        Unit of every state, input, parameter and output (``"1"`` for what has none); of constants where you like.
+    units : mapping of str to str, optional
+        Unit of states, inputs, parameters, outputs and constants (``"1"`` for what has none).
     constants : mapping of str to float, optional
         Names that texts may use.
     definitions : mapping of str to str, optional
@@ -103,7 +103,7 @@ class DAEModel:
         outputs: Equations,
         *,
         states: Mapping[str, float],
-        units: Mapping[str, str],
+        units: Mapping[str, str] | None = None,
         inputs: Mapping[str, float] | None = None,
         parameters: Mapping[str, float] | None = None,
         constants: Mapping[str, float] | None = None,
@@ -130,9 +130,6 @@ class DAEModel:
         problems.raise_if_any()
         check_structure(self, problems)
         required = [*self.state_names, *self.input_names, *self.parameter_names, *self.output_names]
-        missing = [name for name in required if units.get(name, "") == ""]
-        if missing:
-            problems.collect(partial(_units_missing, missing))
         known = {*required, *self.constants, *self.definitions}
         object.__setattr__(self, "units", problems.collect(lambda: checked_units(units, known)))
         problems.raise_if_any()
@@ -247,8 +244,3 @@ class DAEModel:
 
 def _made(given: dict[str, Any]) -> DAEModel:
     return DAEModel(**given)
-
-
-def _units_missing(names: Sequence[str]) -> None:
-    raise SpecError(f"units says nothing of {', '.join(map(repr, names))}: give each a unit, '1' for none.",
-                    path="units")  # fmt: skip

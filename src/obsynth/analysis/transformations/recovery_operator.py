@@ -1,0 +1,141 @@
+"""The states of a large plant from those that elimination left, as a sparse solution instead of a dense matrix."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
+from obsynth.numerics.sparse import csr
+from obsynth.numerics.sparse_factor import SparseFactor
+
+#: Signals in the order in which they stand in the algebraic equations.
+SIGNALS = ("state", "input", "fault", "disturbance", "noise")
+
+
+@dataclass(frozen=True, eq=False)
+class RecoveryOperator:
+    """``x = dynamic xi + algebraic z`` with ``coupling z + right [xi; u; f; d; w] = 0``, all sparse.
+
+    Parameters
+    ----------
+    dynamic, algebraic : sparse matrix
+        ``(nx, count)`` and ``(nx, nx - count)``.
+    coupling : sparse matrix
+        ``(nx - count, nx - count)``, nonsingular.
+    right : sparse matrix
+        ``(nx - count, count + nu + nf + nd + nw)``.
+    counts : tuple of int
+        Numbers of states, inputs, faults, disturbances and noise inputs.
+    states : mapping of str to FloatArray
+        Signal of the plant now -> ``(count, n)``: ``xi`` from its signals, where later transformations changed them.
+    noise_kept : FloatArray
+        ``(nw, nw now)``.
+    """
+
+    dynamic: Any
+    algebraic: Any
+    coupling: Any
+    right: Any
+    counts: tuple[int, ...]
+    states: Mapping[str, FloatArray] = field(default_factory=dict)
+    noise_kept: FloatArray | None = None
+
+    @cached_property
+    def factor(self) -> SparseFactor:
+        """Factors of the algebraic equations."""
+        return SparseFactor(self.coupling)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave the factors behind: they belong to this process."""
+        return {name: value for name, value in self.__dict__.items() if name != "factor"}
+
+    def matrix(self, signal: str) -> FloatArray:
+        """Return the dense map from one kind of signal, ``(nx, n)``."""
+        first, last = self._columns(signal)
+        own = np.eye(last - first)
+        if signal == "noise" and self.noise_kept is not None:
+            own = self.noise_kept
+        given = {signal: own} if signal != "state" else {}
+        xi = self.states.get(signal)
+        if xi is None and signal == "state":
+            xi = own
+        return self.apply(np.zeros((self.counts[0], own.shape[1])) if xi is None else xi, given)
+
+    def apply(self, xi: FloatArray, signals: Mapping[str, FloatArray]) -> FloatArray:
+        """Return columns of ``x`` for columns of the eliminated plant's states and of its signals."""
+        first = self._columns("state")[1]
+        terms = self.right[:, :first] @ xi
+        for name, columns in signals.items():
+            start, end = self._columns(name)
+            terms = terms + self.right[:, start:end] @ columns
+        solution = without_rounding(self.factor, -self.factor.solve(terms))
+        return np.asarray(self.dynamic @ xi + self.algebraic @ solution)
+
+    def then(self, later: Mapping[str, FloatArray], noise_kept: FloatArray) -> RecoveryOperator:
+        """Return the operator through another transformation: its maps of ``xi`` by signal, and the noise it kept."""
+        step = self.states.get("state")
+        states = {name: matrix if step is None else step @ matrix for name, matrix in later.items()}
+        for name, matrix in self.states.items():
+            if name != "state":
+                own = matrix @ noise_kept if name == "noise" else matrix
+                states[name] = states.get(name, np.zeros_like(own)) + own
+        kept = noise_kept if self.noise_kept is None else self.noise_kept @ noise_kept
+        return replace(self, states=states, noise_kept=kept)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain data: the parts of the sparse matrices as arrays."""
+        found: dict[str, Any] = {"counts": list(self.counts), "states": dict(self.states), "noise": self.noise_kept}
+        for name in ("dynamic", "algebraic", "coupling", "right"):
+            matrix = csr(getattr(self, name))
+            found[name] = {
+                "rows": matrix.shape[0], "columns": matrix.shape[1], "values": matrix.data,
+                "indices": matrix.indices.astype(np.float64), "starts": matrix.indptr.astype(np.float64),
+            }  # fmt: skip
+        return found
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> RecoveryOperator:
+        """Return what `as_dict` wrote."""
+        from scipy.sparse import csr_array
+
+        parts = {
+            name: csr_array(
+                (
+                    np.asarray(entry["values"]),
+                    np.asarray(entry["indices"]).astype(np.int64),
+                    np.asarray(entry["starts"]).astype(np.int64),
+                ),
+                shape=(int(entry["rows"]), int(entry["columns"])),
+            )
+            for name, entry in ((name, data[name]) for name in ("dynamic", "algebraic", "coupling", "right"))
+        }
+        noise = None if data["noise"] is None else np.asarray(data["noise"])
+        states = {name: np.asarray(matrix) for name, matrix in data["states"].items()}
+        return cls(**parts, counts=tuple(int(n) for n in data["counts"]), states=states, noise_kept=noise)
+
+    def _columns(self, signal: str) -> tuple[int, int]:
+        ends = np.cumsum([0, *self.counts])
+        place = SIGNALS.index(signal)
+        return int(ends[place]), int(ends[place + 1])
+
+
+def without_rounding(factor: SparseFactor, solution: FloatArray) -> FloatArray:
+    """Set entries to zero that are so small beside the terms they come from that they are only rounding."""
+    sizes = np.abs(solution) / factor.columns[:, None]
+    # No sum of terms is larger than the condition number times the largest unknown.
+    most = CANCELLATION_TOLERANCE * factor.condition * np.max(sizes, axis=0, initial=0.0)
+    suspicious = (sizes > 0.0) & (sizes <= most)
+    rows, columns = np.flatnonzero(suspicious.any(axis=1)), np.flatnonzero(suspicious.any(axis=0))
+    if not rows.size:
+        return solution
+    found = solution.copy()
+    part = np.ix_(rows, columns)
+    terms = factor.size_of_terms(solution[:, columns], rows)
+    found[part] = np.where(np.abs(solution[part]) > CANCELLATION_TOLERANCE * terms, solution[part], 0.0)
+    return found

@@ -1,0 +1,289 @@
+"""Solving the algebraic equations of a large index-1 plant by its sparsity."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from obsynth.analysis.transformations.idle_variables import equation_name, listed, raise_structurally_singular
+from obsynth.analysis.transformations.recovery_operator import RecoveryOperator, without_rounding
+from obsynth.errors import PreconditionError
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, RANK_TOLERANCE
+from obsynth.numerics.scaling import power_of_two_below
+from obsynth.numerics.sparse import csr, dense, selection
+from obsynth.numerics.sparse_factor import NullVectors, SolutionBounds, SparseFactor
+from obsynth.numerics.sparse_structure import coarse_structure, components_of
+from obsynth.plants.descriptor import DescriptorSystem
+
+#: Points without meaning, at which a pencil has its normal rank.
+GENERIC_POINTS = (0.7391, -1.3247)
+#: Entries of null vectors at least this large beside the largest are named.
+NAMED_SHARE = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class SparseCoordinates:
+    """Equations and states of a plant, split into dynamic and algebraic ones by what E does.
+
+    Parameters
+    ----------
+    dynamic_rows, algebraic_rows : sparse matrix
+        ``(count, nx)`` and ``(nx - count, nx)``: combinations of equations; E has none of the latter.
+    dynamic, algebraic : sparse matrix
+        ``(nx, count)`` and ``(nx, nx - count)``: bases of states; E maps the latter to zero.
+    names : tuple of str
+        Of the dynamic states: their own, where these are whole states of the plant.
+    """
+
+    dynamic_rows: Any
+    algebraic_rows: Any
+    dynamic: Any
+    algebraic: Any
+    names: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class SparseReduction:
+    """A plant without its algebraic states: its matrices, and how the others follow from the states that are left.
+
+    Parameters
+    ----------
+    matrices : dict of str to FloatArray
+        ``A, B, Bf, Bd, Bw, C, D, Df, Dd, Dw``.
+    names : tuple of str
+        Of the states.
+    operator : RecoveryOperator
+        All states from these.
+    bounds : SolutionBounds
+        How well the algebraic equations were solved.
+    """
+
+    matrices: dict[str, FloatArray]
+    names: tuple[str, ...]
+    operator: RecoveryOperator
+    bounds: SolutionBounds
+
+
+def reduced_by_sparsity(plant: DescriptorSystem) -> SparseReduction:
+    """Solve the algebraic equations of an index-1 plant with sparse factors.
+
+    Raises
+    ------
+    PreconditionError
+        Not regular, index 2 or more, or no dynamic state: equations and variables are named.
+    """
+    split = split_by_derivatives(plant)
+    count = split.dynamic.shape[1]
+    if count == 0:
+        raise PreconditionError(
+            "Every state is algebraic: nothing is left after elimination. Solve the equations directly.",
+            condition="dynamic states",
+        )
+    a, c = csr(plant.A), csr(plant.C)
+    counts = (count, plant.nu, plant.nf, plant.nd, plant.nw)
+    signals = np.hstack([dense(matrix) for matrix in (plant.B, plant.Bf, plant.Bd, plant.Bw)])
+    inner = csr(split.algebraic_rows @ a @ split.algebraic)
+    factor = SparseFactor(inner)
+    _require_index_one(plant, factor)
+    right = _side_by_side(split.algebraic_rows @ a @ split.dynamic, split.algebraic_rows @ csr(signals))
+    found, backward = factor.solve_with_error(right.toarray())
+    found[:, count:] = without_rounding(factor, found[:, count:])
+    solution = -found
+    kept = _side_by_side(split.dynamic_rows @ a @ split.dynamic, split.dynamic_rows @ csr(signals)).toarray()
+    mass = SparseFactor(split.dynamic_rows @ csr(plant.E) @ split.dynamic)
+    moved, backward_of_e = mass.solve_with_error(_sum(kept, csr(split.dynamic_rows @ a @ split.algebraic), solution))
+    direct = np.hstack([(c @ split.dynamic).toarray(), *(dense(m) for m in (plant.D, plant.Df, plant.Dd, plant.Dw))])
+    shown = _sum(direct, csr(c @ split.algebraic), solution)
+    ends = np.cumsum(counts)[:-1]
+    matrices = dict(zip(("A", "B", "Bf", "Bd", "Bw"), np.split(moved, ends, axis=1), strict=True))
+    matrices |= dict(zip(("C", "D", "Df", "Dd", "Dw"), np.split(shown, ends, axis=1), strict=True))
+    operator = RecoveryOperator(split.dynamic, split.algebraic, inner, right, counts)
+    bounds = SolutionBounds(max(factor.condition, mass.condition), max(backward, backward_of_e))
+    return SparseReduction(matrices, split.names, operator, bounds)
+
+
+def split_by_derivatives(plant: DescriptorSystem) -> SparseCoordinates:
+    """Return dynamic and algebraic equations and states: E is decomposed component by component of its pattern."""
+    e, a = csr(plant.E), csr(plant.A)
+    row_scale, column_scale = _scales(e, a)
+    row_part, column_part = components_of(e)
+    moving = e.tocoo()
+    pieces = _Pieces(e.shape[0])
+    with_entries = np.unique(row_part[moving.row])
+    order = np.argsort(row_part, kind="stable"), np.argsort(column_part, kind="stable")
+    starts = [np.searchsorted(part[o], with_entries) for part, o in zip((row_part, column_part), order, strict=True)]
+    ends = [
+        np.searchsorted(part[o], with_entries, side="right")
+        for part, o in zip((row_part, column_part), order, strict=True)
+    ]
+    in_component = np.zeros(e.shape[0], dtype=bool), np.zeros(e.shape[0], dtype=bool)
+    # Most components are single entries: slicing each would take most of the time.
+    single = np.bincount(row_part[moving.row], weights=moving.data)[with_entries][:, None, None]
+    blocks = []
+    for k in range(len(with_entries)):
+        rows = order[0][starts[0][k] : ends[0][k]]
+        columns = order[1][starts[1][k] : ends[1][k]]
+        in_component[0][rows], in_component[1][columns] = True, True
+        block = e[rows][:, columns].toarray() if len(rows) * len(columns) > 1 else single[k]
+        blocks.append((rows, columns, row_scale[rows][:, None] * block * column_scale[columns]))
+    largest = max((float(np.linalg.norm(block, 2)) for _, _, block in blocks), default=0.0)
+    for rows, columns, block in blocks:
+        pieces.add(rows, columns, block, row_scale[rows], column_scale[columns], largest)
+    pieces.rest(np.flatnonzero(~in_component[0]), np.flatnonzero(~in_component[1]))
+    return pieces.coordinates(plant.state_names)
+
+
+class _Pieces:
+    """Collects the rows and columns of `SparseCoordinates`, one component of E after the other."""
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+        # Each is a list of (place for sorting, indices, values).
+        self.dynamic_rows: list[tuple[int, Any, FloatArray]] = []
+        self.algebraic_rows: list[tuple[int, Any, FloatArray]] = []
+        self.dynamic: list[tuple[int, Any, FloatArray]] = []
+        self.algebraic: list[tuple[int, Any, FloatArray]] = []
+
+    def add(self, rows: Any, columns: Any, block: FloatArray, row_scale: Any, column_scale: Any, norm: float) -> None:
+        """Split one component by its singular values, beside the norm of all of E."""
+        if block.shape == (1, 1):
+            whole_rows = whole_columns = abs(block[0, 0]) > RANK_TOLERANCE * norm
+            rank = int(whole_rows)
+            left, right = np.ones((1, 1)), np.ones((1, 1))
+        else:
+            left, values, right = np.linalg.svd(block)
+            rank = int(np.sum(values > RANK_TOLERANCE * norm))
+            whole_rows, whole_columns = rank == len(rows), rank == len(columns)
+        self._put(self.dynamic_rows, self.algebraic_rows, rows, left.T * row_scale, rank, whole=whole_rows)
+        self._put(self.dynamic, self.algebraic, columns, right * column_scale, rank, whole=whole_columns)
+
+    def _put(self, kept: Any, others: Any, places: Any, basis: FloatArray, rank: int, *, whole: bool) -> None:
+        if whole:
+            kept += [(int(place), np.array([place]), np.ones(1)) for place in places]
+            return
+        kept += [(int(places[0]), places, basis[k]) for k in range(rank)]
+        others += [(int(places[0]), places, basis[k]) for k in range(rank, len(places))]
+
+    def rest(self, rows: Any, columns: Any) -> None:
+        """Add the equations and states that E does not touch."""
+        self.algebraic_rows += [(int(row), np.array([row]), np.ones(1)) for row in rows]
+        self.algebraic += [(int(column), np.array([column]), np.ones(1)) for column in columns]
+
+    def coordinates(self, state_names: tuple[str, ...]) -> SparseCoordinates:
+        """Return the whole, in the order of equations and states."""
+        moving = sorted(self.dynamic, key=lambda piece: piece[0])
+        names = tuple(
+            state_names[piece[1][0]] if len(piece[1]) == 1 else f"xi {k}" for k, piece in enumerate(moving, 1)
+        )
+        return SparseCoordinates(
+            self._matrix(self.dynamic_rows), self._matrix(self.algebraic_rows), csr(self._matrix(self.dynamic).T),
+            csr(self._matrix(self.algebraic).T), names,
+        )  # fmt: skip
+
+    def _matrix(self, pieces: list[tuple[int, Any, FloatArray]]) -> Any:
+        from scipy.sparse import csr_array
+
+        ordered = sorted(pieces, key=lambda piece: piece[0])
+        if all(len(piece[1]) == 1 for piece in ordered):
+            return selection([piece[0] for piece in ordered], self.count)
+        starts = np.concatenate([[0], np.cumsum([len(piece[1]) for piece in ordered])])
+        indices = np.concatenate([piece[1] for piece in ordered])
+        values = np.concatenate([piece[2] for piece in ordered])
+        return csr_array((values, indices, starts), shape=(len(ordered), self.count))
+
+
+def _scales(e: Any, a: Any) -> tuple[FloatArray, FloatArray]:
+    """Return the powers of two that bring the rows, then the columns, of ``[E A]`` near one."""
+    from scipy.sparse import csc_array
+
+    def peaks(matrix: Any) -> FloatArray:
+        found = np.asarray(csc_array(abs(matrix)).max(axis=0).toarray()).ravel()
+        return np.asarray(found, dtype=np.float64)
+
+    rows = 1.0 / power_of_two_below(np.maximum(peaks(e.T), peaks(a.T)))
+    scaled = [matrix.multiply(rows[:, None]) for matrix in (e, a)]
+    return rows, 1.0 / power_of_two_below(np.maximum(peaks(scaled[0]), peaks(scaled[1])))
+
+
+def culprits(plant: DescriptorSystem) -> tuple[str, tuple[str, ...]]:
+    """Return equations, in words, and variables that keep a plant from having index 1; nothing for one that has.
+
+    Raises
+    ------
+    PreconditionError
+        The pattern alone leaves variables free: these are named.
+    """
+    whole = coarse_structure(abs(csr(plant.E)) + abs(csr(plant.A)))
+    if whole.structural_rank < plant.nx:
+        raise_structurally_singular(plant, whole.over_rows, whole.under_columns)
+    split = split_by_derivatives(plant)
+    inner = csr(split.algebraic_rows @ csr(plant.A) @ split.algebraic)
+    factor = SparseFactor(inner)
+    null = factor.null_vectors()
+    if not factor.exactly_singular and null.smallest > RANK_TOLERANCE:
+        return "", ()
+    generic = _generic_factors(plant)
+    if any(not found.singular for found in generic):
+        equations, variables = _leading(split.algebraic_rows, split.algebraic, null, inner)
+    else:
+        null = generic[0].null_vectors()
+        equations, variables = _named(null.rows), _named(null.columns)
+    said = listed([equation_name(plant, i) for i in equations], quoted=False)
+    return said, tuple(plant.state_names[i] for i in variables)
+
+
+def _generic_factors(plant: DescriptorSystem) -> list[SparseFactor]:
+    return [SparseFactor(csr(plant.A) - point * csr(plant.E)) for point in GENERIC_POINTS]
+
+
+def _require_index_one(plant: DescriptorSystem, factor: SparseFactor) -> None:
+    """Refuse a plant whose algebraic equations cannot be solved for its algebraic states; say which, and why."""
+    if not factor.singular:
+        return
+    equations, names = culprits(plant)
+    said = f"equations {equations} do not determine {listed(list(names))}"
+    if all(found.singular for found in _generic_factors(plant)):
+        raise PreconditionError(
+            f"The plant is not regular: det(A - zE) is zero for every z, and {said}. Check for a missing or repeated "
+            "equation.",
+            condition="regularity",
+            signals=names,
+        )
+    raise PreconditionError(
+        f"The plant has index 2 or more: {said} without differentiating. Differentiate the constraints, or use a "
+        "method that takes the descriptor form.",
+        condition="index",
+        signals=names,
+    )
+
+
+def _leading(rows: Any, basis: Any, null: NullVectors, inner: Any) -> tuple[Any, Any]:
+    """Return the equations and variables of the null vectors; by the pattern alone, where that is singular already."""
+    coarse = coarse_structure(inner)
+    if coarse.structural_rank < inner.shape[0]:
+        over, under = np.zeros(inner.shape[0]), np.zeros(inner.shape[0])
+        over[coarse.over_rows], under[coarse.under_columns] = 1.0, 1.0
+        return _named(abs(rows).T @ over), _named(abs(basis) @ under)
+    return _named(abs(rows).T @ null.rows), _named(abs(basis) @ null.columns)
+
+
+def _named(shares: FloatArray) -> Any:
+    """Return the places of the leading entries, largest first."""
+    order = np.argsort(-shares, kind="stable")
+    return order[shares[order] >= NAMED_SHARE * max(float(np.max(shares, initial=0.0)), np.finfo(float).tiny)]
+
+
+def _side_by_side(*blocks: Any) -> Any:
+    from scipy.sparse import hstack
+
+    return csr(hstack([csr(block) for block in blocks]))
+
+
+def _sum(direct: FloatArray, factor: Any, solution: FloatArray) -> FloatArray:
+    """Return ``direct + factor solution`` with entries that are only rounding set to zero."""
+    result = direct + factor @ solution
+    size_of_terms = np.abs(direct) + abs(factor) @ np.abs(solution)
+    return np.where(np.abs(result) > CANCELLATION_TOLERANCE * size_of_terms, result, 0.0)

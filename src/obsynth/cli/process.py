@@ -1,0 +1,54 @@
+"""The process around a verb: standard streams that may be closed or full, and what numbers can do to a computation."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+
+from obsynth.errors import ObsynthError, SolverError, SpecError
+
+#: Exit code of a program whose reader has left, as shells give it.
+BROKEN_PIPE = 141
+
+
+@contextmanager
+def usable_streams() -> Iterator[None]:
+    """Let texts go to nowhere where a standard stream is closed, and print characters that an encoding lacks."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            # The first file that is opened would get its number, and what is meant for the terminal.
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115
+        elif hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="backslashreplace")
+    yield
+
+
+def unwritable_output(error: OSError) -> int:
+    """Say that standard output takes no more, and return the exit code; nothing more is written to it."""
+    with suppress(OSError, ValueError, AttributeError):
+        # The interpreter's own flush at exit must not complain.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    if isinstance(error, BrokenPipeError):
+        return BROKEN_PIPE
+    place = error.filename or "Standard output"
+    with suppress(OSError):
+        print(f"Malformed input: {place} cannot be written: {error.strerror or error}.", file=sys.stderr)
+    return SpecError.exit_code
+
+
+def told_error(error: Exception) -> ObsynthError | None:
+    """Return what an error of Python or of a library is for the user; `None` if it is a mistake of obsynth."""
+    if isinstance(error, MemoryError):
+        return SolverError("The computation does not fit into the memory: nothing is known.")
+    if isinstance(error, RecursionError):
+        return SpecError("An expression or a document is nested too deeply.")
+    if isinstance(error, ImportError):
+        is_ours = (error.name or "").startswith("obsynth")
+        text = f"This needs the library {error.name or error}, which cannot be loaded: install it with pip."
+        return None if is_ours else SpecError(text)
+    from obsynth.numerics.failures import failure_of
+
+    return failure_of(error)

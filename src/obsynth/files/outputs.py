@@ -1,0 +1,208 @@
+"""The one writer: files appear whole or not at all, never over what was read, and over others only if told."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from obsynth.errors import SpecError
+from obsynth.files.inputs import protected_as, reason, special_kind
+from obsynth.files.signals import ending_signals
+
+#: Bytes of the beginning and of the end of a file that are looked at to tell its kind.
+LOOKED_AT = 1 << 16
+
+
+@dataclass(frozen=True)
+class FileKind:
+    """A kind of file that obsynth writes.
+
+    Fields: name: In messages, such as ``a gain set``; mark: What the beginning or the end of each of its files holds
+    (regular expression); ending: How files of this kind are named, and no others.
+    """
+
+    name: str
+    mark: bytes
+    ending: str | None = None
+
+    def recognises(self, path: Path) -> bool:
+        """Whether an existing file is of this kind, by its content or its name; empty files are of every kind."""
+        if self.ending is not None and path.name.endswith(self.ending):
+            return True
+        with path.open("rb") as stream:
+            content = stream.read(LOOKED_AT)
+            size = os.fstat(stream.fileno()).st_size
+            if size > LOOKED_AT:
+                stream.seek(max(size - LOOKED_AT, LOOKED_AT))
+                content += b"\0" + stream.read()
+        return not content or re.search(self.mark, content) is not None
+
+
+def check_output(path: str | Path, *, option: str = "") -> Path:
+    """Return where to write; refuse a hopeless place, and any file that the running command has read."""
+    if not isinstance(path, (str, os.PathLike)):
+        raise SpecError(f"path is {path!r}: give the name of a file.", path="path")
+    target = Path(path)
+    where = str(target)
+    wanted = f"give the name of a file{f' to {option}' if option else ''}"
+    try:
+        if target.is_dir():
+            raise SpecError(f"{target} is a folder: {wanted}.", path=where)
+        folder = _followed(target).parent
+        if not folder.is_dir():
+            raise SpecError(f"The folder {folder} does not exist: {target} cannot be written.", path=where)
+        if not os.access(folder, os.W_OK | os.X_OK):
+            raise SpecError(f"{target} cannot be written: nothing may be written to the folder {folder}.", path=where)
+        # Asks the system about the name, which may be too long or hold a null character.
+        special = special_kind(target) if _exists(target) else None
+    except (OSError, ValueError) as error:
+        raise SpecError(f"{target} cannot be written: {reason(error)}.", path=where) from error
+    if special is not None:
+        raise SpecError(f"{target} is {special}: {wanted}.", path=where)
+    read = protected_as(target)
+    if read is not None:
+        also = "" if str(read) == where else f", as {read}"
+        raise SpecError(f"{target} is read by this command{also}: it cannot be written as well, give another file.",
+                        path=where)  # fmt: skip
+    return target
+
+
+def check_replaceable(target: Path, kind: FileKind | None) -> None:
+    """Raise `SpecError` for an existing file that is read-only or of another kind, both of which have to be forced."""
+    advice = "give another name, or --force to replace it"
+    try:
+        if not _exists(target):
+            return
+        if not os.access(target, os.W_OK):
+            raise SpecError(f"{target} is read-only: {advice}.", path=str(target))
+        if kind is None or not kind.recognises(target):
+            found = "exists" if kind is None else f"exists and is not {kind.name}"
+            raise SpecError(f"{target} {found}: {advice}.", path=str(target))
+    except OSError as error:
+        raise SpecError(f"{target} cannot be read ({reason(error)}): {advice}.", path=str(target)) from error
+
+
+def require_distinct(files: Mapping[str, str | Path | None]) -> None:
+    """Raise `SpecError` if two of the files are the same, links followed; they are given by what they are for."""
+    seen: dict[object, str] = {}
+    for name, file in files.items():
+        if file is None:
+            continue
+        path = Path(file)
+        try:
+            found = os.stat(path)
+            keys: set[object] = {(found.st_dev, found.st_ino), os.path.realpath(path)}
+        except (OSError, ValueError):
+            keys = {os.path.realpath(path)} if "\0" not in str(path) else set()
+        for key in keys:
+            if seen.setdefault(key, name) != name:
+                raise SpecError(f"{name} and {seen[key]} are the same file {path}: give another one.", path=str(path))
+
+
+@contextmanager
+def replacement_of(target: Path) -> Iterator[tuple[int, str]]:
+    """Give an open file, and its path, that takes the place of ``target`` when all went well, else is removed."""
+    with _temporary_beside(target) as (handle, temporary), _written(target):
+        yield handle, temporary
+        _settle(temporary, target)
+
+
+def write_atomically(path: str | Path, content: str | bytes) -> Path:
+    """Write ``content`` (text as UTF-8) to ``path`` so that the file is there whole or not at all."""
+    target = check_output(path)
+    with replacement_of(target) as (handle, _), os.fdopen(handle, "wb") as stream:
+        stream.write(content.encode() if isinstance(content, str) else content)
+    return target
+
+
+def write_together(contents: Mapping[Path, str | bytes]) -> tuple[Path, ...]:
+    """Write files that belong together: all of them appear, whole, or none does."""
+    with ExitStack() as stack:
+        temporaries = {}
+        for target, content in contents.items():
+            handle, temporaries[target] = stack.enter_context(_temporary_beside(target))
+            with _written(target), os.fdopen(handle, "wb") as stream:
+                stream.write(content.encode() if isinstance(content, str) else content)
+        for target, temporary in temporaries.items():
+            with _written(target):
+                stack.enter_context(_undone_on_failure(target))
+                _settle(temporary, target)
+    return tuple(contents)
+
+
+@contextmanager
+def _temporary_beside(target: Path) -> Iterator[tuple[int, str]]:
+    """Give an open temporary file in the folder of ``target``; what is left of it at the end is removed."""
+    check_output(target)
+    with ending_signals():
+        temporary = None
+        try:
+            with _written(target):
+                handle, temporary = tempfile.mkstemp(dir=_followed(target).parent, prefix=".obsynth-", suffix=".part")
+            yield handle, temporary
+        finally:
+            if temporary is not None and os.path.exists(temporary):
+                os.unlink(temporary)
+
+
+def _settle(temporary: str, target: Path) -> None:
+    """Put a temporary file in its place, with the permissions of the old file or else of any new one."""
+    place = _followed(target)
+    if place.exists():
+        mode = place.stat().st_mode & 0o777
+    else:
+        mask = os.umask(0)
+        os.umask(mask)
+        mode = 0o666 & ~mask
+    # What was read since the first check counts as well.
+    check_output(target)
+    os.chmod(temporary, mode)
+    os.replace(temporary, place)
+
+
+@contextmanager
+def _undone_on_failure(target: Path) -> Iterator[None]:
+    """Bring back what stood at ``target``, or nothing, if what follows fails."""
+    place = _followed(target)
+    with ExitStack() as stack:
+        kept = None
+        if place.exists():
+            kept = Path(stack.enter_context(tempfile.TemporaryDirectory(dir=place.parent, prefix=".obsynth-"))) / "old"
+            shutil.copy2(place, kept)
+        try:
+            yield
+        except BaseException:
+            if kept is None:
+                place.unlink(missing_ok=True)
+            else:
+                os.replace(kept, place)
+            raise
+
+
+def _exists(target: Path) -> bool:
+    """Whether there is something at a path, links followed; an impossible name is the system's error."""
+    try:
+        os.stat(target)
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    return True
+
+
+def _followed(target: Path) -> Path:
+    """Return the place that a link points to: the link stays one."""
+    return Path(os.path.realpath(target)) if target.is_symlink() else target
+
+
+@contextmanager
+def _written(target: Path) -> Iterator[None]:
+    """Say of an error of the system which file could not be written."""
+    try:
+        yield
+    except OSError as error:
+        raise SpecError(f"{target} cannot be written: {reason(error)}.", path=str(target)) from error

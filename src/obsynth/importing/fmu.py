@@ -1,0 +1,223 @@
+"""Functional mock-up units (FMI 2 and 3, model exchange), linearised at an operating point by their own derivatives."""
+
+from __future__ import annotations
+
+import difflib
+import shutil
+import zipfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+
+from obsynth.errors import PreconditionError, SpecError
+from obsynth.importing.extras import imported
+from obsynth.importing.fmu_instance import Instance, instance_of
+from obsynth.importing.roles import plant_of
+from obsynth.numerics.arguments import is_finite_number, require_mapping
+from obsynth.numerics.arrays import FloatArray
+from obsynth.plants.descriptor import DescriptorSystem
+
+#: Newton steps towards an equilibrium.
+_STEPS = 50
+#: A derivative counts as zero when it is this small next to the terms it is the sum of.
+_AT_REST = 1e-8
+
+
+def from_fmu(
+    path: str | Path,
+    *,
+    at: Mapping[str, float] | None = None,
+    equilibrium: bool = False,
+    inputs: Sequence[str] | None = None,
+    outputs: Sequence[str] | None = None,
+    faults: Sequence[str] = (),
+    disturbances: Sequence[str] = (),
+    actuator_faults: Sequence[str] = (),
+    sensor_faults: Sequence[str] = (),
+    **plant: Any,
+) -> DescriptorSystem:
+    """Return the plant of an FMU, linearised at an operating point by its own directional derivatives.
+
+    Parameters
+    ----------
+    path : path
+        An FMU for model exchange, FMI 2.0 or 3.0, that provides directional derivatives.
+    at : mapping, optional
+        Values of states, inputs and parameters at the operating point; those of the FMU by default.
+    equilibrium : bool
+        Search the states at which the FMU is at rest with these inputs, from those of ``at``.
+    inputs, outputs : list of str, optional
+        Which of the FMU's inputs and outputs are used; all real ones by default.
+    faults, disturbances : list of str
+        Inputs of the FMU that are faults, or unknown; the others are known inputs.
+    actuator_faults : list of str
+        Known inputs on which a fault acts: adds ``fault of <input>``.
+    sensor_faults : list of str
+        Outputs with a bias: adds ``bias of <output>``.
+    **plant
+        Any other argument of `DescriptorSystem`.
+
+    Returns
+    -------
+    DescriptorSystem
+        Continuous, with names and units of the FMU's variables, and the operating point.
+
+    Raises
+    ------
+    SpecError
+        fmpy is not installed, the file is no such FMU, or a name is unknown.
+    PreconditionError
+        The operating point is no equilibrium (a linear model of deviations would not be one), or none is found.
+    """
+    require_mapping(at, "at")
+    for name, value in (at or {}).items():
+        if not is_finite_number(value):
+            raise SpecError(f"at[{name!r}] is {value!r}: give a finite number.", path="at")
+    with _instance(Path(path)) as instance:
+        used = _used(instance.input_names, inputs, "inputs"), _used(instance.output_names, outputs, "outputs")
+        _require_known(at or {}, instance)
+        instance.begin(at or {})
+        states = np.array([dict(at or {}).get(name, value) for name, value in
+                           zip(instance.state_names, instance.states(), strict=True)])  # fmt: skip
+        instance.set_states(states)
+        if equilibrium:
+            states = _equilibrium(instance, states)
+        a, b, c, d = instance.jacobians(*used)
+        _require_rest(instance, states, a, b, used[0])
+        point = dict(zip(instance.state_names, states.tolist(), strict=True))
+        point |= {name: instance.value(name) for names in used for name in names}
+        units = {name: unit for name in point if (unit := instance.unit(name))}
+    stated = {**point, **(plant.pop("operating_point", None) or {})}
+    units |= plant.pop("units", None) or {}
+    if not len(a):
+        raise SpecError(f"{path} has no continuous states: there is nothing to observe.", path=str(path))
+    return plant_of(
+        {"A": a, "B": b, "C": c, "D": d},
+        labels={"state_names": instance.state_names, "input_names": used[0], "output_names": used[1]},
+        faults=faults, disturbances=disturbances, actuator_faults=actuator_faults, sensor_faults=sensor_faults,
+        more={"dt": 0.0, "operating_point": stated, "units": units, **plant},
+    )  # fmt: skip
+
+
+@contextmanager
+def _instance(path: Path) -> Iterator[Instance]:
+    fmpy = imported("fmpy", extra="fmu")
+    _require_readable(fmpy, path)
+    description = _read(lambda: fmpy.read_model_description(str(path)), path)
+    folder = _read(lambda: fmpy.extract(str(path)), path)
+    try:
+        instance = _read(lambda: instance_of(fmpy, description, folder), path)
+        try:
+            yield instance
+        finally:
+            instance.end()
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _read(make: Callable[[], Any], path: Path) -> Any:
+    """Return what fmpy makes of a file; whatever it says of a damaged one becomes one error."""
+    from fmpy.fmi1 import FMICallException
+    from fmpy.model_description import ValidationError
+
+    # lxml's errors are syntax errors.
+    damaged = (OSError, ValueError, KeyError, SyntaxError, zipfile.BadZipFile, ValidationError, FMICallException)
+    try:
+        return make()
+    except damaged as error:
+        raise SpecError(f"{path} cannot be used as an FMU: {error}", path=str(path)) from error
+
+
+def _require_readable(fmpy: Any, path: Path) -> None:
+    """Raise `SpecError` unless a file is an FMU that can be linearised on this machine."""
+    if not path.is_file():
+        raise SpecError(f"{path} does not exist.", path=str(path))
+    try:
+        with zipfile.ZipFile(path) as archive, archive.open("modelDescription.xml") as stream:
+            root = ElementTree.parse(stream).getroot()
+    except (OSError, KeyError, zipfile.BadZipFile, ElementTree.ParseError) as error:
+        raise SpecError(f"{path} is no FMU: {error}", path=str(path)) from error
+    version = root.get("fmiVersion", "")
+    if version[:2] not in ("2.", "3."):
+        raise SpecError(f"{path} is of FMI {version or '?'}: give an FMU of FMI 2 or 3.", path=str(path))
+    exchange = root.find("ModelExchange")
+    if exchange is None:
+        raise SpecError(f"{path} is for co-simulation only: its states and derivatives cannot be asked for. Export it "
+                        "for model exchange.", path=str(path))  # fmt: skip
+    # fmpy does not read the attribute of FMI 3, which is spelled differently.
+    named = "providesDirectionalDerivative" + ("" if version.startswith("2") else "s")
+    if exchange.get(named) not in ("true", "1"):
+        raise SpecError(f"{path} provides no directional derivatives: switch them on in the tool that exports it.",
+                        path=str(path))  # fmt: skip
+    platforms = fmpy.supported_platforms(str(path))
+    if fmpy.platform not in platforms and fmpy.platform_tuple not in platforms:
+        raise SpecError(f"{path} has no binary for this machine ({fmpy.platform_tuple}); it has "
+                        f"{', '.join(platforms) or 'none'}.", path=str(path))  # fmt: skip
+
+
+def _used(known: Sequence[str], picked: Sequence[str] | None, what: str) -> list[str]:
+    if picked is None:
+        return list(known)
+    if isinstance(picked, str):
+        raise SpecError(f"{what} is {picked!r}: give a list of names.", path=what)
+    for name in picked:
+        if name not in known:
+            raise SpecError(f"{what}: the FMU has no {name!r} among its {what}.{_close(name, known)}", path=what)
+    return list(picked)
+
+
+def _require_known(at: Mapping[str, float], instance: Instance) -> None:
+    for name in at:
+        if name not in instance.settable:
+            close = _close(name, instance.settable)
+            raise SpecError(f"at: the FMU has no real variable {name!r} that can be set.{close}", path="at")
+
+
+def _close(name: str, known: Sequence[str]) -> str:
+    close = difflib.get_close_matches(name, list(known), n=2)
+    return f" Did you mean {' or '.join(map(repr, close))}?" if close else ""
+
+
+def _equilibrium(instance: Instance, states: FloatArray) -> FloatArray:
+    """Return the states at which the derivatives vanish, by Newton with halved steps."""
+    rates = instance.derivatives()
+    for _ in range(_STEPS):
+        a = instance.jacobians([], [])[0]
+        if _is_rest(rates, a, states, np.zeros(len(states))):
+            return states
+        step = np.linalg.lstsq(a, -rates, rcond=None)[0]
+        share = 1.0
+        while True:
+            instance.set_states(states + share * step)
+            found = instance.derivatives()
+            if np.isfinite(found).all() and np.linalg.norm(found) < np.linalg.norm(rates):
+                break
+            share /= 2.0
+            if share < _AT_REST:
+                instance.set_states(states)
+                return states
+        states, rates = states + share * step, found
+    return states
+
+
+def _is_rest(rates: FloatArray, a: FloatArray, states: FloatArray, known: FloatArray) -> bool:
+    terms = np.abs(a) @ np.abs(states) + known + 1.0
+    return bool((np.abs(rates) <= _AT_REST * terms).all())
+
+
+def _require_rest(instance: Instance, states: FloatArray, a: FloatArray, b: FloatArray, inputs: Sequence[str]) -> None:
+    rates = instance.derivatives()
+    known = np.abs(b) @ np.abs([instance.value(name) for name in inputs]) if len(inputs) else np.zeros(len(states))
+    if _is_rest(rates, a, states, known):
+        return
+    worst = int(np.argmax(np.abs(rates)))
+    raise PreconditionError(
+        f"The operating point is no equilibrium: {instance.state_names[worst]!r} changes by {rates[worst]:.6g} per "
+        "second there, so deviations from it obey no linear model without a constant term. Give the point by at={...}, "
+        "or let it be searched by equilibrium=True.", condition="equilibrium",
+        signals=(instance.state_names[worst],),
+    )  # fmt: skip

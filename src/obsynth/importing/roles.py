@@ -1,0 +1,99 @@
+"""Which inputs of somebody's model are known, which are faults, and which are unknown."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from obsynth.errors import SpecError
+from obsynth.numerics.arrays import FloatArray, as_matrix
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.names import checked_names, index_of
+
+
+def plant_of(
+    matrices: Mapping[str, ArrayLike | None],
+    *,
+    labels: Mapping[str, Sequence[str] | None],
+    faults: Sequence[str] = (),
+    disturbances: Sequence[str] = (),
+    actuator_faults: Sequence[str] = (),
+    sensor_faults: Sequence[str] = (),
+    more: Mapping[str, Any],
+) -> DescriptorSystem:
+    """Return the plant of matrices ``E, A, B, C, D`` whose inputs are shared out among known, faults and unknown.
+
+    ``labels`` holds ``state_names``, ``input_names``, ``output_names``; ``more`` goes to `DescriptorSystem` as it is.
+    """
+    a = as_matrix(matrices["A"], "A")
+    given = {name: None if value is None else as_matrix(value, name) for name, value in matrices.items()}
+    c = given.get("C")
+    c = np.eye(a.shape[0]) if c is None else c
+    nu = next((m.shape[1] for name in "BD" if (m := given.get(name)) is not None), 0)
+    inputs = checked_names(labels.get("input_names"), nu, prefix="u", what="input_names")
+    outputs = checked_names(labels.get("output_names"), c.shape[0], prefix="y", what="output_names")
+    b, d = _full(given.get("B"), a.shape[0], nu, "B"), _full(given.get("D"), c.shape[0], nu, "D")
+    _require_lists(faults=faults, disturbances=disturbances, actuator_faults=actuator_faults,
+                   sensor_faults=sensor_faults)  # fmt: skip
+    both = sorted(set(faults) & set(disturbances))
+    if both:
+        raise SpecError(f"Input {both[0]!r} is given as a fault and as a disturbance: keep one.", path="faults")
+    fault, unknown = (
+        _places(names, inputs, what) for names, what in ((faults, "faults"), (disturbances, "disturbances"))
+    )
+    doubled = _places(actuator_faults, inputs, "actuator_faults")
+    gone = [name for name in actuator_faults if name in (*faults, *disturbances)]
+    if gone:
+        raise SpecError(f"actuator_faults names {gone[0]!r}, which is no known input.", path="actuator_faults")
+    biased = _places(sensor_faults, outputs, "sensor_faults")
+    known = [i for i in range(nu) if i not in (*fault, *unknown)]
+    arguments: dict[str, Any] = {
+        "E": given.get("E"), "A": a, "B": b[:, known], "C": c, "D": d[:, known],
+        "state_names": labels.get("state_names"), "output_names": outputs,
+        "input_names": [inputs[i] for i in known],
+    }  # fmt: skip
+    if fault or doubled or biased:
+        _refuse_both(more, "faults", ("Bf", "Df", "fault_names"))
+        bias = np.eye(c.shape[0])[:, biased]
+        arguments |= {
+            "Bf": np.hstack([b[:, [*fault, *doubled]], np.zeros((a.shape[0], len(biased)))]),
+            "Df": np.hstack([d[:, [*fault, *doubled]], bias]),
+            "fault_names": [*faults, *(f"fault of {name}" for name in actuator_faults),
+                            *(f"bias of {name}" for name in sensor_faults)],
+        }  # fmt: skip
+    if unknown:
+        _refuse_both(more, "disturbances", ("Bd", "Dd", "disturbance_names"))
+        arguments |= {"Bd": b[:, unknown], "Dd": d[:, unknown], "disturbance_names": list(disturbances)}
+    return DescriptorSystem(**{**arguments, **more})
+
+
+def _full(matrix: FloatArray | None, rows: int, columns: int, name: str) -> FloatArray:
+    if matrix is None or (matrix.size == 0 and 0 in (rows, columns)):
+        return np.zeros((rows, columns))
+    if matrix.shape != (rows, columns):
+        hint = " Is it transposed?" if matrix.shape == (columns, rows) else ""
+        raise SpecError(f"{name} is {matrix.shape[0]} by {matrix.shape[1]}, but {rows} by {columns} is needed.{hint}",
+                        path=name)  # fmt: skip
+    return matrix
+
+
+def _require_lists(**given: Sequence[str]) -> None:
+    for what, names in given.items():
+        if isinstance(names, str) or not all(isinstance(name, str) for name in names):
+            raise SpecError(f"{what} is {names!r}: give a list of names.", path=what)
+        repeated = [name for name in names if list(names).count(name) > 1]
+        if repeated:
+            raise SpecError(f"{what} repeats {repeated[0]!r}.", path=what)
+
+
+def _places(names: Sequence[str], known: Sequence[str], what: str) -> list[int]:
+    return [index_of(name, known, what=what) for name in names]
+
+
+def _refuse_both(more: Mapping[str, Any], role: str, names: Sequence[str]) -> None:
+    twice = [name for name in names if more.get(name) is not None]
+    if twice:
+        raise SpecError(f"{role} and {twice[0]} are both given: use one of them.", path=twice[0])

@@ -1,0 +1,26 @@
+"""The adaptive observer as a method."""
+
+from __future__ import annotations
+
+from obsynth.methods.method_spec import ClaimMeaning, MethodSpec
+from obsynth.methods.recursive.claims import RECURSIVE_CLAIMS
+
+CLAIMS = {
+    **RECURSIVE_CLAIMS,
+    "excitation": ClaimMeaning("", "least information on the parameters in a window, per parameter unit squared"),
+    "excitation_k": ClaimMeaning("samples", "sample that ends that window"),
+}
+
+METHOD = MethodSpec(
+    id="adaptive-observer",
+    plants=("time-invariant", "time-varying"),
+    time="discrete, time-varying",
+    summary="states and parameters with honest deviations",
+    source="Moussa Ali, Zhang 2013",
+    public="obsynth.methods.adaptive_observer.public:adaptive_observer",
+    options="obsynth.methods.adaptive_observer.options:AdaptiveObserverOptions",
+    conditions="obsynth.methods.adaptive_observer.synthesis:conditions",
+    synthesise="obsynth.methods.adaptive_observer.synthesis:synthesise",
+    checks="obsynth.methods.recursive.checks:checks",
+    claims=CLAIMS,
+)

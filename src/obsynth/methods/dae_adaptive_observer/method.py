@@ -1,0 +1,26 @@
+"""The adaptive observer of nonlinear plants as a method."""
+
+from __future__ import annotations
+
+from obsynth.methods.method_spec import ClaimMeaning, MethodSpec
+
+CLAIMS = {
+    "index": ClaimMeaning("", "index of the plant"),
+    "condition": ClaimMeaning("", "largest condition number of (7) along the nominal run"),
+    "contraction": ClaimMeaning("", "spectral radius of F (I - K H) at its end"),
+    "steps": ClaimMeaning("samples", "steps of the nominal run"),
+}
+
+METHOD = MethodSpec(
+    id="dae-adaptive-observer",
+    plants=("nonlinear",),
+    time="discrete, nonlinear",
+    summary="states and parameters of nonlinear plants",
+    source="Moussa Ali, Zhang 2013 (differential-algebraic systems)",
+    public="obsynth.methods.dae_adaptive_observer.public:dae_adaptive_observer",
+    options="obsynth.methods.dae_adaptive_observer.options:DaeAdaptiveObserverOptions",
+    conditions="obsynth.methods.dae_adaptive_observer.synthesis:conditions",
+    synthesise="obsynth.methods.dae_adaptive_observer.synthesis:synthesise",
+    checks="obsynth.methods.dae_adaptive_observer.checks:checks",
+    claims=CLAIMS,
+)

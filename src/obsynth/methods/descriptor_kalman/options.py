@@ -1,0 +1,22 @@
+"""Options of the descriptor Kalman filter."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar
+
+from obsynth.methods.method_spec import MethodOptions
+from obsynth.numerics.value_types import WrittenAs
+
+
+@dataclass(frozen=True)
+class DescriptorKalmanOptions(MethodOptions):
+    """Options of the method as asked for; see `obsynth.descriptor_kalman`."""
+
+    METHOD: ClassVar[str] = "descriptor-kalman"
+
+    Q: Annotated[Any, WrittenAs("varying covariance")] = None
+    R: Annotated[Any, WrittenAs("varying covariance")] = None
+    initial_state: Annotated[Any, WrittenAs("vector")] = None
+    initial_covariance: Annotated[Any, WrittenAs("covariance")] = None
+    early_constraints: bool = False

@@ -1,0 +1,27 @@
+"""The fault-estimation filter as a method."""
+
+from __future__ import annotations
+
+from obsynth.methods.method_spec import ClaimMeaning, MethodSpec
+
+CLAIMS = {
+    "gamma": ClaimMeaning("", "l2 gain from the disturbance to the fault error: shipped, proved"),
+    "gamma_min": ClaimMeaning("", "least such gain found"),
+    "gamma_bracket_low": ClaimMeaning("", "lower end of the bisection's bracket"),
+    "gamma_bracket_high": ClaimMeaning("", "upper end of the bisection's bracket"),
+    "state_lag": ClaimMeaning("samples", "samples by which the state estimate lags"),
+}
+
+METHOD = MethodSpec(
+    id="fault-estimation-filter",
+    plants=("time-invariant",),
+    time="discrete",
+    summary="fault estimates with a bounded gain from the disturbances",
+    source="Wang, Rodrigues, Theilliol, Shen 2015",
+    public="obsynth.methods.fault_estimation_filter.public:fault_estimation_filter",
+    options="obsynth.methods.fault_estimation_filter.options:FilterOptions",
+    conditions="obsynth.methods.fault_estimation_filter.synthesis:conditions",
+    synthesise="obsynth.methods.fault_estimation_filter.synthesis:synthesise",
+    checks="obsynth.methods.fault_estimation_filter.checks:checks",
+    claims=CLAIMS,
+)

@@ -1,0 +1,101 @@
+"""What a method is: one declaration, from which schema, checks of arguments, reports and lists of methods derive."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, fields
+from importlib import import_module
+from typing import Any, ClassVar, Literal, TypeAlias, cast, get_type_hints
+
+from obsynth.errors import SpecError
+from obsynth.numerics.value_types import problem_with
+
+PlantKind: TypeAlias = Literal["time-invariant", "time-varying", "nonlinear"]
+
+
+@dataclass(frozen=True)
+class MethodOptions:
+    """Options of a method: a frozen dataclass whose annotations say what each may be; rules across options besides."""
+
+    #: Id of the method, for messages.
+    METHOD: ClassVar[str]
+
+    def __post_init__(self) -> None:
+        kinds = option_types(type(self))
+        problems = [text for name, kind in kinds.items() if (text := problem_with(getattr(self, name), name, kind))]
+        # Rules across options presume that each of them is of its type.
+        problems = problems or list(self.conflicts())
+        if problems:
+            raise SpecError(f"Options of {self.METHOD}:", path="method.options", problems=problems)
+
+    def conflicts(self) -> Iterator[str]:
+        """Yield a sentence for each rule across options that is broken."""
+        yield from ()
+
+    def as_given(self) -> dict[str, Any]:
+        """Return every option by name."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+
+def option_types(options: type[MethodOptions]) -> dict[str, Any]:
+    """Return name -> annotated type of every option."""
+    hints = get_type_hints(options, include_extras=True)
+    return {field.name: hints[field.name] for field in fields(options)}
+
+
+@dataclass(frozen=True)
+class ClaimMeaning:
+    """A number that a method may claim: its unit (empty: dimensionless) and what it means."""
+
+    unit: str
+    meaning: str
+
+
+@dataclass(frozen=True)
+class MethodSpec:
+    """One method; callables are named by path ``module:name`` and loaded when they are used.
+
+    Fields: id: As in specs and gain sets; plants: Kinds of plants it takes; time: In words, for lists of methods;
+    summary: One line; source: The paper whose letters its gains have; public: The function of `obsynth`; options: A
+    `MethodOptions`; conditions: Existence, from the plant; synthesise: ``(plant, options, progress=)`` -> `Synthesis`;
+    checks: ``(design, printed_digits)`` -> rows; claims: Every claim that it may make.
+    """
+
+    id: str
+    plants: tuple[PlantKind, ...]
+    time: str
+    summary: str
+    source: str
+    public: str
+    options: str
+    conditions: str
+    synthesise: str
+    checks: str
+    claims: Mapping[str, ClaimMeaning]
+
+    def load(self, part: Literal["public", "options", "conditions", "synthesise", "checks"]) -> Callable[..., Any]:
+        """Return what a path names."""
+        module, name = str(getattr(self, part)).split(":")
+        found: Callable[..., Any] = getattr(import_module(module), name)
+        return found
+
+    @property
+    def option_names(self) -> tuple[str, ...]:
+        """Names of all options, sorted."""
+        return tuple(sorted(option_types(self.options_type)))
+
+    @property
+    def options_type(self) -> type[MethodOptions]:
+        """The dataclass of its options."""
+        loaded: Any = self.load("options")
+        return cast(type[MethodOptions], loaded)
+
+    def read_options(self, given: Mapping[str, Any]) -> MethodOptions:
+        """Return checked options; raise `SpecError` for unknown names, wrong types and broken rules."""
+        unknown = sorted(set(given) - set(self.option_names))
+        if unknown:
+            raise SpecError(
+                f"{self.id} has no option {', '.join(map(repr, unknown))}; there are: {', '.join(self.option_names)}.",
+                path="method.options",
+            )
+        return self.options_type(**given)

@@ -1,0 +1,32 @@
+"""The PD observer as a method."""
+
+from __future__ import annotations
+
+from obsynth.methods.method_spec import ClaimMeaning, MethodSpec
+
+CLAIMS = {
+    "theorem": ClaimMeaning("", "theorem whose inequality is proved"),
+    "delta": ClaimMeaning("s", "the theorem's parameter in the certificate"),
+    "decay": ClaimMeaning("1/s", "rate at which errors die out: imposed, proved (0: stability alone)"),
+    "disk_centre": ClaimMeaning("1/s", "c of the disk |s + c| < r that holds every eigenvalue"),
+    "disk_radius": ClaimMeaning("1/s", "r of that disk"),
+    "gain_bound": ClaimMeaning("", "bound on the norm of the gains"),
+    "fault_rate_gain": ClaimMeaning("s", "bound on the l2 gain from the rate of the faults to the fault error: proved"),
+    "noise_gain": ClaimMeaning("", "bound on the l2 gain from noise and its derivative to the fault error: proved"),
+    "adaptation_low": ClaimMeaning("", "stable for every adaptation gain from here, proved"),
+    "adaptation_high": ClaimMeaning("", "to here"),
+}
+
+METHOD = MethodSpec(
+    id="pd-observer",
+    plants=("time-invariant",),
+    time="continuous",
+    summary="states and faults by proportional and derivative action, no derivative taken",
+    source="Filasova, Krokavec, Serbak",
+    public="obsynth.methods.pd_observer.public:pd_observer",
+    options="obsynth.methods.pd_observer.options:PdOptions",
+    conditions="obsynth.methods.pd_observer.synthesis:conditions",
+    synthesise="obsynth.methods.pd_observer.synthesis:synthesise",
+    checks="obsynth.methods.pd_observer.checks:checks",
+    claims=CLAIMS,
+)

@@ -1,0 +1,58 @@
+"""Sparse matrices of scipy as checked, read-only data, and dense arrays where they are needed."""
+
+from __future__ import annotations
+
+from typing import Any, TypeGuard
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.numerics.arrays import FloatArray, read_only
+
+
+def is_sparse(value: Any) -> TypeGuard[Any]:
+    """Whether ``value`` is a sparse matrix or array of scipy; scipy is not imported for that."""
+    return type(value).__module__.startswith("scipy.sparse") and hasattr(value, "tocsr")
+
+
+def as_sparse_matrix(value: Any, name: str) -> Any:
+    """Return a private, finite, read-only float copy of a sparse matrix in CSR form, or in CSC where that was given."""
+    if value.dtype.kind not in "fiu":
+        kind = {"b": "booleans", "c": "complex numbers"}.get(value.dtype.kind, "entries that are no numbers")
+        raise SpecError(f"{name} holds {kind}: every entry must be a real number.", path=name)
+    if value.ndim != 2:
+        raise SpecError(f"{name} has {value.ndim} dimension(s): give a matrix.", path=name)
+    copy = (value.copy() if value.format in ("csr", "csc") else value.tocsr(copy=True)).astype(np.float64)
+    copy.sum_duplicates()
+    bad = np.flatnonzero(~np.isfinite(copy.data))
+    if bad.size:
+        entries = copy.tocoo()
+        where = np.flatnonzero(~np.isfinite(entries.data))[0]
+        row, column = int(entries.row[where]) + 1, int(entries.col[where]) + 1
+        raise SpecError(
+            f"{name} has {entries.data[where]} in row {row}, column {column}: every entry must be finite.", path=name
+        )
+    copy.eliminate_zeros()
+    for part in (copy.data, copy.indices, copy.indptr):
+        part.setflags(write=False)
+    return copy
+
+
+def dense(matrix: Any) -> FloatArray:
+    """Return a matrix as a read-only array; arrays are returned as they are."""
+    return read_only(matrix.toarray()) if is_sparse(matrix) else matrix
+
+
+def csr(matrix: Any) -> Any:
+    """Return a sparse or dense matrix as a new ``scipy.sparse.csr_array``."""
+    from scipy.sparse import csr_array
+
+    return csr_array(matrix)
+
+
+def selection(rows: Any, count: int) -> Any:
+    """Return the sparse matrix ``(len(rows), count)`` with a one in each row."""
+    from scipy.sparse import csr_array
+
+    places = np.asarray(rows, dtype=np.int64)
+    return csr_array((np.ones(len(places)), (np.arange(len(places)), places)), shape=(len(places), count))

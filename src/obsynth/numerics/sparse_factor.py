@@ -1,0 +1,196 @@
+"""Sparse LU factors (SuperLU) with a condition estimate, refinement in extended precision, and error bounds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.ranks import RANK_TOLERANCE
+from obsynth.numerics.scaling import power_of_two_below
+from obsynth.numerics.sparse import csr
+
+#: Columns that are solved for at a time.
+CHUNK = 256
+#: Sweeps of the scaling; two bring every largest entry near one.
+SCALING_SWEEPS = 3
+#: Steps of inverse iteration for the smallest singular value: the gap to the next decides, and few are needed.
+INVERSE_STEPS = 6
+#: Relative size of what is added to the diagonal of a factor that SuperLU calls singular, to find its null vectors.
+PERTURBATION = 1e-14
+
+
+@dataclass(frozen=True, eq=False)
+class SolutionBounds:
+    """How well a sparse system was solved.
+
+    Parameters
+    ----------
+    condition : float
+        Estimate of the 1-norm condition number of the scaled matrix.
+    backward_error : float
+        Largest componentwise backward error that refinement left.
+    """
+
+    condition: float
+    backward_error: float
+
+    @property
+    def forward_error(self) -> float:
+        """Bound on the relative error of the solution (of each column, in the largest norm of scaled unknowns)."""
+        return self.condition * self.backward_error
+
+
+@dataclass(frozen=True, eq=False)
+class NullVectors:
+    """What makes a matrix singular: ``rows`` and ``columns`` are the sizes of the null vectors, for naming."""
+
+    smallest: float
+    rows: FloatArray
+    columns: FloatArray
+
+
+class SparseFactor:
+    """LU factors of a square sparse matrix, with rows and columns scaled by powers of two."""
+
+    def __init__(self, matrix: Any) -> None:
+        from scipy.sparse import csc_array, diags_array, eye_array
+        from scipy.sparse.linalg import splu
+
+        given = csr(matrix)
+        self.rows, self.columns = np.ones(given.shape[0]), np.ones(given.shape[1])
+        for _ in range(SCALING_SWEEPS):
+            self.rows /= power_of_two_below(_peaks(_scaled(given, self.rows, self.columns), axis=1))
+            self.columns /= power_of_two_below(_peaks(_scaled(given, self.rows, self.columns), axis=0))
+        self.matrix = _scaled(given, self.rows, self.columns)
+        self.size = given.shape[0]
+        try:
+            self._lu = splu(csc_array(self.matrix))
+            self.exactly_singular = False
+        except RuntimeError:
+            # SuperLU met a zero pivot: a perturbed matrix shows by its null vectors where.
+            noise = np.random.default_rng(0).uniform(1.0, 2.0, self.size)
+            ridge = diags_array(PERTURBATION * noise) if self.size else eye_array(0)
+            self._lu = splu(csc_array(self.matrix + ridge))
+            self.exactly_singular = True
+
+    def null_vectors(self) -> NullVectors:
+        """Return an estimate of the smallest singular value of the scaled matrix, relative to its norm, and where."""
+        if not self.size:
+            return NullVectors(1.0, np.zeros(0), np.zeros(0))
+        right = np.random.default_rng(1).normal(size=self.size)
+        left, smallest = right, np.inf
+        norm = _norm_estimate(self.matrix)
+        for _ in range(INVERSE_STEPS):
+            left = self._lu.solve(right / np.linalg.norm(right), trans="T")
+            left = left / max(float(np.linalg.norm(left)), np.finfo(float).tiny)
+            right = self._lu.solve(left)
+            length = float(np.linalg.norm(right))
+            smallest = 0.0 if not np.isfinite(length) or length == 0.0 else 1.0 / length
+            if not np.isfinite(length):
+                break
+        right = right / max(float(np.linalg.norm(right)), np.finfo(float).tiny)
+        value = 0.0 if self.exactly_singular else smallest / norm
+        return NullVectors(value, np.abs(left), np.abs(right))
+
+    @property
+    def singular(self) -> bool:
+        """Whether the matrix is singular to the tolerance of every rank."""
+        return self.exactly_singular or self.null_vectors().smallest <= RANK_TOLERANCE
+
+    @cached_property
+    def condition(self) -> float:
+        """An estimate of the 1-norm condition number of the scaled matrix."""
+        from scipy.sparse.linalg import LinearOperator, onenormest
+
+        if not self.size:
+            return 1.0
+        inverse = LinearOperator(
+            (self.size, self.size), matvec=self._lu.solve, rmatvec=lambda x: self._lu.solve(x, trans="T"),
+            matmat=self._lu.solve, dtype=np.float64,
+        )  # fmt: skip
+        peak = float(np.max(np.asarray(abs(self.matrix).sum(axis=0)), initial=0.0))
+        return peak * float(onenormest(inverse))
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        """Return ``matrix^-1 right`` for dense columns, refined once with residuals in extended precision."""
+        return self.solve_with_error(right)[0]
+
+    def solve_with_error(self, right: FloatArray) -> tuple[FloatArray, float]:
+        """Return the refined solution, and its largest componentwise backward error."""
+        found, worst = np.zeros((self.size, right.shape[1])), 0.0
+        if not self.size:
+            return found, worst
+        exact = self.matrix.astype(np.longdouble)
+        for part in _chunks(right.shape[1]):
+            scaled = self.rows[:, None] * right[:, part]
+            unknown = self._lu.solve(scaled)
+            unknown = unknown + self._lu.solve(np.asarray(scaled - exact @ unknown, dtype=np.float64))
+            residual = np.abs(np.asarray(scaled - exact @ unknown, dtype=np.float64))
+            sizes = abs(self.matrix) @ np.abs(unknown) + np.abs(scaled)
+            worst = max(worst, float(np.max(residual / np.where(sizes > 0.0, sizes, 1.0), initial=0.0)))
+            found[:, part] = self.columns[:, None] * unknown
+        return found, worst
+
+    def solve_unrefined(self, right: FloatArray) -> FloatArray:
+        """Return ``matrix^-1 right`` as the factors give it: of a singular matrix, mostly its null vectors."""
+        return np.asarray(self.columns[:, None] * self._lu.solve(self.rows[:, None] * right))
+
+    def solve_transposed(self, right: FloatArray) -> FloatArray:
+        """Return ``matrix^-T right``, refined once."""
+        if not self.size:
+            return np.zeros((0, right.shape[1]))
+        scaled = self.columns[:, None] * right
+        unknown = self._lu.solve(scaled, trans="T")
+        if not self.exactly_singular:
+            unknown = unknown + self._lu.solve(scaled - self.matrix.T @ unknown, trans="T")
+        return np.asarray(self.rows[:, None] * unknown)
+
+    def size_of_terms(self, solution: FloatArray, places: Any) -> FloatArray:
+        """Return chosen rows of ``|matrix^-1| (|matrix| |solution|)``: rounding is judged beside it.
+
+        Parameters
+        ----------
+        solution : FloatArray
+            ``(size, count)``.
+        places : array of int
+            Rows.
+        """
+        wanted = np.asarray(places, dtype=np.int64)
+        terms = abs(self.matrix) @ (np.abs(solution) / self.columns[:, None])
+        found = np.zeros((len(wanted), solution.shape[1]))
+        for part in _chunks(len(wanted)):
+            units = np.zeros((self.size, len(wanted[part])))
+            units[wanted[part], np.arange(units.shape[1])] = 1.0
+            found[part] = np.abs(self._lu.solve(units, trans="T")).T @ terms
+        return self.columns[wanted][:, None] * found
+
+
+def _chunks(count: int) -> Iterator[slice]:
+    return (slice(start, min(start + CHUNK, count)) for start in range(0, count, CHUNK))
+
+
+def _scaled(matrix: Any, rows: FloatArray, columns: FloatArray) -> Any:
+    copy = matrix.copy()
+    places = np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
+    copy.data = matrix.data * rows[places] * columns[matrix.indices]
+    return copy
+
+
+def _peaks(matrix: Any, *, axis: int) -> FloatArray:
+    """Return the largest absolute entry of each row (``axis=1``) or column."""
+    found = np.zeros(matrix.shape[1 - axis])
+    places = np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr)) if axis else matrix.indices
+    np.maximum.at(found, places, np.abs(matrix.data))
+    return found
+
+
+def _norm_estimate(matrix: Any) -> float:
+    """Return a bound on the 2-norm within a small factor: the root of the product of 1-norm and infinity norm."""
+    sizes = abs(matrix)
+    one, infinity = (float(np.max(np.asarray(sizes.sum(axis=axis)), initial=0.0)) for axis in (0, 1))
+    return float(np.sqrt(one * infinity)) or 1.0

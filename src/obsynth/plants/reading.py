@@ -1,0 +1,175 @@
+"""From what a caller gives for a linear plant to its fields: frames, names for rows, noise of sensors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.numerics.arrays import FloatArray, as_matrix
+from obsynth.numerics.sparse import as_sparse_matrix, dense, is_sparse
+from obsynth.plants.frames import without_frames
+from obsynth.plants.names import checked_names, is_name_list, require_known, rows_picking
+from obsynth.plants.validation import (
+    Problems,
+    any_matrix,
+    checked_dt,
+    checked_point,
+    checked_scales,
+    checked_units,
+    expected_shapes,
+    matrix_or_picks,
+    picked_names,
+    signal_counts,
+    square,
+    uncounted_signals,
+)
+
+#: Names of the signals of each kind, besides the states.
+_SIGNALS = {"input_names": "u", "output_names": "y", "fault_names": "f", "disturbance_names": "d", "noise_names": "w"}
+# Where a matrix picked by names names the signal as well.
+_NAMED_BY = {"output_names": "C", "fault_names": "Bf", "disturbance_names": "Bd"}
+
+
+def plant_fields(
+    asked: Mapping[str, Any],
+    names: Mapping[str, Sequence[str] | None],
+    *,
+    dt: Any,
+    operating_point: Any,
+    scales: Any,
+    units: Any,
+    sensor_noise: Any,
+) -> dict[str, Any]:
+    """Return every field of a `DescriptorSystem`; raise one `SpecError` with all problems."""
+    problems = Problems()
+    matrices, labels = without_frames(asked, names)
+    a = problems.collect(lambda: square(any_matrix(matrices.pop("A"), "A"), "A"))
+    problems.raise_if_any()
+    nx = a.shape[0]
+    states = problems.collect(lambda: checked_names(labels["state_names"], nx, prefix="x", what="state_names"))
+    problems.raise_if_any()
+    given: dict[str, FloatArray | None] = {"A": a, "E": _identity_like(a) if matrices["E"] is None else None}
+    for name, value in matrices.items():
+        if value is not None and not (name in SENSOR_PICKS and is_name_list(value)):
+            given[name] = problems.collect(partial(matrix_or_picks, value, name, states))
+    more = _appended(matrices, labels, given, sensor_noise, problems)
+    sizes = signal_counts(given)
+    # What depends on a matrix that could not be read is not judged: its own message is enough.
+    broken = {name for name, value in matrices.items() if value is not None and given.get(name) is None}
+    unknown = uncounted_signals(given, broken)
+    values: dict[str, Any] = {
+        name: problems.shaped(given.get(name), name, shape)
+        for name, shape in expected_shapes(nx, sizes, unknown).items()
+    }
+    values |= {"dt": problems.collect(lambda: checked_dt(dt)), "state_names": states}
+    for field, signal in _SIGNALS.items():
+        if signal in unknown:
+            continue
+        stated = labels[field] or picked_names(matrices.get(_NAMED_BY.get(field, "")))
+        extra = more.get(field, ())
+        if extra and is_name_list(stated or ["-"]) and (stated is None or len(stated) == sizes[signal] - len(extra)):
+            first = checked_names(stated, sizes[signal] - len(extra), prefix=signal, what=field)
+            stated = (*first, *extra)
+        values[field] = problems.collect(partial(checked_names, stated, sizes[signal], prefix=signal, what=field))
+    problems.raise_if_any()
+    known = {name for field in ("state_names", *_SIGNALS) for name in values[field]}
+    values["operating_point"] = problems.collect(lambda: checked_point(operating_point, known))
+    measured = {*values["input_names"], *values["output_names"]}
+    values["scales"] = problems.collect(lambda: checked_scales(scales, measured))
+    values["units"] = problems.collect(lambda: checked_units(units, known))
+    problems.raise_if_any()
+    return values
+
+
+def _identity_like(a: Any) -> Any:
+    """Return the identity of the size of A, sparse where A is."""
+    if not is_sparse(a):
+        return np.eye(a.shape[0])
+    from scipy.sparse import eye_array
+
+    return as_sparse_matrix(eye_array(a.shape[0], format="csr"), "E")
+
+
+def _appended(
+    matrices: Mapping[str, Any],
+    labels: Mapping[str, Sequence[str] | None],
+    given: dict[str, FloatArray | None],
+    sensor_noise: Any,
+    problems: Problems,
+) -> dict[str, tuple[str, ...]]:
+    """Append what is given by the names of sensors to ``given``; return the names of these signals by field."""
+    if sensor_noise is None and not any(is_name_list(matrices[name]) for name in SENSOR_PICKS):
+        return {}
+    if matrices["C"] is not None and given.get("C") is None:
+        return {}
+    stated = labels["output_names"] or picked_names(matrices["C"])
+    outputs = problems.collect(
+        lambda: checked_names(stated, signal_counts(given)["y"], prefix="y", what="output_names")
+    )
+    problems.raise_if_any()
+    picked = problems.collect(lambda: with_sensor_picks(matrices, given, outputs)) or {}
+    noises = problems.collect(lambda: noise_of_sensors(sensor_noise, given, outputs)) or ()
+    return {"fault_names": picked.get("Df", ()), "disturbance_names": picked.get("Dd", ()), "noise_names": noises}
+
+
+#: Matrices of outputs that may be given by the names of sensors, each with that of the dynamics beside it.
+SENSOR_PICKS = {"Df": "Bf", "Dd": "Bd"}
+
+
+def _size(given: Mapping[str, Any]) -> int:
+    return int(given["A"].shape[0])
+
+
+def with_sensor_picks(
+    asked: Mapping[str, Any], given: dict[str, FloatArray | None], outputs: Sequence[str]
+) -> dict[str, tuple[str, ...]]:
+    """Append one signal for each sensor that Df or Dd names; return the names of the sensors by matrix.
+
+    ``given`` is changed: ``Df (ny, nf)`` and ``Bf (nx, nf)`` get a column for each, after those that are there.
+    """
+    found = {}
+    for name, beside in SENSOR_PICKS.items():
+        picked = asked[name]
+        if not is_name_list(picked):
+            continue
+        columns = rows_picking(picked, outputs, what=name).T
+        own = given.get(beside)
+        dynamics = np.zeros((_size(given), 0)) if own is None else dense(own)
+        given[beside] = np.hstack([dynamics, np.zeros((len(dynamics), len(picked)))])
+        given[name] = np.hstack([np.zeros((len(outputs), dynamics.shape[1])), columns])
+        found[name] = tuple(picked)
+    return found
+
+
+def noise_of_sensors(sensor_noise: Any, given: dict[str, FloatArray | None], outputs: Sequence[str]) -> tuple[str, ...]:
+    """Append one noise input for each sensor with a standard deviation; return the names of these.
+
+    ``given`` is changed: ``Bw (nx, nw)`` and ``Dw (ny, nw)`` get a column for each, after those that are there.
+    """
+    if sensor_noise is None:
+        return ()
+    if not isinstance(sensor_noise, Mapping):
+        raise SpecError(f"sensor_noise is a {type(sensor_noise).__name__}: give a standard deviation by output, such "
+                        "as {'speed': 0.01}.", path="sensor_noise")  # fmt: skip
+    require_known(sensor_noise, outputs, what="sensor_noise", kind="output")
+    columns = np.zeros((len(outputs), len(sensor_noise)))
+    for column, (name, value) in enumerate(sensor_noise.items()):
+        deviation = float(as_matrix(value, f"sensor_noise[{name!r}]")[0, 0])
+        if deviation <= 0.0:
+            raise SpecError(f"sensor_noise[{name!r}] is {deviation:g}: give a standard deviation above 0.",
+                            path="sensor_noise")  # fmt: skip
+        columns[list(outputs).index(name), column] = deviation
+    others = [matrix for name in ("Bw", "Dw") if (matrix := given.get(name)) is not None and 0 not in matrix.shape]
+    nw, nx = others[0].shape[1] if others else 0, _size(given)
+    for name, rows, more in (("Bw", nx, np.zeros((nx, len(sensor_noise)))), ("Dw", len(outputs), columns)):
+        matrix = given.get(name)
+        matrix = np.zeros((rows, nw)) if matrix is None or 0 in matrix.shape else dense(matrix)
+        if matrix.shape != (rows, nw):
+            # Its own message is enough.
+            return ()
+        given[name] = np.hstack([matrix, more])
+    return tuple(f"noise {name}" for name in sensor_noise)

@@ -1,0 +1,230 @@
+"""Observers as functional mock-up units: fmpy validates and runs them, and gets what Python gives."""
+
+from __future__ import annotations
+
+import subprocess
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import obsynth
+from obsynth import SpecError
+from obsynth.observers.dae import compiled_library
+
+fmpy = pytest.importorskip("fmpy", reason="fmpy is not installed (obsynth[fmu])")
+
+ROOT = Path(__file__).parents[2]
+STEPS = 10_000
+VERSIONS = pytest.mark.parametrize("version", ["2.0", "3.0"])
+
+
+@pytest.fixture(scope="module")
+def design() -> obsynth.ObserverDesign:
+    """Two faults, operating points and units."""
+    spec = obsynth.load_spec(ROOT / "designs" / "wang2015" / "spec.yaml")
+    plant = spec.plant.replace(
+        operating_point={"u1": 2.0, "x2": -3.0, "x1": 1.0}, units={"x2": "m", "u1": "V", "actuator 1": "V"}
+    )
+    return obsynth.design(plant, spec.method, name=spec.name, **dict(spec.options))
+
+
+@pytest.fixture
+def compiler() -> list[str]:
+    command = compiled_library.compiler()
+    if command is None:
+        pytest.skip("no C compiler")
+    return command
+
+
+class Stepped:
+    """A unit stepped by fmpy's functions of either version."""
+
+    def __init__(self, path, folder):
+        self.description = fmpy.read_model_description(str(path))
+        self.references = {v.name: v.valueReference for v in self.description.modelVariables}
+        unpacked = fmpy.extract(str(path), unzipdir=str(folder))
+        arguments = {
+            "guid": self.description.guid, "unzipDirectory": unpacked, "instanceName": "observer",
+            "modelIdentifier": self.description.coSimulation.modelIdentifier,
+        }  # fmt: skip
+        self.is_old = self.description.fmiVersion == "2.0"
+        self.unit = fmpy.fmi2.FMU2Slave(**arguments) if self.is_old else fmpy.fmi3.FMU3Slave(**arguments)
+        self.unit.instantiate()
+        self.get = self.unit.getReal if self.is_old else self.unit.getFloat64
+        self.set = self.unit.setReal if self.is_old else self.unit.setFloat64
+
+    def begin(self):
+        if self.is_old:
+            self.unit.setupExperiment(startTime=0.0)
+        self.unit.enterInitializationMode()
+        self.unit.exitInitializationMode()
+
+    def values(self, names):
+        return self.get([self.references[name] for name in names])
+
+    def flag(self, name):
+        return bool(self.unit.getBoolean([self.references[name]])[0])
+
+    def run(self, names, record, dt, shown):
+        references, wanted = [self.references[name] for name in names], [self.references[name] for name in shown]
+        rows = np.empty((len(record), len(shown)))
+        for k, row in enumerate(record):
+            self.set(references, row.tolist())
+            self.unit.doStep(currentCommunicationPoint=k * dt, communicationStepSize=dt)
+            rows[k] = self.get(wanted)
+        return rows
+
+    def end(self):
+        self.unit.terminate()
+        self.unit.freeInstance()
+
+
+def unit_names(observer):
+    return (*observer.input_names, *observer.output_names), (
+        *(f"xhat[{name}]" for name in observer.state_names), *(f"fhat[{name}]" for name in observer.fault_names),
+        *(f"r[{name}]" for name in observer.residual_names),
+    )  # fmt: skip
+
+
+@VERSIONS
+@pytest.mark.usefixtures("compiler")
+def test_a_unit_is_valid_and_gives_what_python_gives(design, tmp_path, version):
+    (path,) = obsynth.export(design, tmp_path / "observer.fmu", fmi=version)
+    assert fmpy.validation.validate_fmu(str(path)) == []
+    observer, point = design.observer, design.plant.operating_point
+    names, shown = unit_names(observer)
+    record = np.random.default_rng(1).normal(size=(STEPS, len(names)))
+    before = np.array([point.get(name, 0.0) for name in names])
+    nu = len(observer.input_names)
+    wanted = observer.run(record[:, nu:] - before[nu:], record[:, :nu] - before[:nu])
+    after = np.array([point.get(name, 0.0) for name in (*observer.state_names, *observer.fault_names)])
+    whole = np.hstack([wanted.states, wanted.faults]) + after, wanted.residuals
+    stepped = Stepped(path, tmp_path / "unpacked")
+    stepped.begin()
+    assert stepped.values(["xhat[x1]", "xhat[x2]"]) == [1.0, -3.0]
+    found = stepped.run(names, record, observer.dt, shown)
+    stepped.end()
+    assert np.abs(found - np.hstack(whole)).max() <= 1e-12 * max(1.0, np.abs(found).max())
+
+
+@VERSIONS
+@pytest.mark.usefixtures("compiler")
+def test_alarms_thresholds_and_operating_points_can_be_changed(design, tmp_path, version):
+    (path,) = obsynth.export(
+        design, tmp_path / "observer.fmu", fmi=version, thresholds={"fhat[actuator 1]": 0.5}, warm_up=3.0
+    )
+    stepped = Stepped(path, tmp_path / "unpacked")
+    assert stepped.values(["threshold[fhat[actuator 1]]", "threshold[fhat[actuator 2]]", "warm_up"]) == [0.5, 0.0, 3.0]
+    stepped.begin()
+    observer, point = design.observer, design.plant.operating_point
+    names, shown = unit_names(observer)
+    rest = np.array([point.get(name, 0.0) for name in names])
+    jump = rest + np.where(np.array(names) == "x2", 50.0, 0.0)
+    found = stepped.run(names, np.array([rest, jump]), 1.0, shown)
+    assert np.array_equal(found[0], [1.0, -3.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    assert not stepped.flag("alarm")  # warm-up
+    stepped.set([stepped.references["warm_up"]], [0.0])
+    stepped.run(names, np.array([jump]), 1.0, shown)
+    assert stepped.flag("alarm")
+    assert stepped.flag("alarm[fhat[actuator 1]]")
+    assert stepped.flag("sample_used")
+    # A sample that is no number leaves the estimates as they are and raises nothing.
+    held = stepped.values(shown)
+    stepped.run(names, np.array([np.where(np.arange(len(names)) == 1, np.nan, rest)]), 1.0, shown)
+    assert stepped.values(shown) == held
+    assert not stepped.flag("sample_used")
+    assert not stepped.flag("alarm")
+    stepped.end()
+
+
+@VERSIONS
+@pytest.mark.usefixtures("compiler")
+def test_the_state_can_be_kept_and_a_wrong_step_is_refused(design, tmp_path, version):
+    (path,) = obsynth.export(design, tmp_path / "observer.fmu", fmi=version)
+    stepped = Stepped(path, tmp_path / "unpacked")
+    stepped.begin()
+    names, shown = unit_names(design.observer)
+    record = np.random.default_rng(2).normal(size=(6, len(names)))
+    stepped.run(names, record[:3], 1.0, shown)
+    state = stepped.unit.getFMUstate() if stepped.is_old else stepped.unit.getFMUState()
+    first = stepped.run(names, record[3:], 1.0, shown)
+    (stepped.unit.setFMUstate if stepped.is_old else stepped.unit.setFMUState)(state)
+    assert np.array_equal(stepped.run(names, record[3:], 1.0, shown), first)
+    (stepped.unit.freeFMUstate if stepped.is_old else stepped.unit.freeFMUState)(state)
+    with pytest.raises(fmpy.fmi1.FMICallException):
+        stepped.unit.doStep(currentCommunicationPoint=9.0, communicationStepSize=0.4)
+    stepped.unit.freeInstance()
+
+
+@VERSIONS
+def test_names_units_and_sources_are_inside(design, tmp_path, version, monkeypatch):
+    monkeypatch.setattr("obsynth.exporting.fmu.archive.compiler", lambda: None)
+    (path,) = obsynth.export(design, tmp_path / "my observer.fmu", fmi=version)
+    assert fmpy.validation.validate_fmu(str(path)) == []
+    variables = {v.name: v for v in fmpy.read_model_description(str(path)).modelVariables}
+    assert variables["x2"].causality == "input"
+    assert variables["x2"].unit == variables["xhat[x2]"].unit == "m"
+    assert variables["fhat[actuator 1]"].unit == "V"
+    assert "1 sample(s) late" in variables["fhat[actuator 1]"].description
+    assert float(variables["operating_point[u1]"].start) == 2.0
+    with zipfile.ZipFile(path) as archive:
+        names = archive.namelist()
+    assert not [name for name in names if name.startswith("binaries")]
+    assert {"sources/observer.c", "sources/observer.h", "sources/layout.h", "sources/instance.h"} <= set(names)
+
+
+@VERSIONS
+def test_the_sources_compile_without_a_warning(design, tmp_path, version, compiler):
+    (path,) = obsynth.export(design, tmp_path / "observer.fmu", fmi=version)
+    with zipfile.ZipFile(path) as archive:
+        archive.extractall(tmp_path / "unpacked")
+    flags = ["-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC"]
+    sources = sorted(map(str, (tmp_path / "unpacked" / "sources").glob("*.c")))
+    done = subprocess.run([*compiler, *flags, *sources, "-o", str(tmp_path / "library.so"), "-lm"],
+                          capture_output=True, text=True, check=False)  # fmt: skip
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.usefixtures("compiler")
+def test_the_observer_of_a_nonlinear_plant_is_a_unit_too(tmp_path):
+    spec = obsynth.load_spec(ROOT / "designs" / "pendulum" / "spec.yaml")
+    design = obsynth.design(spec.plant, spec.method, name=spec.name, **dict(spec.options))
+    (path,) = obsynth.export(design, tmp_path / "observer.fmu")
+    assert fmpy.validation.validate_fmu(str(path)) == []
+    model, observer = design.nonlinear
+    names = (*model.input_names, *model.output_names)
+    shown = [f"xhat[{name}]" for name in model.state_names] + [f"theta[{name}]" for name in model.parameter_names]
+    u = np.tile(list(model.inputs.values()), (200, 1))
+    y = obsynth.simulate_dae(model, u, dt=observer.dt).outputs[:200]
+    y = y + 1e-4 * np.random.default_rng(3).normal(size=y.shape)
+    wanted = observer.run(y, u)
+    stepped = Stepped(path, tmp_path / "unpacked")
+    stepped.begin()
+    found = stepped.run(names, np.hstack([u, y]), observer.dt, shown)
+    stepped.end()
+    whole = np.hstack([wanted.states, wanted.parameters])
+    assert np.abs(found - whole).max() <= 1e-9 * max(1.0, np.abs(whole).max())
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"fmi": "1.0"}, ["fmi", "2.0"]),
+        ({"thresholds": {"fhat[pump]": 1.0}}, ["fhat[pump]", "fhat[actuator 1]"]),
+        ({"thresholds": {"fhat[actuator 1]": -1.0}}, ["positive"]),
+        ({"warm_up": -1.0}, ["warm_up"]),
+        ({"sample_time": 0.1}, ["sampled already"]),
+    ],
+)
+def test_wrong_options_are_refused(design, tmp_path, options, words):
+    with pytest.raises(SpecError) as caught:
+        obsynth.export(design, tmp_path / "observer.fmu", **options)
+    assert all(word in str(caught.value) for word in words)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_thresholds_are_for_units_only(design, tmp_path):
+    with pytest.raises(SpecError, match=r"FMU"):
+        obsynth.export(design, tmp_path / "observer.c", thresholds={"fhat[actuator 1]": 1.0})

@@ -1,0 +1,72 @@
+"""Each method is one declaration: what derives from it agrees with it, and each of its paths leads somewhere."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from typing import Any, get_args
+
+import pytest
+
+import obsynth
+from obsynth.errors import SpecError
+from obsynth.methods.conic.lmi import FILTER_SOLVERS, SOLVER_SETTINGS
+from obsynth.methods.fault_estimation_filter.options import FilterOptions
+from obsynth.methods.method_spec import option_types
+from obsynth.methods.pd_observer.options import PdOptions
+from obsynth.methods.placement.eigenstructure import OBJECTIVES
+from obsynth.methods.registry import REGISTRY, method_spec, methods_for
+from obsynth.methods.ui_pi_observer.options import UiPiOptions
+from obsynth.numerics.value_types import Count, ForgettingFactor, Positive, problem_with
+
+
+@pytest.mark.parametrize("method", REGISTRY)
+def test_every_path_of_a_declaration_leads_somewhere(method: str) -> None:
+    spec = method_spec(method)
+    assert spec.id == method == spec.options_type.METHOD
+    for part in ("public", "options", "conditions", "synthesise", "checks"):
+        assert callable(spec.load(part))
+    assert getattr(obsynth, method.replace("-", "_")) is spec.load("public")
+    assert {field.name for field in fields(spec.options_type)} == set(spec.option_names)
+
+
+def test_kinds_of_plants_have_their_methods() -> None:
+    assert methods_for("time-varying") == ("descriptor-kalman", "adaptive-observer")
+    assert methods_for("nonlinear") == ("dae-adaptive-observer",)
+    assert set(methods_for("time-invariant")) == set(REGISTRY) - {"dae-adaptive-observer"}
+
+
+def test_choices_are_those_of_the_layers_below() -> None:
+    assert set(get_args(option_types(FilterOptions)["solver"])) == set(FILTER_SOLVERS)
+    for options in (PdOptions, UiPiOptions):
+        assert set(get_args(option_types(options)["solver"])) == set(SOLVER_SETTINGS)
+    assert get_args(option_types(UiPiOptions)["objective"]) == OBJECTIVES
+
+
+@pytest.mark.parametrize(
+    ("value", "kind", "problem"),
+    [
+        (True, Positive | None, "number above 0"), (0.0, Positive, "above 0"), (float("nan"), Positive, "above 0"),
+        ("1", Positive, "give a number"), (None, Positive, "missing"), (1.5, ForgettingFactor, "above 0 and at most 1"),
+        (2.0, Count, "whole number at least 1"), (True, Count, "whole number"), (1, bool, "True or False"),
+        (True, option_types(PdOptions)["theorem"], "use one of 1, 2"),
+    ],
+)  # fmt: skip
+def test_values_out_of_type_or_range_are_named(value: Any, kind: Any, problem: str) -> None:
+    assert problem in str(problem_with(value, "option", kind))
+
+
+def test_values_in_range_pass() -> None:
+    for value, kind in ((None, Positive | None), (1, Positive), (1.0, ForgettingFactor), (3, Count), (False, bool)):
+        assert problem_with(value, "option", kind) is None
+
+
+def test_true_is_no_delta() -> None:
+    plant = obsynth.DescriptorSystem(None, [[-1.0]], C=[[1.0]], Bf=[[1.0]])
+    with pytest.raises(SpecError, match="delta is True: give a number above 0"):
+        obsynth.pd_observer(plant, delta=True)
+
+
+def test_unknown_options_are_listed() -> None:
+    plant = obsynth.DescriptorSystem(None, [[-1.0]], C=[[1.0]], Bf=[[1.0]])
+    with pytest.raises(SpecError, match="pd-observer has no option 'gama'; there are: adaptation_gain"):
+        obsynth.design(plant, "pd-observer", gama=1.0)

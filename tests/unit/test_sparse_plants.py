@@ -1,0 +1,216 @@
+"""Plants with sparse matrices: kept, checked, and reduced to what LAPACK finds; variables that act on nothing."""
+
+from __future__ import annotations
+
+import pickle
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+
+import obsynth
+from obsynth.analysis.transformations.elimination import eliminated_by_sparsity
+from obsynth.numerics.sparse_factor import SparseFactor
+from obsynth.numerics.sparse_structure import blocks_of, coarse_structure
+from obsynth.spec.loader import load_spec
+
+sys.path.insert(0, str(Path(__file__).parent))
+from networks import random_network, write
+
+MATRICES = ("A", "B", "C", "D", "Bf", "Df", "Bd", "Dd", "Bw", "Dw")
+MAPS = ("from_state", "from_input", "from_fault", "from_disturbance", "from_noise")
+FORMATS = (np.array, sp.csr_array, sp.csc_matrix, sp.coo_array, sp.lil_matrix)
+
+
+def random_index_one(rng: np.random.Generator, *, mass: bool, mixed: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Return E and A of eight variables, five of them dynamic; a mass matrix, rows in any order."""
+    e, a = np.zeros((8, 8)), rng.normal(size=(8, 8)) * (rng.random((8, 8)) < 0.5) - 2 * np.eye(8)
+    e[:5, :5] = np.diag(rng.uniform(0.5, 2, 5))
+    if mass:
+        e[0, 1], e[3, 2] = 0.3, -0.4
+    order = rng.permutation(8) if mixed else np.arange(8)
+    return e[order], a[order]
+
+
+class TestKept:
+    def test_matrices_stay_as_given(self):
+        e, a = sp.csc_matrix(np.eye(3)), sp.csr_array(-np.eye(3))
+        plant = obsynth.DescriptorSystem(e, a, C=["x1"], B=[[1], [0], [0]])
+        assert isinstance(plant.A, sp.csr_array)
+        assert isinstance(plant.E, sp.csc_matrix)
+        assert plant.is_sparse
+        assert isinstance(plant.B, np.ndarray)
+        with pytest.raises(ValueError, match="read-only"):
+            plant.A.data[0] = 5.0
+        a.data[0] = 7.0
+        assert plant.A[0, 0] == -1.0
+
+    def test_dense(self):
+        plant = obsynth.DescriptorSystem(None, sp.coo_array(np.diag([1.0, 2.0])), C=["x2"])
+        arrays = plant.dense()
+        assert isinstance(arrays.A, np.ndarray)
+        np.testing.assert_array_equal(arrays.E, np.eye(2))
+        assert arrays.dense() is arrays
+        assert arrays.state_names == plant.state_names
+
+    @pytest.mark.parametrize(
+        ("bad", "message"),
+        [
+            (sp.csr_array([[1.0, np.nan], [0, 1]]), "row 1, column 2"),
+            (sp.csr_array([[1j, 0], [0, 1]]), "complex"),
+            (sp.csr_array((2, 3)), "square"),
+        ],
+    )
+    def test_bad_matrices(self, bad, message):
+        with pytest.raises(obsynth.SpecError, match=message):
+            obsynth.DescriptorSystem(None, bad)
+
+    def test_a_sparse_zero_matrix_has_columns(self):
+        plant = obsynth.DescriptorSystem(None, sp.eye_array(2, format="csr"), B=sp.csr_array((2, 3)))
+        assert plant.nu == 3
+
+
+class TestElimination:
+    @pytest.mark.parametrize("make", FORMATS[1:])
+    def test_like_lapack(self, make):
+        rng = np.random.default_rng(1)
+        for trial in range(6):
+            e, a = random_index_one(rng, mass=trial % 2 == 1, mixed=trial % 3 == 0)
+            b = rng.normal(size=(8, 2))
+            signals = {
+                "B": b,
+                "C": rng.normal(size=(3, 8)),
+                "Bf": b[:, :1],
+                "Bd": b[:, 1:],
+                "Bw": b,
+                "D": np.ones((3, 2)),
+            }
+            ours = eliminated_by_sparsity(obsynth.DescriptorSystem(make(e), make(a), **signals))
+            other = obsynth.eliminate_algebraic_states(obsynth.DescriptorSystem(e, a, **signals))
+            for name in MATRICES:
+                np.testing.assert_allclose(getattr(ours.plant, name), getattr(other.plant, name), atol=1e-11)
+            for name in MAPS:
+                np.testing.assert_allclose(getattr(ours.recovery, name), getattr(other.recovery, name), atol=1e-11)
+            assert ours.recovery.flags() == other.recovery.flags()
+            assert ours.plant.state_names == other.plant.state_names
+            assert ours.bounds.forward_error < 1e-11
+
+    def test_networks_against_their_truth(self):
+        network = random_network(300, 60, 3)
+        plant = network.plant()
+        found = obsynth.eliminate_algebraic_states(plant)
+        assert set(found.dropped) == set(network.idle)
+        assert found.plant.state_names == network.dynamic
+        np.testing.assert_allclose(found.plant.A, network.truth(), rtol=1e-10, atol=1e-10)
+        assert all(repr(name) in found.notes[0] for name in network.idle)
+        states = np.random.default_rng(0).normal(size=found.plant.nx)
+        recovered = dict(zip(found.recovery.names, found.recovery.from_state @ states, strict=True))
+        values = np.array([recovered.get(name, 0.0) for name in plant.state_names])
+        algebraic = [i for i, name in enumerate(plant.state_names) if name in recovered and not plant.E[[i]].nnz]
+        np.testing.assert_allclose((plant.A @ values)[algebraic], 0.0, atol=1e-9)
+
+    def test_arrays_of_many_variables_go_by_sparsity(self):
+        network = random_network(520, 40, 4)
+        plant = network.plant()
+        by_sparsity = obsynth.eliminate_algebraic_states(plant.dense())
+        assert by_sparsity.bounds is not None
+        np.testing.assert_array_equal(by_sparsity.plant.A, obsynth.eliminate_algebraic_states(plant).plant.A)
+
+    def test_sampled_and_pickled(self):
+        plant = random_network(300, 40, 5).plant()
+        sampled = obsynth.discretise(plant, 0.02)
+        again = pickle.loads(pickle.dumps(sampled))
+        np.testing.assert_array_equal(again.recovery.from_noise, sampled.recovery.from_noise)
+        dense = obsynth.eliminate_algebraic_states(plant)
+        np.testing.assert_allclose(sampled.recovery.from_state, dense.recovery.from_state, atol=1e-12)
+
+    def test_from_files(self, tmp_path):
+        network = random_network(320, 40, 6)
+        write(network, tmp_path)
+        spec = load_spec(tmp_path / "ui-pi-observer.yaml")
+        assert spec.transformation.source.is_sparse
+        np.testing.assert_allclose(spec.plant.A, network.truth(), rtol=1e-9, atol=1e-9)
+
+
+class TestIdleVariables:
+    E = np.diag([1.0, 1.0, 0.0, 0.0])
+    # x2' = x4, 0 = x1 - x2, 0 = x1 - 2 x3: x4 is the derivative of x1, and acts on nothing.
+    A = np.array([[-1.0, 0, 0, 0], [0, 0, 0, 1], [1, -1, 0, 0], [1, 0, -2, 0]])
+
+    @pytest.mark.parametrize("make", FORMATS)
+    def test_a_derivative_is_left_out(self, make):
+        plant = obsynth.DescriptorSystem(make(self.E), make(self.A), C=[[1, 0, 0, 0]])
+        found = obsynth.eliminate_algebraic_states(plant)
+        assert found.dropped == ("x4",)
+        assert "x4" in found.description
+        assert found.recovery.names == ("x1", "x2", "x3")
+        np.testing.assert_allclose(found.plant.A, [[-1.0]])
+        np.testing.assert_allclose(found.recovery.from_state[:, 0], [1.0, 1.0, 0.5])
+
+    @pytest.mark.parametrize("make", FORMATS)
+    def test_not_where_it_is_measured_or_acts(self, make):
+        acting = self.A.copy()
+        acting[0, 3] = 1.0
+        for a, c in ((self.A, [[1, 0, 0, 1]]), (acting, [[1, 0, 0, 0]])):
+            plant = obsynth.DescriptorSystem(make(self.E), make(a), C=c)
+            with pytest.raises(obsynth.PreconditionError, match="index") as caught:
+                obsynth.eliminate_algebraic_states(plant)
+            assert "x4" in caught.value.signals
+
+    @pytest.mark.parametrize("make", FORMATS)
+    def test_an_equation_that_repeats_another(self, make):
+        e, a = np.diag([1.0, 0, 0]), np.array([[-1.0, 0, 0], [1, -1, 0], [3, -3, 0]])
+        found = obsynth.eliminate_algebraic_states(obsynth.DescriptorSystem(make(e), make(a), C=[[1, 0, 0]]))
+        assert found.dropped == ("x3",)
+        for other in ([3, -2, 0], [0, 0, 0]):
+            a[2] = other
+            with pytest.raises(obsynth.PreconditionError) as caught:
+                obsynth.eliminate_algebraic_states(obsynth.DescriptorSystem(make(e), make(a), C=[[1, 0, 0]]))
+            assert caught.value.condition == "regularity"
+
+    @pytest.mark.parametrize("make", FORMATS)
+    def test_a_repetition_that_a_fault_enters_is_none(self, make):
+        e, a = np.diag([1.0, 0, 0]), np.array([[-1.0, 0, 0], [1, -1, 0], [3, -3, 0]])
+        plant = obsynth.DescriptorSystem(make(e), make(a), C=[[1, 0, 0]], Bf=[[0], [0], [1]])
+        with pytest.raises(obsynth.PreconditionError) as caught:
+            obsynth.eliminate_algebraic_states(plant)
+        assert caught.value.condition == "regularity"
+
+
+class TestNumerics:
+    def test_overdetermined_and_underdetermined(self):
+        pattern = sp.csr_array([[1, 0, 0, 0], [1, 0, 0, 0], [0, 1, 1, 1], [0, 0, 0, 0]])
+        found = coarse_structure(pattern)
+        assert found.structural_rank == 2
+        assert set(found.over_rows) == {0, 1, 3}
+        assert set(found.under_columns) == {1, 2, 3}
+
+    def test_blocks(self):
+        pattern = sp.csr_array([[1, 1, 0], [1, 1, 0], [0, 1, 1]])
+        count, block = blocks_of(pattern, coarse_structure(pattern).row_of_column)
+        assert count == 2
+        assert block[0] == block[1] != block[2]
+
+    def test_condition_and_errors_of_a_factor(self):
+        rng = np.random.default_rng(2)
+        matrix = rng.normal(size=(40, 40)) * 10.0 ** rng.uniform(-6, 6, 40)
+        factor = SparseFactor(sp.csr_array(matrix))
+        right = rng.normal(size=(40, 3))
+        solution, error = factor.solve_with_error(right)
+        assert error < 1e-15
+        np.testing.assert_allclose(matrix @ solution, right, atol=1e-10)
+        transposed = factor.solve_transposed(right)
+        assert np.all(np.abs(matrix.T @ transposed - right) <= 1e-13 * (np.abs(matrix.T) @ np.abs(transposed)))
+        true = np.linalg.cond(factor.matrix.toarray(), 1)
+        assert 0.1 * true <= factor.condition <= 1.01 * true
+
+    @pytest.mark.parametrize("exactly", [True, False])
+    def test_null_vectors(self, exactly):
+        rng = np.random.default_rng(3)
+        matrix = rng.normal(size=(12, 12))
+        matrix[:, 5] = 2.0 * matrix[:, 7] if exactly else matrix[:, 7] * (1.0 + 1e-15)
+        factor = SparseFactor(sp.csr_array(matrix))
+        assert factor.singular
+        assert set(np.argsort(-factor.null_vectors().columns)[:2]) == {5, 7}
