@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from obsynth.proofs.enclosed_pencils import EnclosedPencil, Rows
     from obsynth.proofs.exact_pencils import ExactPencil
 
+#: Zeros of computed data beyond this many typical rates are infinite ones that rounding has moved.
+NEARLY_INFINITE = 1e8
 #: Plants of more states are decided in floating point.
 EXACT_STATES = 64
 SAMPLED_STATES = 24
@@ -115,11 +117,12 @@ class PlantNumbers(ABC):
 
 @dataclass(frozen=True, eq=False)
 class WrittenNumbers(PlantNumbers):
-    """Rational matrices."""
+    """Rational matrices; ``computed`` where some were computed in floating point and are known to their last digit."""
 
     matrices: Mapping[str, fmpq_mat]
     discrete: bool
     exact: bool = True
+    computed: bool = False
 
     @property
     def rational(self) -> Mapping[str, fmpq_mat]:  # type: ignore[override]
@@ -194,6 +197,10 @@ class WrittenNumbers(PlantNumbers):
         pencil = self.pencil(inputs, direct)
         rank, columns = pencil.normal_rank, pencil.shape[1]
         found = pencil.zeros(discrete=self.discrete).roots if rank == columns else ()
+        if self.computed:
+            # What rounding has made of an infinite zero is no zero of the data.
+            far = NEARLY_INFINITE * (1.0 if self.discrete else pencil.typical_size)
+            found = tuple(root for root in found if abs(root.value) <= far)
         values = tuple(root.value for root in found for _ in range(root.multiplicity))
         return SystemFacts(rank, columns, tuple(root.value for root in found if root.side != "stable"), values, True)
 
@@ -299,7 +306,7 @@ class SampledNumbers(PlantNumbers):
 @lru_cache(maxsize=4)
 def numbers_of(plant: DescriptorSystem) -> PlantNumbers | None:
     """Return the numbers on which existence is decided; ``None`` where the plant has too many states for that."""
-    from obsynth.proofs.written_numbers import rational_matrix, written_matrix
+    from obsynth.proofs.written_numbers import computed_entries, rational_matrix, written_matrix
 
     origin = origin_of(plant)
     if origin is not None:
@@ -307,12 +314,15 @@ def numbers_of(plant: DescriptorSystem) -> PlantNumbers | None:
         sizes = {"E": states, "A": states, "C": states, "Bf": plant.nf, "Df": plant.nf, "Bd": plant.nd, "Dd": plant.nd}
         exact = {name: rational_matrix(origin.exact[name], sizes[name]) for name in DECISIVE}
         if origin.sample_time is None:
-            return WrittenNumbers(exact, plant.is_discrete) if states <= EXACT_STATES else None
+            written = WrittenNumbers(exact, plant.is_discrete, computed=origin.computed)
+            return written if states <= EXACT_STATES else None
         return sampled_numbers(exact, origin.sample_time) if states <= SAMPLED_STATES else None
     if plant.nx > EXACT_STATES:
         return None
     plant = plant.dense()
-    return WrittenNumbers({name: written_matrix(getattr(plant, name)) for name in DECISIVE}, plant.is_discrete)
+    computed = any(computed_entries(getattr(plant, name)) for name in DECISIVE)
+    matrices = {name: written_matrix(getattr(plant, name)) for name in DECISIVE}
+    return WrittenNumbers(matrices, plant.is_discrete, computed=computed)
 
 
 def sampled_numbers(exact: Mapping[str, fmpq_mat], sample_time: Any) -> SampledNumbers:

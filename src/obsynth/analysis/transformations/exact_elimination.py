@@ -43,11 +43,14 @@ class ExactElimination:
         ``x`` from the new states (``A``) and from the signals (``B, Bf, Bd, Bw``).
     pivots : tuple of int
         States that stand for the dynamic ones.
+    computed : bool
+        Whether some of the data were computed in floating point.
     """
 
     matrices: Mapping[str, fmpq_mat]
     recovery: Mapping[str, fmpq_mat]
     pivots: tuple[int, ...]
+    computed: bool
 
     @property
     def origin(self) -> PlantOrigin:
@@ -56,7 +59,7 @@ class ExactElimination:
         from obsynth.proofs.written_numbers import fractions_of
 
         found: dict[str, fmpq_mat] = {"E": identity(len(self.pivots)), **self.matrices}
-        return PlantOrigin({name: fractions_of(found[name]) for name in DECISIVE})
+        return PlantOrigin({name: fractions_of(found[name]) for name in DECISIVE}, computed=self.computed)
 
 
 def exact_elimination(plant: DescriptorSystem) -> ExactElimination | None:
@@ -93,6 +96,7 @@ def exact_elimination(plant: DescriptorSystem) -> ExactElimination | None:
         | dict(zip(("C", *_DIRECT), _split(direct, widths), strict=True)),
         dict(zip(("A", *_SIGNALS), _split(states, widths), strict=True)),
         tuple(pivots),
+        computed,
     )
 
 

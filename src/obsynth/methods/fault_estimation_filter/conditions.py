@@ -41,6 +41,7 @@ def examine_fault_filter(
     plant: DescriptorSystem, *, structure: PencilStructure | None = None
 ) -> tuple[tuple[Condition, ...], PreparedPlant | None]:
     """Return the existence conditions, and the prepared plant on which the last of them were decided."""
+    plant = plant.dense()
     prepared: PreparedPlant | None = None
 
     def visibility_conditions() -> list[Condition]:

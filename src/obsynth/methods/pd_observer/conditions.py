@@ -49,6 +49,7 @@ def explicit_form(plant: DescriptorSystem) -> Transformation | None:
 
 def _all_conditions(plant: DescriptorSystem) -> Iterator[Condition]:
     """Yield the conditions; each may rely on those before it."""
+    plant = plant.dense()
     yield _condition(
         "continuous time", "a continuous-time plant (dt = 0)", not plant.is_discrete, plant.dt, 0.0, _SOURCE,
         f"a plant sampled every {plant.dt:g} s. Give the continuous one (no sample_time in its transform): the "

@@ -73,6 +73,7 @@ class Existence:
 
 def existence(plant: DescriptorSystem, model: Exosystem) -> Existence:
     """Return the existence conditions of the unknown-input PI observer, and the plant to design for."""
+    plant = plant.dense()
     nothing = np.zeros(0, dtype=np.complex128)
     enough = _enough_outputs(plant)
     if not enough.holds:
