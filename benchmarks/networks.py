@@ -98,7 +98,8 @@ def random_network(
     speeds = [_machine(made, rng, k + 1, angle[bus], voltage[bus]) for k, bus in enumerate(places)]
     for k in range(idle_filters):
         _idle_filter(made, k, speeds[int(rng.integers(machines))])
-    measured = [int(b) for b in np.sort(rng.choice(buses, min(buses, measured_buses), replace=False))]
+    # At machines: elsewhere angle and voltage of one bus may repeat those of its neighbour.
+    measured = sorted(int(bus) for bus in places[-measured_buses:])
     outputs = [f"omega GENROU {k + 1}" for k in range(min(machines, most_speeds))]
     outputs += [made.names[angle[b]] for b in measured] + [made.names[voltage[b]] for b in measured]
     faults = [f"tm GENROU {k + 1}" for k in range(min(2, machines))]

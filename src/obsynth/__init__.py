@@ -13,6 +13,10 @@ if TYPE_CHECKING:
     from obsynth.analysis.identifiability import Identifiability, identifiability
     from obsynth.analysis.structure import analyse_structure
     from obsynth.analysis.transformations import discretise, eliminate_algebraic_states
+    from obsynth.analysis.transformations.linearisation import linearise
+    from obsynth.calibration.box import CalibratedBox
+    from obsynth.calibration.calibrating import calibrate
+    from obsynth.calibration.result import Calibration
     from obsynth.data.run import DataRun, run_on_data
     from obsynth.errors import (
         InfeasibleError,
@@ -46,6 +50,7 @@ if TYPE_CHECKING:
         fault_estimation_filter,
         fault_estimation_filter_from_gains,
     )
+    from obsynth.methods.functional_filter.public import functional_filter
     from obsynth.methods.pd_observer.public import (
         apply_adaptation_gain,
         pd_delta_scan,
@@ -89,6 +94,11 @@ __version__ = "0.1.0"
 
 # Names are imported when they are first used, so that `import obsynth` stays fast.
 _HOMES = {
+    "functional_filter": "obsynth.methods.functional_filter.public",
+    "CalibratedBox": "obsynth.calibration.box",
+    "Calibration": "obsynth.calibration.result",
+    "calibrate": "obsynth.calibration.calibrating",
+    "linearise": "obsynth.analysis.transformations.linearisation",
     "DecoupledPlant": "obsynth.analysis.diagnosis.decoupled",
     "decouple": "obsynth.analysis.diagnosis.decoupled",
     "diagnose": "obsynth.analysis.diagnosis.diagnosing",
@@ -195,6 +205,8 @@ __all__ = [
     "Adaptation",
     "Alarm",
     "BatchEstimates",
+    "CalibratedBox",
+    "Calibration",
     "Certificate",
     "Check",
     "DAEBatchEstimates",
@@ -251,6 +263,7 @@ __all__ = [
     "adaptive_observer",
     "analyse_structure",
     "apply_adaptation_gain",
+    "calibrate",
     "dae_adaptive_observer",
     "decide",
     "decouple",
@@ -273,8 +286,10 @@ __all__ = [
     "from_pandas",
     "from_scipy",
     "from_sympy",
+    "functional_filter",
     "html_report",
     "identifiability",
+    "linearise",
     "load",
     "load_spec",
     "monitor",

@@ -48,19 +48,22 @@ class SpecError(ObsynthError):
         Where: a file, or a path inside a document such as ``plant.E``.
     problems : sequence of str, optional
         All problems found, when there are several; they are appended to the message.
+    code : str, optional
+        Short name of the problem that stays the same, for programs; empty if it has none.
     """
 
     exit_code = 2
 
-    def __init__(self, message: str, *, path: str | None = None, problems: Sequence[str] = ()) -> None:
+    def __init__(self, message: str, *, path: str | None = None, problems: Sequence[str] = (), code: str = "") -> None:
         self.path = path
+        self.code = code
         self.problems = tuple(problems)
         lines = [message, *(f"  - {problem}" for problem in self.problems)]
         super().__init__("\n".join(lines))
 
     def as_dict(self) -> dict[str, Any]:
         """Return the error as plain data, for ``--json``."""
-        return {**super().as_dict(), "path": self.path, "problems": list(self.problems)}
+        return {**super().as_dict(), "path": self.path, "problems": list(self.problems), "code": self.code}
 
 
 class PreconditionError(ObsynthError):
@@ -83,7 +86,7 @@ class PreconditionError(ObsynthError):
     def __init__(
         self, message: str, *, condition: str, mode: complex | None = None, signals: Sequence[str] = ()
     ) -> None:
-        self.condition = condition
+        self.condition = self.code = condition
         self.mode = mode
         self.signals = tuple(signals)
         super().__init__(message)

@@ -10,6 +10,7 @@ from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.pencils import FiniteZeros, finite_zeros
 from obsynth.numerics.ranks import BOUNDARY_RANK_TOLERANCE, CLUSTER_TOLERANCE
 from obsynth.numerics.scaling import EquilibratedPencil, equilibrate_pencil, power_of_two_below
+from obsynth.numerics.small_singular_values import FEW_COLUMNS, smallest_singular
 
 #: Steps in which a computed zero is improved before the pencil there is judged.
 NEWTON_STEPS = 4
@@ -40,13 +41,21 @@ def _is_singular(E: FloatArray, A: FloatArray, value: complex, normal_rank: int,
     pencil = equilibrated_at(E, A, value, nx=nx)
     point, best = value, np.inf
     for _ in range(NEWTON_STEPS):
-        left, sizes, right = np.linalg.svd(pencil.A - point * pencil.E)
-        if sizes[0] == 0.0:
+        matrix = pencil.A - point * pencil.E
+        if matrix.shape[0] >= matrix.shape[1] == normal_rank >= FEW_COLUMNS:
+            found = smallest_singular(matrix)
+            largest, smallest, v = found.largest, float(found.values[0]), found.right[:, 0]
+            u = (matrix @ v).conj()
+            u = u / (float(np.linalg.norm(u)) or 1.0)
+        else:
+            left, sizes, right = np.linalg.svd(matrix)
+            largest, smallest = float(sizes[0]), float(sizes[normal_rank - 1])
+            u, v = left[:, normal_rank - 1].conj(), right[normal_rank - 1].conj()
+        if largest == 0.0:
             return True
-        best = min(best, sizes[normal_rank - 1] / sizes[0])
+        best = min(best, smallest / largest)
         if best <= BOUNDARY_RANK_TOLERANCE:
             return True
-        u, v = left[:, normal_rank - 1].conj(), right[normal_rank - 1].conj()
         slope = u @ pencil.E @ v
         # A zero far out is known only to the rounding of the largest: Newton's method on u' (A - z E) v finds the rest.
         step = (u @ (pencil.A - point * pencil.E) @ v) / slope if slope != 0.0 else 0.0

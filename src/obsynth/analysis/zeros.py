@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from obsynth.analysis.far_zeros import equilibrated_at, system_zeros
 from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.numerics.pencil_points import MOST_DIRECTIONS, PencilPoints
 from obsynth.numerics.pencils import FiniteZeros
 from obsynth.numerics.ranks import (
     BOUNDARY_NEIGHBOURHOOD,
@@ -23,6 +24,7 @@ from obsynth.numerics.ranks import (
     RankDecision,
 )
 from obsynth.numerics.scaling import EquilibratedPencil, equilibrate_pencil
+from obsynth.numerics.small_singular_values import FEW_COLUMNS, smallest_singular
 from obsynth.plants.descriptor import DescriptorSystem
 
 #: Points without meaning, tried as generic ones; the clearest of them is used.
@@ -90,7 +92,7 @@ def are_outside(E: FloatArray, A: FloatArray, zeros: FiniteZeros, dt: float) -> 
 
     Shapes: ``E (m, n)``, ``A (m, n)``.
     """
-    pencil: EquilibratedPencil | None = None
+    judged: PencilPoints | EquilibratedPencil | None = None
     found: dict[complex, bool] = {}
     for value in map(complex, zeros.values):
         # Of a pair both are where the one before was found to be: the pencil is real.
@@ -99,8 +101,8 @@ def are_outside(E: FloatArray, A: FloatArray, zeros: FiniteZeros, dt: float) -> 
         elif is_outside(value, dt) or not _is_near_boundary(value, dt):
             found[value] = is_outside(value, dt)
         else:
-            pencil = equilibrate_pencil(E, A) if pencil is None else pencil
-            found[value] = _reaches_boundary(pencil, value, dt, zeros.normal_rank)
+            judged = _judged(E, A, zeros.normal_rank) if judged is None else judged
+            found[value] = _reaches_boundary(judged, value, dt, zeros.normal_rank)
     return tuple(found[value] for value in map(complex, zeros.values))
 
 
@@ -118,10 +120,8 @@ def invariant_zeros(
 def fault_zeros(plant: DescriptorSystem) -> FaultZeros:
     """Return the invariant zeros from the faults of ``plant`` to its outputs."""
     plant = plant.dense()
+    found, zeros, outside = zeros_of_system(plant.E, plant.A, plant.Bf, plant.C, plant.Df, dt=plant.dt)
     e, a = system_pencil(plant.E, plant.A, plant.Bf, plant.C, plant.Df)
-    found = system_zeros(e, a, nx=plant.nx)
-    zeros = _with_directions(e, a, found, nx=plant.nx)
-    outside = tuple(zero for zero, out in zip(zeros, are_outside(e, a, found, plant.dt), strict=True) if out)
     missing = plant.nx + plant.nf - found.normal_rank
     direction, names = _hidden(e, a, plant, missing=missing) if missing else (None, ())
     return FaultZeros(zeros, outside, missing == 0, direction, names, found.decisions)
@@ -142,6 +142,17 @@ def hidden_direction(plant: DescriptorSystem, *, missing: int) -> tuple[FloatArr
     return _hidden(e, a, plant, missing=missing)
 
 
+def zeros_of_system(
+    E: FloatArray, A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray | None, *, dt: float
+) -> tuple[FiniteZeros, tuple[Zero, ...], tuple[Zero, ...]]:
+    """Return what `finite_zeros` says of ``[A - z E, B; C, D]``, the zeros, and those not strictly stable."""
+    e, a = system_pencil(E, A, B, C, D)
+    found = system_zeros(e, a, nx=E.shape[0])
+    zeros = _with_directions(e, a, found, nx=E.shape[0])
+    outside = tuple(zero for zero, out in zip(zeros, are_outside(e, a, found, dt), strict=True) if out)
+    return found, zeros, outside
+
+
 def system_pencil(
     E: FloatArray, A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray | None
 ) -> tuple[FloatArray, FloatArray]:
@@ -157,14 +168,26 @@ def _is_near_boundary(value: complex, dt: float) -> bool:
     return distance <= BOUNDARY_NEIGHBOURHOOD * max(1.0, abs(value))
 
 
-def _reaches_boundary(pencil: EquilibratedPencil, value: complex, dt: float, normal_rank: int) -> bool:
+def _judged(E: FloatArray, A: FloatArray, normal_rank: int) -> PencilPoints | EquilibratedPencil:
+    """Return the equilibrated pencil; a large one of full column rank ready for many points."""
+    pencil, columns = equilibrate_pencil(E, A), E.shape[1]
+    if columns < FEW_COLUMNS or normal_rank < columns or E.shape[0] < columns:
+        return pencil
+    return PencilPoints(pencil.E, pencil.A, (1.0, 1.0))
+
+
+def _reaches_boundary(pencil: PencilPoints | EquilibratedPencil, value: complex, dt: float, normal_rank: int) -> bool:
     point = value / abs(value) if dt > 0.0 else complex(0.0, value.imag)
     # All the way to the boundary: another zero that lies there is no evidence about this one.
     for fraction in _PATH_TO_BOUNDARY:
         place = value + fraction * (point - value)
-        matrix = pencil.A - (place if place.imag else place.real) * pencil.E
-        singular_values = np.linalg.svd(matrix, compute_uv=False)
-        if singular_values[normal_rank - 1] > BOUNDARY_RANK_TOLERANCE * singular_values[0]:
+        place = place if place.imag else place.real
+        if isinstance(pencil, PencilPoints):
+            smallest = pencil.smallest(place)
+        else:
+            singular_values = np.linalg.svd(pencil.A - place * pencil.E, compute_uv=False)
+            smallest = singular_values[normal_rank - 1] / singular_values[0] if singular_values[0] else 0.0
+        if smallest > BOUNDARY_RANK_TOLERANCE:
             return False
     return True
 
@@ -187,6 +210,10 @@ def _with_directions(E: FloatArray, A: FloatArray, found: FiniteZeros, *, nx: in
 def _kernel(pencil: EquilibratedPencil, value: complex, *, least: int) -> NDArray[Any]:
     """Return an orthonormal null basis of the pencil at ``value``, with ``least`` columns or more."""
     matrix = pencil.A - (value if value.imag else value.real) * pencil.E
+    if matrix.shape[0] >= matrix.shape[1] >= FEW_COLUMNS and least <= MOST_DIRECTIONS:
+        found = smallest_singular(matrix, MOST_DIRECTIONS)
+        count = max(least, int(np.sum(found.values <= RANK_TOLERANCE * found.largest)))
+        return np.asarray(found.right[:, :count])
     _, singular_values, right = np.linalg.svd(matrix)
     kept = int(np.sum(singular_values > RANK_TOLERANCE * singular_values[0])) if singular_values.size else 0
     return np.asarray(right[min(kept, matrix.shape[1] - least) :].conj().T)

@@ -12,6 +12,7 @@ REGISTRY: dict[str, str] = {
     "fault-estimation-filter": "obsynth.methods.fault_estimation_filter.method",
     "pd-observer": "obsynth.methods.pd_observer.method",
     "ui-pi-observer": "obsynth.methods.ui_pi_observer.method",
+    "functional-filter": "obsynth.methods.functional_filter.method",
     "descriptor-kalman": "obsynth.methods.descriptor_kalman.method",
     "adaptive-observer": "obsynth.methods.adaptive_observer.method",
     "dae-adaptive-observer": "obsynth.methods.dae_adaptive_observer.method",

@@ -11,6 +11,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.results.design import Certificate
 
@@ -23,7 +24,7 @@ class Synthesis:
     certificate: Witnesses and claims; solver: Records of the solver runs; notes: What a user should know;
     transformation: What the method did to the plant before it designed for it (such as the elimination of algebraic
     states): the design is then for the transformed plant, with the way back; plant: The plant as the recursive methods
-    see it, where they were given another kind.
+    see it, where they were given another kind; or with the noise that the design is for.
     """
 
     options: Mapping[str, Any]
@@ -33,4 +34,4 @@ class Synthesis:
     solver: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     transformation: Transformation | None = None
-    plant: TimeVaryingDescriptorSystem | None = None
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem | None = None

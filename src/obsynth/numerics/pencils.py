@@ -17,8 +17,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.numerics.pencil_points import PencilPoints
 from obsynth.numerics.ranks import CLUSTER_TOLERANCE, RANK_TOLERANCE, RankDecision
 from obsynth.numerics.scaling import equilibrate_pencil
 from obsynth.numerics.staircase import (
@@ -106,16 +108,32 @@ def finite_zeros(E: FloatArray, A: FloatArray, *, to_the_end: bool = True) -> Fi
     tall = equilibrate_pencil(E, A) if E.shape[0] >= E.shape[1] else equilibrate_pencil(E.T, A.T)
     scales, right = without_infinite_part(tall)
     rows, columns = right.E.shape
-    parts = _SquarePart.of(right.E, right.A) if rows > columns > 0 else None
-    clear = parts is not None and _clearly_without_zeros(parts, scales)
-    if clear and not to_the_end:
+    if not rows > columns > 0:
+        left = without_left_singular_part(right, scales)
+        values = _eigenvalues(left.E, left.A)
+        return FiniteZeros(values, normal_rank_of(right, left), right.decisions + left.decisions)
+    parts = _SquarePart.of(right.E, right.A)
+    candidates, clear = _clearly_no_zeros(parts, scales)
+    if np.all(clear) and not to_the_end:
         # Full rank of the columns everywhere.
         return FiniteZeros(_in_pairs(np.zeros(0, dtype=np.complex128)), sum(right.ranks) + columns, right.decisions)
     left = without_left_singular_part(right, scales)
-    values = _eigenvalues(left.E, left.A)
-    if parts is not None and not clear:
-        values = _with_missed_zeros(values, right.E, right.A, parts, scales)
-    return FiniteZeros(values, normal_rank_of(right, left), right.decisions + left.decisions)
+    found, rank = _eigenvalues(left.E, left.A), normal_rank_of(right, left)
+    decisions = right.decisions + left.decisions
+    if np.all(clear):
+        return FiniteZeros(_in_pairs(found[:0]), sum(right.ranks) + columns, decisions)
+    if rank < sum(right.ranks) + columns:
+        # Singular everywhere: that the pencil is so at a point says nothing.
+        return FiniteZeros(found, rank, decisions)
+    points = PencilPoints(right.E, right.A, scales)
+    kept = _confirmed_zeros(found, points)
+    return FiniteZeros(_with_missed_zeros(kept, candidates[~clear], points), rank, decisions)
+
+
+def _confirmed_zeros(found: ComplexArray, points: PencilPoints) -> ComplexArray:
+    """Return the computed zeros at which the pencil is singular: a staircase on the verge of a rank invents others."""
+    upper = [points.confirmed(complex(value)) for value in found if value.imag >= 0.0]
+    return _in_pairs(np.array([value for value in upper if value is not None], dtype=np.complex128))
 
 
 class _SquarePart(NamedTuple):
@@ -135,9 +153,7 @@ class _SquarePart(NamedTuple):
         return cls(square[:columns], turned[:columns], turned[columns:])
 
 
-def _with_missed_zeros(
-    found: ComplexArray, E: FloatArray, A: FloatArray, parts: _SquarePart, scales: tuple[float, float]
-) -> ComplexArray:
+def _with_missed_zeros(found: ComplexArray, candidates: ComplexArray, points: PencilPoints) -> ComplexArray:
     """Add zeros of a tall pencil, ``E`` of full column rank, that a long staircase lost.
 
     A chain of many steps, each with a modest singular value, may hide that the pencil is singular at
@@ -145,22 +161,21 @@ def _with_missed_zeros(
     these candidates can be tested by itself.
     """
     zeros = list(found)
-    for candidate in _eigenvalues(parts.E, parts.A):
-        values = np.linalg.svd(A - candidate * E, compute_uv=False)
-        nullity = np.sum(values <= RANK_TOLERANCE * (scales[1] + abs(candidate) * scales[0]))
-        if nullity > sum(abs(zero - candidate) <= CLUSTER_TOLERANCE * max(1.0, abs(candidate)) for zero in zeros):
+    for candidate in _in_pairs(candidates):
+        near = sum(abs(zero - candidate) <= CLUSTER_TOLERANCE * max(1.0, abs(candidate)) for zero in zeros)
+        if points.nullity(complex(candidate)) > near:
             zeros.append(candidate)
     return _in_pairs(np.array(zeros, dtype=np.complex128))
 
 
-def _clearly_without_zeros(parts: _SquarePart, scales: tuple[float, float]) -> bool:
-    """Return whether ``[square_a - z square_e; rest]`` clearly has full rank at every z; false says nothing.
+def _clearly_no_zeros(parts: _SquarePart, scales: tuple[float, float]) -> tuple[ComplexArray, NDArray[np.bool_]]:
+    """Return the eigenvalues of the square part, and around which ``[square_a - z square_e; rest]`` has full rank.
 
     Suppose it maps ``x`` of unit norm to no more than t.  Let V hold eigenvectors of the square part, F their residual,
     w_j be the rows of ``(square_e V)^-1``, and ``x = V y``.  Then ``|y_j| <= |w_j| (t + |F| |V^-1|) / |lambda_j - z|``.
     So x is a multiple of the eigenvector v whose lambda is closest to z, but for r, the sum of these over the others,
-    and ``rest`` cannot map it to less than ``|rest v| (1 - r) - |rest| r``.  Where that is more than t for every v,
-    there is no z left to look at.  Ill-conditioned eigenvectors and close eigenvalues leave the question open.
+    and ``rest`` cannot map it to less than ``|rest v| (1 - r) - |rest| r``.  Where that is more than t for a v, no
+    zero is closest to its lambda.  Ill-conditioned eigenvectors and close eigenvalues leave the question open.
     """
     square_e, square_a, rest = parts
     # What overflows is not clear.
@@ -170,7 +185,7 @@ def _clearly_without_zeros(parts: _SquarePart, scales: tuple[float, float]) -> b
             weights = np.linalg.norm(np.linalg.inv(square_e @ vectors), axis=1)
             spread = float(np.linalg.norm(np.linalg.inv(vectors)))
         except np.linalg.LinAlgError:
-            return False
+            return _candidates(parts)
         residual = float(np.linalg.norm(square_a @ vectors - square_e @ vectors * values))
         tolerances = RANK_TOLERANCE * (scales[1] + np.abs(values) * scales[0])
         apart = np.abs(values - values[:, None])
@@ -178,7 +193,18 @@ def _clearly_without_zeros(parts: _SquarePart, scales: tuple[float, float]) -> b
         # Closest to lambda_i means up to half way to the others.
         away = (tolerances + residual * spread) * np.sum(2.0 * weights / apart, axis=1)
         least = np.linalg.norm(rest @ vectors, axis=0) * (1.0 - away) - float(np.linalg.norm(rest)) * away
-    return bool(np.all(away < 1.0) and np.all(least > 2.0 * tolerances))
+        clear = np.asarray((away < 1.0) & (least > 2.0 * tolerances))
+    if not np.all(clear) and _safe_inverse(square_e) is None:
+        return _candidates(parts)
+    pairs = np.flatnonzero(values.imag > 0.0)
+    clear[pairs] &= clear[pairs + 1]
+    return np.asarray(values, dtype=np.complex128), clear
+
+
+def _candidates(parts: _SquarePart) -> tuple[ComplexArray, NDArray[np.bool_]]:
+    """Return the eigenvalues of the square part by QZ, none of them clear: its E may be nearly singular."""
+    values = _eigenvalues(parts.E, parts.A)
+    return values, np.zeros(len(values), dtype=bool)
 
 
 def regularity(E: FloatArray, A: FloatArray) -> tuple[bool, int]:

@@ -47,6 +47,7 @@ KINDS: Mapping[str, Any] = {
     "text": Text | None,
     "texts": Annotated[list[Text], Field(min_length=1)] | None,
     "fault model": Text | dict[Text, Any],
+    "fault sets": Text | list[Text | list[Text]] | None,
     "poles": list[float | Two] | None,
     "pole region": PoleRegion | None,
     "noise weights": NoiseSection | None,

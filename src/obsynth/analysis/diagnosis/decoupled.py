@@ -14,6 +14,9 @@ from obsynth.numerics.arrays import ComplexArray, FloatArray, read_only
 from obsynth.numerics.ranks import CLEAR_GAP, RankDecision
 from obsynth.plants.descriptor import DescriptorSystem
 
+#: Entries of unit rows below this are rounding of the orthogonal transformations that made them.
+ROUNDING = 1e-14
+
 
 @dataclass(frozen=True, eq=False)
 class DecoupledPlant:
@@ -169,7 +172,8 @@ def decoupled(plant: DescriptorSystem, removed: Sequence[int], kept: Sequence[in
     found = left_part(
         units.rows[:, None] * pencil_e * units.columns * units.time, units.rows[:, None] * pencil_a * units.columns
     )
-    rows = found.left * units.rows
+    # Rows of the orthogonal reduction have unit length: what is below rounding is nothing.
+    rows = np.where(np.abs(found.left) > ROUNDING, found.left, 0.0) * units.rows
     faults = np.vstack([plant.Bf, plant.Df])[:, list(kept)]
     k = found.order
     parts = {

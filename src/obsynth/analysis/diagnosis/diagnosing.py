@@ -17,7 +17,8 @@ from obsynth.numerics.arguments import is_finite_number, require_kind
 from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.threads import one_thread_if_small
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.exosystems import exosystem
+from obsynth.plants.exosystems import Exosystem, exosystem
+from obsynth.plants.fault_model_spectra import stated_eigenvalues
 
 #: Zeros that are named in a sentence; the others are counted.
 MOST_ZEROS = 4
@@ -77,7 +78,7 @@ def diagnose(
         shown = [Question(plant, (), i, exactly) for i in range(plant.nf)]
         free = [Question(plant, _others(plant, i), i, exactly) for i in range(plant.nf)]
         faults = tuple(
-            _verdict(plant, own, alone, frequencies, _modes(model, i), suggest=suggest)
+            _verdict(plant, own, alone, frequencies, model_points(model, i), suggest=suggest)
             for i, (own, alone) in enumerate(zip(shown, free, strict=True))
         )
         report_stage("telling faults from each other")
@@ -98,13 +99,13 @@ def _others(plant: DescriptorSystem, fault: int) -> tuple[int, ...]:
     return tuple(j for j in range(plant.nf) if j != fault)
 
 
-def _modes(model: Any, fault: int) -> list[complex]:
+def model_points(model: Exosystem, fault: int) -> list[complex]:
     """Return the eigenvalues of the part of the exosystem that a fault is made of."""
     reached = model.Cw[fault] != 0.0
     for _ in range(len(reached)):
         reached = reached | np.any(model.Phi[reached] != 0.0, axis=0)
     part = model.Phi[np.ix_(reached, reached)]
-    return [complex(value) for value in np.linalg.eigvals(part)] if part.size else []
+    return [complex(value) for value in stated_eigenvalues(part)] if part.size else []
 
 
 def _point(plant: DescriptorSystem, frequency: float) -> complex:

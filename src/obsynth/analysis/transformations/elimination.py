@@ -107,7 +107,11 @@ def _without_idle_variables(plant: DescriptorSystem, refusal: PreconditionError)
         said = f" Equations {equations} do not determine {', '.join(map(repr, variables))}." if variables else ""
         raise PreconditionError(f"{refusal}{said}", condition=refusal.condition, signals=variables) from refusal
     part = active_part(plant, active)
-    found = eliminated_exactly(part) or _eliminated_densely(part, _dynamic_count(part))
+    try:
+        found = eliminated_exactly(part) or _eliminated_densely(part, _dynamic_count(part))
+    except PreconditionError:
+        # It did not help: what is wrong with the plant as written is what a user can mend.
+        raise refusal from None
     return replace(
         found, source=plant, description=_description(part, found.plant.nx, active.dropped), dropped=active.dropped,
         notes=(active.note(),),

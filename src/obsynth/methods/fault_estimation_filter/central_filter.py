@@ -33,6 +33,13 @@ LEVEL_FACTORS = (1.0, 1.5)
 #: Above so many states the higher level, which makes gains up to a quarter smaller, would cost up to half of the time.
 MOST_STATES_FOR_LEVELS = 200
 WEIGHT_STEPS = 4
+#: A disturbance that does less than this share of what it does to the starting filter is decoupled; the level at which
+#: such a filter is looked for, relative to the same; a point without meaning; and the share of rows xi that counts as
+#: nothing.
+DECOUPLED_GAIN = 1e-7
+DECOUPLING_LEVEL = 1e-4
+GENERIC_POINT = 1.3247
+SAME_ROWS = 1e-8
 #: A level this far above anything a disturbance could do is no limit.
 WITHOUT_LIMIT = 1e4
 
@@ -71,6 +78,8 @@ def search_central_filter(
         tolerance = LEVEL_TOLERANCE if problem.order <= FEW_STATES else COARSE_LEVEL_TOLERANCE
     best, gain = start, problem.achieved_gain(start) if gain is None else gain
     low, most_noise = least_level(problem), np.inf
+    if low <= DECOUPLED_GAIN * gain and (decoupled := _decoupling_filter(problem, gain)) is not None:
+        return decoupled
     for noise in NOISES if problem.order <= FEW_STATES else COARSE_NOISES:
         if gain <= low * (1.0 + 2.0 * tolerance):
             break
@@ -92,6 +101,30 @@ def search_central_filter(
         if reached < gain:
             best, gain = injection, reached
     return best, gain
+
+
+def _decoupling_filter(problem: GainProblem, gain: float) -> tuple[Injection, float] | None:
+    """Return a filter that no disturbance reaches, and its gain, from one solution; ``None`` where there is none.
+
+    It exists only if what xi shows follows from the measurements at almost every point, whatever the disturbance does.
+    """
+    if not _follows_from_measurements(problem):
+        return None
+    found = central_injection(problem, DECOUPLING_LEVEL * gain, noise=NOISES[0])
+    reached = np.inf if found is None else problem.achieved_gain(found)
+    return (found, reached) if found is not None and reached <= DECOUPLED_GAIN * gain else None
+
+
+def _follows_from_measurements(problem: GainProblem) -> bool:
+    """Whether the rows of xi are combinations of those of state and measurements, at a point without meaning."""
+    shifted = problem.A - GENERIC_POINT * np.eye(problem.order)
+    known = np.vstack([np.hstack([shifted, problem.B]), np.hstack([problem.C, problem.D])])
+    wanted = np.hstack([problem.Z, problem.Zd])
+    from scipy.linalg import lstsq
+
+    solved = lstsq(known.T, wanted.T, lapack_driver="gelsy", check_finite=False)[0]
+    left = float(np.linalg.norm(known.T @ solved - wanted.T))
+    return left <= SAME_ROWS * float(np.linalg.norm(wanted))
 
 
 def least_level(problem: GainProblem) -> float:

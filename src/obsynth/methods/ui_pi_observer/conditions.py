@@ -22,10 +22,9 @@ import numpy as np
 from obsynth.analysis.conditions import Condition
 from obsynth.analysis.existence.numbers import numbers_of
 from obsynth.analysis.existence.verdicts import described_distance, in_own_time, unclear_detail, zero_verdict
-from obsynth.analysis.far_zeros import system_zeros
 from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.transformations import Transformation
-from obsynth.analysis.zeros import Zero, are_outside, invariant_zeros, leading_names, zero_at
+from obsynth.analysis.zeros import Zero, leading_names, zero_at, zeros_of_system
 from obsynth.methods.ui_pi_observer.augmented_plant import AugmentedPlant
 from obsynth.methods.ui_pi_observer.decoupling_condition import (
     SOURCE,
@@ -150,13 +149,10 @@ def _hidden_trajectories(rank: int, full: int) -> Condition:
 
 def _zero_condition_in_floating_point(plant: DescriptorSystem, units: PlantUnits) -> Condition:
     inputs, direct = independent_disturbances(plant)
-    wide_e, wide_a = system_pencil(plant.E, plant.A, inputs, plant.C, direct)
-    found = system_zeros(wide_e, wide_a, nx=plant.nx)
-    full = wide_e.shape[1]
+    found, zeros, outside = zeros_of_system(plant.E, plant.A, inputs, plant.C, direct, dt=plant.dt)
+    full = plant.nx + inputs.shape[1]
     if found.normal_rank < full:
         return _hidden_trajectories(found.normal_rank, full)
-    zeros = invariant_zeros(plant.E, plant.A, inputs, plant.C, direct)
-    outside = [zero for zero, out in zip(zeros, are_outside(wide_e, wide_a, found, plant.dt), strict=True) if out]
     if outside:
         worst = max(outside, key=lambda zero: instability(zero.value, plant.dt))
         return _zero_failure(plant, units, worst, inputs, direct)

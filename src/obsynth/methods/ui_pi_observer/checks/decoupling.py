@@ -60,7 +60,7 @@ def decoupling_norm(plant: DescriptorSystem, observer: LinearObserver) -> Decoup
     scaled = units.scaled_plant(plant)
     points = boundary_points(frequencies * (1.0 if units.discrete else units.time), scaled.dt)
     pencils = [np.hstack([point * scaled.E - scaled.A, -scaled.Bd]) for point in points]
-    moved = [_trajectories(pencil) for pencil in pencils]
+    moved = [trajectories_at(pencil) for pencil in pencils]
     # How many trajectories there are at almost every frequency: where there seem to be more, rounding hides the rest.
     count = min(nullity for _, nullity in moved)
     worst = DecouplingNorm(0.0, 0.0, 0.0)
@@ -79,7 +79,7 @@ def decoupling_norm(plant: DescriptorSystem, observer: LinearObserver) -> Decoup
     return worst
 
 
-def _trajectories(pencil: ComplexArray) -> tuple[ComplexArray, int]:
+def trajectories_at(pencil: ComplexArray) -> tuple[ComplexArray, int]:
     """Return the right singular vectors ``(n, n)``, least singular value last, and how many are null vectors.
 
     Equations and signals are scaled by powers of two first: fast and slow ones meet at every frequency.

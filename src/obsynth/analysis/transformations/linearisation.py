@@ -1,0 +1,204 @@
+"""From equations to matrices: exact linear models of nonlinear plants at rest, or at a point of a motion."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from obsynth.analysis.transformations.equations_at_a_point import LocalEquations, local_equations
+from obsynth.analysis.transformations.equilibrium import Point, consistent_point, equilibrium, nominal_point
+from obsynth.errors import PreconditionError, SpecError
+from obsynth.numerics.arguments import require_kind
+from obsynth.numerics.arrays import FloatArray
+from obsynth.plants.dae.model import DAEModel
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.names import index_of
+
+#: What E x' may be, in sizes of its row, where a point counts as resting.
+MOVING = 1e-9
+#: Input of a linear model at a moving point: it is one, always.
+DRIFT = "drift"
+
+
+def linearise(
+    model: DAEModel,
+    *,
+    at: str = "equilibrium",
+    given: Mapping[str, float] | None = None,
+    free: Sequence[str] | Mapping[str, tuple[float, float]] = (),
+    faults: Sequence[str] | None = None,
+    disturbances: Sequence[str] = (),
+    start: Mapping[str, float] | None = None,
+    drift: bool = False,
+) -> DescriptorSystem:
+    r"""Linearise a nonlinear plant: exact Jacobians, names, units and operating point.
+
+    With ``F(d/dt q(x, theta), x, u, theta) = 0`` and ``G(x', x, u, theta) = F(q_x x', x, u, theta)``
+
+    .. math::
+        E = G_{x'}, \quad A = -G_x, \quad B = -G_u, \quad B_f = -G_\theta, \quad C = h_x, \quad D_f = h_\theta .
+
+    Parameters
+    ----------
+    model : DAEModel
+        ``nx`` states, ``nu`` inputs, ``ny`` outputs, ``nq`` parameters.
+    at : {"equilibrium", "point"}, optional
+        Where nothing moves, found from what is given; or the point that is given, nominal where nothing is said, with
+        the algebraic states solved for.
+    given : mapping, optional
+        Values of states, inputs, parameters and (at an equilibrium) outputs, in their units.  Inputs and parameters
+        that are not given have their nominal values; states are unknown.
+    free : list of str, or mapping of str to (low, high), optional
+        Inputs and parameters that are solved for at an equilibrium, with the bounds they must keep.
+    faults : list of str, optional
+        Parameters that become faults ``Bf (nx, nf)``, ``Df (ny, nf)``: deviations from their values at the point; all
+        by default.  Where a derivative is taken of something that contains one, the columns hold while its deviation
+        is constant.
+    disturbances : list of str, optional
+        Inputs that are not known: they become ``Bd (nx, nd)``.
+    start : mapping, optional
+        Where the search for an equilibrium begins: states by name; nominal values by default.
+    drift : bool, optional
+        Whether a point that moves is taken: its motion becomes an input ``drift``, which is 1 in every row.
+
+    Returns
+    -------
+    DescriptorSystem
+        Continuous in time, in deviations from ``operating_point``.  A state whose name an output has, with another
+        value, is called ``"... (state)"``.
+
+    Raises
+    ------
+    SpecError
+        A name is unknown, a value is no finite number, or an output is given for a point.
+    PreconditionError
+        ``no-equilibrium``: nothing satisfies the equations at rest; the combination of equations that no unknown
+        changes is named.  ``equilibrium-not-unique``: the direction that nothing determines is named.
+        ``outside-bounds``: what is free would leave its bounds.  ``no-consistent-point``: no derivatives satisfy the
+        equations at the point.
+
+    Examples
+    --------
+    >>> tank = DAEModel(
+    ...     {"balance": "2.0 * der(level) = inflow - c * sqrt(level)"}, {"seen": "level"}, states={"level": 1.0},
+    ...     inputs={"inflow": 0.5}, parameters={"c": 0.5},
+    ...     units={"level": "m", "inflow": "m3/s", "c": "m2.5/s", "seen": "m"},
+    ... )
+    >>> linear = linearise(tank, given={"level": 4.0}, free=["inflow"])
+    >>> float(linear.operating_point["inflow"]), linear.A.tolist()
+    (1.0, [[-0.125]])
+
+    References
+    ----------
+    .. [CampbellLinearisation1995] S. L. Campbell, "Linearization of DAEs along trajectories", ZAMP 46, 1995; at a
+       moving point we keep E x' as an input, which is exact to first order.
+    """
+    require_kind(model, DAEModel, "model", "a DAEModel")
+    if at not in ("equilibrium", "point"):
+        raise SpecError(f"at is {at!r}: use 'equilibrium' or 'point'.", path="at")
+    values, freed = dict(given or {}), _names(free, "free")
+    if at == "equilibrium":
+        point = equilibrium(model, values, freed, start)
+        _require_bounds(model, point, free)
+    else:
+        if freed or start:
+            raise SpecError("free and start belong to an equilibrium: at a point, give every value.", path="free")
+        wrong = [name for name in values if name in model.output_names and not _is_state_or_input(model, name)]
+        if wrong:
+            raise SpecError(
+                f"The output {wrong[0]!r} cannot be given at a point: give states.", path=f"given.{wrong[0]}"
+            )
+        point = consistent_point(model, nominal_point(model, values), values)
+    return linear_model(model, point, faults=faults, disturbances=disturbances, drift=drift)
+
+
+def linear_model(
+    model: DAEModel, point: Point, *, faults: Sequence[str] | None, disturbances: Sequence[str], drift: bool
+) -> DescriptorSystem:
+    """Return the linear model at a point that satisfies the equations."""
+    local = local_equations(model, point.rates, point.x, point.u, point.theta)
+    if not local.is_defined:
+        raise PreconditionError("The derivatives of the model are not finite at the point: move it.",
+                                condition="not-differentiable", signals=list(model.equation_names))  # fmt: skip
+    motion = local.E @ point.rates
+    moves = np.abs(motion) > MOVING * np.maximum(np.abs(local.by_state) @ model.state_scales, np.abs(motion).min())
+    if moves.any() and not drift:
+        raise _moving(model, motion, moves)
+    chosen = model.parameter_names if faults is None else _names(faults, "faults")
+    fault_columns = [index_of(name, model.parameter_names, what="faults") for name in chosen]
+    unknown = [index_of(name, model.input_names, what="disturbances") for name in _names(disturbances, "disturbances")]
+    known = [i for i in range(model.nu) if i not in unknown]
+    inputs, B = [model.input_names[i] for i in known], -local.by_input[:, known]
+    if moves.any():
+        inputs, B = [*inputs, DRIFT], np.column_stack([B, motion])
+    names = [_state_name(model, i, point, local) for i in range(model.nx)]
+    values = _operating_point(model, point, local, names) | ({DRIFT: 0.0} if moves.any() else {})
+    signals = {*names, *inputs, *model.output_names, *chosen, *disturbances}
+    units = {name: unit for name, unit in model.units.items() if name in signals}
+    units |= {name: model.units[given] for name, given in zip(names, model.state_names, strict=True)}
+    return DescriptorSystem(
+        local.E, -local.by_state, B if inputs else None, local.C, dt=0.0,
+        Bf=-local.by_parameter[:, fault_columns] if fault_columns else None,
+        Df=local.outputs_by_parameter[:, fault_columns] if fault_columns else None,
+        Bd=-local.by_input[:, unknown] if unknown else None,
+        state_names=names, input_names=inputs or None, output_names=list(model.output_names),
+        fault_names=list(chosen) or None, disturbance_names=list(disturbances) or None, units=units,
+        operating_point={name: value for name, value in values.items() if name in signals},
+    )  # fmt: skip
+
+
+def _state_name(model: DAEModel, i: int, point: Point, local: LocalEquations) -> str:
+    """Return a state's name, which must not be that of an output with another value."""
+    name = model.state_names[i]
+    if name in model.output_names and local.y[model.output_names.index(name)] != point.x[i]:
+        return f"{name} (state)"
+    return name
+
+
+def _operating_point(model: DAEModel, point: Point, local: LocalEquations, names: Sequence[str]) -> dict[str, float]:
+    found: dict[str, FloatArray] = {}
+    for signals, values in ((model.parameter_names, point.theta), (model.input_names, point.u), (names, point.x),
+                            (model.output_names, local.y)):  # fmt: skip
+        found |= dict(zip(signals, values, strict=True))
+    return {name: float(value) for name, value in found.items()}
+
+
+def _is_state_or_input(model: DAEModel, name: str) -> bool:
+    return name in (*model.state_names, *model.input_names, *model.parameter_names)
+
+
+def _names(value: Sequence[str] | Mapping[str, tuple[float, float]], what: str) -> list[str]:
+    if isinstance(value, str):
+        raise SpecError(f"{what} is the text {value!r}: give a list of names.", path=what)
+    return list(value)
+
+
+def _require_bounds(model: DAEModel, point: Point, free: Sequence[str] | Mapping[str, tuple[float, float]]) -> None:
+    if not isinstance(free, Mapping):
+        return
+    values = dict(zip(model.input_names, point.u, strict=True)) | dict(
+        zip(model.parameter_names, point.theta, strict=True)
+    )
+    outside = []
+    for name, bounds in free.items():
+        if np.shape(bounds) != (2,) or not float(bounds[0]) <= float(bounds[1]):
+            raise SpecError(f"free.{name} must be [low, high].", path=f"free.{name}")
+        low, high = map(float, bounds)
+        if not low <= values[name] <= high:
+            outside.append((name, f"{name} = {values[name]:.6g} is outside [{low:g}, {high:g}]"))
+    if outside:
+        raise PreconditionError(
+            f"The equilibrium is not admissible: {'; '.join(text for _, text in outside)}. Give other values, or free "
+            "something else.", condition="outside-bounds", signals=[name for name, _ in outside],
+        )  # fmt: skip
+
+
+def _moving(model: DAEModel, motion: FloatArray, moves: FloatArray) -> PreconditionError:
+    names = [name for name, moving in zip(model.equation_names, moves, strict=True) if moving]
+    told = ", ".join(f"{name}: {value:.4g}" for name, value, moving in
+                     zip(model.equation_names, motion, moves, strict=True) if moving)  # fmt: skip
+    return PreconditionError(
+        f"The point moves: E x' = ({told}), so that it is no equilibrium. With drift=True this motion becomes an input "
+        f"{DRIFT!r}, which is 1 in every row.", condition="no-equilibrium", signals=names,
+    )  # fmt: skip

@@ -1,0 +1,176 @@
+"""Fitting a model's constants and noise to a log: the public function, and the order in which it asks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from obsynth.calibration.innovations_fit import Timing, chosen_timing, innovations_fit
+from obsynth.calibration.integration_choice import IntegrationError, integration_error
+from obsynth.calibration.logs import LogData, read_log
+from obsynth.calibration.problem import Problem, calibration_problem, require_variation
+from obsynth.calibration.reporting import reported
+from obsynth.calibration.result import Calibration
+from obsynth.calibration.simulation_error import Fit, SimulationError, simulation_fits
+from obsynth.errors import SolverError, SpecError
+from obsynth.numerics.arguments import require_kind
+from obsynth.plants.dae.model import DAEModel
+
+METHODS = ("innovations", "simulation")
+INTEGRATIONS = ("auto", "backward-euler", "radau")
+
+
+def calibrate(
+    model: DAEModel,
+    log: LogData,
+    unknown: Mapping[str, Sequence[float]],
+    *,
+    priors: Mapping[str, Sequence[float]] | None = None,
+    noisy: Sequence[str] | None = None,
+    R: Mapping[str, float | None] | None = None,
+    Q: Mapping[str, float | None] | None = None,
+    initial_state: ArrayLike | Mapping[str, float] | None = None,
+    initial_covariance: ArrayLike | Mapping[str, float] | None = None,
+    rows: str | slice | Sequence[int] | None = None,
+    columns: Mapping[str, str] | None = None,
+    scales: Mapping[str, float] | None = None,
+    dt: float | None = None,
+    input_delay: int | str = "auto",
+    method: str = "innovations",
+    integration: str = "auto",
+    substeps: int = 1,
+    level: float = 0.95,
+    starts: int = 3,
+    seed: int = 0,
+    progress: Callable[[str], object] | None = None,
+) -> Calibration:
+    r"""Fit constants and noise covariances of a nonlinear plant to a log of rows without faults.
+
+    The start is a least-squares fit of simulations.  Then the likelihood of the innovations is made greatest,
+
+    .. math::
+        -\log p = \tfrac12 \sum_k e_k^T S_k^{-1} e_k + \log\det 2 \pi S_k , \qquad
+        S_k = H_k P_k^- H_k^T + R ,
+
+    over constants, Q and R, by the recursion that the observers run, with exact gradients.
+
+    Parameters
+    ----------
+    model : DAEModel
+        ``nx`` states, ``nu`` inputs, ``ny`` outputs.
+    log : path, pandas.DataFrame or mapping
+        CSV or Parquet file, or columns by name: ``time`` in seconds, every input and every output; NaN where an output
+        is missing.
+    unknown : mapping of str to (low, high)
+        Constants and parameters that are to be found, with finite bounds around their nominal values.
+    priors : mapping of str to (mean, deviation), optional
+        What is known of them besides, as normal distributions.
+    noisy : list of str, optional
+        Equations to whose right sides noise is added in each step; all by default.
+    R, Q : mapping of str to float, optional
+        Variances that are known, by sensor and by noisy equation; the others are found.
+    initial_state : array_like or mapping, optional
+        ``(nx,)``, or values by name; nominal values by default.
+    initial_covariance : array_like or mapping, optional
+        ``(nx, nx)``, one variance, or variances by name; deviations of 10 % of the nominal sizes by default.
+    rows : str, slice or pair, optional
+        ``"a:b"``: the rows that are free of faults, as Python counts; all by default.
+    columns : mapping of str to str, optional
+        Column of a signal, or of ``time``, where the names differ.
+    scales : mapping of str to float, optional
+        What a column is multiplied by to be in the signal's unit.
+    dt : float, optional
+        Seconds between rows; the median of the stamps by default.
+    input_delay : int or "auto", optional
+        Rows by which the log's inputs act later than the convention says, ``u(k)`` during the step that ends at k.
+        ``"auto"`` takes 1 where the likelihood is clearly better: a log that writes what is sent at k.
+    method : {"innovations", "simulation"}, optional
+        The second one stops at the fit of simulations, whose boxes are too small where its residuals are not white.
+    integration : {"auto", "backward-euler", "radau"}, optional
+        ``"auto"`` takes backward Euler unless its error of one step exceeds a quarter of a sensor's deviation.
+    substeps : int, optional
+        Steps in a sample.
+    level : float, optional
+        Probability of the box, for all constants at once.
+    starts : int, optional
+        Fits of simulations, from the nominal constants and from random ones.
+    seed : int, optional
+        Of those.
+    progress : callable, optional
+        Called with the name of each stage.
+
+    Returns
+    -------
+    Calibration
+        Nominal values, box, undetermined directions, Q and R, checks of the innovations, and a verdict.
+
+    Raises
+    ------
+    SpecError
+        A name, a bound or an option is wrong; or the log is (``code``: ``irregular``, ``time``, ``nan``,
+        ``too-short``).
+    PreconditionError
+        ``not-exciting``: nothing moves.  ``explains-nothing``: the model cannot follow the log, for example as units
+        are off by 1000.  ``cannot-simulate``: it has no solution along the log's inputs.
+
+    References
+    ----------
+    .. [Ljung1999] L. Ljung, System Identification, 2nd ed., 1999, 7.2 and 10.1: prediction errors and their gradients.
+    .. [Chung2013] Y. Chung et al., "A nondegenerate penalized likelihood estimator for variance parameters",
+       Psychometrika 78, 2013: the weight that keeps variances from zero, which we give only to those that the log
+       cannot tell from it.
+    """
+    require_kind(model, DAEModel, "model", "a DAEModel")
+    _check_options(method, integration, level, starts, input_delay)
+    note = progress or (lambda text: None)
+    whole = read_log(log, model.input_names, model.output_names, rows=rows, columns=columns, scales=scales, dt=dt)
+    whole = whole.shifted(input_delay) if isinstance(input_delay, int) else whole
+    problem = calibration_problem(
+        model, whole, unknown=unknown, priors=priors, noisy=noisy, Q=Q, R=R, initial_state=initial_state,
+        initial_covariance=initial_covariance, substeps=substeps,
+        integration="backward-euler" if integration == "auto" else integration,
+    )  # fmt: skip
+    require_variation(problem)
+    fits = simulation_fits(problem, starts, seed, note)
+    error = None
+    if integration == "auto":
+        error = _step_error(problem, fits[0])
+        if error is not None and error.matters:
+            note("integrating by Radau")
+            problem = problem.integrated("radau", substeps)
+            fits = simulation_fits(problem, starts, seed, note)
+    timing = Timing(input_delay if isinstance(input_delay, int) else 0, {})
+    if method == "innovations" and input_delay == "auto" and model.nu:
+        problem, fits, timing = chosen_timing(problem, fits, seed, note)
+    fit = innovations_fit(problem, fits, level, note) if method == "innovations" else None
+    return reported(problem, fits[0], fit, level=level, timing=timing, error=error)
+
+
+def _step_error(problem: Problem, fit: Fit) -> IntegrationError | None:
+    """Return what backward Euler errs along the best simulation; nothing where it cannot be told."""
+    error = SimulationError(problem)
+    states = error.states(fit)
+    theta = np.array(problem.model.nominal_parameters)
+    for name, value in zip(problem.unknown, fit.t, strict=True):
+        theta[problem.model.parameter_names.index(name)] = value
+    try:
+        return integration_error(problem.model, states, problem.u, theta, fit.deviations, problem.log.dt)
+    except SolverError:
+        # Where Radau has no solution there is nothing to choose.
+        return None
+
+
+def _check_options(method: Any, integration: Any, level: Any, starts: Any, input_delay: Any) -> None:
+    if method not in METHODS:
+        raise SpecError(f"method is {method!r}: use one of {', '.join(METHODS)}.", path="method")
+    if integration not in INTEGRATIONS:
+        raise SpecError(f"integration is {integration!r}: use one of {', '.join(INTEGRATIONS)}.", path="integration")
+    if not isinstance(level, (int, float)) or not 0.0 < level < 1.0:
+        raise SpecError(f"level is {level!r}: give a probability, such as 0.95.", path="level")
+    if not isinstance(starts, int) or isinstance(starts, bool) or starts < 1:
+        raise SpecError(f"starts is {starts!r}: give a whole number, at least 1.", path="starts")
+    if input_delay != "auto" and (not isinstance(input_delay, int) or isinstance(input_delay, bool)):
+        raise SpecError(f"input_delay is {input_delay!r}: give whole rows, or 'auto'.", path="input_delay")

@@ -1,0 +1,87 @@
+"""What whitened innovations say of a model: their size, whether they are white, and whether their mean changes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from obsynth.numerics.arrays import FloatArray
+
+#: Lags of the whiteness test, and their least number of rows each.
+LAGS, ROWS_PER_LAG = 10, 5
+#: A test fails below this probability.
+SIGNIFICANT = 0.01
+#: A change of the mean is told above this confidence, shared by all rows at which it may be.
+CHANGE_CONFIDENCE = 0.999
+#: Rows at both ends between which a change is looked for, and how many there must be at all.
+CHANGE_MARGIN, LEAST_ROWS = 5, 20
+
+
+@dataclass(frozen=True)
+class Whiteness:
+    """Ljung and Box: statistic, its probability for white noise, and the first autocorrelation."""
+
+    statistic: float
+    probability: float
+    first: float
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """Normalised innovations squared per degree of freedom, with the interval of ``level`` for a true model."""
+
+    value: float
+    low: float
+    high: float
+    samples: int
+
+    @property
+    def holds(self) -> bool:
+        """Whether the value is in its interval."""
+        return self.low <= self.value <= self.high
+
+
+def consistency(whitened: FloatArray, seen: Any, *, level: float = 0.95) -> Consistency:
+    """Return the mean square of whitened innovations where they were seen, with its chi-square interval."""
+    from scipy.stats import chi2
+
+    count = int(np.sum(seen))
+    if not count:
+        return Consistency(float("nan"), 0.0, float("inf"), 0)
+    share = (1.0 - level) / 2.0
+    low, high = chi2.ppf([share, 1.0 - share], count) / count
+    return Consistency(float((whitened[seen] ** 2).sum() / count), float(low), float(high), count)
+
+
+def whiteness(column: FloatArray) -> Whiteness:
+    """Return the test of Ljung and Box of a column, NaN left out."""
+    from scipy.stats import chi2
+
+    e = column[np.isfinite(column)]
+    n = len(e)
+    lags = max(1, min(LAGS, n // ROWS_PER_LAG))
+    e = e - (e.mean() if n else 0.0)
+    power = float(e @ e)
+    if n <= lags + 1 or power == 0.0:
+        return Whiteness(0.0, 1.0, 0.0)
+    r = np.array([float(e[lag:] @ e[:-lag]) / power for lag in range(1, lags + 1)])
+    statistic = float(n * (n + 2.0) * (r**2 / (n - np.arange(1, lags + 1))).sum())
+    return Whiteness(statistic, float(chi2.sf(statistic, lags)), float(r[0]))
+
+
+def change_of_mean(whitened: FloatArray, *, confidence: float = CHANGE_CONFIDENCE) -> int | None:
+    """Return the row where the mean of whitened innovations ``(n, ny)`` changes: the likeliest split, or none."""
+    from scipy.stats import chi2
+
+    w = np.nan_to_num(whitened)
+    n, m = w.shape
+    if n < LEAST_ROWS:
+        return None
+    total = np.cumsum(w, axis=0)
+    k = np.arange(CHANGE_MARGIN, n - CHANGE_MARGIN)
+    before, after = total[k - 1] / k[:, None], (total[-1] - total[k - 1]) / (n - k)[:, None]
+    statistic = ((before - after) ** 2).sum(axis=1) * k * (n - k) / n / max(float((w**2).mean()), 1.0)
+    limit = chi2.ppf(1.0 - (1.0 - confidence) / n, m)
+    return int(k[int(np.argmax(statistic))]) if statistic.max() > limit else None

@@ -1,0 +1,117 @@
+"""The likelihood's maximum with everything that is read off it: boxes, directions, limits of variances, timing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.calibration.intervals import Information, Side, information, profile_box, quantile, upper_limit
+from obsynth.calibration.maximum import (
+    Maximum,
+    Objective,
+    at_bounds,
+    collapsed,
+    descent,
+    greatest_likelihood,
+    without_collapse,
+)
+from obsynth.calibration.problem import Problem
+from obsynth.calibration.simulation_error import Fit, simulation_fits
+from obsynth.numerics.arrays import FloatArray
+
+BoolArray = NDArray[np.bool_]
+
+#: Nats by which another timing of the inputs must be better to be taken: a likelihood ratio of about 150.
+TIMING_NATS = 5.0
+#: A likeliest variance below this share of its upper limit counts as zero.
+ZERO_SHARE = 0.01
+#: Rows by which the inputs are tried later; only the positive one is ever taken.
+TRIED_DELAYS = (-1, 1)
+
+
+@dataclass(frozen=True, eq=False)
+class Timing:
+    """Rows by which the inputs are taken later, and the loss of each in nats."""
+
+    delay: int
+    losses: Mapping[int, float]
+
+
+@dataclass(frozen=True, eq=False)
+class InnovationsFit:
+    """Constants ``(nt,)``, their information and box, variances by equation and sensor, and what the filter said."""
+
+    t: FloatArray
+    value: float
+    information: Information
+    sides: list[tuple[Side, Side]]
+    Q: FloatArray
+    R: FloatArray
+    limited_Q: BoolArray
+    limited_R: BoolArray
+    at_bounds: BoolArray
+    whitened: FloatArray
+    innovations: FloatArray
+    variances: FloatArray
+
+
+def chosen_timing(
+    problem: Problem, fits: list[Fit], seed: int, note: Callable[[str], object]
+) -> tuple[Problem, list[Fit], Timing]:
+    """Return the problem with the inputs as the likelihood wants them."""
+    objective = Objective(problem, fits[0])
+    value, z = descent(objective, objective.start(fits[0].t), objective.low, objective.high, objective.scale)
+    values = {0: value}
+    for delay in TRIED_DELAYS:
+        note(f"inputs {delay:+d} row")
+        moved = Objective(problem.with_log(problem.log.shifted(delay)), fits[0])
+        values[delay] = descent(moved, np.clip(z, moved.low, moved.high), moved.low, moved.high, moved.scale)[0]
+    best = min(values.values())
+    delay = 1 if values[0] - values[1] > TIMING_NATS and values[1] == best else 0
+    losses = {rows: found - best for rows, found in sorted(values.items())}
+    if delay:
+        problem = problem.with_log(problem.log.shifted(delay))
+        fits = simulation_fits(problem, 1, seed, note, start=fits[0].t)
+    return problem, fits, Timing(delay, losses)
+
+
+def innovations_fit(problem: Problem, fits: list[Fit], level: float, note: Callable[[str], object]) -> InnovationsFit:
+    """Return the fit of the innovations, from fits of the simulation."""
+    objective = Objective(problem, fits[0])
+    maximum = greatest_likelihood(objective, fits, note)
+    found = information(maximum.hessian, objective, maximum.z)
+    if not found.undetermined:
+        # Along a direction that the log leaves open the weight of a variance would only lead the constants away.
+        maximum = without_collapse(objective, maximum, note)
+        found = information(maximum.hessian, objective, maximum.z)
+    variances = int((objective.is_q | objective.is_r).sum())
+    root = quantile(level, objective.nt, problem.log.samples, variances)
+    note("boxes by profile likelihood")
+    sides = profile_box(objective, maximum, root)
+    Q, R = objective.noise(maximum.z)
+    limited, limits = _limits(objective, maximum)
+    Q, R = np.where(limited[: len(Q)], limits[: len(Q)], Q), np.where(limited[len(Q) :], limits[len(Q) :], R)
+    whitened, e, spread = objective.likelihood.innovations(objective.full(maximum.z))
+    bounds = at_bounds(maximum.z, objective.low, objective.high)[: objective.nt]
+    return InnovationsFit(
+        objective.constants(maximum.z), objective.plain(maximum.z), found, sides, Q, R, limited[: len(Q)],
+        limited[len(Q) :], bounds, whitened, e, spread,
+    )  # fmt: skip
+
+
+def _limits(objective: Objective, maximum: Maximum) -> tuple[BoolArray, FloatArray]:
+    """Return which variances, of equations and then of sensors, are told by an upper limit, and the limits."""
+    free = np.flatnonzero(objective.is_q | objective.is_r)
+    places = np.flatnonzero(objective.free[objective.nt :])
+    limited = np.zeros(len(objective.free) - objective.nt, dtype=bool)
+    limits = np.zeros(len(limited))
+    weak = (objective.avoided > 0.0) | collapsed(objective, maximum)
+    for i, place in zip(free, places, strict=True):
+        if weak[i]:
+            limit = upper_limit(objective, maximum, int(i))
+            limited[place] = maximum.likeliest[i] - limit < np.log(ZERO_SHARE)
+            limits[place] = np.exp(limit)
+    return limited, limits

@@ -1,0 +1,183 @@
+"""What a log says of each constant: information, directions it does not determine, and boxes by profile likelihood."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from obsynth.calibration.maximum import Maximum, Objective, at_bounds, descent
+from obsynth.numerics.arrays import FloatArray
+
+#: A direction whose deviation exceeds this share of the bounds' width is not determined by the log.
+UNDETERMINED = 1.0 / 6.0
+#: Entries of a direction that are named.
+NAMED_SHARE = 0.05
+#: Eigenvalues of the variances' information below this share of the largest are left out.
+LEAST_INFORMATION = 1e-10
+#: Variances that are found from n rows are themselves uncertain, which a quantile of Student's distribution covers in
+#: part; what it leaves was measured (benchmarks/campaigns/calibration_coverage.md): boxes of `SHORT` rows need this.
+SHORT, SHORT_WIDENING = 56.0, 1.05
+#: Root of the deviance at a one-sided limit of 95 %.
+LIMIT_ROOT = 1.645
+#: A profile ends when its root is within this share of what is sought.
+PROFILE_TOLERANCE = 0.02
+MOST_PROFILE_STEPS = 12
+
+
+@dataclass(frozen=True, eq=False)
+class Information:
+    """Covariance of the constants ``(nt, nt)``, and directions of bounds' widths that the log does not determine."""
+
+    covariance: FloatArray
+    undetermined: tuple[dict[str, float], ...]
+
+
+def information(hessian: FloatArray, objective: Objective, z: FloatArray) -> Information:
+    """Return what the log says of the constants, the variances integrated out."""
+    nt, widths = objective.nt, objective.problem.widths
+    held = at_bounds(z, objective.low, objective.high)
+    nuisance = [i for i in range(nt, len(z)) if not held[i]]
+    found = hessian[:nt, :nt]
+    if nuisance:
+        values, vectors = np.linalg.eigh(hessian[np.ix_(nuisance, nuisance)])
+        kept = values > LEAST_INFORMATION * max(float(values.max()), 1e-300)
+        across = hessian[:nt, nuisance] @ vectors[:, kept]
+        found = found - (across / values[kept]) @ across.T
+    return covariance_of(found, widths, objective.problem.unknown)
+
+
+def covariance_of(found: FloatArray, widths: FloatArray, names: tuple[str, ...]) -> Information:
+    """Return covariance and undetermined directions of information in widths of the bounds."""
+    values, vectors = np.linalg.eigh(0.5 * (found + found.T))
+    # What is not determined counts as the whole width: rounding times more would spoil every other constant.
+    deviations = 1.0 / np.sqrt(np.maximum(values, 1.0))
+    directions = []
+    for i in np.argsort(-deviations):
+        if deviations[i] > UNDETERMINED:
+            shares = vectors[:, i] / vectors[int(np.argmax(np.abs(vectors[:, i]))), i]
+            directions.append({name: float(share) for name, share in zip(names, shares, strict=True)
+                               if abs(share) > NAMED_SHARE})  # fmt: skip
+    covariance = (vectors * deviations**2) @ vectors.T * np.outer(widths, widths)
+    return Information(covariance, tuple(directions))
+
+
+def quantile(level: float, constants: int, samples: int, variances: int) -> float:
+    """Return the root of the deviance that bounds every constant at once with probability ``level``.
+
+    Bonferroni's share of the level each; Student's distribution for variances that are found; widened for short logs.
+    """
+    from scipy.stats import norm, t
+
+    each = 1.0 - (1.0 - level) / (2.0 * max(constants, 1))
+    if not variances:
+        return float(norm.ppf(each))
+    return float(t.ppf(each, max(samples - constants - 2, 3))) * widening(samples)
+
+
+def widening(samples: int) -> float:
+    """Return by how much boxes of few rows are wider than Student's distribution says."""
+    return 1.0 + (SHORT_WIDENING - 1.0) * min(1.0, SHORT / samples)
+
+
+@dataclass(frozen=True, eq=False)
+class Side:
+    """One end of a box: its value, and whether the log bounds it there."""
+
+    value: float
+    is_open: bool
+
+
+def profile_box(objective: Objective, maximum: Maximum, root: float) -> list[tuple[Side, Side]]:
+    """Return both ends of each constant's box, in its own units."""
+    found = []
+    for i, width in enumerate(objective.problem.widths):
+        sides = [_side(objective, maximum, i, sign, root) for sign in (-1.0, 1.0)]
+        found.append((Side(sides[0].value * width, sides[0].is_open), Side(sides[1].value * width, sides[1].is_open)))
+    return found
+
+
+def upper_limit(objective: Objective, maximum: Maximum, i: int) -> float:
+    """Return the one-sided limit of a logarithm of a variance that the log cannot tell from zero."""
+    avoided = objective.avoided.copy()
+    objective.avoided[:] = 0.0
+    lowest = maximum.z.copy()
+    lowest[i] = objective.low[i]
+    value = min(objective(maximum.z)[0], objective(lowest)[0])
+    side = _side(objective, replace(maximum, value=value), i, 1.0, LIMIT_ROOT)
+    objective.avoided[:] = avoided
+    return side.value
+
+
+class _Profile:
+    """The least value of the objective as a function of one variable, the others led along."""
+
+    def __init__(self, objective: Objective, maximum: Maximum, i: int) -> None:
+        self.objective, self.maximum, self.i = objective, maximum, i
+        self.others = [j for j in range(len(maximum.z)) if j != i]
+        values, vectors = np.linalg.eigh(maximum.hessian)
+        values = np.maximum(values, 1e-8 * max(float(values.max()), 1e-300))
+        self.covariance = (vectors / values) @ vectors.T
+        inner = maximum.hessian[np.ix_(self.others, self.others)]
+        values, vectors = np.linalg.eigh(inner)
+        values = np.maximum(values, 1e-8 * max(float(values.max(initial=0.0)), 1e-300))
+        spread = np.sqrt(np.diag((vectors / values) @ vectors.T))
+        # Variables that the log does not determine move by no more than their search does.
+        self.scale = np.minimum(spread, np.where(np.arange(len(maximum.z))[self.others] < objective.nt, 1.0, 3.0))
+        self.place, self.rest = float(maximum.z[i]), maximum.z[self.others].copy()
+
+    def root(self, value: float) -> float:
+        """Return the root of the deviance at a value of the variable."""
+        o, i, others = self.objective, self.i, self.others
+        slope = self.covariance[others, i] / self.covariance[i, i]
+        low, high = o.low[others], o.high[others]
+        guess = np.clip(self.rest + slope * (value - self.place), low, high)
+
+        def both(w: FloatArray) -> tuple[float, FloatArray]:
+            z = np.empty(len(others) + 1)
+            z[others], z[i] = w, value
+            found, gradient = o(z)
+            return found, gradient[others]
+
+        if others:
+            least, self.rest = descent(both, guess, low, high, self.scale, tolerance=1e-4, most=60)
+        else:
+            least = both(self.rest)[0]
+        self.place = value
+        return math.sqrt(max(2.0 * (least - self.maximum.value), 0.0))
+
+
+def _side(objective: Objective, maximum: Maximum, i: int, sign: float, target: float) -> Side:
+    """Return where the root of the profile's deviance reaches a target; open where a bound comes first."""
+    profile, begin = _Profile(objective, maximum, i), float(maximum.z[i])
+    end = float(objective.low[i] if sign < 0 else objective.high[i])
+    if abs(end - begin) < 1e-9:
+        return Side(end, True)
+    deviation = math.sqrt(max(profile.covariance[i, i], 1e-18))
+    inner, reached_inner = begin, 0.0
+    outer, reached = begin + sign * min(target * deviation, abs(end - begin)), 0.0
+    for _ in range(MOST_PROFILE_STEPS):
+        reached = profile.root(outer)
+        if reached >= target or outer == end:
+            break
+        inner, reached_inner = outer, reached
+        longer = abs(outer - begin) * min(max(1.1 * target / max(reached, 1e-9), 1.2), 4.0)
+        outer = begin + sign * min(longer, abs(end - begin))
+    if reached < target:
+        return Side(end, True)
+    for _ in range(MOST_PROFILE_STEPS):
+        if reached - target < PROFILE_TOLERANCE * target or abs(outer - inner) < 1e-3 * abs(outer - begin):
+            break
+        share = min(max((target - reached_inner) / (reached - reached_inner), 0.1), 0.9)
+        middle = inner + share * (outer - inner)
+        found = profile.root(middle)
+        if found >= target:
+            outer, reached = middle, found
+        else:
+            inner, reached_inner = middle, found
+        if target - reached_inner < PROFILE_TOLERANCE * target:
+            # The outer end would do as well; between them the interpolation is better than either.
+            share = (target - reached_inner) / max(reached - reached_inner, 1e-12)
+            return Side(inner + share * (outer - inner), False)
+    return Side(outer, False)

@@ -1,0 +1,223 @@
+"""Recorded logs: their columns by signal, a regular grid of stamps, and what makes a log unusable."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+
+from obsynth.calibration.refusals import bad_log
+from obsynth.errors import SpecError
+from obsynth.numerics.arrays import FloatArray, read_only
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+LogData: TypeAlias = "str | Path | pd.DataFrame | Mapping[str, Any] | Log"
+
+#: Stamps further off the grid than this share of a step are refused, and further than the second are told.
+LARGEST_JITTER = 0.2
+NOTED_JITTER = 0.02
+#: What counts as one quantum between values of a column: all differences are whole multiples within this.
+QUANTUM_SLACK = 0.02
+#: Share of distinct values above which a column shows no quantum that limits its noise: a ramp has none twice.
+REPEATED = 0.7
+
+
+@dataclass(frozen=True, eq=False)
+class Log:
+    """Inputs and outputs on a regular grid.
+
+    time : ``(n,)`` seconds; u : ``(n, nu)``; y : ``(n, ny)`` with NaN for what is missing; dt : seconds.
+    rows : first row and one past the last, of the data that were given; notes : what was noticed and repaired.
+    """
+
+    time: FloatArray
+    u: FloatArray
+    y: FloatArray
+    dt: float
+    input_names: tuple[str, ...]
+    output_names: tuple[str, ...]
+    rows: tuple[int, int]
+    source: str = ""
+    notes: tuple[str, ...] = ()
+
+    @property
+    def samples(self) -> int:
+        """Number of rows."""
+        return len(self.time)
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of stamps, inputs and outputs: the same numbers have the same digest, however they were stored."""
+        seen = np.ascontiguousarray(np.column_stack([self.time, self.u, self.y]), dtype="<f8")
+        names = "\n".join((*self.input_names, "", *self.output_names)).encode()
+        return hashlib.sha256(names + b"\0" + np.where(np.isnan(seen), np.nan, seen).tobytes()).hexdigest()
+
+    def shifted(self, rows: int) -> Log:
+        """Return the log with its inputs later by whole rows: what row k says acts from row k on for ``rows = 1``."""
+        u = np.roll(self.u, rows, axis=0)
+        if rows > 0:
+            u[:rows] = self.u[0]
+        elif rows < 0:
+            u[rows:] = self.u[-1]
+        return Log(self.time, read_only(u), self.y, self.dt, self.input_names, self.output_names, self.rows,
+                   self.source, self.notes)  # fmt: skip
+
+
+def parsed_rows(rows: str | slice | Sequence[int] | None, count: int) -> tuple[int, int]:
+    """Return first row and one past the last of ``"a:b"``, a slice or a pair, as Python counts."""
+    if isinstance(rows, str):
+        found = re.fullmatch(r"\s*(-?\d*)\s*:\s*(-?\d*)\s*", rows)
+        if found is None:
+            raise SpecError(f"rows is {rows!r}: give a:b, such as 0:56 for the first 56 rows.", path="rows")
+        rows = slice(*(int(text) if text else None for text in found.groups()))
+    elif isinstance(rows, Sequence):
+        if len(rows) != 2 or not all(isinstance(row, (int, np.integer)) for row in rows):
+            raise SpecError(f"rows is {list(rows)}: give the first row and one past the last.", path="rows")
+        rows = slice(int(rows[0]), int(rows[1]))
+    first, last, step = (rows or slice(None)).indices(count)
+    if step != 1 or last <= first:
+        raise SpecError(f"rows {first}:{last} holds nothing: the log has {count} rows.", path="rows")
+    if isinstance(rows, slice) and any(end is not None and abs(end) > count for end in (rows.start, rows.stop)):
+        raise SpecError(f"rows asks for {rows.start}:{rows.stop}, but the log has {count} rows.", path="rows")
+    return first, last
+
+
+def read_log(
+    log: LogData, input_names: Sequence[str], output_names: Sequence[str], *,
+    rows: str | slice | Sequence[int] | None = None, columns: Mapping[str, str] | None = None,
+    scales: Mapping[str, float] | None = None, dt: float | None = None,
+) -> Log:  # fmt: skip
+    """Return the rows of a log as inputs and outputs on a grid.
+
+    A log is a CSV or Parquet file, a data frame, or a mapping from names to columns; ``columns`` says which column a
+    signal (or ``time``) is in where the names differ, ``scales`` what its values are multiplied by.
+    """
+    if isinstance(log, Log):
+        if (log.input_names, log.output_names) != (tuple(input_names), tuple(output_names)):
+            raise SpecError("The log is of another plant: its signals differ.", path="log")
+        first, last = parsed_rows(rows, log.samples)
+        return Log(log.time[first:last], log.u[first:last], log.y[first:last], log.dt, log.input_names,
+                   log.output_names, (log.rows[0] + first, log.rows[0] + last), log.source, log.notes)  # fmt: skip
+    table, source = _table(log)
+    signals = ("time", *input_names, *output_names)
+    for what, given in (("columns", columns or {}), ("scales", scales or {})):
+        wrong = [name for name in given if name not in signals]
+        if wrong:
+            raise SpecError(f"{what} names {wrong[0]!r}, which is no signal: there are {', '.join(signals)}.",
+                            path=f"{what}.{wrong[0]}")  # fmt: skip
+    length = max((len(values) for values in table.values()), default=0)
+    first, last = parsed_rows(rows, length)
+
+    def column(name: str) -> FloatArray:
+        wanted = (columns or {}).get(name, name)
+        if wanted not in table:
+            raise SpecError(f"The log has no column {wanted!r} for {name!r}: there are {', '.join(table)}.",
+                            path=f"columns.{name}")  # fmt: skip
+        numbers = _numbers(table[wanted], wanted, length)[first:last]
+        return np.asarray(numbers * float((scales or {}).get(name, 1.0)), dtype=np.float64)
+
+    in_table = (columns or {}).get("time", "time") in table
+    if not in_table and dt is None:
+        raise SpecError("The log has no column 'time': name it by columns, or give dt.", path="columns.time")
+    time = column("time") if in_table else np.asarray(np.arange(first, last) * float(dt or 0.0))
+    u = np.column_stack([column(name) for name in input_names]) if input_names else np.zeros((last - first, 0))
+    y = np.column_stack([column(name) for name in output_names])
+    return _on_grid(time, u, y, dt, tuple(input_names), tuple(output_names), (first, last), source)
+
+
+def _table(log: Any) -> tuple[dict[str, Any], str]:
+    if isinstance(log, str | Path):
+        path = Path(log)
+        if path.is_dir() or not path.exists():
+            raise SpecError(f"{path} {'is a folder' if path.is_dir() else 'does not exist'}.", path=str(path))
+        import pandas as pd
+
+        try:
+            frame = pd.read_parquet(path) if path.suffix.lower() == ".parquet" else pd.read_csv(path)
+        except (ValueError, OSError, ImportError) as error:
+            raise SpecError(f"{path} cannot be read: {' '.join(str(error).split())}", path=str(path)) from error
+        return {str(name).strip(): frame[name].to_numpy() for name in frame.columns}, path.name
+    if isinstance(log, Mapping) or hasattr(log, "columns"):
+        names = log.keys() if isinstance(log, Mapping) else log.columns
+        return {str(name): np.asarray(log[name]) for name in names}, ""
+    raise SpecError("log must be the name of a file, a pandas.DataFrame, or a mapping from names to columns.",
+                    path="log")  # fmt: skip
+
+
+def _numbers(values: Any, name: str, length: int) -> FloatArray:
+    if len(values) != length:
+        raise SpecError(f"The column {name!r} has {len(values)} rows, another {length}.", path=f"log.{name}")
+    try:
+        return np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise SpecError(f"The column {name!r} holds something that is no number.", path=f"log.{name}") from None
+
+
+def _on_grid(
+    time: FloatArray, u: FloatArray, y: FloatArray, dt: float | None, inputs: tuple[str, ...],
+    outputs: tuple[str, ...], rows: tuple[int, int], source: str,
+) -> Log:  # fmt: skip
+    """Return the log on its grid; missing rows become rows without outputs whose inputs are those that follow."""
+    if not np.isfinite(time).all() or (np.diff(time) <= 0).any():
+        bad = (
+            int(np.argmax(~np.isfinite(time)))
+            if not np.isfinite(time).all()
+            else int(np.argmax(np.diff(time) <= 0)) + 1
+        )
+        raise bad_log("time", f"Stamps must rise and be finite, but that of row {rows[0] + bad} is {time[bad]:g} s.",
+                      path="log.time")  # fmt: skip
+    gaps = np.diff(time)
+    step = float(np.median(gaps)) if dt is None and gaps.size else float(dt or 1.0)
+    counts = np.round(gaps / step).astype(int)
+    jitter = np.abs(gaps / step - counts)
+    notes = []
+    if jitter.max(initial=0.0) > LARGEST_JITTER or (counts < 1).any():
+        worst = int(np.argmax(jitter))
+        raise bad_log("irregular", f"The stamps are irregular: row {rows[0] + worst + 1} is {jitter[worst]:.0%} "
+                      f"of a step off the grid of {step:g} s. Resample the log.", path="log.time")  # fmt: skip
+    if jitter.max(initial=0.0) > NOTED_JITTER:
+        notes.append(f"The stamps jitter by {jitter.max():.1%} of a step.")
+    for name, column in zip(inputs, u.T, strict=True):
+        if not np.isfinite(column).all():
+            row = rows[0] + int(np.argmax(~np.isfinite(column)))
+            raise bad_log("nan", f"The input {name!r} is not finite in row {row}: inputs must be known. Fill the gap, "
+                          "or take other rows.", path=f"log.{name}")  # fmt: skip
+    for name, column in zip(outputs, y.T, strict=True):
+        if np.isinf(column).any() or not np.isfinite(column).any():
+            what = "infinite" if np.isinf(column).any() else "nowhere finite"
+            raise bad_log("nan", f"The output {name!r} is {what} in these rows.", path=f"log.{name}")
+    places = np.concatenate([[0], np.cumsum(counts)])
+    if (counts > 1).any():
+        notes.append(f"{int((counts - 1).sum())} rows are missing: their outputs count as not measured.")
+        whole = np.arange(places[-1] + 1)
+        u = u[np.searchsorted(places, whole)]
+        wide = np.full((len(whole), y.shape[1]), np.nan)
+        wide[places] = y
+        y, time = wide, time[0] + step * whole
+    return Log(read_only(time), read_only(u), read_only(y), step, inputs, outputs, rows, source, tuple(notes))
+
+
+def quantum(column: FloatArray) -> float:
+    """Return the smallest step between values of a column of which all others are multiples; zero without one."""
+    values = np.unique(np.round(column[np.isfinite(column)], 12))
+    steps = np.diff(values)
+    steps = steps[steps > 1e-9 * max(1.0, float(np.abs(values).max(initial=0.0)))]
+    if not steps.size:
+        return 0.0
+    ratios = steps / steps.min()
+    if np.abs(ratios - np.round(ratios)).max() > QUANTUM_SLACK or steps.size < 3:
+        return 0.0
+    return float(np.median(steps[np.round(ratios) == 1]))
+
+
+def repeats(column: FloatArray) -> bool:
+    """Whether values of a column come again often enough that its quantum limits what its noise can be."""
+    values = column[np.isfinite(column)]
+    return bool(len(np.unique(np.round(values, 12))) < REPEATED * len(values))

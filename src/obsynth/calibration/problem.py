@@ -1,0 +1,208 @@
+"""What is asked of a calibration, checked: a model with unknown constants, a log, priors and what is known of noise."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from obsynth.calibration.logs import Log, quantum, repeats
+from obsynth.calibration.refusals import bad_log, refused
+from obsynth.calibration.step_graphs import SampleGraphs, promoted, sample_graphs
+from obsynth.errors import SpecError
+from obsynth.numerics.arrays import FloatArray, as_matrix
+from obsynth.numerics.covariances import covariance_factor
+from obsynth.plants.dae.checks import finite_vector
+from obsynth.plants.dae.model import DAEModel
+from obsynth.plants.names import index_of
+
+#: Measured values for each unknown constant and variance that are needed at least.
+VALUES_PER_UNKNOWN = 5
+#: Deviation of an initial state that is not stated, as a share of its nominal size.
+DEFAULT_STATE_SHARE = 0.1
+#: Least deviation of a sensor, as a share of its largest value: rounding.
+LEAST_NOISE = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """A promoted model with its log; arrays by unknown ``(nt,)``, by sensor ``(ny,)``, by noisy equation."""
+
+    model: DAEModel
+    log: Log
+    unknown: tuple[str, ...]
+    nominal: FloatArray
+    low: FloatArray
+    high: FloatArray
+    prior_means: FloatArray
+    prior_weights: FloatArray
+    noisy: tuple[str, ...]
+    known_Q: FloatArray
+    known_R: FloatArray
+    x0: FloatArray
+    P0: FloatArray
+    quanta: FloatArray
+    floors: FloatArray
+    graphs: SampleGraphs
+    integration: str
+    substeps: int
+
+    @property
+    def u(self) -> FloatArray:
+        """Inputs ``(n, nu)``."""
+        return self.log.u
+
+    @property
+    def y(self) -> FloatArray:
+        """Outputs ``(n, ny)``, NaN where missing."""
+        return self.log.y
+
+    @property
+    def widths(self) -> FloatArray:
+        """Width of the bounds of each unknown ``(nt,)``."""
+        return self.high - self.low
+
+    @property
+    def output_names(self) -> tuple[str, ...]:
+        """The sensors."""
+        return self.log.output_names
+
+    @property
+    def noisy_equations(self) -> list[int]:
+        """Numbers of the noisy equations."""
+        return [self.model.equation_names.index(name) for name in self.noisy]
+
+    def integrated(self, integration: str, substeps: int) -> Problem:
+        """Return the same problem with other steps."""
+        graphs = sample_graphs(
+            self.model, self.unknown, self.log.dt, integration=integration, substeps=substeps, samples=self.log.samples
+        )
+        return Problem(**{**vars(self), "graphs": graphs, "integration": integration, "substeps": substeps})
+
+    def with_log(self, log: Log) -> Problem:
+        """Return the same problem with another log of the same signals."""
+        return Problem(**{**vars(self), "log": log})
+
+
+def calibration_problem(
+    model: DAEModel, log: Log, *, unknown: Mapping[str, Sequence[float]], priors: Mapping[str, Sequence[float]] | None,
+    noisy: Sequence[str] | None, Q: Mapping[str, float | None] | None, R: Mapping[str, float | None] | None,
+    initial_state: Any, initial_covariance: Any, integration: str, substeps: int,
+) -> Problem:  # fmt: skip
+    """Return the problem, or say what is wrong with what is asked."""
+    if not unknown:
+        raise SpecError("unknown is empty: name the constants that are to be found, with their bounds.", path="unknown")
+    if not isinstance(substeps, (int, np.integer)) or isinstance(substeps, bool) or substeps < 1:
+        raise SpecError(f"substeps is {substeps!r}: give a whole number, at least 1.", path="substeps")
+    if not log.samples > 1:
+        raise bad_log("too-short", f"The log has {log.samples} row(s): a calibration needs more.")
+    names = tuple(unknown)
+    values = {**model.constants, **model.parameters}
+    for name in names:
+        index_of(name, list(values), what="unknown")
+    low, high = _bounds(unknown, values)
+    equations = tuple(model.equation_names if noisy is None else noisy)
+    for name in equations:
+        index_of(name, model.equation_names, what="noisy")
+    means, weights = _priors(priors, names, values)
+    known_Q = _variances(Q, equations, "Q")
+    known_R = _variances(R, log.output_names, "R")
+    quanta = np.array([quantum(column) for column in log.y.T])
+    held = np.array([repeats(column) for column in log.y.T])
+    largest = np.nanmax(np.abs(log.y), axis=0)
+    floors = np.maximum(
+        np.where(held, quanta**2 / 12.0, 0.0), (LEAST_NOISE * np.where(largest > 0.0, largest, 1.0)) ** 2
+    )
+    variances = int(np.isnan(known_Q).sum() + np.isnan(known_R).sum())
+    needed, seen = VALUES_PER_UNKNOWN * (len(names) + variances), int(np.isfinite(log.y).sum())
+    if seen < needed:
+        raise bad_log("too-short", f"The log is too short: {seen} measured values for {len(names)} constants and "
+                      f"{variances} variances; at least {needed} are needed. Take more rows, fewer unknowns, or state "
+                      "Q and R.")  # fmt: skip
+    whole = promoted(model, names)
+    x0 = _state(model, initial_state)
+    graphs = sample_graphs(whole, names, log.dt, integration=integration, substeps=substeps, samples=log.samples)
+    return Problem(
+        whole, log, names, np.array([values[name] for name in names]), low, high, means, weights, equations, known_Q,
+        known_R, x0, _covariance(model, initial_covariance), quanta, floors, graphs, integration, int(substeps),
+    )  # fmt: skip
+
+
+def _bounds(unknown: Mapping[str, Sequence[float]], values: Mapping[str, float]) -> tuple[FloatArray, FloatArray]:
+    rows = []
+    for name, pair in unknown.items():
+        if np.shape(pair) != (2,) or not np.isfinite(np.asarray(pair, dtype=np.float64)).all() or not pair[0] < pair[1]:
+            raise SpecError(f"unknown.{name} is {pair!r}: give [low, high], finite, the lower one first.",
+                            path=f"unknown.{name}")  # fmt: skip
+        if not pair[0] <= values[name] <= pair[1]:
+            raise SpecError(f"The nominal value of {name!r}, {values[name]:g}, is outside its bounds [{pair[0]:g}, "
+                            f"{pair[1]:g}]: move one of them.", path=f"unknown.{name}")  # fmt: skip
+        rows.append([float(pair[0]), float(pair[1])])
+    low, high = np.array(rows).T
+    return low, high
+
+
+def _priors(
+    priors: Mapping[str, Sequence[float]] | None, names: Sequence[str], values: Mapping[str, float]
+) -> tuple[FloatArray, FloatArray]:
+    means, weights = np.array([values[name] for name in names]), np.zeros(len(names))
+    for name, pair in (priors or {}).items():
+        i = index_of(name, names, what="priors")
+        if np.shape(pair) != (2,) or not np.isfinite(np.asarray(pair, dtype=np.float64)).all() or not pair[1] > 0.0:
+            raise SpecError(f"priors.{name} is {pair!r}: give [mean, standard deviation].", path=f"priors.{name}")
+        means[i], weights[i] = float(pair[0]), float(pair[1]) ** -2
+    return means, weights
+
+
+def _variances(given: Mapping[str, float | None] | None, names: Sequence[str], what: str) -> FloatArray:
+    """Return known variances, NaN for those that are to be found."""
+    if given is not None and not isinstance(given, Mapping):
+        raise SpecError(f"{what} must be a mapping from names to variances.", path=what)
+    found = np.full(len(names), np.nan)
+    for name, value in (given or {}).items():
+        i = index_of(name, names, what=what)
+        if value is None:
+            continue
+        if not isinstance(value, (int, float, np.number)) or isinstance(value, bool) or not value > 0.0:
+            raise SpecError(f"{what}.{name} is {value!r}: give a positive variance, or leave it out to have it found.",
+                            path=f"{what}.{name}")  # fmt: skip
+        found[i] = float(value)
+    return found
+
+
+def _state(model: DAEModel, value: Any) -> FloatArray:
+    if not isinstance(value, Mapping):
+        return finite_vector(value, model.state_names, model.nominal_state, "initial_state")
+    x = np.array(model.nominal_state)
+    for name, entry in value.items():
+        x[index_of(name, model.state_names, what="initial_state")] = float(entry)
+    return finite_vector(x, model.state_names, x, "initial_state")
+
+
+def _covariance(model: DAEModel, value: Any) -> FloatArray:
+    default = (DEFAULT_STATE_SHARE * model.state_scales) ** 2
+    if value is None:
+        return np.diag(default)
+    if isinstance(value, Mapping):
+        variances = np.array(default)
+        for name, entry in value.items():
+            variances[index_of(name, model.state_names, what="initial_covariance")] = float(entry)
+        matrix = np.diag(variances)
+    elif np.ndim(value) == 0:
+        matrix = float(value) * np.eye(model.nx)
+    else:
+        matrix = as_matrix(value, "initial_covariance")
+    if matrix.shape != (model.nx, model.nx):
+        raise SpecError(f"initial_covariance is {matrix.shape}, but {(model.nx, model.nx)} is needed.",
+                        path="initial_covariance")  # fmt: skip
+    covariance_factor(matrix, "initial_covariance")
+    return matrix
+
+
+def require_variation(problem: Problem) -> None:
+    """Refuse a log in which nothing moves and nothing is put in: it determines no constant."""
+    if not np.nanstd(problem.y, axis=0).any() and not np.std(problem.u, axis=0).any():
+        raise refused("not-exciting", "Nothing moves in these rows: every signal is constant, and no dynamics show.",
+                      signals=list(problem.unknown))  # fmt: skip

@@ -1,0 +1,152 @@
+"""From a fit to a calibration: tables by name, checks of the innovations, and a sentence for each thing found."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from obsynth.calibration.box import CalibratedBox
+from obsynth.calibration.diagnostics import SIGNIFICANT, Consistency, Whiteness, change_of_mean, consistency, whiteness
+from obsynth.calibration.innovations_fit import InnovationsFit, Timing
+from obsynth.calibration.integration_choice import IntegrationError
+from obsynth.calibration.intervals import covariance_of, quantile
+from obsynth.calibration.problem import Problem
+from obsynth.calibration.result import Calibration
+from obsynth.calibration.simulation_error import Fit, SimulationError
+from obsynth.numerics.arrays import FloatArray, read_only
+
+#: Constants whose correlation exceeds this are named together.
+CORRELATED = 0.9
+#: A sensor's variance below this multiple of its quantisation's is told.
+AT_QUANTISATION = 1.5
+#: A timing that is better by this many nats is told, even where it is not taken.
+NOTED_NATS = 2.0
+
+
+def reported(
+    problem: Problem, start: Fit, fit: InnovationsFit | None, *, level: float, timing: Timing,
+    error: IntegrationError | None,
+) -> Calibration:  # fmt: skip
+    """Return the calibration of a fit of innovations, or of a simulation where there is none."""
+    found = fit if fit is not None else _of_simulation(problem, start, level)
+    names, seen = problem.unknown, np.isfinite(problem.y)
+    covariance = found.information.covariance
+    deviations = np.sqrt(np.diag(covariance))
+    correlation = covariance / np.outer(deviations, deviations)
+    whitened = np.where(seen, found.whitened, np.nan)
+    colours = {name: whiteness(column) for name, column in zip(problem.output_names, whitened.T, strict=True)}
+    change = change_of_mean(whitened)
+    nis = consistency(np.where(seen, found.whitened, 0.0), seen)
+    sides = dict(zip(names, found.sides, strict=True))
+    open_sides = tuple((name, side) for name, pair in sides.items()
+                       for side, end in zip(("low", "high"), pair, strict=True) if end.is_open)  # fmt: skip
+    nominal = {name: float(value) for name, value in zip(names, found.t, strict=True)}
+    box = CalibratedBox(
+        nominal, {name: min(pair[0].value, nominal[name]) for name, pair in sides.items()},
+        {name: max(pair[1].value, nominal[name]) for name, pair in sides.items()}, open_sides, level,
+        problem.log.digest,
+    )  # fmt: skip
+    Q = {name: float(value) for name, value in zip(problem.noisy, found.Q, strict=True)} if fit is not None else {}
+    R = {name: float(value) for name, value in zip(problem.output_names, found.R, strict=True)}
+    limited = [name for name, weak in zip((*problem.noisy, *problem.output_names),
+                                          (*found.limited_Q, *found.limited_R), strict=True) if weak]  # fmt: skip
+    row = None if change is None else problem.log.rows[0] + change
+    at_end = tuple(name for name, there in zip(names, found.at_bounds, strict=True) if there)
+    verdict = [*problem.log.notes, *_fitted(problem, box, found, at_end, correlation, limited, Q, R),
+               *_checked(nis, colours, row, fit is None), *_told(problem, R, timing, error)]  # fmt: skip
+    return Calibration(
+        nominal, read_only(covariance), read_only(correlation), box, found.information.undetermined, Q, R,
+        tuple(limited), nis, colours, row, timing.delay, dict(timing.losses),
+        dict(zip(problem.output_names, problem.quanta.tolist(), strict=True)), at_end, problem.integration,
+        problem.substeps, "innovations" if fit is not None else "simulation", -found.value, tuple(verdict),
+        read_only(whitened), read_only(problem.y - found.innovations), read_only(np.sqrt(found.variances)),
+        {"source": problem.log.source, "rows": list(problem.log.rows), "digest": problem.log.digest,
+         "samples": problem.log.samples, "dt": problem.log.dt},
+        {name: problem.model.units.get(name, "1") for name in names}, problem.output_names,
+    )  # fmt: skip
+
+
+def _of_simulation(problem: Problem, start: Fit, level: float) -> InnovationsFit:
+    """Return what the fit of a simulation says, in the form of a fit of innovations; its boxes are Wald's."""
+    from obsynth.calibration.intervals import Side
+
+    error = SimulationError(problem)
+    nt, scale = error.nt, error.scale
+    inner = start.information
+    found = inner[:nt, :nt] - inner[:nt, nt:] @ np.linalg.solve(inner[nt:, nt:], inner[nt:, :nt])
+    information = covariance_of(found, problem.widths, problem.unknown)
+    y = error.simulated(np.concatenate([start.t, start.x0]) / scale)[0]
+    e = np.where(np.isfinite(problem.y), problem.y - y, 0.0)
+    root = quantile(level, nt, problem.log.samples, len(problem.output_names))
+    spread = root * np.sqrt(np.diag(information.covariance))
+    sides = []
+    for t, half, low, high in zip(start.t, spread, problem.low, problem.high, strict=True):
+        sides.append((Side(max(t - half, low), t - half <= low), Side(min(t + half, high), t + half >= high)))
+    ends = (start.t - problem.low < 1e-6 * problem.widths) | (problem.high - start.t < 1e-6 * problem.widths)
+    variances = np.tile(start.deviations**2, (len(y), 1))
+    nothing = np.zeros(len(problem.noisy))
+    return InnovationsFit(
+        start.t, start.cost, information, sides, nothing, start.deviations**2, nothing.astype(bool),
+        np.zeros(len(problem.output_names), dtype=bool), ends, e / start.deviations, e, variances,
+    )  # fmt: skip
+
+
+def _fitted(
+    problem: Problem, box: CalibratedBox, fit: InnovationsFit, at_end: tuple[str, ...], correlation: FloatArray,
+    limited: list[str], Q: dict[str, float], R: dict[str, float],
+) -> list[str]:  # fmt: skip
+    found = []
+    for direction in fit.information.undetermined:
+        told = ", ".join(f"{name} {share:+.2g}" for name, share in direction.items())
+        found.append(f"This log does not determine the direction ({told}), in widths of the bounds: move "
+                     "what excites it, state a prior, or fix one of them.")  # fmt: skip
+    for name, side in box.open_sides:
+        found.append(f"The box of {name} is open on its {side} side: the bound stands there, not the log.")
+    found += [f"{name} is at a bound: widen it if the constant may lie beyond." for name in at_end]
+    free = [name for name in box.nominal if not any(name in direction for direction in fit.information.undetermined)]
+    for i, first in enumerate(problem.unknown):
+        for j in range(i + 1, len(problem.unknown)):
+            second = problem.unknown[j]
+            if first in free and second in free and abs(correlation[i, j]) > CORRELATED:
+                found.append(f"{first} and {second} are correlated by {correlation[i, j]:+.2f}: their combination "
+                             "is known better than either.")  # fmt: skip
+    for name in limited:
+        value = {**Q, **R}[name]
+        found.append(f"The variance of {name} cannot be told from zero: its upper limit {value:.3g} is used.")
+    return found
+
+
+def _checked(nis: Consistency, colours: dict[str, Whiteness], row: int | None, simulated: bool) -> list[str]:
+    found = []
+    coloured = [name for name, test in colours.items() if test.probability < SIGNIFICANT]
+    for name in coloured:
+        test = colours[name]
+        found.append(f"The innovations of {name} are not white (p = {test.probability:.2g}, first autocorrelation "
+                     f"{test.first:+.2f}): something that moves {name} is not in the model.")  # fmt: skip
+    if simulated and coloured:
+        found.append("The residuals of a simulation that are not white make boxes too small: use method='innovations'.")
+    if not simulated and not nis.holds:
+        found.append(f"NIS per degree of freedom is {nis.value:.2f}, outside {nis.low:.2f} to {nis.high:.2f}.")
+    if row is not None:
+        found.append(f"These rows are not of one piece: the mean of the innovations changes at row {row}. If a fault "
+                     "begins there, end the rows before it.")  # fmt: skip
+    return found
+
+
+def _told(problem: Problem, R: dict[str, float], timing: Timing, error: IntegrationError | None) -> list[str]:
+    found = []
+    for name, step in zip(problem.output_names, problem.quanta, strict=True):
+        if step > 0.0 and R[name] < AT_QUANTISATION * step**2 / 12.0:
+            found.append(f"The noise of {name} is at its quantisation ({step:.3g} / sqrt 12): its R is no lower in "
+                         "truth than what a ramp makes of it.")  # fmt: skip
+    if timing.delay and timing.losses:
+        found.append(f"The inputs are taken {timing.delay} row later than the log writes them: better by "
+                     f"{timing.losses[0]:.1f} nats.")  # fmt: skip
+    elif timing.losses.get(0, 0.0) > NOTED_NATS:
+        rows = min(timing.losses, key=lambda delay: timing.losses[delay])
+        found.append(f"The inputs taken {rows:+d} row would be better by {timing.losses[0]:.1f} nats: see input_delay.")
+    if error is not None:
+        what = "Radau is taken" if problem.integration == "radau" else "it is taken"
+        found.append(
+            f"A step of backward Euler errs by at most {error.largest:.2g} deviations of {error.sensor}: {what}."
+        )
+    return found

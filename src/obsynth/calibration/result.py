@@ -1,0 +1,159 @@
+"""What a calibration found, frozen, with a table for people and plain data for programs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from obsynth.calibration.box import CalibratedBox
+from obsynth.calibration.diagnostics import Consistency, Whiteness
+from obsynth.numerics.arrays import FloatArray
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """Constants, noise and verdict that a log gives a model.
+
+    Parameters
+    ----------
+    nominal : mapping of str to float
+        The likeliest value of each unknown constant, in its unit.
+    covariance, correlation : FloatArray
+        ``(nt, nt)``, in the order of ``nominal``; what the log does not determine counts as the width of its bounds.
+    box : CalibratedBox
+        Simultaneous ranges by profile likelihood.
+    undetermined : tuple of mapping
+        Directions that the log does not determine: constants with their shares, in widths of their bounds.
+    Q, R : mapping of str to float
+        Variances to design with, by equation (per step) and by sensor; an upper limit where the log cannot tell a
+        variance from zero.
+    upper_limits : tuple of str
+        Equations and sensors whose variance is such a limit.
+    nis : Consistency
+        Normalised innovations squared per degree of freedom, with its 95 % interval.
+    whiteness : mapping of str to Whiteness
+        By sensor.
+    change : int or None
+        Row of the log at which the mean of the innovations changes: the rows are then not free of faults.
+    input_delay : int
+        Rows by which the inputs were taken later than the log writes them.
+    timing : mapping of int to float
+        Loss of log likelihood with the inputs later by that many rows, in nats; the best has zero.
+    quanta : mapping of str to float
+        Resolution of each sensor; zero where none shows.
+    at_bounds : tuple of str
+        Constants at an end of their bounds.
+    integration : str
+        How the model was integrated, ``substeps`` to a sample.
+    substeps : int
+        Steps in a sample.
+    method : str
+        ``"innovations"`` or ``"simulation"``.
+    log_likelihood : float
+        Of the log, in nats.
+    verdict : tuple of str
+        A sentence for each thing that was found.
+    innovations : FloatArray
+        ``(n, ny)`` whitened, NaN where nothing was measured.
+    predictions : FloatArray
+        ``(n, ny)`` before each measurement.
+    deviations : FloatArray
+        ``(n, ny)`` of the innovations, in units of the sensors.
+    log : mapping
+        ``source``, ``rows``, ``digest``, ``samples`` and ``dt`` of the log.
+    units : mapping of str to str
+        By constant, where the model says one.
+    output_names : tuple of str
+        The sensors.
+    """
+
+    nominal: Mapping[str, float]
+    covariance: FloatArray
+    correlation: FloatArray
+    box: CalibratedBox
+    undetermined: tuple[Mapping[str, float], ...]
+    Q: Mapping[str, float]
+    R: Mapping[str, float]
+    upper_limits: tuple[str, ...]
+    nis: Consistency
+    whiteness: Mapping[str, Whiteness]
+    change: int | None
+    input_delay: int
+    timing: Mapping[int, float]
+    quanta: Mapping[str, float]
+    at_bounds: tuple[str, ...]
+    integration: str
+    substeps: int
+    method: str
+    log_likelihood: float
+    verdict: tuple[str, ...]
+    innovations: FloatArray
+    predictions: FloatArray
+    deviations: FloatArray
+    log: Mapping[str, Any]
+    units: Mapping[str, str]
+    output_names: tuple[str, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The constants, in order."""
+        return tuple(self.nominal)
+
+    @property
+    def fault_free(self) -> bool:
+        """Whether the rows look as if one model held in all of them."""
+        return self.change is None
+
+    def __str__(self) -> str:
+        rows = f"rows {self.log['rows'][0]}:{self.log['rows'][1]}"
+        lines = [f"Calibration of {len(self.nominal)} constants from {self.log['source'] or 'a log'}, {rows} ("
+                 f"{100 * self.box.level:g} % box, all at once)"]  # fmt: skip
+        width = max((len(name) for name in self.nominal), default=0)
+        marks = set(self.box.open_sides)
+        for name, value in self.nominal.items():
+            ends = [f"{'open ' if (name, side) in marks else ''}{getattr(self.box, side)[name]:.5g}"
+                    for side in ("low", "high")]  # fmt: skip
+            unit = "" if self.units.get(name, "1") == "1" else f" {self.units[name]}"
+            lines.append(f"  {name:<{width}}  {value:.5g}  [{ends[0]}, {ends[1]}]{unit}")
+        told = {name: f"{name} {'<= ' if name in self.upper_limits else ''}{value:.3g}"
+                for name, value in (*self.Q.items(), *self.R.items())}  # fmt: skip
+        if self.Q:
+            lines.append("  Q per step: " + ", ".join(told[name] for name in self.Q))
+        lines.append("  R: " + ", ".join(told[name] for name in self.R))
+        lines.append(
+            f"  NIS per degree of freedom {self.nis.value:.2f} (95 %: {self.nis.low:.2f} to {self.nis.high:.2f})"
+        )
+        return "\n".join([*lines, *(f"  - {sentence}" for sentence in self.verdict)])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything but the records as plain data."""
+        return {
+            "constants": {name: {"nominal": value, "range": [self.box.low[name], self.box.high[name]],
+                                 "open": [side for other, side in self.box.open_sides if other == name],
+                                 "unit": self.units.get(name, "1")} for name, value in self.nominal.items()},
+            "level": self.box.level, "covariance": self.covariance.tolist(), "correlation": self.correlation.tolist(),
+            "undetermined": [dict(direction) for direction in self.undetermined], "Q": dict(self.Q), "R": dict(self.R),
+            "upper_limits": list(self.upper_limits), "nis": vars(self.nis) | {"holds": self.nis.holds},
+            "whiteness": {name: vars(found) for name, found in self.whiteness.items()}, "change": self.change,
+            "input_delay": self.input_delay, "timing": {str(rows): loss for rows, loss in self.timing.items()},
+            "quanta": dict(self.quanta), "at_bounds": list(self.at_bounds), "integration": self.integration,
+            "substeps": self.substeps, "method": self.method, "log_likelihood": self.log_likelihood,
+            "log": dict(self.log), "verdict": list(self.verdict),
+        }  # fmt: skip
+
+    def plot(self) -> Figure:
+        """Return a picture: each constant in its box, and the innovations of each sensor in deviations."""
+        from obsynth.calibration.pictures import calibration_figure
+
+        return calibration_figure(self)
+
+    @property
+    def innovation_deviation(self) -> FloatArray:
+        """Root mean square of each sensor's innovations ``(ny,)``, in its unit."""
+        return np.asarray(np.sqrt(np.nanmean((self.innovations * self.deviations) ** 2, axis=0)))

@@ -1,0 +1,182 @@
+"""The start of a calibration: constants and initial state whose simulation follows the log, by sensitivities."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from obsynth.calibration.likelihood import LARGEST_RESIDUAL
+from obsynth.calibration.problem import Problem
+from obsynth.calibration.refusals import refused
+from obsynth.numerics.arrays import FloatArray
+from obsynth.plants.dae.functions import Compiled
+
+#: Rounds in which the sensors' weights are estimated again; the first is robust against single wrong values.
+ROUNDS = 3
+MOST_EVALUATIONS = 60
+#: Share of a signal's deviation that stands for its noise before anything is fitted.
+FIRST_NOISE = 0.05
+#: Residuals are cut here, so that a trajectory that runs away does not overflow.
+LARGEST_MISFIT = 1e6
+#: A moving signal of whose deviation more than this share is left is not explained; and one that rests.
+UNEXPLAINED = 0.9
+UNEXPLAINED_AT_REST = 5.0
+#: A signal moves if its deviation is this many times its roughness from sample to sample.
+MOVING = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A simulation that follows the log: ``t (nt,)``, ``x0 (nx,)``, deviations of the sensors ``(ny,)``, cost."""
+
+    t: FloatArray
+    x0: FloatArray
+    deviations: FloatArray
+    cost: float
+    information: FloatArray
+
+
+class SimulationError:
+    """Weighted differences between simulation and log, prior terms included, as a function of ``[t, x0]`` scaled."""
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem, graphs = problem, problem.graphs
+        self.spread = np.sqrt(np.maximum(np.diag(problem.P0), 1e-300))
+        self.scale = np.concatenate([problem.widths, self.spread])
+        self.run = Compiled(_simulated(problem))
+        self.nt, self.ny, self.size = graphs.nt, graphs.ny, graphs.nt + graphs.nx
+        self.mask = np.isfinite(problem.y).ravel()
+        self._last: tuple[bytes, FloatArray, FloatArray] | None = None
+
+    def simulated(self, v: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return outputs ``(n, ny)`` and their derivatives by the scaled variables ``(n * ny, nt + nx)``."""
+        key = v.tobytes()
+        if self._last is None or self._last[0] != key:
+            rows = self.run(v * self.scale)[0].T
+            y = rows[:, : self.ny].copy()
+            y[np.abs(rows[:, -1]) > LARGEST_RESIDUAL] = np.nan
+            S = rows[:, self.ny : -1].reshape(len(rows), self.size, self.ny).transpose(0, 2, 1)
+            self._last = key, y, S.reshape(-1, self.size) * self.scale
+        return self._last[1], self._last[2]
+
+    def states(self, fit: Fit) -> FloatArray:
+        """Return the states of a fit ``(n, nx)``."""
+        p, g = self.problem, self.problem.graphs
+        x, found = fit.x0, [fit.x0]
+        for u in p.u[1:]:
+            x = np.array(g.solve(x, u, fit.t)[0])[-g.nx :, 0]
+            found.append(x)
+        return np.array(found)
+
+    def residuals(self, v: FloatArray, weights: FloatArray) -> FloatArray:
+        """Return differences in units of the sensors' deviations, then those from the priors."""
+        p, (y, _) = self.problem, self.simulated(v)
+        e = ((y - p.y) / weights).ravel()[self.mask]
+        e = np.clip(np.nan_to_num(e, nan=LARGEST_MISFIT), -LARGEST_MISFIT, LARGEST_MISFIT)
+        constants = np.sqrt(p.prior_weights) * (v[: self.nt] * p.widths - p.prior_means)
+        return np.concatenate([e, v[self.nt :] - p.x0 / self.spread, constants])
+
+    def jacobian(self, v: FloatArray, weights: FloatArray) -> FloatArray:
+        """Return the derivatives of `residuals`."""
+        p, (_, S) = self.problem, self.simulated(v)
+        rows = (S / np.tile(weights, len(p.y))[:, None])[self.mask]
+        rows = np.nan_to_num(rows, nan=0.0, posinf=0.0, neginf=0.0)
+        nx = self.size - self.nt
+        states = np.hstack([np.zeros((nx, self.nt)), np.eye(nx)])
+        priors = np.hstack([np.diag(np.sqrt(p.prior_weights) * p.widths), np.zeros((self.nt, nx))])
+        return np.vstack([rows, states, priors])
+
+    def fit(self, start: FloatArray) -> Fit | None:
+        """Return the fit that is reached from constants ``(nt,)``, or nothing where the model cannot be simulated."""
+        from scipy.optimize import least_squares
+
+        p = self.problem
+        low = np.concatenate([p.low / p.widths, np.full(len(p.x0), -np.inf)])
+        high = np.concatenate([p.high / p.widths, np.full(len(p.x0), np.inf)])
+        inside = np.clip(start / p.widths, low[: self.nt] + 1e-9, high[: self.nt] - 1e-9)
+        v = np.concatenate([inside, p.x0 / self.spread])
+        weights = FIRST_NOISE * np.nanstd(p.y, axis=0) + np.sqrt(p.floors)
+        for i in range(ROUNDS):
+            found = least_squares(
+                self.residuals, v, jac=self.jacobian, bounds=(low, high), args=(weights,), x_scale="jac",
+                loss="soft_l1" if i == 0 else "linear", max_nfev=MOST_EVALUATIONS,
+            )  # fmt: skip
+            v = np.asarray(found.x)
+            left = self.simulated(v)[0] - p.y
+            if not np.isfinite(left[np.isfinite(p.y)]).all():
+                return None
+            weights = np.sqrt(np.maximum(np.nanmean(left**2, axis=0), p.floors))
+        J = self.jacobian(v, weights)
+        cost = float(0.5 * found.fun @ found.fun + np.log(weights).sum() * len(p.y))
+        return Fit(v[: self.nt] * p.widths, v[self.nt :] * self.spread, weights, cost, J.T @ J)
+
+
+def simulation_fits(
+    problem: Problem, starts: int, seed: int, note: Callable[[str], object], *, start: FloatArray | None = None
+) -> list[Fit]:
+    """Return fits from given or nominal constants and random ones within their bounds, the best first."""
+    error, rng = SimulationError(problem), np.random.default_rng(seed)
+    fits = []
+    for i in range(starts):
+        note(f"simulation error, start {i + 1} of {starts}")
+        drawn = problem.low + problem.widths * rng.uniform(0.05, 0.95, len(problem.low))
+        found = error.fit(drawn if i else problem.nominal if start is None else start)
+        if found is not None:
+            fits.append(found)
+    if not fits:
+        raise refused(
+            "cannot-simulate", "No start gives a trajectory: the model has no solution along the log's inputs. Check "
+            "units, the sample time and the initial state, and narrow the bounds.", signals=list(problem.unknown),
+        )  # fmt: skip
+    fits.sort(key=lambda fit: fit.cost)
+    _require_explained(problem, fits[0].deviations)
+    return fits
+
+
+def _require_explained(problem: Problem, left: FloatArray) -> None:
+    """Refuse a model whose best fit leaves as much as there was: its units, scales or sample time are wrong."""
+    y = problem.y
+    deviations = np.nanstd(y, axis=0)
+    share = left / np.maximum(deviations, 1e-300)
+    with np.errstate(invalid="ignore"):
+        roughness = np.nan_to_num(np.nanstd(np.diff(y, axis=0), axis=0)) / np.sqrt(2.0)
+    moves = deviations > MOVING * np.maximum(roughness, np.sqrt(problem.floors))
+    bad = np.where(moves, share > UNEXPLAINED, share > UNEXPLAINED_AT_REST)
+    if bad.any() and (bad[moves].all() if moves.any() else True):
+        names = [name for name, wrong in zip(problem.output_names, bad, strict=True) if wrong]
+        told = ", ".join(f"{name}: {100 * part:.3g} %" for name, part in zip(problem.output_names, share, strict=True))
+        raise refused(
+            "explains-nothing", f"The model cannot follow the log: what the best fit leaves is as large as the signals "
+            f"({told} of their deviations). Check units and scales (a factor of 1000?), the sample time, and the "
+            "bounds.", signals=names,
+        )  # fmt: skip
+
+
+def _simulated(problem: Problem) -> Any:
+    """Return the function from ``[t, x0]`` to rows: outputs, their derivatives by t and x0, and the residual."""
+    import casadi as ca
+
+    g, n = problem.graphs, len(problem.y)
+    nx, ny, nt, size = g.nx, g.ny, g.nt, g.nt + g.nx
+    packed, u, t = ca.MX.sym("packed", nx + nx * size), ca.MX.sym("u", g.nu), ca.MX.sym("t", nt)
+
+    def row(x: Any, S: Any, t: Any, left: Any) -> Any:
+        y, H, L = g.outputs(x, t)
+        return ca.vertcat(y, ca.vec(H @ S + ca.horzcat(L, ca.MX.zeros(ny, nx))), left)
+
+    x, S = packed[:nx], ca.reshape(packed[nx:], nx, size)
+    stages, left = g.solve(x, u, t)
+    after, F, G, _ = g.fast(x, u, t, t, g.sensitivities(x, u, t, stages))
+    S = F @ S + ca.horzcat(G, ca.MX.zeros(nx, nx))
+    one = ca.Function("one", [packed, u, t], [ca.vertcat(after, ca.vec(S)), row(after, S, t, left)])
+    v = ca.MX.sym("v", size)
+    first = ca.DM(np.hstack([np.zeros((nx, nt)), np.eye(nx)]))
+    rows = row(v[nt:], ca.MX(first), v[:nt], ca.MX(0.0))
+    if n > 1:
+        begin = ca.vertcat(v[nt:], ca.vec(first))
+        _, later = one.mapaccum(n - 1)(begin, ca.DM(problem.u[1:].T), ca.repmat(v[:nt], 1, n - 1))
+        rows = ca.horzcat(rows, later)
+    return ca.Function("simulated", [v], [ca.densify(rows)])

@@ -1,0 +1,241 @@
+"""One sample of a nonlinear plant as CasADi functions of state, input and unknown constants, with derivatives.
+
+The derivative of a likelihood needs that of F and of the noise's way, but not of Newton's iterations: the solved stages
+and their first derivatives enter the differentiated part as numbers, and the implicit function theorem does the rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from obsynth.calibration.compilation import compiled
+from obsynth.errors import SpecError
+from obsynth.numerics.symbolic_solve import largest_entries
+from obsynth.plants.dae.functions import DAEFunctions
+from obsynth.plants.dae.model import DAEModel
+from obsynth.plants.dae.symbols import symbols_of
+from obsynth.plants.names import index_of
+
+#: Newton iterations of every step, from the last sample's state, and further ones where the residual is above `SOLVED`.
+ITERATIONS, FURTHER = 3, 8
+SOLVED = 1e-11
+
+
+#: Operations in one evaluation above which functions are compiled: some seconds, before thousands of evaluations.
+COMPILED_OPERATIONS = 2_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class SampleGraphs:
+    """The functions of one sample; ``t (nt,)`` are the unknown constants.
+
+    solve : from x, u, t to the stages of all substeps and the scaled residual that is left.
+    sensitivities : from x, u, t, stages to what `local` takes as numbers: stages and their derivatives.
+    local : from x, u, t and those numbers (with x itself) to the state after, F, G by t, and the noise's way.
+    outputs : from x, t to y, H and L by t.
+    fast : `local`, to be evaluated and not to be differentiated; in_c : whether functions are machine code.
+    """
+
+    solve: Any
+    sensitivities: Any
+    local: Any
+    outputs: Any
+    fast: Any
+    nx: int
+    nu: int
+    ny: int
+    nt: int
+    numbers: int
+    in_c: bool
+    made: dict[Any, Any] = field(default_factory=dict, repr=False)
+
+
+def promoted(model: DAEModel, names: Sequence[str]) -> DAEModel:
+    """Return a model whose named constants are parameters, before those it has."""
+    for name in names:
+        index_of(name, [*model.parameter_names, *model.constants], what="unknown")
+    new = [name for name in names if name in model.constants]
+    if not new:
+        return model
+    if not model.is_data:
+        raise SpecError(f"{new[0]!r} is a constant of Python functions, which only texts can give up: make it a "
+                        "parameter.", path=f"unknown.{new[0]}")  # fmt: skip
+    return model.replace(
+        constants={name: value for name, value in model.constants.items() if name not in new},
+        parameters={**{name: model.constants[name] for name in new}, **model.parameters},
+        units={**dict.fromkeys(new, "1"), **model.units},
+    )
+
+
+def sample_graphs(
+    model: DAEModel, unknown: Sequence[str], dt: float, *, integration: str, substeps: int, samples: int = 1
+) -> SampleGraphs:
+    """Return the functions of one sample of ``dt`` seconds of a promoted model, in C where there are many."""
+    import casadi as ca
+
+    base = _Substep(model, unknown, dt / substeps, integration)
+    nx, nu, nt, n = model.nx, model.nu, len(unknown), base.size
+    x, u, t = ca.MX.sym("x", nx), ca.MX.sym("u", nu), ca.MX.sym("t", nt)
+    stages: list[Any] = []
+    state, left = x, ca.MX(0.0)
+    for _ in range(substeps):
+        X, rest = base.solve(ca.repmat(state, base.stages, 1), state, u, t)
+        stages, state, left = [*stages, X], X[n - nx :], ca.fmax(left, rest)
+    solve = ca.Function("solve", [x, u, t], [ca.vertcat(*stages), left])
+
+    Z, numbers, state = ca.MX.sym("Z", n * substeps), [x], x
+    for i in range(substeps):
+        X = Z[n * i : n * (i + 1)]
+        numbers += [X, *(ca.vec(part) for part in base.derivatives(X, state, u, t))]
+        state = X[n - nx :]
+    packed = ca.vertcat(*numbers)
+    sensitivities = ca.Function("sensitivities", [x, u, t, Z], [packed])
+    symbols = symbols_of(model)
+    theta, H = symbols.theta, ca.jacobian(symbols.outputs, symbols.x)
+    L = ca.jacobian(symbols.outputs, symbols.theta)[:, base.columns]
+    full = ca.Function("h", [symbols.x, theta], [ca.densify(part) for part in (symbols.outputs, H, L)])
+    xs, ts = ca.SX.sym("x", nx), ca.SX.sym("t", nt)
+    outputs = ca.Function("outputs", [xs, ts], list(full(xs, base.theta(ts))))
+    local = _local(base, substeps, nx, nu, nt)
+    fast, in_c = local, 8 * samples * local.n_instructions() > COMPILED_OPERATIONS
+    if in_c:
+        solve, sensitivities, fast = compiled([solve, sensitivities, local])
+    return SampleGraphs(solve, sensitivities, local, outputs, fast, nx, nu, model.ny, nt, packed.shape[0], in_c)
+
+
+def _local(base: _Substep, substeps: int, nx: int, nu: int, nt: int) -> Any:
+    """Return the differentiable part: values from the numbers, derivatives from the equations at them."""
+    import casadi as ca
+
+    n = base.size
+    x, u, t, tc = (ca.SX.sym(name, size) for name, size in (("x", nx), ("u", nu), ("t", nt), ("tc", nt)))
+    length = nx + substeps * n * (1 + nx + nt)
+    packed = ca.SX.sym("numbers", length)
+    before, state, place = packed[:nx], x, nx
+    F, G, noise = ca.SX.eye(nx), ca.SX.zeros(nx, nt), ca.SX.zeros(nx, nx)
+    for _ in range(substeps):
+        X = packed[place : place + n]
+        by_x = ca.reshape(packed[place + n : place + n * (1 + nx)], n, nx)
+        by_t = ca.reshape(packed[place + n * (1 + nx) : place + n * (1 + nx + nt)], n, nt)
+        moved = X + by_x @ (state - before) + by_t @ (t - tc)
+        by_x, by_t, way = base.symbolic(moved, state, u, t)
+        # What is added to the equations is added during the whole sample, in every substep.
+        noise = by_x[n - nx :, :] @ noise + way
+        F, G = by_x[n - nx :, :] @ F, by_x[n - nx :, :] @ G + by_t[n - nx :, :]
+        state, before, place = moved[n - nx :], X[n - nx :], place + n * (1 + nx + nt)
+    return ca.Function("local", [x, u, t, tc, packed], [state, ca.densify(F), ca.densify(G), ca.densify(noise)])
+
+
+class _Substep:
+    """One implicit step: its Newton iteration and its derivatives, by elimination in an order that is fixed."""
+
+    def __init__(self, model: DAEModel, unknown: Sequence[str], dt: float, integration: str) -> None:
+        import casadi as ca
+
+        self.model, functions = model, DAEFunctions(model, integration)
+        self.stages, self.size = functions.stages, functions.stages * model.nx
+        self.columns = [model.parameter_names.index(name) for name in unknown]
+        self.functions, self.dt = functions, dt
+        X, x = ca.SX.sym("X", self.size), ca.SX.sym("x", model.nx)
+        u, t = ca.SX.sym("u", model.nu), ca.SX.sym("t", len(unknown))
+        sizes = ca.DM(np.tile(model.state_scales, self.stages))
+        equations = self._equations(X, x, u, t)
+        J = ca.jacobian(equations, X)
+        self.order = _pivots(ca.Function("J", [X, x, u, t], [ca.densify(J)]), model, self.stages, self.columns)
+        step = eliminated(J, -equations, self.order)
+        weights = 1.0 / ca.fmax(largest_entries(ca.densify(J) @ ca.diag(sizes)), 1e-300)
+        left = ca.mmax(ca.fabs(weights * equations)) if self.size > 1 else ca.fabs(weights * equations)
+        # The residual is that before the iteration, so that the last one is better than it says.
+        self.newton = ca.Function("newton", [X, x, u, t], [X + step, left])
+        self.solve = self._solve()
+        found = [ca.densify(part) for part in self.symbolic(X, x, u, t)[:2]]
+        self.derivatives = ca.Function("derivatives", [X, x, u, t], found)
+
+    def _solve(self) -> Any:
+        """Return the solution of the stages from a start, in as many iterations as it takes."""
+        import casadi as ca
+
+        start = [ca.MX.sym(name, self.newton.size1_in(i)) for i, name in enumerate(("X", "x", "u", "t"))]
+        X, before = start[0], start[1:]
+        for _ in range(ITERATIONS):
+            X, left = self.newton(X, *before)
+        X, left = self.newton(X, *before)
+        more, rest = start[0], ca.MX(0.0)
+        for _ in range(FURTHER):
+            more, rest = self.newton(more, *before)
+        further = ca.Function("iterate", start, [more, rest])
+        done = ca.Function("done", start, [start[0], ca.MX(0.0)])
+        choice = ca.Function.if_else("choice", further, done)
+        unsolved = ca.logic_not(left <= SOLVED)
+        after, rest = choice(unsolved, X, *before)
+        return ca.Function("solution", start, [after, ca.if_else(unsolved, rest, left)])
+
+    def theta(self, t: Any) -> Any:
+        """Return all parameters: the unknown, and nominal values for the rest."""
+        import casadi as ca
+
+        entries = [ca.SX(value) for value in self.model.nominal_parameters]
+        for i, column in enumerate(self.columns):
+            entries[column] = t[i]
+        return ca.vertcat(*entries) if entries else ca.SX(0, 1)
+
+    def _equations(self, X: Any, x: Any, u: Any, t: Any) -> Any:
+        return self.functions.residual_function(X, x, u, self.theta(t), self.dt)[0]
+
+    def symbolic(self, X: Any, x: Any, u: Any, t: Any) -> tuple[Any, Any, Any]:
+        """Return the derivatives of the stages by x and by t, and of the state after by what is added."""
+        import casadi as ca
+
+        Xs, xs, us, ts = (ca.SX.sym(name, part.numel()) for name, part in zip("Xxut", (X, x, u, t), strict=True))
+        equations, nx, nt = self._equations(Xs, xs, us, ts), self.model.nx, ts.numel()
+        right = ca.horzcat(-ca.jacobian(equations, xs), -ca.jacobian(equations, ts),
+                           ca.repmat(ca.SX.eye(nx), self.stages, 1))  # fmt: skip
+        found = eliminated(ca.jacobian(equations, Xs), right, self.order)
+        found = ca.Function("found", [Xs, xs, us, ts], [found])(X, x, u, t)
+        return found[:, :nx], found[:, nx : nx + nt], found[self.size - nx :, nx + nt :]
+
+
+def _pivots(jacobian: Any, model: DAEModel, stages: int, columns: Sequence[int]) -> list[int]:
+    """Return the order of rows in which elimination goes at the nominal point."""
+    from scipy.linalg import lu_factor
+
+    x = model.nominal_state
+    J = np.array(jacobian(np.tile(x, stages), x, model.nominal_input, model.nominal_parameters[list(columns)]))
+    J = np.nan_to_num(J * np.tile(model.state_scales, stages))
+    peaks = np.abs(J).max(axis=1)
+    _, exchanges = lu_factor(J / np.where(peaks > 0.0, peaks, 1.0)[:, None], check_finite=False)
+    order = list(range(len(J)))
+    for i, j in enumerate(exchanges):
+        order[i], order[j] = order[j], order[i]
+    return order
+
+
+def eliminated(matrix: Any, right: Any, order: Sequence[int]) -> Any:
+    """Return ``matrix^-1 right`` by scalar operations, rows in a given order; structural zeros cost nothing."""
+    import casadi as ca
+
+    n, m = matrix.shape[0], right.shape[1]
+    rows = [[matrix[i, j] for j in range(n)] + [right[i, j] for j in range(m)] for i in order]
+    for j in range(n):
+        for i in range(j + 1, n):
+            if rows[i][j].is_zero():
+                continue
+            factor = rows[i][j] / rows[j][j]
+            for c in range(j + 1, n + m):
+                if not rows[j][c].is_zero():
+                    rows[i][c] = rows[i][c] - factor * rows[j][c]
+    found: list[list[Any]] = [[]] * n
+    for j in reversed(range(n)):
+        solution = []
+        for c in range(m):
+            rest = rows[j][n + c]
+            for i in range(j + 1, n):
+                if not (rows[j][i].is_zero() or found[i][c].is_zero()):
+                    rest = rest - rows[j][i] * found[i][c]
+            solution.append(rest if rest.is_zero() else rest / rows[j][j])
+        found[j] = solution
+    return ca.vertcat(*(ca.horzcat(*row) for row in found))

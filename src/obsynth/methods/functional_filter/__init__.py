@@ -1,0 +1,1 @@
+"""Functional filter: estimates faults, or shows them in residuals, and nothing else."""

@@ -1,0 +1,180 @@
+"""Checks of a functional filter, from the plant, the shipped realisation and T, T0 alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from obsynth.methods.functional_filter.checks.leaks import leak_rows
+from obsynth.methods.functional_filter.checks.noise import noise_rows
+from obsynth.methods.functional_filter.conditions import conditions
+from obsynth.methods.functional_filter.tracking import wanted_faults
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.scaling import balance_by_least_squares
+from obsynth.numerics.spectra import decay_rates, eigenvalues
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.exosystems import Exosystem
+from obsynth.plants.fault_model_spectra import stated_eigenvalues
+from obsynth.results.design import ObserverDesign
+from obsynth.results.report import Check, lower_bound_check, upper_bound_check
+from obsynth.verification.identities import Identity, equality, relative_tolerance
+from obsynth.verification.lyapunov import prove_stable
+from obsynth.verification.plant import condition_rows, plant_information
+
+_MATRICES = ("T", "T0", "Phi", "Cw", "walks", "stability", "tracking", "deviations")
+#: A claimed rate may be missed by this share.
+RATE_TOLERANCE = 1e-4
+_SOURCE = "identities of the error z - T E x, ours"
+
+
+def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
+    """Yield every check of ``design``; see `obsynth.methods.verifying.verify`."""
+    (plant, observer), matrices = design.linear, design.certificate.matrices
+    yield from plant_information(plant)
+    fitting = _fits(design)
+    yield upper_bound_check(
+        "fits the plant", "observer, certificate and plant have matching signals and shapes", float(not fitting), 0.0,
+        source="shipped realisation",
+    )  # fmt: skip
+    if not fitting:
+        return
+    options = design.options
+    yield from condition_rows(
+        conditions(
+            plant, fault_model=_model(plant, matrices), faults=options.get("faults"), residuals=options.get("residuals")
+        )
+    )
+    tolerance = relative_tolerance(printed_digits, plant.nx + plant.ny + observer.order)
+    for name, claim, identity in _identities(plant, observer, matrices["T"], matrices["T0"]):
+        yield equality(name, claim, identity.residual(), _SOURCE, bound=tolerance)
+    proof = prove_stable(observer.Az, matrices["stability"], plant.dt)
+    yield Check(
+        "stability", "every error dies out: the Lyapunov inequality is positive definite", proof.lower_bound, 0.0,
+        proof.lower_bound, proof.proved, "Lyapunov", "proved", proof.text,
+    )  # fmt: skip
+    yield from _claimed(design)
+    for name, claim, identity in _tracking(plant, observer, design):
+        yield equality(name, claim, identity.residual(), "regulator equation, ours", bound=max(tolerance, 1e-8))
+    yield from leak_rows(design)
+    yield from noise_rows(design)
+
+
+def _model(plant: DescriptorSystem, matrices: Mapping[str, FloatArray]) -> Exosystem:
+    phi = matrices["Phi"]
+    names = tuple(f"w{i + 1}" for i in range(len(phi)))
+    return Exosystem(phi, matrices["Cw"], names, stated_eigenvalues(phi), ("as shipped",) * plant.nf)
+
+
+def _fits(design: ObserverDesign) -> bool:
+    (plant, observer), matrices = design.linear, design.certificate.matrices
+    if any(name not in matrices or not np.all(np.isfinite(matrices[name])) for name in _MATRICES):
+        return False
+    order, count = observer.order, len(matrices["Phi"])
+    shapes = {
+        "T": (order, plant.nx), "T0": (len(observer.Cz), plant.nx), "Phi": (count, count), "Cw": (plant.nf, count),
+        "walks": (count, count), "stability": (order, order), "tracking": (order, count),
+        "deviations": (len(observer.fault_names), 2),
+    }  # fmt: skip
+    finite = all(np.all(np.isfinite(part)) for part in (observer.Az, observer.Bu, observer.By, observer.Cz))
+    return bool(
+        all(matrices[name].shape == shape for name, shape in shapes.items())
+        and finite
+        and observer.input_names == plant.input_names
+        and observer.output_names == plant.output_names
+        and observer.state_names == ()
+        and set(observer.fault_names) <= set(plant.fault_names)
+        and (observer.fault_names or observer.residual_names)
+        and observer.dt == plant.dt
+        and list(observer.fault_names) == list(design.options.get("faults") or [])
+        and all(delay == _delay(design) for delay in observer.fault_delays)
+    )
+
+
+def _delay(design: ObserverDesign) -> int:
+    return int(design.options.get("delay", 0)) + (int(design.options.get("mean", 1)) - 1) // 2
+
+
+def _identities(
+    plant: DescriptorSystem, observer: LinearObserver, t: FloatArray, t0: FloatArray
+) -> Iterator[tuple[str, str, Identity]]:
+    """Yield the identities that leave neither x, nor u, nor d in the error: name, claim, terms."""
+    az, bu, by, cz, du, dy = observer.Az, observer.Bu, observer.By, observer.Cz, observer.Du, observer.Dy
+    scaling = balance_by_least_squares(plant.E, plant.A, outputs=[plant.C])
+    units = scaling.states
+    # What cancels down to rounding is judged by the terms that it was formed of.
+    size_t, size_t0 = np.abs(t), np.abs(t0)
+    yield "state in the error", "Az T E + By C = T A", Identity(
+        (az @ (t @ plant.E), by @ plant.C, -t @ plant.A),
+        ((az, t, plant.E), (by, plant.C), (size_t, plant.A), (az, t, plant.A)), units,
+    )  # fmt: skip
+    yield (
+        "inputs in the error",
+        "Bu + By D = T B",
+        Identity((bu, by @ plant.D, -t @ plant.B), ((by, plant.D), (size_t, plant.B))),
+    )
+    yield (
+        "unknown inputs in the error",
+        "By Dd = T Bd",
+        Identity((by @ plant.Dd, -t @ plant.Bd), ((by, plant.Dd), (size_t, plant.Bd))),
+    )
+    yield "algebraic rows", "T0 E = 0", Identity((t0 @ plant.E,), ((size_t0, plant.E), (size_t0, plant.A)), units)
+    yield "state in the estimates", "Cz T E + Dy C = T0 A", Identity(
+        (cz @ (t @ plant.E), dy @ plant.C, -t0 @ plant.A),
+        ((cz, t, plant.E), (dy, plant.C), (size_t0, plant.A), (cz, t, plant.A)), units,
+    )  # fmt: skip
+    yield (
+        "inputs in the estimates",
+        "Du + Dy D = T0 B",
+        Identity((du, dy @ plant.D, -t0 @ plant.B), ((dy, plant.D), (size_t0, plant.B))),
+    )
+    yield (
+        "unknown inputs in the estimates",
+        "Dy Dd = T0 Bd",
+        Identity((dy @ plant.Dd, -t0 @ plant.Bd), ((dy, plant.Dd), (size_t0, plant.Bd), (cz, t, plant.Bd))),
+    )
+
+
+def _tracking(
+    plant: DescriptorSystem, observer: LinearObserver, design: ObserverDesign
+) -> Iterator[tuple[str, str, Identity]]:
+    """Yield what the estimates make of faults that follow their models: each its own, and no other."""
+    matrices = design.certificate.matrices
+    pi, phi, cw = matrices["tracking"], matrices["Phi"], matrices["Cw"]
+    entering = observer.By @ plant.Df - matrices["T"] @ plant.Bf
+    direct = observer.Dy @ plant.Df - matrices["T0"] @ plant.Bf
+    # The filter's states are of like size: an entry that is nothing but rounding is judged beside them.
+    largest = np.full_like(pi, np.max(np.abs(pi), initial=0.0))
+    yield (
+        "motion with the fault model",
+        "Az Pi + (By Df - T Bf) Cw = Pi Phi",
+        Identity((observer.Az @ pi, entering @ cw, -pi @ phi), ((observer.Az, largest), (largest, phi))),
+    )
+    if not observer.fault_names:
+        return
+    wanted = wanted_faults(plant, observer, matrices, mean=int(design.options.get("mean", 1)))[observer.fault_rows]
+    rows = observer.fault_rows
+    yield (
+        "fault models", "the gain of each estimate for its own fault model is one, for all others zero",
+        Identity(
+            (observer.Cz[rows] @ pi, direct[rows] @ cw, -wanted),
+            ((observer.Cz[rows], largest), (np.abs(direct[rows]), cw)),
+        ),
+    )  # fmt: skip
+
+
+def _claimed(design: ObserverDesign) -> Iterator[Check]:
+    (plant, observer), claims = design.linear, design.certificate.claims
+    yield upper_bound_check(
+        "order", "number of states of the filter", float(observer.order), claims.get("order", float("nan")),
+        source="shipped realisation",
+    )  # fmt: skip
+    if "decay" in claims:
+        rates = decay_rates(eigenvalues(observer.Az), plant.dt)
+        slowest = float(np.min(rates, initial=np.inf))
+        yield lower_bound_check(
+            "decay", "every mode decays at the claimed rate (1/s) or faster", slowest,
+            claims["decay"] - RATE_TOLERANCE * abs(claims["decay"]), source="recomputed eigenvalues",
+            detail=f"slowest time constant {1.0 / slowest:.3g} s" if slowest > 0.0 else "",
+        )  # fmt: skip

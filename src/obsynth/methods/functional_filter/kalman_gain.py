@@ -1,0 +1,124 @@
+"""The Kalman gain of a filter model: correlated noise, walks of the fault models, and gains for a fixed lag.
+
+A decoupled plant is driven by y itself, so the same noise stands in its states and in its outputs.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+
+from obsynth.errors import PreconditionError, SolverError
+from obsynth.methods.functional_filter.filter_model import FilterModel
+from obsynth.methods.riccati import riccati_solution
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.ranks import RANK_TOLERANCE, decide_rank
+from obsynth.numerics.spectra import abscissa
+
+#: Noise that every state gets besides the stated one, as a share of the sensors', where the equation has no stable
+#: solution without: a mode that nothing drives would never be corrected.
+SHARES_OF_NOISE = (0.0, 1e-6, 1e-4, 1e-2, 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class KalmanGain:
+    """A stable gain.
+
+    Fields: K ``(n, p)``: gain of the prediction; lag ``(n, p)`` each: gain of xi(k) from the innovation at k + j;
+    innovation ``(p, p)``: its covariance (intensity in continuous time); added: noise given to every state besides.
+    """
+
+    K: FloatArray
+    lag: tuple[FloatArray, ...]
+    innovation: FloatArray
+    added: float
+
+
+def require_noise(model: FilterModel, plant_outputs: tuple[str, ...], noise: FloatArray) -> None:
+    """Raise `PreconditionError` where a combination of outputs is free of noise.
+
+    Shapes: ``noise (ny, nw)``.
+    """
+    silent = [name for name, row in zip(plant_outputs, noise, strict=True) if not row.any()]
+    if model.M.shape[0] and decide_rank(model.M, expected=model.M.shape[0]).rank < model.M.shape[0]:
+        which = f"no noise is stated for {', '.join(silent)}" if silent else "equations without any output constrain it"
+        raise PreconditionError(
+            f"A combination of the outputs is free of noise: {which}. A Kalman gain would trust it without limit; "
+            "state the noise of every sensor (sensor_noise), or give poles.",
+            condition="noise of every output",
+            signals=silent or plant_outputs,
+        )
+
+
+def kalman_gain(model: FilterModel, rates: FloatArray, *, lag: int = 0, decay: float = 0.0) -> KalmanGain:
+    """Return the gain for walks of the fault models' states, ``rates (model states,)``, by one Riccati equation.
+
+    With a ``decay`` (1/s) every error decays at this rate or faster.
+    """
+    n, p = model.A.shape[0], model.C.shape[0]
+    if n == 0:
+        return KalmanGain(np.zeros((0, p)), (np.zeros((0, p)),) * (lag + 1), model.M @ model.M.T, 0.0)
+    process = model.N @ model.N.T + (model.drive * rates**2) @ model.drive.T
+    measured, cross = model.M @ model.M.T, model.N @ model.M.T
+    unit = max(float(np.max(np.abs(model.N[: model.order]), initial=0.0)), float(np.max(np.abs(model.M), initial=0.0)))
+    states = np.diag(np.r_[np.ones(model.order), np.zeros(n - model.order)])
+    for share in SHARES_OF_NOISE:
+        drive = process + (share * unit) ** 2 * states
+        if model.dt > 0.0:
+            found = _discrete(model, drive, measured, cross, lag, float(np.exp(decay * model.dt)))
+        else:
+            found = _continuous(model, drive, measured, cross, decay)
+        if found is not None:
+            return KalmanGain(*found, share * unit)
+    raise SolverError(
+        "The Riccati equation of the filter has no stable solution that double precision could find: look at the units "
+        "and the noise of the sensors, or give poles."
+    )
+
+
+def _discrete(
+    model: FilterModel, process: FloatArray, measured: FloatArray, cross: FloatArray, lag: int, growth: float
+) -> tuple[FloatArray, tuple[FloatArray, ...], FloatArray] | None:
+    p = riccati_solution(growth * model.A, model.C, process, measured, growth * cross)
+    if p is None or not np.all(np.isfinite(p)):
+        return None
+    p = 0.5 * (p + p.T)
+    innovation = model.C @ p @ model.C.T + measured
+    gain = np.linalg.solve(innovation, (model.A @ p @ model.C.T + cross).T).T
+    closed = model.A - gain @ model.C
+    if not abscissa(closed, model.dt) < 1.0 / growth:
+        return None
+    gains, moved = [], p.copy()
+    for _ in range(lag + 1):
+        gains.append(np.asarray(np.linalg.solve(innovation, model.C @ moved).T))
+        moved = closed @ moved
+    return np.asarray(gain, dtype=np.float64), tuple(gains), innovation
+
+
+def _continuous(
+    model: FilterModel, process: FloatArray, measured: FloatArray, cross: FloatArray, decay: float
+) -> tuple[FloatArray, tuple[FloatArray, ...], FloatArray] | None:
+    from scipy.linalg import solve_continuous_are
+
+    try:
+        with warnings.catch_warnings():
+            # What a badly conditioned equation gives is judged by its poles.
+            warnings.simplefilter("ignore")
+            p = solve_continuous_are((model.A + decay * np.eye(len(model.A))).T, model.C.T, process, measured, s=cross)
+    except (np.linalg.LinAlgError, ValueError):
+        return None
+    gain = np.asarray(np.linalg.solve(measured, (p @ model.C.T + cross).T).T)
+    if not np.all(np.isfinite(gain)) or not abscissa(model.A - gain @ model.C, 0.0) < -decay:
+        return None
+    return gain, (), measured
+
+
+def whitening(innovation: FloatArray) -> FloatArray:
+    """Return W ``(p, p)`` with ``W innovation W' = I``; rows of nothing but rounding are left out of it."""
+    if not innovation.size:
+        return innovation
+    sizes, directions = np.linalg.eigh(0.5 * (innovation + innovation.T))
+    kept = sizes > RANK_TOLERANCE**2 * sizes[-1]
+    return np.asarray((directions[:, kept] / np.sqrt(sizes[kept])).T)

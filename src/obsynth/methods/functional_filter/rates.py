@@ -1,0 +1,93 @@
+"""How fast a fault is held to walk where nobody says so: slowly, but so that a step is seen in the plant's own time."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from obsynth.errors import SolverError
+from obsynth.methods.functional_filter.filter_model import FilterModel
+from obsynth.methods.functional_filter.kalman_gain import KalmanGain, kalman_gain
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.pencils import pencil_structure
+from obsynth.numerics.spectra import speeds
+from obsynth.plants.descriptor import DescriptorSystem
+
+#: A step is to be seen to 90 % after so many time constants of the plant, but no sooner than so many samples.
+TIME_CONSTANTS, LEAST_SAMPLES = 7.0, 4.0
+#: Estimates of a step within this of one count as there; asked at these multiples of the time.
+REACHED, ASKED_AT = 0.1, (1.0, 1.5, 2.5)
+#: Decades of the search around a rate of the size of the noise, and its steps per decade at the end.
+DECADES, BISECTIONS = 8, 9
+
+
+def settling_time(plant: DescriptorSystem) -> float:
+    """Return the time in seconds after which a step of a fault should be seen."""
+    values = pencil_structure(plant.E, plant.A).finite_eigenvalues
+    found = speeds(values, plant.dt)
+    alive = found[np.isfinite(found) & (found > 1e-6 * np.max(found, initial=0.0))]
+    wanted = TIME_CONSTANTS / float(np.median(alive)) if alive.size else max(plant.dt, 1.0) * 10.0
+    return max(wanted, LEAST_SAMPLES * plant.dt)
+
+
+def default_rates(model: FilterModel, seconds: float, *, lag: int) -> tuple[FloatArray, KalmanGain]:
+    """Return the slowest walk of all fault models with which steps are seen in time, and its gain."""
+    states = model.drive.shape[1]
+    natural = np.max(np.abs(model.estimate[:, model.order :]), axis=0, initial=0.0)
+    sizes = np.ones(states)
+    for row, size in zip(model.estimate[:, model.order :], model.fault_sizes, strict=True):
+        sizes[row != 0.0] = max(float(size), np.finfo(np.float64).tiny)
+    noise = max(float(np.max(np.abs(model.M), initial=0.0)), float(np.max(np.abs(model.N), initial=0.0)))
+    unit = np.where(natural > 0.0, noise / sizes, noise / float(np.max(sizes, initial=1.0)))
+    tried: dict[float, KalmanGain | None] = {}
+
+    def gain(exponent: float) -> KalmanGain | None:
+        if exponent not in tried:
+            try:
+                tried[exponent] = kalman_gain(model, 10.0**exponent * unit, lag=lag)
+            except SolverError:
+                tried[exponent] = None
+        return tried[exponent]
+
+    def in_time(exponent: float) -> bool:
+        found = gain(exponent)
+        return found is not None and step_misses(model, found, seconds) <= REACHED
+
+    low = float(-DECADES)
+    high = next((float(e) for e in range(-DECADES, DECADES + 1) if in_time(float(e))), None)
+    if high is None:
+        # Some zero keeps every estimate from a step for long: the one that comes closest.
+        usable = [e for e, found in tried.items() if found is not None]
+        if not usable:
+            raise SolverError("No walk of the fault gives a stable filter: give fault_rate, or poles.")
+        high = min(usable, key=lambda e: step_misses(model, _known(tried[e]), seconds))
+        return 10.0**high * unit, _known(tried[high])
+    low = high - 1.0
+    for _ in range(BISECTIONS):
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if in_time(middle) else (middle, high)
+    return 10.0**high * unit, _known(gain(high))
+
+
+def step_misses(model: FilterModel, gain: KalmanGain, seconds: float) -> float:
+    """Return how far estimates of a unit step of each fault are from it at and after a time, at worst."""
+    a = model.A - gain.K @ model.C
+    worst = 0.0
+    start = model.drive @ np.linalg.pinv(model.estimate[:, model.order :])
+    for share in ASKED_AT:
+        error = model.estimate @ _after(a, share * seconds, model.dt) @ start
+        worst = max(worst, float(np.max(np.abs(error), initial=0.0)))
+    return worst
+
+
+def _after(a: FloatArray, seconds: float, dt: float) -> FloatArray:
+    from scipy.linalg import expm
+
+    if dt > 0.0:
+        return np.asarray(np.linalg.matrix_power(a, max(round(seconds / dt), 1)))
+    return np.asarray(expm(a * seconds))
+
+
+def _known(gain: KalmanGain | None) -> KalmanGain:
+    if gain is None:
+        raise SolverError("The Riccati equation of the filter has no stable solution: give fault_rate, or poles.")
+    return gain

@@ -1,0 +1,145 @@
+"""The shipped observer of a functional filter, and the matrices T and T0 that prove it.
+
+With eps = z - T E x, and rows of the plant's equations multiplied by T and T0,
+
+    eps+ = Az eps + (By Df - T Bf) f,    estimates = Cz eps + (Dy Df - T0 Bf) f
+
+when ``Az T E + By C = T A``, ``By Dd = T Bd``, ``Bu + By D = T B``, ``T0 E = 0``, ``Cz T E + Dy C = T0 A``,
+``Dy Dd = T0 Bd``, ``Du + Dy D = T0 B``: neither the state, nor u, nor an unknown input is left.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import reduce
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from obsynth.methods.functional_filter.filter_model import FilterModel
+from obsynth.methods.functional_filter.kalman_gain import KalmanGain
+from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.plants.descriptor import DescriptorSystem
+
+
+@dataclass(frozen=True, eq=False)
+class Dynamics:
+    """``z+ = A z + B v`` with v = [u; y], and T ``(nz, nx)``."""
+
+    A: FloatArray
+    B: FloatArray
+    T: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """``C z + D v``, and T0 ``(rows, nx)``; C may have fewer columns than there are states: the first ones."""
+
+    C: FloatArray
+    D: FloatArray
+    T0: FloatArray
+
+    def of_order(self, order: int) -> FloatArray:
+        """Return C for so many states."""
+        return np.hstack([self.C, np.zeros((len(self.C), order - self.C.shape[1]))])
+
+    def plus(self, other: Rows) -> Rows:
+        """Return the sum."""
+        order = max(self.C.shape[1], other.C.shape[1])
+        return Rows(self.of_order(order) + other.of_order(order), self.D + other.D, self.T0 + other.T0)
+
+    def times(self, matrix: FloatArray) -> Rows:
+        """Return combinations of the rows."""
+        return Rows(matrix @ self.C, matrix @ self.D, matrix @ self.T0)
+
+
+@dataclass(frozen=True, eq=False)
+class FilterPart:
+    """A filter for some faults: its dynamics, rows that estimate them, and residuals; ``delay`` in samples."""
+
+    dynamics: Dynamics
+    estimates: Rows
+    residuals: Rows
+    faults: tuple[int, ...]
+    delay: int
+
+
+def filter_part(model: FilterModel, gain: KalmanGain, shown: FloatArray, *, delay: int, mean: int) -> FilterPart:
+    """Return the filter of a gain; its estimates lag by ``delay`` samples and are means of ``mean`` of them.
+
+    Shapes: ``shown (rows, p)``: combinations of the innovation that are shipped as residuals.
+    """
+    dynamics = Dynamics(model.A - gain.K @ model.C, model.B + gain.K @ model.L, model.T + gain.K @ model.T0)
+    innovation = Rows(-model.C, model.L, model.T0)
+    count, nx = len(model.estimate), model.T.shape[1]
+    row = Rows(model.estimate, np.zeros((count, model.L.shape[1])), np.zeros((count, nx)))
+    corrections = [innovation.times(model.estimate @ part) for part in gain.lag]
+    if corrections:
+        row = row.plus(corrections[0])
+    for correction in corrections[1:]:
+        dynamics, row = _registered(dynamics, row)
+        row = row.plus(correction)
+    row, total = row, row
+    for _ in range(mean - 1):
+        dynamics, row = _registered(dynamics, row)
+        total = total.plus(row)
+    estimates = total.times(np.eye(count) / mean) if mean > 1 else total
+    return FilterPart(dynamics, estimates, innovation.times(shown), model.faults, delay + (mean - 1) // 2)
+
+
+def _registered(dynamics: Dynamics, row: Rows) -> tuple[Dynamics, Rows]:
+    """Return the dynamics with states that hold the last value of ``row``, and the rows that read them."""
+    order, count = len(dynamics.A), len(row.C)
+    more = Dynamics(
+        np.block([[dynamics.A, np.zeros((order, count))], [row.of_order(order), np.zeros((count, count))]]),
+        np.vstack([dynamics.B, row.D]),
+        np.vstack([dynamics.T, row.T0]),
+    )
+    read = np.hstack([np.zeros((count, order)), np.eye(count)])
+    return more, Rows(read, np.zeros_like(row.D), np.zeros_like(row.T0))
+
+
+def assembled(
+    plant: DescriptorSystem, parts: Sequence[FilterPart], residual_names: Sequence[str]
+) -> tuple[LinearObserver, FloatArray, FloatArray]:
+    """Return the observer of several filters side by side, with T ``(nz, nx)`` and T0 ``(rows, nx)``."""
+    nu, nx = plant.nu, plant.nx
+    a = block_diag(*(part.dynamics.A for part in parts)) if parts else np.zeros((0, 0))
+    b = _stacked([part.dynamics.B for part in parts], nu + plant.ny)
+    order = len(a)
+    places = np.cumsum([0, *(len(part.dynamics.A) for part in parts)])
+    estimates = [_placed(part.estimates, place, len(part.dynamics.A), order) for part, place in _with(parts, places)]
+    residuals = [_placed(part.residuals, place, len(part.dynamics.A), order) for part, place in _with(parts, places)]
+    faults = [(fault, part.delay) for part in parts for fault in part.faults if len(part.estimates.C)]
+    rows = sorted(range(len(faults)), key=lambda i: faults[i][0])
+    whole = Rows(np.zeros((0, order)), np.zeros((0, nu + plant.ny)), np.zeros((0, nx)))
+    estimate, residual = (reduce(_under, group, whole) for group in (estimates, residuals))
+    ordered = Rows(estimate.C[rows], estimate.D[rows], estimate.T0[rows])
+    shipped = _under(ordered, residual)
+    observer = LinearObserver(
+        Az=a, Bu=b[:, :nu], By=b[:, nu:], Cz=shipped.C, Du=shipped.D[:, :nu], Dy=shipped.D[:, nu:], dt=plant.dt,
+        input_names=plant.input_names, output_names=plant.output_names, state_names=(),
+        fault_names=tuple(plant.fault_names[faults[i][0]] for i in rows), residual_names=tuple(residual_names),
+        state_delays=(), fault_delays=tuple(faults[i][1] for i in rows),
+    )  # fmt: skip
+    return observer, _stacked([part.dynamics.T for part in parts], nx), shipped.T0
+
+
+def _with(parts: Sequence[FilterPart], places: FloatArray) -> list[tuple[FilterPart, int]]:
+    return [(part, int(place)) for part, place in zip(parts, places[:-1], strict=True)]
+
+
+def _placed(rows: Rows, place: int, width: int, order: int) -> Rows:
+    c = np.zeros((len(rows.C), order))
+    c[:, place : place + width] = rows.of_order(width)
+    return Rows(c, rows.D, rows.T0)
+
+
+def _under(first: Rows, second: Rows) -> Rows:
+    return Rows(np.vstack([first.C, second.C]), np.vstack([first.D, second.D]), np.vstack([first.T0, second.T0]))
+
+
+def _stacked(matrices: Sequence[FloatArray], width: int) -> FloatArray:
+    return np.vstack([np.zeros((0, width)), *matrices])

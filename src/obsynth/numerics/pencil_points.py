@@ -1,0 +1,105 @@
+"""Whether a tall pencil loses rank at given points: the Schur form is taken once, each point costs a square of it.
+
+In the Schur basis of the part on the range of E a pencil is ``[T - z I; W]`` with T triangular and few rows W, and its
+QR factorisation at a point is that of a triangle with a few rows below (LAPACK's ``tpqrt``).
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.numerics.ranks import RANK_TOLERANCE
+from obsynth.numerics.small_singular_values import FEW_COLUMNS, iterated, smallest_singular
+
+#: Above this condition of its leading part the Schur basis is not orthonormal enough to judge the pencil in it.
+SAFE_CONDITION = 1e5
+#: Columns that LAPACK's ``tpqrt`` treats at once.
+BLOCK = 32
+#: Most null directions that are looked for at a point.
+MOST_DIRECTIONS = 4
+#: Steps in which a computed zero is improved before the pencil there is judged.
+NEWTON_STEPS = 4
+#: A zero that moves further than this, relative to its size or one, is another one.
+NEWTON_REACH = 1e-2
+
+
+class PencilPoints:
+    """A tall pencil ``A - z E (m, n)``, E of full column rank, judged at points; ``scales`` are the norms of E, A."""
+
+    def __init__(self, E: FloatArray, A: FloatArray, scales: tuple[float, float]) -> None:
+        self.E, self.A, self.scales = E, A, scales
+
+    def nullity(self, point: complex) -> int:
+        """Return how many singular values at a point are below the tolerance of every rank."""
+        bound = RANK_TOLERANCE * (self.scales[1] + abs(point) * self.scales[0])
+        if self.E.shape[1] < FEW_COLUMNS or self._schur is None:
+            values = np.linalg.svd(self.A - point * self.E, compute_uv=False)
+            return int(np.sum(values <= bound))
+        count = min(MOST_DIRECTIONS, self.E.shape[1])
+        found = iterated(self._triangle(point), 1)
+        # In the basis of the Schur form values are those of the pencil up to the condition of E.
+        if found.values[0] > bound * self._schur[3]:
+            return 0
+        vectors = self._schur[1] @ iterated(self._triangle(point), count).right
+        basis = np.linalg.qr(vectors)[0]
+        values = np.linalg.svd((self.A - point * self.E) @ basis, compute_uv=False)
+        return int(np.sum(values <= bound))
+
+    def smallest(self, point: complex) -> float:
+        """Return the smallest singular value at a point relative to the largest, up to the condition of E."""
+        if self.E.shape[1] < FEW_COLUMNS or self._schur is None:
+            found = smallest_singular(self.A - point * self.E)
+        else:
+            found = iterated(self._triangle(point), 1)
+        return float(found.values[0]) / found.largest if found.largest else 0.0
+
+    def confirmed(self, point: complex) -> complex | None:
+        """Return a computed zero, improved where that is needed; ``None`` where the pencil has full rank all around."""
+        if self.nullity(point):
+            return point
+        place = point
+        for _ in range(NEWTON_STEPS):
+            matrix = self.A - place * self.E
+            left, _, right = np.linalg.svd(matrix, full_matrices=False)
+            u, v = left[:, -1].conj(), right[-1].conj()
+            slope = u @ self.E @ v
+            if slope == 0.0:
+                return None
+            place = place + (u @ matrix @ v) / slope
+            if not abs(place - point) <= NEWTON_REACH * max(1.0, abs(point)):
+                return None
+            if self.nullity(place):
+                return complex(place.real, place.imag if point.imag else 0.0)
+        return None
+
+    @cached_property
+    def _schur(self) -> tuple[ComplexArray, ComplexArray, ComplexArray, float] | None:
+        """Return T, the basis, the rows below, and the condition of E; ``None`` where that is too large."""
+        from scipy.linalg import rsf2csf, schur
+
+        columns = self.E.shape[1]
+        basis, square = np.linalg.qr(self.E, mode="complete")
+        turned, top = basis.T @ self.A, square[:columns]
+        sizes = np.linalg.svd(top, compute_uv=False)
+        if not sizes[-1] * SAFE_CONDITION > sizes[0]:
+            return None
+        t, u = rsf2csf(*schur(np.linalg.solve(top, turned[:columns]), check_finite=False))
+        # The leading part is divided by E; the rows below are brought to its size.
+        return t, u, np.asarray(turned[columns:] @ u / sizes[0]), float(sizes[0] / sizes[-1] / sizes[-1])
+
+    def _triangle(self, point: complex) -> NDArray[Any]:
+        from scipy.linalg.lapack import ztpqrt
+
+        schur = self._schur
+        triangle = np.array(schur[0] if schur else self.A, order="F")
+        np.einsum("ii->i", triangle)[:] -= point
+        below = np.array(schur[2] if schur else self.E, dtype=np.complex128, order="F")
+        if not below.shape[0]:
+            return triangle
+        found, _, _, _ = ztpqrt(0, min(BLOCK, triangle.shape[0]), triangle, below, overwrite_a=1, overwrite_b=1)
+        return np.triu(found)

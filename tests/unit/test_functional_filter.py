@@ -1,0 +1,176 @@
+"""The functional filter: order, proof from the file alone, refusals, delay, residuals, and what is done with it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import obsynth
+from obsynth.spec.loader import load_spec
+
+DESIGNS = Path(__file__).parents[2] / "designs"
+
+
+def motor() -> obsynth.DescriptorSystem:
+    return load_spec(DESIGNS / "motor" / "spec.yaml").plant
+
+
+def smib() -> obsynth.DescriptorSystem:
+    return load_spec(DESIGNS / "smib" / "functional.yaml").plant
+
+
+def tanks() -> obsynth.DescriptorSystem:
+    return load_spec(DESIGNS / "tanks" / "spec.yaml").plant
+
+
+def on_the_log(design: obsynth.ObserverDesign) -> float:
+    log = pd.read_csv(DESIGNS / "motor" / "log.csv")
+    true = pd.read_csv(DESIGNS / "motor" / "true_log.csv")
+    observer = design.observer if design.plant.dt else obsynth.sample_observer(design.observer, 0.005)
+    found = observer.run(log[list(design.plant.output_names)], log[["voltage"]])
+    return float(np.sqrt(np.mean((found.faults[:, 0] - true["f"]) ** 2)))
+
+
+def test_motor_order_proof_and_error_on_the_log() -> None:
+    plant = motor()
+    found = obsynth.functional_filter(plant, fault_rate=1.0)
+    assert found.observer.order == 3
+    assert found.observer.state_names == ()
+    assert max(check.value for check in found.report.checks if check.kind == "equality") < 1e-9
+    observer, t = found.observer, found.certificate.matrices["T"]
+    t0 = found.certificate.matrices["T0"]
+    at_rest = (
+        observer.Dy[0] @ plant.Df
+        - t0[0] @ plant.Bf
+        - observer.Cz[0] @ np.linalg.solve(observer.Az, observer.By @ plant.Df - t @ plant.Bf)
+    )
+    assert abs(at_rest[0] - 1.0) < 1e-8
+    assert on_the_log(found) < 0.02
+
+
+@pytest.mark.parametrize("options", [{}, {"decay": 5.0, "fault_rate": 1.0}, {"poles": [-30, -31, -32]}])
+def test_motor_by_default_and_by_speed(options: dict[str, object]) -> None:
+    found = obsynth.functional_filter(motor(), **options)
+    assert found.report.passed
+    assert on_the_log(found) < 0.025
+
+
+def test_refusal_names_the_load_and_the_sensor() -> None:
+    plant = load_spec(DESIGNS / "motor" / "one_encoder.yaml").plant
+    with pytest.raises(obsynth.PreconditionError) as caught:
+        obsynth.functional_filter(plant)
+    assert "hidden by a step of -1 in load torque with theta l = -0.02" in str(caught.value)
+    assert "Add one of: theta l." in str(caught.value)
+    assert caught.value.signals == ("torque",)
+
+
+def test_delay_against_noise_is_what_monte_carlo_finds() -> None:
+    plant = smib()
+    found = obsynth.functional_filter(plant, fault_rate=0.01, delay=5)
+    _, claimed = found.certificate.matrices["deviations"][0]
+    assert claimed == pytest.approx(0.0090, rel=0.02)
+    rng = np.random.default_rng(5)
+    steps = 40_000
+    f = np.cumsum(0.01 * rng.standard_normal(steps))
+    d = np.cumsum(0.01 * rng.standard_normal(steps))
+    noise = rng.standard_normal((steps, plant.nw))
+    x, outputs = np.zeros(plant.nx), np.empty((steps, plant.ny))
+    for k in range(steps):
+        w = noise[k]
+        outputs[k] = plant.C @ x + plant.Dd[:, 0] * d[k] + plant.Df[:, 0] * f[k] + plant.Dw @ w
+        x = plant.A @ x + plant.Bd[:, 0] * d[k] + plant.Bf[:, 0] * f[k] + plant.Bw @ w
+    estimate = found.observer.run(outputs).faults[:, 0]
+    error = estimate[1000:] - f[995:-5]
+    assert np.sqrt(np.mean(error**2)) == pytest.approx(claimed, rel=0.03)
+    assert found.observer.fault_delays == (5,)
+
+
+def test_leak_of_the_load_is_rounding() -> None:
+    plant = smib()
+    found = obsynth.functional_filter(plant, fault_rate=0.01, delay=5)
+    observer = found.observer
+    for w in (1e-3, 0.1, 1.0, 10.0, 100.0):
+        z = np.exp(1j * w * plant.dt)
+        y = plant.C @ np.linalg.solve(z * np.eye(plant.nx) - plant.A, plant.Bd) + plant.Dd
+        out = observer.Cz @ np.linalg.solve(z * np.eye(observer.order) - observer.Az, observer.By @ y) + observer.Dy @ y
+        assert abs(out[0, 0]) < 1e-10
+
+
+def test_mean_and_delay_count_samples_from_the_fault() -> None:
+    found = obsynth.functional_filter(smib(), fault_rate=0.01, delay=2, mean=5)
+    assert found.observer.fault_delays == (4,)
+    assert found.report["fault models"].passed
+
+
+def test_joint_and_free_estimates_and_some_faults_only() -> None:
+    plant = tanks()
+    free = obsynth.functional_filter(plant, fault_rate=1e-3)
+    joint = obsynth.functional_filter(plant, fault_rate=1e-3, joint=True)
+    one = obsynth.functional_filter(plant, fault_rate=1e-3, faults=["clog 13"])
+    assert (free.observer.order, joint.observer.order, one.observer.order) == (6, 6, 2)
+    assert one.observer.fault_names == ("clog 13",)
+    assert "free of others: clog 13" in [check.name for check in one.report.checks]
+    noise = [design.certificate.matrices["deviations"][:, 1] for design in (free, joint)]
+    assert np.all(noise[1] <= noise[0] * (1 + 1e-9))
+
+
+def test_residuals_only() -> None:
+    plant = tanks()
+    bank = obsynth.functional_filter(plant, residuals="isolate")
+    assert bank.observer.fault_names == ()
+    assert bank.observer.order == 3
+    assert bank.observer.residual_names == ("1: r1", "2: r1", "3: r1") or len(bank.observer.residual_names) == 3
+    detect = obsynth.functional_filter(motor(), residuals="detect", poles=[-5, -6])
+    assert sorted(np.linalg.eigvals(detect.observer.Az).real) == pytest.approx([-6, -5])
+    chosen = obsynth.functional_filter(plant, residuals=[["leak 1", "leak 2"], ["clog 13"]])
+    assert chosen.report.passed
+
+
+def test_index_two_and_algebraic_rows_are_proved_with_t0() -> None:
+    # y = x1 measures the algebraic equation 0 = x1 - x2 + f: the estimate uses the row itself.
+    plant = obsynth.DescriptorSystem(
+        [[1, 0], [0, 0]], [[-0.5, 0], [1, -1]], None, np.eye(2), Bf=[[0], [1]], Bw=np.zeros((2, 2)),
+        Dw=0.1 * np.eye(2), dt=1.0,
+    )  # fmt: skip
+    found = obsynth.functional_filter(plant, fault_rate=0.1, delay=1)
+    assert np.any(found.certificate.matrices["T0"])
+    assert found.report.passed
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"delay": 3}, "count samples"),
+        ({"faults": ["torgue"]}, "no such fault"),
+        ({"fault_rate": {"torgue": 1.0}}, "unknown"),
+        ({"poles": [-1, -2, -3], "fault_rate": 1.0}, "choose gains"),
+        ({"residuals": "detect", "joint": True}, "leave them out"),
+        ({"residuals": ["torgue"]}, "lists of faults to see"),
+        ({"delay": -1}, "at least 0"),
+        ({"fault_rate": float("nan")}, "positive numbers"),
+    ],
+)
+def test_bad_options(options: dict[str, object], text: str) -> None:
+    with pytest.raises(obsynth.SpecError, match=text):
+        obsynth.functional_filter(motor(), **options)
+
+
+def test_a_sensor_without_noise_is_refused() -> None:
+    plant = motor()
+    silent = plant.Dw.copy()
+    silent[0] = 0.0
+    with pytest.raises(obsynth.PreconditionError, match="state the noise of every sensor"):
+        obsynth.functional_filter(plant.replace(Dw=silent), fault_rate=1.0)
+
+
+def test_saved_file_is_verified_alone_and_exported(tmp_path: Path) -> None:
+    found = obsynth.functional_filter(smib(), fault_rate=0.01, delay=5)
+    loaded = obsynth.load(found.save(tmp_path / "gains.json"))
+    assert obsynth.verify(loaded).passed
+    obsynth.export(loaded, tmp_path / "filter.c")
+    obsynth.export(loaded, tmp_path / "filter.mat")
+    assert "fhat[tm GENCLS 1]" in obsynth.html_report(loaded, tmp_path / "page.html").read_text(encoding="utf-8")
+    assert loaded.to_control().noutputs == len(loaded.observer.Cz)
