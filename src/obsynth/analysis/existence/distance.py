@@ -6,6 +6,7 @@ points where a random compression of the rows loses rank, which are close to whe
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +16,11 @@ from numpy.typing import NDArray
 from obsynth.analysis.far_zeros import equilibrated_at
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 
+#: Below this distance, relative to the data, rounding of the data is as large as what a unit fault moves: gains of its
+#: inverse would be needed, which double precision drowns.
+DROWNED = 2e-14
+#: Zeros closer than this, relative to their size, may be one that rounding has moved.
+SAME_ZERO = 1e-3
 #: Points on the stability boundary; in continuous time between these magnitudes of the own rates.
 BOUNDARY_POINTS = 33
 SLOWEST, FASTEST = 1e-3, 1e3
@@ -46,6 +52,18 @@ def distance_to_loss(
         if value < best.value:
             best = Distance(value, point)
     return best
+
+
+def drowned_zeros(
+    E: FloatArray, A: FloatArray, found: Iterable[complex], exact: Sequence[complex], *, nx: int
+) -> list[complex]:
+    """Return those zeros found in floating point that the exact ones lack only by rounding of the data."""
+    return [
+        value
+        for value in map(complex, found)
+        if not any(abs(value - other) <= SAME_ZERO * max(1.0, abs(other)) for other in exact)
+        and relative_singular_value(E, A, value, nx=nx) <= DROWNED
+    ]
 
 
 def relative_singular_value(E: FloatArray, A: FloatArray, point: complex, *, nx: int) -> float:

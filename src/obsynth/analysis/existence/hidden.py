@@ -6,13 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from obsynth.analysis.existence.distance import relative_singular_value
+from obsynth.analysis.existence.distance import drowned_zeros
 from obsynth.analysis.existence.numbers import numbers_of
-from obsynth.analysis.existence.verdicts import DROWNED
 from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.zeros import are_outside
 from obsynth.numerics.pencils import finite_zeros
-from obsynth.numerics.ranks import CLUSTER_TOLERANCE, RankDecision
+from obsynth.numerics.ranks import RankDecision
 from obsynth.plants.descriptor import DescriptorSystem
 
 
@@ -39,12 +38,8 @@ def hidden_modes(plant: DescriptorSystem) -> HiddenModes:
         return HiddenModes(tuple(found), undetectable, hidden.normal_rank, hidden.decisions)
     exact = numbers.system(numbers.zeros(plant.nx, 0), numbers.zeros(plant.ny, 0))
     scaled = PlantUnits.of(plant).rounded().scaled_pencil(tall_e, tall_a)
-    drowned = [
-        (value, out)
-        for value, out in zip(found, outside, strict=True)
-        if not any(abs(value - other) <= CLUSTER_TOLERANCE**0.5 * max(1.0, abs(other)) for other in exact.zeros)
-        and relative_singular_value(*scaled, value, nx=plant.nx) <= DROWNED
-    ]
-    modes = tuple(sorted((*exact.zeros, *(value for value, _ in drowned)), key=lambda value: (value.real, value.imag)))
-    undetectable = (*exact.outside, *(value for value, out in drowned if out))
+    drowned = drowned_zeros(*scaled, found, exact.zeros, nx=plant.nx)
+    unstable = {value for value, out in zip(found, outside, strict=True) if out}
+    modes = tuple(sorted((*exact.zeros, *drowned), key=lambda value: (value.real, value.imag)))
+    undetectable = (*exact.outside, *(value for value in drowned if value in unstable))
     return HiddenModes(modes, undetectable, exact.normal_rank, ())

@@ -8,14 +8,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from obsynth.analysis.existence.distance import Distance, distance_to_loss
+from obsynth.analysis.existence.distance import DROWNED, Distance, distance_to_loss
 from obsynth.analysis.existence.numbers import SystemFacts
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import RankDecision
-
-#: Below this distance, relative to the data, rounding of the data is as large as what a unit fault moves: gains of its
-#: inverse would be needed, which double precision drowns.
-DROWNED = 2e-14
 
 
 def settled_rank(decision: RankDecision, exact_rank: int | None) -> RankDecision:

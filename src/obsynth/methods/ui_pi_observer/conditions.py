@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from obsynth.analysis.conditions import Condition
+from obsynth.analysis.existence.distance import drowned_zeros
 from obsynth.analysis.existence.numbers import numbers_of
 from obsynth.analysis.existence.verdicts import described_distance, in_own_time, unclear_detail, zero_verdict
 from obsynth.analysis.plant_units import PlantUnits
@@ -197,8 +198,10 @@ def _fixed_modes(
     below = np.vstack([inputs, np.zeros((model.order, inputs.shape[1]))])
     pencil = system_pencil(augmented.E, augmented.A, below, augmented.C, direct)
     if exact is not None and exact.facts.full and not exact.facts.outside:
-        zeros = np.array(exact.facts.zeros, dtype=np.complex128)
         scaled = replace(exact.facts, zeros=tuple(value * units.rate for value in exact.facts.zeros))
+        # A mode that only rounding of the data moves is fixed as well.
+        nearly = drowned_zeros(*pencil, finite_zeros(*pencil).values, scaled.zeros, nx=augmented.order)
+        zeros = np.array([*exact.facts.zeros, *map(units.eigenvalue, nearly)], dtype=np.complex128)
         verdict = zero_verdict(scaled, *pencil, nx=augmented.order, discrete=plant.dt > 0.0)
         if verdict.answer == "unclear" and verdict.distance is not None:
             return zeros, lost_in_rounding(
