@@ -35,8 +35,6 @@ _PRIMES = ((1 << 61) - 1, 2305843009213693921, 2305843009213693907)
 #: Size of the random integers of a compression, and the seed that makes every decision repeatable.
 _COMPRESSION_SIZE = 1 << 12
 _SEED = 20150709
-#: Powers of two beyond this are no doubles.
-MOST_EXPONENT = 1000
 #: Compressions after which a factor that all of them share is a factor of all minors.
 _MOST_COMPRESSIONS = 6
 
@@ -100,12 +98,6 @@ class ExactPencil:
     def zeros(self, *, discrete: bool) -> RootLocation:
         """Return the finite zeros and where they are: exact, however close to the stability boundary."""
         return locate_roots(self.zero_polynomial, discrete=discrete)
-
-    @property
-    def typical_size(self) -> float:
-        """The size of s at which both matrices weigh the same, in the units in which their entries are integers."""
-        bits = [max((int(value).bit_length() for value in part.entries()), default=0) for part in self._integers]
-        return 2.0 ** min(max(bits[1] - bits[0], -MOST_EXPONENT), MOST_EXPONENT) if all(bits) else 1.0
 
     def rank_at(self, point: Fraction) -> int:
         """Return the rank at a rational point."""

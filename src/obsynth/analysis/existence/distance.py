@@ -23,9 +23,8 @@ DROWNED = 2e-14
 SAME_ZERO = 1e-3
 #: Points on the stability boundary; in continuous time between these magnitudes of the own rates.
 BOUNDARY_POINTS = 33
+#: Further out a pencil is close to what it is at infinity, where other conditions decide.
 SLOWEST, FASTEST = 1e-3, 1e3
-#: Points further out than this many of the own rates are not told from infinity, where other conditions decide.
-NEARLY_INFINITE = 1e8
 #: Compressions of a tall pencil, at most so many points of each.
 COMPRESSIONS = 2
 MOST_POINTS = 40
@@ -106,7 +105,7 @@ def _compressed_points(E: FloatArray, A: FloatArray, discrete: bool) -> list[com
             values: ComplexArray = eigvals(left @ A, left @ E)
         except np.linalg.LinAlgError:
             continue
-        finite = values[np.abs(values) <= NEARLY_INFINITE * (1.0 if discrete else _typical_rate(E, A))]
+        finite = values[np.abs(values) <= FASTEST * (1.0 if discrete else _typical_rate(E, A))]
         outside = finite[np.abs(finite) >= 1.0] if discrete else finite[finite.real >= 0.0]
         upper = outside[outside.imag >= 0.0]
         found += [complex(value) for value in upper[np.argsort(np.abs(upper))][:MOST_POINTS]]

@@ -8,6 +8,7 @@ import numpy as np
 
 from obsynth.analysis.existence.distance import drowned_zeros
 from obsynth.analysis.existence.numbers import numbers_of
+from obsynth.analysis.existence.verdicts import believed
 from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.zeros import are_outside
 from obsynth.numerics.pencils import finite_zeros
@@ -37,6 +38,7 @@ def hidden_modes(plant: DescriptorSystem) -> HiddenModes:
         undetectable = tuple(value for value, out in zip(found, outside, strict=True) if out)
         return HiddenModes(tuple(found), undetectable, hidden.normal_rank, hidden.decisions)
     exact = numbers.system(numbers.zeros(plant.nx, 0), numbers.zeros(plant.ny, 0))
+    exact = believed(exact, tall_e, tall_a, nx=plant.nx)
     scaled = PlantUnits.of(plant).rounded().scaled_pencil(tall_e, tall_a)
     drowned = drowned_zeros(*scaled, found, exact.zeros, nx=plant.nx)
     unstable = {value for value, out in zip(found, outside, strict=True) if out}

@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from obsynth.proofs.enclosed_pencils import EnclosedPencil, Rows
     from obsynth.proofs.exact_pencils import ExactPencil
 
-#: Zeros of computed data beyond this many typical rates are infinite ones that rounding has moved.
-NEARLY_INFINITE = 1e8
 #: Plants of more states are decided in floating point.
 EXACT_STATES = 64
 SAMPLED_STATES = 24
@@ -36,6 +34,8 @@ class SystemFacts:
         Finite zeros on or outside the stability boundary, the most unstable first, and all of them.
     exact : bool
         Whether all was decided in rational arithmetic.
+    computed : bool
+        Whether some of the data were computed in floating point.
     """
 
     normal_rank: int
@@ -43,6 +43,7 @@ class SystemFacts:
     outside: tuple[complex, ...]
     zeros: tuple[complex, ...]
     exact: bool
+    computed: bool = False
 
     @property
     def full(self) -> bool:
@@ -54,6 +55,7 @@ class PlantNumbers(ABC):
     """Matrices of a plant, ranks and zeros of what is made of them."""
 
     exact: bool
+    computed: bool
     discrete: bool
     rational: Mapping[str, fmpq_mat]
 
@@ -197,12 +199,9 @@ class WrittenNumbers(PlantNumbers):
         pencil = self.pencil(inputs, direct)
         rank, columns = pencil.normal_rank, pencil.shape[1]
         found = pencil.zeros(discrete=self.discrete).roots if rank == columns else ()
-        if self.computed:
-            # What rounding has made of an infinite zero is no zero of the data.
-            far = NEARLY_INFINITE * (1.0 if self.discrete else pencil.typical_size)
-            found = tuple(root for root in found if abs(root.value) <= far)
         values = tuple(root.value for root in found for _ in range(root.multiplicity))
-        return SystemFacts(rank, columns, tuple(root.value for root in found if root.side != "stable"), values, True)
+        outside = tuple(root.value for root in found if root.side != "stable")
+        return SystemFacts(rank, columns, outside, values, True, self.computed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,6 +213,7 @@ class SampledNumbers(PlantNumbers):
     bits: int
     discrete: bool = True
     exact: bool = False
+    computed: bool = False
 
     @cached_property
     def states(self) -> int:
@@ -299,7 +299,7 @@ class SampledNumbers(PlantNumbers):
         values = tuple(sorted(pencil.zeros, key=abs, reverse=True)) if rank == columns else ()
         stable = rank < columns or pencil.stable
         outside = tuple(value for value in values if abs(value) >= 1.0) or values[:1]
-        return SystemFacts(rank, columns, () if stable else outside, values, False)
+        return SystemFacts(rank, columns, () if stable else outside, values, False, self.computed)
 
 
 # Conditions ask for the same plant's several times; plants never change.
@@ -316,7 +316,8 @@ def numbers_of(plant: DescriptorSystem) -> PlantNumbers | None:
         if origin.sample_time is None:
             written = WrittenNumbers(exact, plant.is_discrete, computed=origin.computed)
             return written if states <= EXACT_STATES else None
-        return sampled_numbers(exact, origin.sample_time) if states <= SAMPLED_STATES else None
+        sampled = sampled_numbers(exact, origin.sample_time) if states <= SAMPLED_STATES else None
+        return None if sampled is None else replace(sampled, computed=origin.computed)
     if plant.nx > EXACT_STATES:
         return None
     plant = plant.dense()

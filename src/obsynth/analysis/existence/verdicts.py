@@ -8,8 +8,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from obsynth.analysis.existence.distance import DROWNED, Distance, distance_to_loss
 from obsynth.analysis.existence.numbers import SystemFacts
+from obsynth.analysis.far_zeros import system_zeros
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import RankDecision
 
@@ -26,6 +29,10 @@ def settled_rank(decision: RankDecision, exact_rank: int | None) -> RankDecision
     if enough:
         return replace(decision, rank=decision.expected, means="exact")
     return replace(decision, rank=min(decision.rank, decision.expected - 1), means="unclear")
+
+
+#: Rounding scatters a multiple zero by up to this, relative to its size or one.
+SCATTER = 1e-2
 
 
 @dataclass(frozen=True)
@@ -49,10 +56,24 @@ class ZeroVerdict:
 
 def zero_verdict(facts: SystemFacts, E: FloatArray, A: FloatArray, *, nx: int, discrete: bool) -> ZeroVerdict:
     """Return the answer for the pencil ``A - s E (m, n)`` of which the facts are known."""
+    facts = believed(facts, E, A, nx=nx)
     if not facts.full or facts.outside:
         return ZeroVerdict("no", facts)
     distance = distance_to_loss(E, A, nx=nx, discrete=discrete, zeros=facts.zeros)
     return ZeroVerdict("yes" if distance.value > DROWNED else "unclear", facts, distance)
+
+
+def believed(facts: SystemFacts, E: FloatArray, A: FloatArray, *, nx: int) -> SystemFacts:
+    """Return the facts without zeros that rounding of computed data has brought in from infinity."""
+    if not facts.computed or not facts.zeros:
+        return facts
+    found = system_zeros(E, A, nx=nx).values
+
+    def near(value: complex) -> bool:
+        return bool(np.any(np.abs(found - value) <= SCATTER * max(1.0, abs(value))))
+
+    zeros, outside = (tuple(filter(near, values)) for values in (facts.zeros, facts.outside))
+    return replace(facts, zeros=zeros, outside=outside)
 
 
 def in_own_time(verdict: ZeroVerdict, rate: float) -> ZeroVerdict:

@@ -208,7 +208,7 @@ def _split(matrix: fmpq_mat, widths: list[int]) -> list[fmpq_mat]:
 
 def sampled_origin(smooth: DescriptorSystem, sample_time: float) -> PlantOrigin:
     """Return what a plant that is sampled from one with ``E = I`` remembers."""
-    from obsynth.proofs.written_numbers import fractions_of, written_fraction, written_matrix
+    from obsynth.proofs.written_numbers import computed_entries, fractions_of, written_fraction, written_matrix
 
     origin = origin_of(smooth)
     exact: Mapping[str, tuple[tuple[Fraction, ...], ...]] = (
@@ -216,4 +216,5 @@ def sampled_origin(smooth: DescriptorSystem, sample_time: float) -> PlantOrigin:
         if origin is not None
         else {name: fractions_of(written_matrix(getattr(smooth, name))) for name in DECISIVE}
     )
-    return PlantOrigin(exact, written_fraction(sample_time))
+    computed = origin.computed if origin else any(computed_entries(getattr(smooth, name)) for name in DECISIVE)
+    return PlantOrigin(exact, written_fraction(sample_time), computed)

@@ -8,6 +8,7 @@ inside the unit circle.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -197,11 +198,16 @@ def _zero_conditions(plant: DescriptorSystem) -> list[Condition]:
     wide_e, wide_a = system_pencil(plant.E, plant.A, plant.Bf, plant.C, plant.Df)
     units = PlantUnits.of(plant).rounded()
     verdict = zero_verdict(facts, *units.scaled_pencil(wide_e, wide_a, units.faults), nx=plant.nx, discrete=True)
+    facts = verdict.facts
     if facts.outside:
         return [_zero_failure(plant, zero_at(plant.E, plant.A, facts.outside[0], plant.Bf, plant.C, plant.Df))]
     largest = max((abs(value) for value in facts.zeros), default=0.0)
     if verdict.answer == "unclear":
         detail = unclear_detail(verdict, "A filter")
+        outside = fault_zeros(plant).outside
+        if outside:
+            lost = _zero_failure(plant, max(outside, key=lambda zero: abs(zero.value)))
+            return [replace(lost, detail=f"{detail} In floating point, {lost.detail}", unclear=True)]
         return [Condition("fault zeros", _CLAIM, False, largest, 1.0, _SOURCE, detail, unclear=True)]
     detail = f"{len(facts.zeros)} zero(s)" + (f", largest modulus {largest:.6g}" if facts.zeros else "")
     detail += f"; {described_distance(verdict)}"

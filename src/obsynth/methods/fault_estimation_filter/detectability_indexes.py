@@ -19,8 +19,8 @@ from obsynth.numerics.ranks import DEAD_CHAIN_TOLERANCE, MARKOV_TOLERANCE, RankD
 
 #: A fault detectability matrix with a larger condition number is usable but noisy: a note says so.
 WARN_CONDITION = 1e4
-#: Above this its inverse means nothing in double precision.
-REFUSE_CONDITION = 1e8
+#: Above this rounding of data and gains is as large as what tells the faults apart.
+REFUSE_CONDITION = 1e12
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +70,8 @@ def fault_detectability(
     values = np.linalg.svd(unit, compute_uv=False) if unit.size else np.ones(1)
     invertible = unit.shape[0] >= unit.shape[1] and values[-1] > 0.0
     condition = float(values[0] / values[-1]) if invertible else np.inf
-    rank = settled_rank(decide_rank(unit, expected=tf.shape[1]), None if exact is None else exact.rank)
+    rank = decide_rank(unit, expected=tf.shape[1], tolerance=1.0 / REFUSE_CONDITION)
+    rank = settled_rank(rank, None if exact is None else exact.rank)
     return FaultDetectability(tuple(index for index, _ in results), psi, upsilon, rank, condition)
 
 

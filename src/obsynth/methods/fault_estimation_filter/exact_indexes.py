@@ -61,10 +61,10 @@ def numbers_with_fault_states(plant: DescriptorSystem) -> PlantNumbers | None:
 
 @lru_cache(maxsize=4)
 def exact_indexes(plant: DescriptorSystem) -> ExactIndexes | None:
-    """Return them where ``rank [E; C]`` is full; ``None`` where that fails or the plant has too many states."""
+    """Return them where ``rank [E; C]`` is full; ``None`` where that fails, or data were computed."""
     numbers = numbers_with_fault_states(plant)
-    if numbers is None:
-        return None
+    if numbers is None or numbers.computed:
+        return None  # a Markov parameter that is zero may have been computed as one that is not
     t = _nonsingular_t(numbers)
     if t is None:
         return None

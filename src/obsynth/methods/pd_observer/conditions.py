@@ -146,10 +146,15 @@ def _detectability(plant: DescriptorSystem, numbers: PlantNumbers) -> Condition:
     wide_e, wide_a = system_pencil(plant.E, plant.A, none, plant.C, np.zeros((plant.ny, 0)))
     scaled = PlantUnits.of(plant).rounded().scaled_pencil(wide_e, wide_a)
     verdict = zero_verdict(facts, *scaled, nx=plant.nx, discrete=False)
+    facts = verdict.facts
     if verdict.answer == "no":
         return _hidden_mode(plant, list(facts.outside))
     if verdict.answer == "unclear":
         detail = unclear_detail(verdict, "An observer")
+        hidden = list(analyse_structure(plant).undetectable_modes)
+        if hidden:
+            lost = _hidden_mode(plant, hidden)
+            return replace(lost, detail=f"{detail} In floating point, {lost.detail}", unclear=True)
         return Condition("detectability", _CLAIM, False, 0.0, 0.0, _NEEDED_FOR, detail, unclear=True)
     detail = f"{len(facts.zeros)} unobservable mode(s)" + (
         f", slowest real part {max(value.real for value in facts.zeros):.6g}" if facts.zeros else ""

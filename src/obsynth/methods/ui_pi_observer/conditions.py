@@ -21,8 +21,8 @@ import numpy as np
 
 from obsynth.analysis.conditions import Condition
 from obsynth.analysis.existence.distance import drowned_zeros
-from obsynth.analysis.existence.numbers import numbers_of
-from obsynth.analysis.existence.verdicts import described_distance, in_own_time, unclear_detail, zero_verdict
+from obsynth.analysis.existence.numbers import SystemFacts, numbers_of
+from obsynth.analysis.existence.verdicts import believed, described_distance, in_own_time, unclear_detail, zero_verdict
 from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.transformations import Transformation
 from obsynth.analysis.zeros import Zero, leading_names, zero_at, zeros_of_system
@@ -125,22 +125,31 @@ def _zero_condition(given: DescriptorSystem, plant: DescriptorSystem, units: Pla
     inputs, direct = plant.Bd[:, kept], plant.Dd[:, kept]
     if not facts.full:
         return _hidden_trajectories(facts.normal_rank, facts.columns)
-    if facts.outside:
-        value = facts.outside[0] * units.rate
-        zero = zero_at(plant.E, plant.A, value, inputs, plant.C, direct)
-        return _zero_failure(plant, units, zero, inputs, direct)
     wide_e, wide_a = system_pencil(plant.E, plant.A, inputs, plant.C, direct)
-    scaled = replace(facts, zeros=tuple(value * units.rate for value in facts.zeros))
-    verdict = zero_verdict(scaled, wide_e, wide_a, nx=plant.nx, discrete=plant.dt > 0.0)
+    verdict = zero_verdict(_timed(facts, units.rate), wide_e, wide_a, nx=plant.nx, discrete=plant.dt > 0.0)
+    if verdict.facts.outside:
+        zero = zero_at(plant.E, plant.A, verdict.facts.outside[0], inputs, plant.C, direct)
+        return _zero_failure(plant, units, zero, inputs, direct)
     if verdict.answer == "unclear":
+        detail = unclear_detail(in_own_time(verdict, units.rate), "An observer")
+        _, _, outside = zeros_of_system(plant.E, plant.A, inputs, plant.C, direct, dt=plant.dt)
+        if outside:
+            worst = max(outside, key=lambda zero: instability(zero.value, plant.dt))
+            lost = _zero_failure(plant, units, worst, inputs, direct)
+            return replace(lost, detail=f"{detail} In floating point, {lost.detail}", unclear=True)
         return Condition(
-            "(D2) zeros", _D2, False, float(facts.normal_rank), float(facts.columns), _D2_SOURCE,
-            unclear_detail(in_own_time(verdict, units.rate), "An observer"), unclear=True,
-        )  # fmt: skip
+            "(D2) zeros", _D2, False, float(facts.normal_rank), float(facts.columns), _D2_SOURCE, detail, unclear=True
+        )
     return Condition(
         "(D2) zeros", _D2, True, float(facts.normal_rank), float(facts.columns), _D2_SOURCE,
-        f"{len(facts.zeros)} stable zero(s); {described_distance(in_own_time(verdict, units.rate))}",
+        f"{len(verdict.facts.zeros)} stable zero(s); {described_distance(in_own_time(verdict, units.rate))}",
     )  # fmt: skip
+
+
+def _timed(facts: SystemFacts, rate: float) -> SystemFacts:
+    """Return facts in the time of the scaled plant."""
+    zeros, outside = (tuple(value * rate for value in values) for values in (facts.zeros, facts.outside))
+    return replace(facts, zeros=zeros, outside=outside)
 
 
 def _hidden_trajectories(rank: int, full: int) -> Condition:
@@ -197,12 +206,12 @@ def _fixed_modes(
         inputs, direct = independent_disturbances(plant)
     below = np.vstack([inputs, np.zeros((model.order, inputs.shape[1]))])
     pencil = system_pencil(augmented.E, augmented.A, below, augmented.C, direct)
-    if exact is not None and exact.facts.full and not exact.facts.outside:
-        scaled = replace(exact.facts, zeros=tuple(value * units.rate for value in exact.facts.zeros))
+    facts = None if exact is None else believed(_timed(exact.facts, units.rate), *pencil, nx=augmented.order)
+    if facts is not None and facts.full and not facts.outside:
         # A mode that only rounding of the data moves is fixed as well.
-        nearly = drowned_zeros(*pencil, finite_zeros(*pencil).values, scaled.zeros, nx=augmented.order)
-        zeros = np.array([*exact.facts.zeros, *map(units.eigenvalue, nearly)], dtype=np.complex128)
-        verdict = zero_verdict(scaled, *pencil, nx=augmented.order, discrete=plant.dt > 0.0)
+        nearly = drowned_zeros(*pencil, finite_zeros(*pencil).values, facts.zeros, nx=augmented.order)
+        zeros = np.array([*map(units.eigenvalue, (*facts.zeros, *nearly))], dtype=np.complex128)
+        verdict = zero_verdict(facts, *pencil, nx=augmented.order, discrete=plant.dt > 0.0)
         if verdict.answer == "unclear" and verdict.distance is not None:
             return zeros, lost_in_rounding(
                 model, plant.fault_names, units.eigenvalue(verdict.distance.point), augmented.order
