@@ -134,7 +134,7 @@ class PlantReference(Section):
 class MethodSection(Section):
     """The method and its options; the options have a schema per method."""
 
-    id: Text
+    id: Text = "auto"
     options: dict[str, Any] = Field(default_factory=dict)
 
 
@@ -200,5 +200,5 @@ class SpecDocument(Section):
         | Annotated[DAESection, Tag(_NONLINEAR)],
         Discriminator(_kind_of_plant),
     ]
-    method: MethodSection
+    method: MethodSection = Field(default_factory=MethodSection)
     scenario: ScenarioSection | None = None
