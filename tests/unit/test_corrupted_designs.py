@@ -93,7 +93,14 @@ def quiet() -> DescriptorSystem:
     )
 
 
-PLANTS = {"paper": paper, "chain": chain, "direct": direct, "quiet": quiet}
+def drifting() -> DescriptorSystem:
+    """A state that adds up the disturbance for ever, and from which the fault estimate is all but decoupled."""
+    return DescriptorSystem(
+        None, [[1.0, 0], [0, 0.5]], C=np.eye(2), Bf=[[0.0], [1]], Bd=[[1000.0], [0.01]], dt=1.0
+    )  # fmt: skip
+
+
+PLANTS = {"paper": paper, "chain": chain, "direct": direct, "quiet": quiet, "drifting": drifting}
 
 
 @cache
@@ -325,6 +332,9 @@ def with_state(
             "Upsilon": grown(gains["Upsilon"], more, 0),
         }
     )
+    # What rounding adds is claimed of the smaller plant.
+    kept = {name: matrix for name, matrix in matrices.items() if not name.endswith("_error")}
+    larger = larger.replace(certificate=Certificate(kept, larger.certificate.claims))
     larger = with_certificate(
         larger,
         tracking=grown(matrices["tracking"], copied, 1, float(copied)),
@@ -350,6 +360,17 @@ def with_hidden_fault(design: ObserverDesign) -> ObserverDesign:
 WRONG_FAULT = (DECOUPLED, *ESTIMATES, IN_STATE)
 OTHER_GAINS = (WEIGHT, MATRIX, REALISED)
 UNBIASED = (DYNAMICS, STATE, FAULT, RESIDUAL)
+
+
+def without_stored_errors(design: ObserverDesign) -> ObserverDesign:
+    """The claims that schema 2 adds are gone, and so are the letters: the realisation stands for itself."""
+    kept = {name: m for name, m in design.certificate.matrices.items() if not name.endswith("_error")}
+    return design.replace(gains={}, certificate=Certificate(kept, design.certificate.claims))
+
+
+#: Rows on the stored numbers, and on claims that nothing checks.
+STORED_X, STORED_U, COVERED = "stored numbers: states", "stored numbers: inputs", "claims covered"
+COMPOSITE = "gain with stored numbers"
 
 #: What is corrupted -> (good design, corruption, exactly the rows that fail).
 TABLE: dict[str, tuple[str, Callable[[ObserverDesign], ObserverDesign], tuple[str, ...]]] = {
@@ -540,6 +561,15 @@ TABLE: dict[str, tuple[str, Callable[[ObserverDesign], ObserverDesign], tuple[st
     "a mode on the unit circle that nothing measures": (
         "quiet", lambda d: with_state(d, e=1.0, a=1.0, measured=False, estimated_by="copy"),
         ("exists: fault zeros", RADIUS, LMI)),
+    # The last digits: every identity passes, and the claimed error per unit of a state or an input is passed.
+    "By in the last digits": ("paper", lambda d: with_observer(d, By=d.observer.By * (1.0 + 3e-13)), (STORED_X,)),
+    "a claimed error per unit of a state": ("paper", certificate_times("state_error", 0.9), (STORED_X,)),
+    "a claimed error per unit of an input": ("direct", certificate_times("input_error", 0.9), (STORED_U,)),
+    "a claimed error that is no number": ("paper", certificate_entry("state_error", 0, 0, np.nan), (STORED_X,)),
+    "a claimed error of another shape": ("paper", certificate_cut("state_error", slice(1, None)), (STORED_X,)),
+    "a leak from a state that never forgets": (
+        "drifting", lambda d: without_stored_errors(entry("By", 1, 0, 5e-10)(d)), (COMPOSITE,)),
+    "a matrix that nothing checks": ("paper", lambda d: with_certificate(d, more=np.eye(2)), (COVERED,)),
 }  # fmt: skip
 
 

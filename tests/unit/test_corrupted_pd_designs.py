@@ -367,6 +367,13 @@ TABLE: dict[str, tuple[str, Corruption, tuple[str, ...]]] = {
     "a zero at the origin": (
         "single", plant_field(A=[[0.5, 0.0], [1.0, -1.0]], Bf=[[0.0], [1.0]]),
         ("exists: rank [A F; C Df]", DYNAMICS, PAIR)),
+    # The last digits, and what nothing checks.
+    "By in the last digits": (
+        "paper", lambda d: with_observer(d, By=d.observer.By * (1.0 + 1e-12)), ("stored numbers: states",)),
+    "a claimed error per unit of an input": (
+        "paper", lambda d: with_certificate(d, input_error=0.9 * d.certificate.matrices["input_error"]),
+        ("stored numbers: inputs",)),
+    "a claimed gain": ("paper", claim("gamma", 1e-9), ("claims covered",)),
 }  # fmt: skip
 
 

@@ -150,6 +150,8 @@ TABLE: dict[str, tuple[str, Corruption, set[str]]] = {
     "claim: excitation": ("innovation", times("excitation", 1.001), {CLAIMS}),
     "claim: directions": ("innovation", times("residual_directions", 2.0), {CLAIMS}),
     "claim: steps": ("innovation", times("steps", 2.0), {CLAIMS}),
+    "claim: sample of the condition": ("innovation", claim("condition_k", 3.5), {CLAIMS}),
+    "claim: a gain": ("innovation", claim("gamma", 1e-9), {"claims covered"}),
     "claim: not a number": ("innovation", claim("contraction", np.nan), {CLAIMS}),
     "claim: missing": (
         "innovation", lambda d: d.replace(certificate=Certificate({}, {"steps": 60.0})), {CLAIMS},

@@ -305,6 +305,15 @@ TABLE: dict[str, tuple[str, Callable[[ObserverDesign], ObserverDesign], tuple[st
     "a sinusoidal fault like the disturbance, discrete": ("direct", like_the_disturbance(1), (SYLVESTER, D3_SINE)),
     "a zero where a long fault model hides": ("long", plant_entry("A", 0, 2, 0.96), (SYLVESTER, DECOUPLING, ORDER)),
     "a fault model at the zero": ("fixed", plant_field(Bf=[[0.0], [1], [0]]), (SYLVESTER, D3_STEP)),
+    # The last digits, and what nothing checks.
+    "By in the last digits": (
+        "paper", lambda d: d.replace(observer=dataclasses.replace(d.observer, By=d.observer.By * (1.0 + 3e-12))),
+        ("stored numbers: states",)),
+    "a claimed error per unit of an input": ("paper", scaled("input_error", 0.9), ("stored numbers: inputs",)),
+    "a claimed error per unit of a disturbance": (
+        "paper", scaled("disturbance_error", 0.9), ("stored numbers: disturbances",)),
+    "a claimed error per unit of a state": ("paper", scaled("state_error", 0.9), ("stored numbers: states",)),
+    "a claimed gain": ("paper", lambda d: with_certificate(d, {"gamma": 1e-9}), ("claims covered",)),
 }  # fmt: skip
 
 

@@ -45,10 +45,15 @@ def option_types(options: type[MethodOptions]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class ClaimMeaning:
-    """A number that a method may claim: its unit (empty: dimensionless) and what it means."""
+    """A number that a method may claim: its unit (empty: dimensionless), what it means, and the row that checks it.
+
+    Without a row the claim is refused; `obsynth.verification.closed_claims.STATED` is for numbers of a search that no
+    check recomputes: these get a row that says so.
+    """
 
     unit: str
     meaning: str
+    row: str = ""
 
 
 @dataclass(frozen=True)
@@ -58,7 +63,8 @@ class MethodSpec:
     Fields: id: As in specs and gain sets; plants: Kinds of plants it takes; time: In words, for lists of methods;
     summary: One line; source: The paper whose letters its gains have; public: The function of `obsynth`; options: A
     `MethodOptions`; conditions: Existence, from the plant; synthesise: ``(plant, options, progress=)`` -> `Synthesis`;
-    checks: ``(design, printed_digits)`` -> rows; claims: Every claim that it may make.
+    checks: ``(design, printed_digits)`` -> rows; claims: Every claim that it may make; witnesses: Matrices that its
+    certificate may hold; tracked: ``(design)`` -> `TrackedPlant`, of a linear observer.
     """
 
     id: str
@@ -72,8 +78,12 @@ class MethodSpec:
     synthesise: str
     checks: str
     claims: Mapping[str, ClaimMeaning]
+    witnesses: frozenset[str] = frozenset()
+    tracked: str = ""
 
-    def load(self, part: Literal["public", "options", "conditions", "synthesise", "checks"]) -> Callable[..., Any]:
+    def load(
+        self, part: Literal["public", "options", "conditions", "synthesise", "checks", "tracked"]
+    ) -> Callable[..., Any]:
         """Return what a path names."""
         module, name = str(getattr(self, part)).split(":")
         found: Callable[..., Any] = getattr(import_module(module), name)

@@ -11,6 +11,8 @@ from obsynth.methods.registry import REGISTRY, method_spec
 from obsynth.numerics.failures import failed_computations
 from obsynth.numerics.threads import one_thread_if_small
 from obsynth.results.report import VerificationReport
+from obsynth.verification.closed_claims import closed_claims
+from obsynth.verification.stored_numbers import stored_number_rows
 
 if TYPE_CHECKING:
     from obsynth.results.design import ObserverDesign
@@ -44,7 +46,14 @@ def verify(design: ObserverDesign, *, printed_digits: int | None = None) -> Veri
         raise SpecError(f"Designs of method {design.method!r} cannot be verified by this version.", path="method")
     if printed_digits is not None and not 1 <= printed_digits <= 15:
         raise SpecError(f"printed_digits is {printed_digits}: give 1 to 15 decimals.", path="printed_digits")
-    checks = method_spec(design.method).load("checks")
+    spec = method_spec(design.method)
+    checks = spec.load("checks")
     # A corrupted design may overflow; what is not a number fails its check, so no warning is needed.
     with np.errstate(all="ignore"), failed_computations(), one_thread_if_small(design.plant.nx):
-        return VerificationReport.of(tuple(checks(design, printed_digits)))
+        rows = tuple(checks(design, printed_digits))
+        if spec.tracked and all(row.passed for row in rows):
+            gamma = design.certificate.claims.get("gamma") if "gamma" in spec.claims else None
+            rows = (*rows, *stored_number_rows(design, spec.load("tracked")(design), gamma))
+        covered = {name: meaning.row for name, meaning in spec.claims.items()}
+        meanings = {name: meaning.meaning for name, meaning in spec.claims.items()}
+        return VerificationReport.of((*rows, *closed_claims(design, rows, covered, meanings, spec.witnesses)))

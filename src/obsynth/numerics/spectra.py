@@ -17,6 +17,9 @@ SAME_POLE = 1e-3
 DEAD_BEAT = 1e-6
 #: Relative difference of two ways of computing a variance up to which it counts as known.
 AGREEMENT = 1e-2
+#: Rounding, relative to a matrix, that scatters an eigenvalue of multiplicity m by its m-th root; and the largest share
+#: of a pole that counts as scatter, whatever the multiplicity.
+SCATTER, MOST_SCATTER = 1e4 * float(np.finfo(np.float64).eps), 0.05
 
 
 def eigenvalues(matrix: FloatArray) -> ComplexArray:
@@ -32,28 +35,50 @@ def spectrum_error(matrix: FloatArray, wanted: Sequence[complex] | ComplexArray,
 
     Eigenvalues are assigned to wanted ones with the least total distance, and the means of groups are compared.
     """
-    from scipy.optimize import linear_sum_assignment
-
     goal = np.asarray(wanted, dtype=np.complex128)
     if matrix.shape[0] != goal.size or not np.all(np.isfinite(matrix)):
         return float("inf")
+    groups = _groups(eigenvalues(matrix), goal, dt)
+    return max((abs(complex(np.mean(misses))) for misses in groups), default=0.0)
+
+
+def lost_poles(matrix: FloatArray, wanted: Sequence[complex] | ComplexArray, dt: float) -> float:
+    """Return how far the worst eigenvalue is from the wanted one it belongs to, if that is more than rounding scatters.
+
+    Zero where each eigenvalue of a group of m equal wanted ones lies within the m-th root of the rounding, and within
+    `MOST_SCATTER`; distances are relative, as in `spectrum_error`.
+    """
+    goal = np.asarray(wanted, dtype=np.complex128)
+    if matrix.shape[0] != goal.size or not np.all(np.isfinite(matrix)):
+        return float("inf")
+    worst = 0.0
+    for misses in _groups(eigenvalues(matrix), goal, dt):
+        far = float(np.max(np.abs(misses)))
+        if far > min(MOST_SCATTER, SCATTER ** (1.0 / len(misses))):
+            worst = max(worst, far)
+    return worst
+
+
+def _groups(found: ComplexArray, goal: ComplexArray, dt: float) -> list[ComplexArray]:
+    """Return, for each group of wanted poles that are the same, by how much eigenvalues miss them, relatively."""
+    from scipy.optimize import linear_sum_assignment
+
     if goal.size == 0:
-        return 0.0
-    found = eigenvalues(matrix)
+        return []
     rows, columns = linear_sum_assignment(np.abs(found[:, None] - goal[None, :]))
     assigned = np.empty_like(goal)
     assigned[columns] = found[rows]
     largest = float(np.max(np.abs(goal))) or 1.0
-    worst, waiting = 0.0, list(range(goal.size))
+    groups, waiting = [], list(range(goal.size))
     while waiting:
         first = goal[waiting[0]]
         reach = SAME_POLE * (1.0 if dt > 0.0 else abs(first))
         group = [i for i in waiting if abs(goal[i] - first) <= reach] or [waiting[0]]
         waiting = [i for i in waiting if i not in group]
-        miss = abs(complex(np.mean(assigned[group] - goal[group])))
         # A pole at zero is compared with the others.
-        worst = max(worst, miss / (1.0 if dt > 0.0 else max(abs(first), SAME_POLE * largest)))
-    return worst
+        size = 1.0 if dt > 0.0 else max(abs(first), SAME_POLE * largest)
+        groups.append(np.asarray((assigned[group] - goal[group]) / size))
+    return groups
 
 
 def abscissa(matrix: FloatArray, dt: float) -> float:

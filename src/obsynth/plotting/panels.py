@@ -103,7 +103,8 @@ def plain_decades(panel: Axes) -> None:
     from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
     panel.set_yscale("log")
-    shown = np.concatenate([np.asarray(line.get_ydata(), dtype=np.float64) for line in panel.get_lines()])
+    lines = [np.asarray(line.get_ydata(), dtype=np.float64) for line in panel.get_lines()]
+    shown = np.concatenate([np.zeros(0), *lines])
     shown = shown[np.isfinite(shown) & (shown > 0.0)]
     if not shown.size or shown.max() > SHORT_SPREAD * shown.min():
         return

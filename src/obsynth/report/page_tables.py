@@ -12,7 +12,7 @@ from rich.table import Table
 
 from obsynth.numerics.arrays import FloatArray
 from obsynth.report.layout import number, verdict
-from obsynth.results.report import Check, CheckKind
+from obsynth.results.report import Check, CheckKind, Status
 
 #: Prefix of a check's name -> heading of its group; the others are about the shipped observer.
 _GROUPS = {"plant": "The plant", "exists": "Does such an observer exist?"}
@@ -27,6 +27,13 @@ KINDS: dict[CheckKind, str] = {
     "proved",
     "computed": "a number that was found again by a second route",
     "information": "a number worth knowing that no verdict depends on",
+}
+#: What each row is worth, whatever its kind.
+STATUSES: dict[Status, str] = {
+    "proved": "outward rounding, on the numbers that are stored",
+    "computed twice": "double precision, by a route that shares no intermediate result with the design",
+    "estimated": "statistics, with the interval in which chance alone puts the number",
+    "assumed": "stated by whoever made the design, and not checked",
 }
 
 
@@ -72,6 +79,9 @@ def check_rows(checks: Sequence[Check]) -> Iterator[str]:
     for kind, meaning in KINDS.items():
         if kind in found:
             yield f'<tr><th scope="row">{kind}</th><td>{meaning}</td></tr>'
+    for status, meaning in STATUSES.items():
+        if any(check.status == status for check in checks):
+            yield f'<tr><th scope="row">({status})</th><td>{meaning}</td></tr>'
     yield "</tbody></table></div>"
 
 
@@ -86,7 +96,8 @@ def _place(check: Check) -> int:
 def _row(check: Check) -> str:
     word = verdict(check).plain
     detail = f"<div>{escape(check.detail)}</div>" if check.detail else ""
-    kind = "" if word == "info" else f'<span class="kind">{escape(check.kind)}</span>'
+    parts = dict.fromkeys([*([] if word == "info" else [check.kind]), f"({check.status})"])
+    kind = f'<span class="kind">{escape(" ".join(parts))}</span>'
     numbers = "".join(
         f'<td class="number{" none" if number(value) == "-" else ""}" data-label="{label}">{number(value)}</td>'
         for label, value in (("value", check.value), ("bound", check.bound), ("margin", check.margin))

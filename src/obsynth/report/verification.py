@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from io import StringIO
 
 from rich.console import Console, Group, RenderableType
 from rich.padding import Padding
@@ -18,6 +19,8 @@ WIDE_ENOUGH = 110
 
 _HEADINGS = ("check", "claim", "value", "bound", "margin", "verdict", "kind")
 _NUMBER_WIDTH = 10
+#: As wide as "computed twice".
+_KIND_WIDTH = 14
 
 
 def checks_table(checks: Sequence[Check], *, width: int) -> RenderableType:
@@ -44,7 +47,7 @@ def _stacked(checks: Sequence[Check], width: int) -> Iterable[RenderableType]:
 
 def _grid(width: int, *, with_claim: bool) -> Table:
     grid = Table.grid(padding=(0, 1, 0, 0))
-    others = 3 * (_NUMBER_WIDTH + 1) + 8 + 9
+    others = 3 * (_NUMBER_WIDTH + 1) + 8 + _KIND_WIDTH
     if with_claim:
         grid.add_column(width=26, overflow="fold")
         grid.add_column(width=max(width - others - 28, 20), overflow="fold")
@@ -53,7 +56,7 @@ def _grid(width: int, *, with_claim: bool) -> Table:
     for _ in range(3):
         grid.add_column(width=_NUMBER_WIDTH, justify="right", no_wrap=True)
     grid.add_column(width=7, no_wrap=True)
-    grid.add_column(width=9, no_wrap=True)
+    grid.add_column(width=_KIND_WIDTH, no_wrap=True)
     return grid
 
 
@@ -63,10 +66,8 @@ def _claim(check: Check) -> Text:
 
 
 def _numbers_and_verdict(check: Check) -> list[Text]:
-    # The verdict of information is its kind already.
-    kind = "" if check.kind == "information" and check.passed else check.kind
     numbers = [Text(number(value)) for value in (check.value, check.bound, check.margin)]
-    return [*numbers, verdict(check), Text(kind, style="dim")]
+    return [*numbers, verdict(check), Text(check.status, style="dim")]
 
 
 def verdict_line(report: VerificationReport) -> Text:
@@ -78,6 +79,14 @@ def verdict_line(report: VerificationReport) -> Text:
         return Text("FAILS: the report is empty, so nothing is verified.", style="bold red")
     failed = ", ".join(check.name for check in report.failures)
     return Text(f"FAILS: {len(report.failures)} of {len(real)} checks do not hold: {failed}.", style="bold red")
+
+
+def report_text(report: VerificationReport, *, width: int = 120) -> str:
+    """Return what ``print(report)`` shows: the table of the checks, and the verdict."""
+    console = Console(file=StringIO(), width=width, markup=False, highlight=False, emoji=False, color_system=None)
+    verification_report(report, console=console)
+    text: str = console.file.getvalue()  # type: ignore[attr-defined]
+    return "\n".join(line.rstrip() for line in text.splitlines())
 
 
 def verification_report(report: VerificationReport, *, console: Console) -> None:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
+from importlib import import_module
 from typing import Any, Literal
 
 CheckKind = Literal["proved", "equality", "computed", "condition", "information"]
+Status = Literal["proved", "computed twice", "estimated", "assumed"]
 
 
 @dataclass(frozen=True)
@@ -36,6 +38,12 @@ class Check:
         ``condition`` (an existence condition) or ``information`` (never fails).
     detail : str, optional
         One more sentence for the reader.
+    status : str, optional
+        What the row is worth: ``proved`` (outward rounding, on the stored numbers), ``computed twice`` (double
+        precision, by a route that shares no intermediate result with the design), ``estimated`` (statistics: see
+        ``interval``) or ``assumed`` (stated by whoever made the design, and not checked).  That of the kind by default.
+    interval : tuple of float, optional
+        Of an estimate: where it lies by chance alone, with the probability that ``detail`` says.
     """
 
     name: str
@@ -47,6 +55,15 @@ class Check:
     source: str
     kind: CheckKind = "computed"
     detail: str = ""
+    status: Status | Literal[""] = ""
+    interval: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        if not self.status:
+            object.__setattr__(self, "status", "proved" if self.kind == "proved" else "computed twice")
+        if self.interval is not None:
+            low, high = self.interval
+            object.__setattr__(self, "interval", (low, high))
 
 
 def upper_bound_check(
@@ -65,9 +82,11 @@ def lower_bound_check(
     return Check(name, claim, float(value), float(bound), float(value - bound), passed, source, kind, detail)
 
 
-def information(name: str, claim: str, value: float, *, source: str, detail: str = "") -> Check:
+def information(
+    name: str, claim: str, value: float, *, source: str, detail: str = "", status: Status = "computed twice"
+) -> Check:
     """Return a row that informs and cannot fail."""
-    return Check(name, claim, float(value), math.nan, math.nan, True, source, "information", detail)
+    return Check(name, claim, float(value), math.nan, math.nan, True, source, "information", detail, status)
 
 
 @dataclass(frozen=True)
@@ -109,6 +128,10 @@ class VerificationReport:
             if check.name == name:
                 return check
         raise KeyError(f"no check named {name!r}; there are: {', '.join(c.name for c in self.checks)}")
+
+    def __str__(self) -> str:
+        """Return the table of the checks."""
+        return str(import_module("obsynth.report.verification").report_text(self))
 
     def as_dict(self) -> dict[str, Any]:
         """Return the report as plain data."""

@@ -7,8 +7,10 @@ from obsynth.methods.recursive.claims import RECURSIVE_CLAIMS
 
 CLAIMS = {
     **RECURSIVE_CLAIMS,
-    "excitation": ClaimMeaning("", "least information on the parameters in a window, per parameter unit squared"),
-    "excitation_k": ClaimMeaning("samples", "sample that ends that window"),
+    "excitation": ClaimMeaning(
+        "", "least information on the parameters in a window, per parameter unit squared", "claims"
+    ),
+    "excitation_k": ClaimMeaning("samples", "sample that ends that window", "claims"),
 }
 
 METHOD = MethodSpec(

@@ -5,10 +5,10 @@ from __future__ import annotations
 from obsynth.methods.method_spec import ClaimMeaning, MethodSpec
 
 CLAIMS = {
-    "index": ClaimMeaning("", "index of the plant"),
-    "condition": ClaimMeaning("", "largest condition number of (7) along the nominal run"),
-    "contraction": ClaimMeaning("", "spectral radius of F (I - K H) at its end"),
-    "steps": ClaimMeaning("samples", "steps of the nominal run"),
+    "index": ClaimMeaning("", "index of the plant", "claims"),
+    "condition": ClaimMeaning("", "largest condition number of (7) along the nominal run", "claims"),
+    "contraction": ClaimMeaning("", "spectral radius of F (I - K H) at its end", "claims"),
+    "steps": ClaimMeaning("samples", "steps of the nominal run", "claims"),
 }
 
 METHOD = MethodSpec(

@@ -5,11 +5,11 @@ from __future__ import annotations
 from obsynth.methods.method_spec import ClaimMeaning, MethodSpec
 
 CLAIMS = {
-    "gamma": ClaimMeaning("", "l2 gain from the disturbance to the fault error: shipped, proved"),
-    "gamma_min": ClaimMeaning("", "least such gain found"),
-    "gamma_bracket_low": ClaimMeaning("", "lower end of the bisection's bracket"),
-    "gamma_bracket_high": ClaimMeaning("", "upper end of the bisection's bracket"),
-    "state_lag": ClaimMeaning("samples", "samples by which the state estimate lags"),
+    "gamma": ClaimMeaning("", "l2 gain from the disturbance to the fault error: shipped, proved", "LMI"),
+    "gamma_min": ClaimMeaning("", "least such gain found", "claimed gains"),
+    "gamma_bracket_low": ClaimMeaning("", "lower end of the bisection's bracket", "claimed gains"),
+    "gamma_bracket_high": ClaimMeaning("", "upper end of the bisection's bracket", "claimed gains"),
+    "state_lag": ClaimMeaning("samples", "samples by which the state estimate lags", "unbiased: state"),
 }
 
 METHOD = MethodSpec(
@@ -24,4 +24,6 @@ METHOD = MethodSpec(
     synthesise="obsynth.methods.fault_estimation_filter.synthesis:synthesise",
     checks="obsynth.methods.fault_estimation_filter.checks:checks",
     claims=CLAIMS,
+    witnesses=frozenset({"P_factor", "tracking", "T0"}),
+    tracked="obsynth.methods.fault_estimation_filter.checks:tracked_plant",
 )

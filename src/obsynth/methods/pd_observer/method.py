@@ -5,16 +5,20 @@ from __future__ import annotations
 from obsynth.methods.method_spec import ClaimMeaning, MethodSpec
 
 CLAIMS = {
-    "theorem": ClaimMeaning("", "theorem whose inequality is proved"),
-    "delta": ClaimMeaning("s", "the theorem's parameter in the certificate"),
-    "decay": ClaimMeaning("1/s", "rate at which errors die out: imposed, proved (0: stability alone)"),
-    "disk_centre": ClaimMeaning("1/s", "c of the disk |s + c| < r that holds every eigenvalue"),
-    "disk_radius": ClaimMeaning("1/s", "r of that disk"),
-    "gain_bound": ClaimMeaning("", "bound on the norm of the gains"),
-    "fault_rate_gain": ClaimMeaning("s", "bound on the l2 gain from the rate of the faults to the fault error: proved"),
-    "noise_gain": ClaimMeaning("", "bound on the l2 gain from noise and its derivative to the fault error: proved"),
-    "adaptation_low": ClaimMeaning("", "stable for every adaptation gain from here, proved"),
-    "adaptation_high": ClaimMeaning("", "to here"),
+    "theorem": ClaimMeaning("", "theorem whose inequality is proved", "LMI"),
+    "delta": ClaimMeaning("s", "the theorem's parameter in the certificate", "LMI"),
+    "decay": ClaimMeaning("1/s", "rate at which errors die out: imposed, proved (0: stability alone)", "LMI"),
+    "disk_centre": ClaimMeaning("1/s", "c of the disk |s + c| < r that holds every eigenvalue", "disk"),
+    "disk_radius": ClaimMeaning("1/s", "r of that disk", "disk"),
+    "gain_bound": ClaimMeaning("", "bound on the norm of the gains", "gain bound"),
+    "fault_rate_gain": ClaimMeaning(
+        "s", "bound on the l2 gain from the rate of the faults to the fault error: proved", "LMI, rate"
+    ),
+    "noise_gain": ClaimMeaning(
+        "", "bound on the l2 gain from noise and its derivative to the fault error: proved", "LMI, noise"
+    ),
+    "adaptation_low": ClaimMeaning("", "stable for every adaptation gain from here, proved", "adaptation range"),
+    "adaptation_high": ClaimMeaning("", "to here", "adaptation range"),
 }
 
 METHOD = MethodSpec(
@@ -29,4 +33,6 @@ METHOD = MethodSpec(
     synthesise="obsynth.methods.pd_observer.synthesis:synthesise",
     checks="obsynth.methods.pd_observer.checks:checks",
     claims=CLAIMS,
+    witnesses=frozenset({"P1", "P3", "P_rate", "P_noise", "P1_low", "P1_high", "T0"}),
+    tracked="obsynth.methods.pd_observer.checks:tracked_plant",
 )

@@ -28,9 +28,10 @@ from obsynth.results.design import ObserverDesign
 from obsynth.results.report import Check, information, upper_bound_check
 from obsynth.verification.bounded_real import prove_bounded_real
 from obsynth.verification.claims import UNCERTAIN, claim_rows, claimed, recovery_rows
-from obsynth.verification.error_system import ErrorSystem
+from obsynth.verification.error_system import ErrorSystem, LaggedPlant
 from obsynth.verification.identities import equality, tracking_identities
 from obsynth.verification.plant import condition_rows, plant_information
+from obsynth.verification.remainder_channel import TrackedPlant
 
 _IDENTITIES = {
     "dynamics": ("unbiased: dynamics", "Az V E + By C = V A", "Wang 2015, eqs. (7), (26)"),
@@ -128,6 +129,19 @@ def _with_sensor_faults(plant: DescriptorSystem) -> DescriptorSystem | None:
 def _whole(lag: float) -> int:
     """Return a lag as a number of samples, -1 when it is none."""
     return int(lag) if np.isfinite(lag) and lag == int(lag) else -1
+
+
+def tracked_plant(design: ObserverDesign) -> TrackedPlant:
+    """Return the plant with its past states as the shipped observer tracks it."""
+    (plant, observer), matrices = design.linear, design.certificate.matrices
+    lag = int(claimed(design.certificate.claims, "state_lag"))
+    lagged = LaggedPlant.of(plant, lag)
+    goal = np.zeros((len(observer.Cz), lagged.E.shape[1]))
+    goal[observer.state_rows] = lagged.oldest
+    names = tuple(f"{name}(k-{age})" if age else name for age in range(lag + 1) for name in plant.state_names)
+    return TrackedPlant(
+        lagged.E, lagged.A, lagged.B, lagged.C, plant.D, matrices["tracking"], goal, names, matrices.get("T0")
+    )
 
 
 def _fits(

@@ -28,6 +28,7 @@ from obsynth.results.design import ObserverDesign
 from obsynth.results.report import Check, information, lower_bound_check, upper_bound_check
 from obsynth.verification.identities import equality, relative_tolerance, residual, tracking_identities, worst
 from obsynth.verification.plant import condition_rows, plant_information
+from obsynth.verification.remainder_channel import TrackedPlant
 
 _IDENTITIES = {
     "dynamics": ("unbiased: dynamics", "Az + By C = A, with the faults as states", "Filasova et al., eq. (29)"),
@@ -68,6 +69,14 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     yield _pencil_row(design, augmented)
     yield from proof_rows(design)
     yield from norm_rows(design, errors)
+
+
+def tracked_plant(design: ObserverDesign) -> TrackedPlant:
+    """Return the plant with its faults as states as the shipped observer tracks it."""
+    plant, observer = design.linear
+    augmented = with_faults_as_states(plant)
+    goal = np.eye(len(observer.Cz), augmented.nx)
+    return TrackedPlant.of(augmented, np.eye(augmented.nx), goal, T0=design.certificate.matrices.get("T0"))
 
 
 def _fits(plant: DescriptorSystem, observer: LinearObserver) -> bool:

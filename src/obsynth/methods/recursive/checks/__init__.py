@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from obsynth.analysis.time_varying import horizon_ranks
+from obsynth.analysis.time_varying import HorizonRanks, horizon_ranks
 from obsynth.errors import ObsynthError
 from obsynth.methods.recursive.checks.batch import batch_residuals
 from obsynth.methods.recursive.conditions import recursive_conditions
@@ -93,7 +93,7 @@ def _dynamic_rows(design: ObserverDesign, observer: RecursiveObserver, stated: R
                 f"noise in fhat[{name}]", "standard deviation of the parameter after the last step", float(deviation),
                 source="recomputed", detail=observer.plant.units.get(name, ""),
             )  # fmt: skip
-    yield _claims_row(design, facts, ranks.condition, float(ranks.directions))
+    yield _claims_row(design, facts, ranks)
     yield from consistency(stated, observer, looked_at(observer))
 
 
@@ -108,12 +108,17 @@ def _contraction_rows(facts: GainScheduleSummary) -> Iterator[Check]:
         )
 
 
-def _claims_row(design: ObserverDesign, facts: GainScheduleSummary, condition: float, directions: float) -> Check:
+def _claims_row(design: ObserverDesign, facts: GainScheduleSummary, ranks: HorizonRanks) -> Check:
     claims = design.certificate.claims
     found = {
-        "condition": condition, "residual_directions": directions, "contraction": facts.contraction,
+        "condition": ranks.condition, "residual_directions": float(ranks.directions), "contraction": facts.contraction,
         "steps": float(facts.steps),
     }  # fmt: skip
+    places = {
+        "condition_k": (ranks.condition_k, ranks.condition),
+        "excitation_k": (facts.excitation_k, facts.excitation),
+    }
+    found |= {name: float(k) for name, (k, value) in places.items() if name in claims and not np.isnan(value)}
     if not np.isnan(facts.excitation):
         found["excitation"] = facts.excitation
     scale = {name: max(abs(value), np.finfo(np.float64).tiny) for name, value in found.items()}

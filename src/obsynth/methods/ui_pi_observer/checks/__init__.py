@@ -24,6 +24,7 @@ from obsynth.results.design import ObserverDesign
 from obsynth.results.report import Check, information, upper_bound_check
 from obsynth.verification.identities import Residual, equality, relative_tolerance, residual
 from obsynth.verification.plant import condition_rows, plant_information
+from obsynth.verification.remainder_channel import TrackedPlant
 
 #: Estimates at a frequency may miss by this much, relative to terms that pass through the inverse of ``sI - Az``.
 DECOUPLING_TOLERANCE = 1e-8
@@ -69,6 +70,21 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     )
     yield from noise_rows(design)
     yield from tracking_rows(plant, observer, tracking, phi, cw)
+
+
+def tracked_plant(design: ObserverDesign) -> TrackedPlant:
+    """Return the plant with the fault model as the shipped observer tracks it, decoupled from the disturbances."""
+    (plant, observer), matrices = design.linear, design.certificate.matrices
+    phi, cw = matrices["Phi"], matrices["Cw"]
+    names = tuple(f"w{i + 1}" for i in range(len(phi)))
+    augmented = AugmentedPlant.of(plant, Exosystem(phi, cw, names, stated_eigenvalues(phi), ()))
+    goal = np.zeros((len(observer.Cz), augmented.order))
+    goal[observer.state_rows, : plant.nx] = np.eye(plant.nx)
+    goal[observer.fault_rows, plant.nx :] = cw
+    return TrackedPlant(
+        augmented.E, augmented.A, augmented.B, augmented.C, plant.D, matrices["tracking"], goal, augmented.names,
+        matrices.get("T0"), augmented.Bd, plant.Dd,
+    )  # fmt: skip
 
 
 def _fits(design: ObserverDesign) -> bool:

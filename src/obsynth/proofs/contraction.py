@@ -1,0 +1,155 @@
+r"""A norm in which a stable matrix contracts, proved, and what follows for sums over all time.
+
+With P = Q'Q and a rate :math:`\rho < 1` (:math:`\alpha > 0` in continuous time), the proved inequality
+
+.. math::
+    \rho^2 P - A^T P A > 0 \qquad (\text{continuous: } -(A + \alpha I)^T P - P (A + \alpha I) > 0)
+
+gives :math:`\|Q A^j b\| \le \rho^j \|Q b\|`, so that
+:math:`\sum_j \|c A^j b\| \le \|c Q^{-1}\| \|Q b\| / (1 - \rho)` (:math:`/ \alpha` for the integral).  Every norm below
+is rounded up.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+
+from obsynth.numerics.arrays import FloatArray
+from obsynth.proofs.balls import Ball, Enclosed, block, rounded_up
+from obsynth.proofs.definiteness import prove_positive_definite
+
+#: Where between the spectral radius (0) and one (1) the rate is tried, in turn.
+RATES = (0.5, 0.2, 0.8, 0.95)
+
+
+@dataclass(frozen=True, eq=False)
+class Contraction:
+    """A proved contraction ``|Q A b| <= rate |Q b|`` (continuous: ``|Q e^{At} b| <= e^{-rate t} |Q b|``).
+
+    Q ``(n, n)`` is triangular; ``inverse`` is near its inverse, and ``defect`` bounds ``|Q inverse - I|``.
+    """
+
+    Q: FloatArray
+    inverse: FloatArray
+    defect: float
+    rate: float
+    discrete: bool
+
+    @property
+    def factor(self) -> float:
+        """Upper bound on the sum (integral) of all powers of the rate."""
+        return float(rounded_up(np.asarray(1.0 / ((1.0 - self.rate) if self.discrete else self.rate)), 4))
+
+    def sizes(self, columns: FloatArray, radius: FloatArray | None = None) -> FloatArray:
+        """Return upper bounds on ``|Q b|`` of columns ``(n, m)``, known to within ``radius``, as ``(m,)``."""
+        ball = Ball.exact(columns) if radius is None else Ball(np.asarray(columns, dtype=np.float64), radius)
+        return column_norms(Ball.exact(self.Q) @ ball)
+
+    def sizes_in_sum(self, sums: FloatArray) -> FloatArray:
+        """Return upper bounds on ``sum_j |Q d_j|`` for columns with ``sum_j |d_j| <= sums (n, m)``, as ``(m,)``."""
+        return np.asarray(rounded_up(np.sum(np.abs(self.Q) @ sums, axis=0), 4 * len(sums) + 8))
+
+    def seen(self, rows: FloatArray) -> float:
+        """Return an upper bound on the norm of ``c Q^-1`` for rows ``c (p, n)``."""
+        if not rows.size:
+            return 0.0
+        product = Ball.exact(rows) @ Ball.exact(self.inverse)
+        size = rounded_up(np.abs(product.midpoint) + product.radius, 2)
+        # |X|^2 <= |X|_1 |X|_inf, or Frobenius: both bound the spectral norm.
+        frobenius = float(np.sqrt(rounded_up(np.asarray(np.sum(size**2)), size.size + 2)))
+        mixed = float(np.sqrt(np.max(np.sum(size, axis=0)) * np.max(np.sum(size, axis=1))))
+        return float(rounded_up(np.asarray(min(frobenius, mixed) / (1.0 - self.defect)), 2 * sum(size.shape) + 8))
+
+    def gain(self, rows: FloatArray, columns: FloatArray, radius: FloatArray | None = None) -> FloatArray:
+        """Return ``(p, m)``: upper bounds on ``sum_j |c A^j b|`` of each row and column, from ``j = 0``."""
+        sizes = self.sizes(columns, radius)
+        shown = np.array([self.seen(rows[i : i + 1]) for i in range(len(rows))])
+        return rounded_up(shown[:, None] * sizes[None, :] * self.factor, 4)
+
+
+def column_norms(ball: Ball) -> FloatArray:
+    """Return upper bounds on the norms of the columns of every member, ``(m,)``."""
+    size = rounded_up(np.abs(ball.midpoint) + ball.radius, 2)
+    largest = np.max(size, axis=0, initial=0.0)
+    safe = np.where((largest > 0.0) & np.isfinite(largest), largest, 1.0)
+    sums = rounded_up(np.sum((size / safe) ** 2, axis=0), len(size) + 6)
+    return np.asarray(rounded_up(safe * np.sqrt(sums), 4))
+
+
+def prove_contraction(matrix: FloatArray | Ball, *, discrete: bool, rate: float | None = None) -> Contraction | None:
+    """Return a proved contraction of every member of ``matrix (n, n)``; ``None`` where none is found.
+
+    With ``rate`` (modulus per step, or decay in 1/s) that rate alone is tried.
+    """
+    ball = matrix if isinstance(matrix, Ball) else Ball.exact(matrix)
+    a = ball.midpoint
+    if not a.size:
+        return Contraction(a, a, 0.0, 0.0 if discrete else 1.0, discrete)
+    if not (np.all(np.isfinite(a)) and np.all(np.isfinite(ball.radius))):
+        return None
+    values = np.linalg.eigvals(a)
+    bound = float(np.max(np.abs(values))) if discrete else float(-np.max(values.real))
+    if rate is not None:
+        return _tried(ball, rate, discrete=discrete)
+    if (discrete and not bound < 1.0) or (not discrete and not bound > 0.0):
+        return None
+    for share in RATES:
+        tried = bound + share * (1.0 - bound) if discrete else (1.0 - share) * bound
+        found = _tried(ball, tried, discrete=discrete)
+        if found is not None:
+            return found
+    return None
+
+
+def _tried(ball: Ball, rate: float, *, discrete: bool) -> Contraction | None:
+    factor = _lyapunov_factor(ball.midpoint, rate, discrete=discrete)
+    if factor is None:
+        return None
+    inverse = np.triu(np.linalg.inv(factor))
+    if not np.all(np.isfinite(inverse)) or np.any(np.diag(inverse) == 0.0) or np.any(np.diag(factor) == 0.0):
+        return None
+    n = len(factor)
+
+    def formula(kind: type[Enclosed]) -> Enclosed:
+        q, s = kind.exact(factor), kind.exact(inverse)
+        whole, moved = q @ s, q @ (kind.of(ball) @ s)
+        if discrete:
+            return block([[(whole.T @ whole).scaled(rate), moved.T], [moved, kind.exact(np.eye(n)).scaled(rate)]])
+        half = whole.T @ (moved + whole.scaled(rate))
+        return -(half + half.T)
+
+    if not prove_positive_definite(formula).proved:
+        return None
+    product = Ball.exact(factor) @ Ball.exact(inverse) - Ball.exact(np.eye(n))
+    size = np.abs(product.midpoint) + product.radius
+    defect = float(rounded_up(np.asarray(np.sqrt(np.sum(size**2))), n * n + 6))
+    return Contraction(factor, inverse, defect, rate, discrete) if defect < 0.5 else None
+
+
+def _lyapunov_factor(a: FloatArray, rate: float, *, discrete: bool) -> FloatArray | None:
+    """Return an upper triangular Q with ``P = Q'Q`` near a solution; ``None`` where there is none."""
+    from scipy.linalg import matrix_balance, qr, solve_continuous_lyapunov, solve_discrete_lyapunov
+
+    balanced, (scale, _) = matrix_balance(a, permute=False, separate=True)
+    one = np.eye(len(a))
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore")
+        try:
+            if discrete:
+                solution = solve_discrete_lyapunov((balanced / rate).T, one) if rate > 0.0 else None
+            else:
+                shifted = balanced + rate * one
+                size = float(np.linalg.norm(shifted, 2)) or 1.0
+                solution = solve_continuous_lyapunov(shifted.T / size, -one)
+        except (np.linalg.LinAlgError, ValueError):
+            return None
+    if solution is None or not np.all(np.isfinite(solution)):
+        return None
+    values, vectors = np.linalg.eigh((solution + solution.T) / 2.0)
+    if not np.all(values > 0.0):
+        return None
+    root = (np.sqrt(values)[:, None] * vectors.T) / scale[None, :]
+    return np.asarray(np.triu(qr(root, mode="r")[0][: len(a)]))

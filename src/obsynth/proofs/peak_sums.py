@@ -1,0 +1,179 @@
+r"""Sums over all time of what a system makes of its inputs, from above, every rounding accounted for.
+
+``v_{j+1} = fl(M v_j)`` misses ``M v_j`` by a defect that is known; with a proved contraction (`Contraction`) the
+defects add no more than ``|c Q^-1| sum |Q defect| / (1 - rate)`` to all later terms together, and what follows the last
+term that is computed no more than that of ``|Q v_N|``.
+
+Where an input acts for an interval of length h, ``\int_0^h |g(s)| ds`` of ``g(s) = c M^j e^{A s} b`` is the trapezoidal
+sum over p pieces of length ``p d = h``, plus ``d^3 / 12`` times the largest second derivative of each piece; that is at
+most its value at the left end plus d times the largest third derivative, which the contraction bounds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from obsynth.numerics.arrays import FloatArray
+from obsynth.proofs.balls import UNDERFLOW, Ball, gamma, rounded_up
+from obsynth.proofs.contraction import Contraction
+from obsynth.proofs.exponentials import exponential
+
+#: Most steps that are summed up one by one, and the share of the sum that the rest may then have.
+MOST_STEPS, LEFT = 16_384, 1e-4
+#: A piece of an interval is at most this share of one over the norm of A; most pieces.
+PIECE, MOST_PIECES = 0.05, 1_024
+#: Length of an interval in units of one over the norm of A, and the largest order, for gains in continuous time.
+LENGTH, MOST_STATES = 0.4, 12
+#: Share of such a gain that the rest may have.
+LEFT_OF_GAINS = 0.05
+
+
+class PeakSums(NamedTuple):
+    """Upper bounds on partial and whole sums, one column for each input.
+
+    ``partial (steps, ..., m)`` holds the terms ``0 .. k``, ``whole (..., m)`` all of them.
+    """
+
+    partial: FloatArray
+    whole: FloatArray
+
+
+def peak_sums(
+    matrix: Ball, rows: FloatArray, columns: Ball, contraction: Contraction, *, least: int = 0, left: float = LEFT,
+    each: bool = False,
+) -> PeakSums:  # fmt: skip
+    """Return bounds on the sums over j of ``|c M^j b|`` of every column ``b``, for ``c (p, n)``.
+
+    Euclidean norms, or with ``each`` the absolute value of each row.  At least ``least`` terms are summed up one by
+    one, and more until the rest is bounded by the share ``left``.
+    """
+    moving, held, n = matrix.midpoint, columns.midpoint.copy(), len(matrix.midpoint)
+    growth, shown = gamma(n + 2), np.abs(rows)
+    seen = (
+        np.array([contraction.seen(rows[i : i + 1]) for i in range(len(rows))])[:, None]
+        if each
+        else np.array(contraction.seen(rows))
+    )
+
+    def rest(of: FloatArray) -> FloatArray:
+        """Return what the terms after these columns add up to, at most."""
+        sizes = contraction.sizes(moving @ of, rounded_up(_missed(matrix, np.abs(of), growth), 3 * n + 8))
+        return np.asarray(seen * contraction.factor * sizes)
+
+    terms: list[FloatArray] = []
+    gathered_columns = np.zeros_like(held)
+    total: FloatArray | float = 0.0
+    while True:
+        product = np.abs(rows @ held)
+        terms.append(product if each else _norms(product))
+        total, gathered_columns = total + terms[-1], gathered_columns + np.abs(held)
+        done = len(terms) >= max(MOST_STEPS, least)
+        if done or (len(terms) >= least and (len(terms) % 64 == 0 or not held.any())):
+            after = rest(held)
+            if done or np.all(after <= left * total):
+                break
+        held = moving @ held
+    count = len(terms) + 8
+    # Every defect, and what the columns are off by: sums of norms are at most the norm of the sums in the 1-norm.
+    defects = rounded_up(_missed(matrix, gathered_columns, growth) + columns.radius, 3 * n + count)
+    products = rounded_up(growth * (shown @ gathered_columns) + count * n * UNDERFLOW, 3 * n + count)
+    added = seen * contraction.factor * contraction.sizes_in_sum(defects) + (
+        products if each else np.sum(products, axis=0)
+    )
+    partial = rounded_up(np.cumsum(np.array(terms), axis=0), count + 2 * len(rows) + 10) + added
+    return PeakSums(rounded_up(partial, 4), rounded_up(partial[-1] + after, 6))
+
+
+def _missed(matrix: Ball, sizes: FloatArray, growth: float) -> FloatArray:
+    """Return what products of the midpoint with columns of these sizes miss of those of any member."""
+    n = len(sizes)
+    return np.asarray(growth * (np.abs(matrix.midpoint) @ sizes) + matrix.radius @ sizes + n * UNDERFLOW)
+
+
+def _norms(sizes: FloatArray) -> FloatArray:
+    """Return Euclidean norms of columns of upper bounds, rounded up."""
+    largest = np.max(sizes, axis=0, initial=0.0)
+    safe = np.where((largest > 0.0) & np.isfinite(largest), largest, 1.0)
+    return np.asarray(rounded_up(safe * np.sqrt(np.sum((sizes / safe) ** 2, axis=0)), 2 * len(sizes) + 10))
+
+
+class Pieces(NamedTuple):
+    """Columns whose weighted norms, summed up, bound the integral over an interval of what inputs do.
+
+    ``columns (n, k)``, ``weights (k,)``, ``inputs (k,)``: to which input a column belongs.
+    """
+
+    columns: Ball
+    weights: FloatArray
+    inputs: np.ndarray
+
+
+def interval_pieces(a: FloatArray, b: FloatArray, into: Ball, length: float) -> Pieces:
+    """Return the pieces of ``into e^{A s} b``, s from 0 to ``length``: ``a (n, n)``, ``b (n, m)``, ``into (k, n)``."""
+    norm = float(np.linalg.norm(a, 2)) if a.size else 0.0
+    count = int(np.clip(np.ceil(length * norm / PIECE), 1, MOST_PIECES))
+    step, m = length / count, b.shape[1]
+    transition, ball_a = exponential(a, step), Ball.exact(a)
+    at = Ball.exact(b)
+    first = ball_a @ (ball_a @ Ball.exact(b))
+    third = _growth(a, step) @ np.abs(_upper(ball_a @ first))
+    parts: list[Ball] = []
+    weights: list[float] = []
+    largest = np.zeros_like(b)
+    for i in range(count + 1):
+        parts.append(into @ at)
+        weights.append(step * (0.5 if i in (0, count) else 1.0))
+        if i < count:
+            parts.append(into @ first)
+            weights.append(step**3 / 12.0)
+            largest = np.maximum(largest, third)
+            at, first = transition @ at, transition @ first
+            third = _growth(a, step) @ _upper(ball_a @ first)
+    # What is left, of any sign, in every coordinate at once: as many columns as coordinates.
+    rest = Ball(np.zeros((into.shape[0], m)), rounded_up(_upper(into) @ largest, 2 * len(a) + 6))
+    parts.append(rest)
+    weights.append(count * step**4 / 12.0)
+    joined = Ball(np.hstack([part.midpoint for part in parts]), np.hstack([part.radius for part in parts]))
+    scale = rounded_up(np.repeat(np.array(weights), m), 6)
+    return Pieces(joined, scale, np.tile(np.arange(m), len(parts)))
+
+
+def _growth(a: FloatArray, step: float) -> FloatArray:
+    """Return an upper bound on ``|e^{A s}|``, entry by entry, for s up to ``step``."""
+    return _upper(exponential(np.abs(a), step))
+
+
+def _upper(ball: Ball) -> FloatArray:
+    return np.asarray(rounded_up(np.abs(ball.midpoint) + ball.radius, 2))
+
+
+def gathered(pieces: Pieces, sums: FloatArray, inputs: int) -> FloatArray:
+    """Return the bound of each input, ``(..., inputs)``, from the sums ``(..., k)`` of all pieces."""
+    weighted = sums * pieces.weights
+    found = np.stack([np.sum(weighted[..., pieces.inputs == i], axis=-1) for i in range(inputs)], axis=-1)
+    return np.asarray(rounded_up(found, len(pieces.weights) + 4))
+
+
+def absolute_gains(a: FloatArray, rows: FloatArray, contraction: Contraction) -> FloatArray:
+    """Return upper bounds on ``sum_j |c A^j|`` (the integral of ``|c e^{A t}|``), entry by entry, for ``c (p, n)``."""
+    n = len(a)
+    loose = contraction.gain(rows, np.eye(n))
+    if not n or (not contraction.discrete and n > MOST_STATES):
+        return loose
+    if contraction.discrete:
+        moving, columns, gather = Ball.exact(a), Ball.exact(np.eye(n)), None
+        held: Contraction | None = contraction
+    else:
+        length = LENGTH / float(np.linalg.norm(a, 2))
+        gather = interval_pieces(a, np.eye(n), Ball.exact(np.eye(n)), length)
+        moving, columns = exponential(a, length), gather.columns
+        # The contraction in continuous time is one of its samples as well.
+        rate = float(rounded_up(np.exp(-contraction.rate * length), 4))
+        held = replace(contraction, rate=rate, discrete=True) if rate < 1.0 else None
+    if held is None:
+        return loose
+    whole = peak_sums(moving, rows, columns, held, left=LEFT_OF_GAINS, each=True).whole
+    return np.asarray(np.minimum(loose, whole if gather is None else gathered(gather, whole, n)))

@@ -1,0 +1,223 @@
+"""What the stored numbers of a linear design add to the errors, whatever the identities are in exact arithmetic.
+
+The identities hold to rounding, not exactly: what they miss is driven by the plant's state and its known inputs (see
+`obsynth.verification.remainder_channel`).  The rows bound the errors per unit of each; where the plant does not forget,
+its state has no bound, no finite gain from the disturbances exists, and what can be said is after how long it matters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.numerics.pencils import pencil_structure
+from obsynth.numerics.spectra import boundary_points
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.results.design import ObserverDesign
+from obsynth.results.report import Check, information, upper_bound_check
+from obsynth.verification.remainder_channel import (
+    RemainderChannel,
+    TrackedPlant,
+    contraction_of,
+    remainder_channel,
+)
+
+#: A bound that is claimed may be found again this much larger: sums are added up in another order.
+REPEATED = 1.01
+#: A gain is claimed for disturbances that last up to one over this, rad per sample: slower ones are reported.
+SLOWEST, POINTS = 1e-7, 120
+#: Frequencies beyond that at which the time is looked for after which stored numbers matter, rad per sample.
+SLOWER = tuple(10.0**-k for k in range(8, 17))
+#: Eigenvalues within this of the boundary of stability (relative to the unit circle, or to the largest) may be on it.
+BOUNDARY = 1e-8
+#: Without a claimed gain stored numbers matter when they turn a unit disturbance into this error.
+NOTICED = 1e-3
+#: Tolerance of the comparison of gains found in double precision.
+GAIN_TOLERANCE = 1e-9
+
+_ON_THE_BOUNDARY = "the plant has a pole on the boundary of stability: no finite gain exists for stored numbers"
+_NAMES = ("states", "inputs", "disturbances")
+_WITNESSES = ("state_error", "input_error", "disturbance_error")
+
+
+@dataclass(frozen=True, eq=False)
+class StoredErrors:
+    """Upper bounds on the error of every row of output per unit of states, inputs and decoupled disturbances."""
+
+    channel: RemainderChannel
+    bounds: tuple[FloatArray, ...]
+
+    @classmethod
+    def of(cls, tracked: TrackedPlant, observer: LinearObserver) -> StoredErrors | None:
+        """Return the bounds; ``None`` where no contraction of the observer can be proved."""
+        contraction = contraction_of(observer)
+        if contraction is None:
+            return None
+        channel = remainder_channel(tracked, observer)
+        bounds = channel.errors_per_unit(observer, contraction)
+        if not all(np.all(np.isfinite(bound)) for bound in bounds):
+            return None
+        return cls(channel, bounds)
+
+    def witnesses(self) -> dict[str, FloatArray]:
+        """Return what a certificate claims of them, by name; what has no column is left out."""
+        return {name: bound for name, bound in zip(_WITNESSES, self.bounds, strict=True) if bound.shape[1]}
+
+
+def stored_number_rows(design: ObserverDesign, tracked: TrackedPlant, gamma: float | None = None) -> Iterator[Check]:
+    """Yield the rows on stored numbers; ``gamma`` is the gain from the disturbances that is claimed, if any."""
+    plant, observer = design.linear
+    found = StoredErrors.of(tracked, observer)
+    claimed = {name: design.certificate.matrices.get(name) for name in _WITNESSES}
+    if found is None:
+        yield information(
+            "stored numbers", "what rounding of the stored numbers adds to the errors: no bound was found", np.nan,
+            source="stored numbers", status="assumed",
+        )  # fmt: skip
+        if any(value is not None for value in claimed.values()):
+            yield upper_bound_check("stored numbers: states", "the claimed bounds are found again", np.nan, 0.0,
+                                    source="stored numbers")  # fmt: skip
+        return
+    columns = (tracked.state_names, plant.input_names, plant.disturbance_names)
+    for kind, name, bound, labels in zip(_NAMES, _WITNESSES, found.bounds, columns, strict=True):
+        if bound.size:
+            yield _per_unit(observer, kind, bound, claimed[name], labels)
+        elif claimed[name] is not None:
+            yield upper_bound_check(f"stored numbers: {kind}", "there is something to claim", 1.0, 0.0,
+                                    source="certificate")  # fmt: skip
+    yield from _gain_rows(design, tracked, found.channel, gamma)
+
+
+def _per_unit(
+    observer: LinearObserver, kind: str, bound: FloatArray, claimed: FloatArray | None, labels: tuple[str, ...]
+) -> Check:
+    rows = (
+        *(f"xhat[{name}]" for name in observer.state_names),
+        *(f"fhat[{name}]" for name in observer.fault_names),
+        *(f"r[{name}]" for name in observer.residual_names),
+    )
+    shown = bound[observer.fault_rows] if observer.fault_names else bound
+    first = observer.fault_rows.start if observer.fault_names else 0
+    i, j = np.unravel_index(int(np.argmax(shown)), shown.shape)
+    text = f"largest to {rows[first + int(i)]}: {shown[i, j]:.2g} per unit of {labels[int(j)]}"
+    what = f"error of an estimate per unit of the plant's {kind}, from rounding of the stored numbers"
+    name, source = f"stored numbers: {kind}", "the residuals of the identities, outward rounded"
+    if claimed is None:
+        row = information(name, what, float(shown[i, j]), source=source, detail=f"{text}; no bound is claimed")
+        return Check(**{**row.__dict__, "status": "proved"})
+    if claimed.shape != bound.shape or not np.all(np.isfinite(claimed)):
+        return upper_bound_check(name, what, np.nan, 0.0, source=source, detail="the claimed bound has another shape")
+    allowed = REPEATED * claimed
+    # Where nothing is claimed to be left, nothing may be.
+    shares = np.where(allowed > 0.0, bound / np.where(allowed > 0.0, allowed, 1.0), np.inf)
+    ratios = np.where(bound > allowed, shares, 0.0)
+    row_found, column = divmod(int(np.argmax(ratios)), ratios.shape[1])
+    if not ratios[row_found, column] > 0.0:
+        row_found, column = first + int(i), int(j)
+    return upper_bound_check(
+        name, f"{what}: at most as claimed", float(bound[row_found, column]), float(allowed[row_found, column]),
+        source=source, kind="proved", detail=text,
+    )  # fmt: skip
+
+
+def _gain_rows(
+    design: ObserverDesign, tracked: TrackedPlant, channel: RemainderChannel, gamma: float | None
+) -> Iterator[Check]:
+    """Yield what plant and stored observer together make of disturbances."""
+    plant, observer = design.linear
+    if not plant.nd or not observer.fault_names:
+        return
+    system = _Composite(plant, observer, tracked, channel)
+    unit = 1.0 if plant.dt > 0.0 else system.fastest
+    frequencies = unit * np.geomspace(SLOWEST, np.pi if plant.dt > 0.0 else 10.0, POINTS)
+    gains = np.array([system.gain(frequency) for frequency in frequencies])
+    worst = int(np.argmax(gains))
+    verdict, seconds = _when_it_matters(system, NOTICED if gamma is None else float(gamma), unit, gains[0])
+    if gamma is not None:
+        yield upper_bound_check(
+            "gain with stored numbers",
+            f"gain d -> fault error of the plant and the stored observer, from {SLOWEST:.0e} rad per sample up",
+            float(gains[worst]), float(gamma) * (1.0 + GAIN_TOLERANCE), source="recomputed, plant included",
+            detail=f"largest at {frequencies[worst]:.2g} rad per sample; {verdict}",
+        )  # fmt: skip
+    yield information(
+        "stored numbers: horizon",
+        "seconds for which a unit disturbance may last before rounding of the stored numbers "
+        + ("reaches the claimed gain" if gamma is not None else f"makes an error of {NOTICED:g} of it"),
+        seconds, source="recomputed, plant included", detail=verdict,
+    )  # fmt: skip
+
+
+class _Composite:
+    """The transfer from the disturbances to the fault error of a plant and its stored observer, at any frequency."""
+
+    def __init__(
+        self, plant: DescriptorSystem, observer: LinearObserver, tracked: TrackedPlant, channel: RemainderChannel
+    ) -> None:
+        self.plant, self.observer = plant, observer
+        rows = observer.fault_rows
+        self.K, self.J = channel.K.midpoint, channel.J.midpoint[rows]
+        # Faults and lagged states are appended to the states of the plant.
+        self.copies = tracked.T.shape[1] // plant.nx if tracked.T.shape[1] % plant.nx == 0 else 1
+        width = plant.nx * (self.copies if tracked.state_names[: plant.nx] == plant.state_names else 1)
+        self.lags = width // plant.nx
+        self.K, self.J = self.K[:, :width], self.J[:, :width]
+        padded = np.vstack([plant.Bd, np.zeros((tracked.T.shape[1] - plant.nx, plant.nd))])
+        self.driven = observer.By @ plant.Dd - tracked.T @ padded
+        self.direct = observer.Dy[rows] @ plant.Dd
+        self.shown = observer.Cz[rows]
+        values = pencil_structure(plant.E, plant.A).finite_eigenvalues
+        self.poles: ComplexArray = np.asarray(values, dtype=np.complex128)
+        own = np.abs(np.linalg.eigvals(observer.Az)) if observer.order else np.ones(1)
+        self.fastest = float(max(np.max(own, initial=0.0), np.finfo(np.float64).tiny))
+
+    def gain(self, frequency: float) -> float:
+        """Return the largest singular value at a frequency (rad per sample, or rad/s); zero at a pole of the plant."""
+        dt = self.plant.dt
+        point = complex(boundary_points(np.array([frequency / dt if dt > 0.0 else frequency]), dt)[0])
+        try:
+            x = np.linalg.solve(point * self.plant.E - self.plant.A, self.plant.Bd.astype(complex))
+            stacked = np.vstack([x * point**-age for age in range(self.lags)])
+            inner = np.linalg.solve(
+                point * np.eye(self.observer.order) - self.observer.Az, self.K @ stacked + self.driven
+            )
+        except np.linalg.LinAlgError:
+            return 0.0
+        whole = self.shown @ inner + self.J @ stacked + self.direct
+        return float(np.linalg.norm(whole, 2)) if np.all(np.isfinite(whole)) else 0.0
+
+
+def _when_it_matters(system: _Composite, level: float, unit: float, slow: float) -> tuple[str, float]:
+    """Return what to say of disturbances that last, and for how many seconds they may."""
+    dt, poles = system.plant.dt, system.poles
+    per_unit = dt if dt > 0.0 else 1.0 / unit
+    size = max(float(np.max(np.abs(poles), initial=0.0)), np.finfo(np.float64).tiny)
+    distance = np.abs(poles) - 1.0 if dt > 0.0 else poles.real / size
+    outside = distance > BOUNDARY
+    if not poles.size or np.all(distance < -BOUNDARY):
+        return "the plant forgets: a finite gain exists", np.inf
+    if outside.any():
+        rate = float(np.max(np.log(np.abs(poles[outside])) / dt if dt > 0.0 else poles[outside].real))
+        left = max(float(np.max(np.abs(system.K), initial=0.0)), float(np.max(np.abs(system.J), initial=0.0)))
+        seconds = float(np.log(max(level / max(left, 1e-300), 1.0)) / rate)
+        return (
+            "the plant has a pole outside the region of stability: no finite gain exists for stored numbers; where its "
+            f"state is not held down, they matter after about {seconds:.3g} s"
+        ), seconds
+    last = SLOWEST
+    for frequency in SLOWER:
+        if system.gain(frequency * unit) > level:
+            seconds = per_unit / frequency
+            return (
+                f"{_ON_THE_BOUNDARY}; they matter for disturbances that last longer than about "
+                f"{seconds:.3g} s ({seconds / 86_400:.3g} days)"
+            ), seconds
+        last = frequency
+    if slow > level:
+        last = SLOWEST
+    seconds = per_unit / last
+    return f"{_ON_THE_BOUNDARY}; they do not matter within {seconds:.3g} s", seconds
