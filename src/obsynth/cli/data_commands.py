@@ -181,6 +181,7 @@ def monitor_of(
 
 
 def summary_of_run(found: DataRun, watched: OnlineMonitor | None) -> str:
+    """Return what a run was, in a few lines."""
     counts = ", ".join(f"{count} {status}" for status, count in found.statuses.items())
     lines = [f"{found.rows} rows: {counts}."]
     if found.recovered:

@@ -202,7 +202,10 @@ def plot_gains(design: ObserverDesign, *, to: str = "faults", axes: Axes | None 
     plain_decades(panel)
     panel.set_xlabel("frequency (rad/s)")
     panel.set_ylabel("singular value")
-    panel.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False)
+    if found.gains:
+        panel.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False)
+    else:
+        panel.set_title("The plant states no faults, disturbances or noise.")
     tidy(panel)
     return panel
 

@@ -17,7 +17,7 @@ from obsynth.report.pictures import pictures_of
 from obsynth.report.summary import summary
 from obsynth.report.verification import verdict_line
 from obsynth.results.design import ObserverDesign
-from obsynth.results.gain_sets import design_as_dict
+from obsynth.results.gain_sets import gain_set_digest
 from obsynth.results.report import VerificationReport
 from obsynth.simulation.scenario import Scenario
 
@@ -78,7 +78,7 @@ def _page_text(
     design: ObserverDesign, report: VerificationReport, gains_file: str | None, scenario: Scenario | None,
     system_file: str | None, own: Sequence[str], data_file: str | None,
 ) -> str:  # fmt: skip
-    digest = str(design_as_dict(design)["sha256"])
+    digest = gain_set_digest(design)
     title = escape(f"{design.name}: {design.method}")
     state = "holds" if report.passed else "fails"
     sections = {
