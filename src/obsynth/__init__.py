@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from obsynth.calibration.box import CalibratedBox
     from obsynth.calibration.calibrating import calibrate
     from obsynth.calibration.result import Calibration
+    from obsynth.calibration.validating import validate
+    from obsynth.calibration.validation import Validation
+    from obsynth.calibration.validity import Validity, validity
     from obsynth.compare.sensor_sets import SensorSet, SensorSets, sensor_sets
     from obsynth.data.run import DataRun, run_on_data
     from obsynth.errors import (
@@ -101,6 +104,10 @@ __version__ = "0.1.0"
 
 # Names are imported when they are first used, so that `import obsynth` stays fast; ``module:name`` is another name.
 _HOMES = {
+    "Validation": "obsynth.calibration.validation",
+    "Validity": "obsynth.calibration.validity",
+    "validate": "obsynth.calibration.validating",
+    "validity": "obsynth.calibration.validity",
     "SensorSet": "obsynth.compare.sensor_sets",
     "SensorSets": "obsynth.compare.sensor_sets",
     "sensor_sets": "obsynth.compare.sensor_sets",
@@ -208,6 +215,9 @@ _HOMES = {
     "pd_observer_from_gains": "obsynth.methods.pd_observer.public",
     "run_batch": "obsynth.observers.batches",
     "run_on_data": "obsynth.data.run",
+    "Sweep": "obsynth.sweeps.sweep",
+    "SweepResult": "obsynth.sweeps.sweep",
+    "sweep": "obsynth.sweeps.sweep",
     "sample_observer": "obsynth.observers.linear.sampling",
     "simulate": "obsynth.experiments.simulation",
     "simulate_time_varying": "obsynth.simulation.time_varying",
@@ -277,9 +287,13 @@ __all__ = [
     "Step",
     "StructuredResidual",
     "Stuck",
+    "Sweep",
+    "SweepResult",
     "TimeVaryingDescriptorSystem",
     "Uncertainty",
     "Uniform",
+    "Validation",
+    "Validity",
     "VerificationError",
     "VerificationReport",
     "adaptive_observer",
@@ -328,9 +342,12 @@ __all__ = [
     "simulate_dae",
     "simulate_time_varying",
     "steady_state_filter",
+    "sweep",
     "ui_pi_observer",
     "ui_pi_observer_from_gains",
     "uncertain_system",
+    "validate",
+    "validity",
     "verify",
 ]
 

@@ -106,24 +106,38 @@ def uncertain_system(
             raise SpecError("plant has no matrix A.", path="plant.A") from error
         except TypeError as error:
             raise SpecError(f"plant: {error}.", path="plant") from error
+    return with_expressions(system, entries, constants, tolerance=tolerance, **options)
+
+
+def with_expressions(
+    system: DescriptorSystem, entries: Mapping[str, list[Entry]], constants: Any, *, tolerance: Any = None,
+    **options: Any,
+) -> DescriptorSystem:  # fmt: skip
+    """Return a plant with expressions in some entries, at the nominal values of the constants."""
+    names = set(constants.constants if isinstance(constants, ConstantsBox) else constants or {})
+    # What an expression puts into an entry is no number of its own, to have a tolerance of its own.
     box, more = _boxed(constants, tolerance, {}, matrices_of(system), entries, options)
-    return filled_plant(system, Uncertainty(box, _joined(entries, more)))
+    return filled_plant(system, Uncertainty(box, _joined(entries, more)), names)
 
 
-def filled_plant(system: DescriptorSystem, uncertainty: Uncertainty) -> DescriptorSystem:
+def filled_plant(system: DescriptorSystem, uncertainty: Uncertainty, stated: set[str]) -> DescriptorSystem:
     """Return a plant as written with its entries at the nominal values of the constants."""
     values = {name: item.nominal for name, item in uncertainty.box.constants.items()}
     matrices = uncertainty.filled(matrices_of(system), values)
-    unknown = sorted(name for name in uncertainty.box.constants if name not in uncertainty.used)
+    _require_used(uncertainty, stated)
+    for name, matrix in matrices.items():
+        if not np.isfinite(matrix).all():
+            raise SpecError(f"{name} is not finite at the nominal values of the constants.", path=name)
+    return system.replace(**matrices, uncertainty=uncertainty)
+
+
+def _require_used(uncertainty: Uncertainty, stated: set[str]) -> None:
+    unknown = sorted(name for name in stated - uncertainty.used if name in uncertainty.box.constants)
     if unknown:
         raise SpecError(
             f"The constant {unknown[0]!r} stands in no matrix: write an entry as an expression in it, or remove it.",
             path=f"constants.{unknown[0]}",
         )  # fmt: skip
-    for name, matrix in matrices.items():
-        if not np.isfinite(matrix).all():
-            raise SpecError(f"{name} is not finite at the nominal values of the constants.", path=name)
-    return system.replace(**matrices, uncertainty=uncertainty)
 
 
 def _with_tolerances(
@@ -139,6 +153,7 @@ def _with_tolerances(
         kept |= {"level": None, "digest": None}
     box, more = _boxed(constants, tolerance, before.box.constants, written, entries, kept | stated)
     after = Uncertainty(box, _joined(entries, more), before.written, before.steps)
+    _require_used(after, set(box.constants))
     for name, item in before.box.constants.items():
         if name not in box.constants or abs(box.constants[name].nominal - item.nominal) > SAME_SHARE * abs(
             item.nominal

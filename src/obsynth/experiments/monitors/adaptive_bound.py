@@ -10,6 +10,7 @@ kept, what is older is bounded through eps.  See robust.md, theorems 1 and 2.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -54,6 +55,7 @@ class AdaptiveBound:
     solved: FloatArray
     tail: FloatArray
     nominal: FloatArray
+    more: FloatArray
     rounding: FloatArray
     start: FloatArray
     start_later: tuple[float, FloatArray]
@@ -65,7 +67,7 @@ class AdaptiveBound:
         """Samples in the ring."""
         return self.responses.length
 
-    @property
+    @cached_property
     def counts(self) -> tuple[int, int, int, int, int]:
         """``p, nz, rows, m, no``: constants, eps, channel rows, channels, outputs."""
         structure = self.structure
@@ -77,6 +79,22 @@ class AdaptiveBound:
         """Numbers of a sample that the ring holds."""
         return self.counts[3] + len(self.remainder_inputs)
 
+    @cached_property
+    def memory(self) -> FloatArray:
+        """For varying constants ``(L, p, rows + no + nz, nv)``, oldest sample first: what signals of the past do."""
+        nz = self.counts[1]
+        powers = self.responses.powers[:-1][::-1]
+        inner = self.drive[:, :nz]
+        shown = np.concatenate([np.broadcast_to(self.shown, (len(powers), *self.shown.shape)) @ powers, powers], axis=1)
+        return np.asarray(np.einsum("jrz,pzv->jprv", shown, inner))
+
+    @cached_property
+    def tail_rows(self) -> FloatArray:
+        """What a bound of eps from before the ring adds to each channel row, ``(rows, nz)``."""
+        left = self.structure.channel_rows @ self.structure.Cx
+        powers = self.responses.powers
+        return np.asarray((np.abs(left @ powers[-1]) + power_rounding(left, powers)) * OUTWARD)
+
     def start_at(self, k: int) -> FloatArray:
         """Return what the start adds to channels and outputs ``(m + no,)`` at sample k after it."""
         if k < len(self.start):
@@ -86,10 +104,16 @@ class AdaptiveBound:
 
     def known(self, estimates: FloatArray, inputs: FloatArray) -> FloatArray:
         """Return what signals put into the ring ``(..., w)``: estimates through remainders, inputs with remainders."""
-        own = len(self.structure.owner)
-        seen = np.moveaxis(self.structure.seen(np.moveaxis(estimates @ self.structure.channel_rows.T, -1, 0)), 0, -1)
-        seen[..., :own] = 0.0
-        return np.concatenate([seen, np.abs(inputs[..., list(self.remainder_inputs)])], axis=-1)
+        own, structure = len(self.structure.owner), self.structure
+        sizes = np.abs(estimates @ structure.channel_rows[own:].T)
+        single = structure.single - own
+        found = np.zeros((*estimates.shape[:-1], self.width))
+        found[..., own : structure.single] = sizes[..., :single]
+        if sizes.shape[-1] > single:
+            found[..., structure.single] = sizes[..., single:].max(axis=-1)
+        if self.remainder_inputs:
+            found[..., structure.channels :] = np.abs(inputs[..., list(self.remainder_inputs)])
+        return found
 
 
 class Start:
@@ -145,6 +169,7 @@ def adaptive_bound(
     return AdaptiveBound(
         structure, responses, varying, drive, np.vstack([rows @ structure.Cx, structure.Co]), kernels,
         np.ascontiguousarray(same.T), solved, tail, outward @ _nominal(structure, responses),
+        _nominal(structure, responses, center=False)[m:],
         outward @ _rounding(structure, responses, observer, start.state), table @ outward.T * OUTWARD,
         (theta, outward @ settled * OUTWARD), 1.0 + np.abs(structure.offsets), tuple(driven.tolist()),
     )  # fmt: skip
@@ -182,12 +207,12 @@ def _start_table(
     return np.array(found), (theta, np.concatenate([structure.seen(channels), outputs]) * factor)
 
 
-def _nominal(structure: ErrorStructure, responses: Responses) -> FloatArray:
-    """Return what disturbances and noise add to channels and outputs, over the whole box."""
+def _nominal(structure: ErrorStructure, responses: Responses, *, center: bool = True) -> FloatArray:
+    """Return what disturbances and noise add to channels and outputs, over the whole box (or the tolerances alone)."""
     given, (inner, state, outputs) = structure.disturbances, structure.rows
 
     def total(left: FloatArray, direct: AffineMatrix) -> FloatArray:
-        found = responses.gain(left, given.center[inner], direct.center)
+        found = responses.gain(left, given.center[inner], direct.center) * float(center)
         for part, at_once in zip(given.parts, direct.parts, strict=True):
             if part.any():
                 found = found + responses.gain(left, part[inner], at_once)

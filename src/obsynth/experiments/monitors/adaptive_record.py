@@ -121,7 +121,7 @@ def _first_varying(bound: AdaptiveBound, v: FloatArray) -> tuple[FloatArray, Flo
         eps[:, k] += eps[:, k - bound.length] @ bound.responses.tail_eps.T
     first = whole * bound.spans[:, None]
     older = eps[:, :steps]
-    channels = _seen(bound, first[..., :rows].sum(axis=2)) + older @ bound.responses.tail_channels.T
+    channels = _seen(bound, first[..., :rows].sum(axis=2) + older @ bound.tail_rows.T)
     outputs = first[..., rows:]
     # What is older than the ring belongs to all constants: it is shared out evenly.
     outputs = outputs + (older @ bound.responses.tail_outputs.T)[:, :, None, :] / p
