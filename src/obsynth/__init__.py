@@ -75,7 +75,8 @@ if TYPE_CHECKING:
     from obsynth.observers.linear.sampling import sample_observer
     from obsynth.observers.recursive.estimates import RecursiveEstimates
     from obsynth.observers.recursive.gain_schedule import BatchEstimates
-    from obsynth.observers.recursive.observer import Adaptation, RecursiveObserver
+    from obsynth.observers.recursive.observer import RecursiveObserver
+    from obsynth.observers.recursive.settings import Adaptation
     from obsynth.observers.running import RunningObserver
     from obsynth.observers.running import RunningObserver as RunningDAEObserver
     from obsynth.observers.running import RunningObserver as RunningRecursiveObserver
@@ -137,7 +138,7 @@ _HOMES = {
     "Identifiability": "obsynth.analysis.identifiability",
     "identifiability": "obsynth.analysis.identifiability",
     "DAEModel": "obsynth.plants.dae.model",
-    "Adaptation": "obsynth.observers.recursive.observer",
+    "Adaptation": "obsynth.observers.recursive.settings",
     "Alarm": "obsynth.observers.alarms",
     "BatchEstimates": "obsynth.observers.recursive.gain_schedule",
     "Certificate": "obsynth.results.design",
@@ -214,6 +215,9 @@ _HOMES = {
     "pd_observer_from_gains": "obsynth.methods.pd_observer.public",
     "run_batch": "obsynth.observers.batches",
     "run_on_data": "obsynth.data.run",
+    "Sweep": "obsynth.sweeps.sweep",
+    "SweepResult": "obsynth.sweeps.sweep",
+    "sweep": "obsynth.sweeps.sweep",
     "sample_observer": "obsynth.observers.linear.sampling",
     "simulate": "obsynth.experiments.simulation",
     "simulate_time_varying": "obsynth.simulation.time_varying",
@@ -283,6 +287,8 @@ __all__ = [
     "Step",
     "StructuredResidual",
     "Stuck",
+    "Sweep",
+    "SweepResult",
     "TimeVaryingDescriptorSystem",
     "Uncertainty",
     "Uniform",
@@ -336,6 +342,7 @@ __all__ = [
     "simulate_dae",
     "simulate_time_varying",
     "steady_state_filter",
+    "sweep",
     "ui_pi_observer",
     "ui_pi_observer_from_gains",
     "uncertain_system",

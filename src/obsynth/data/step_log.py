@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -15,12 +14,10 @@ from obsynth.data.log_estimator import GAP, LONGEST_BRIDGE, OK, PARTIAL, RECOVER
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.monitors.online import Evidence
 from obsynth.numerics.arrays import FloatArray
-from obsynth.observers.dae.observer import DAEObserver
-from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.robustness import Robust, with_outliers
 from obsynth.observers.running import RunningObserver, state_as_data, state_from_data
 
 Found = TypeVar("Found")
-Robust = TypeVar("Robust", RecursiveObserver, DAEObserver)
 
 
 def without_outliers(observer: Robust, outliers: str | None) -> Robust:
@@ -28,11 +25,7 @@ def without_outliers(observer: Robust, outliers: str | None) -> Robust:
     wanted = outliers or ("gate" if observer.outliers == "none" else observer.outliers)
     if wanted == observer.outliers:
         return observer
-    found = replace(observer, outliers=wanted)  # type: ignore[arg-type]
-    if "graph" in vars(observer):
-        # The steps are the same; what is added stands outside of them.
-        vars(found)["graph"] = vars(observer)["graph"]
-    return found
+    return with_outliers(observer, wanted)
 
 
 class SteppingEngine(ABC, Generic[Found]):

@@ -6,7 +6,6 @@ Source of the claims: Moussa Ali, Zhang 2013 (DAE), (7)-(9), (26); the bands are
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 
@@ -20,6 +19,7 @@ from obsynth.observers.dae.batch import run_dae_batch
 from obsynth.observers.dae.building import OPTIONS, dae_observer_from_options, resolved_options
 from obsynth.observers.dae.nominal_run import NOMINAL_STEPS, DAEFacts, dae_facts
 from obsynth.observers.dae.observer import DAEObserver
+from obsynth.observers.robustness import with_outliers
 from obsynth.results.design import ObserverDesign
 from obsynth.results.report import Check, information, upper_bound_check
 from obsynth.simulation.dae import simulate_dae
@@ -56,8 +56,7 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
         source="shipped observer", kind="equality", detail=problem,
     )  # fmt: skip
     # What is checked is the recursion; records that no plant made would seem full of outliers.
-    graph, observer = observer.graph, replace(observer, outliers="none")
-    vars(observer)["graph"] = graph
+    observer = with_outliers(observer, "none")
     try:
         facts = dae_facts(observer)
         yield from _model_rows(observer, facts)
