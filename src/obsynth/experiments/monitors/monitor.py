@@ -24,7 +24,10 @@ STATEMENTS: Mapping[str, str] = {
     "probability, for Gaussian noise, after the start is forgotten",
 }
 #: What a statement adds for a continuous design.
-BETWEEN_SAMPLES = "; as far as outputs are straight lines between samples, where disturbances bend them"
+BETWEEN_SAMPLES = "; disturbances may do anything within their bounds between samples, at the stated sample time"
+#: The assumptions of every bound that is never passed.
+EXACT_MODEL = "; the model is exact, and known inputs go in straight lines between samples"
+HELD = "; the model is exact, and inputs and disturbances are held between samples, as the sampled model has them"
 
 
 def statement_of(kind: str, *, continuous: bool) -> str:
