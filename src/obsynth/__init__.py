@@ -17,6 +17,10 @@ if TYPE_CHECKING:
     from obsynth.calibration.box import CalibratedBox
     from obsynth.calibration.calibrating import calibrate
     from obsynth.calibration.result import Calibration
+    from obsynth.calibration.validating import validate
+    from obsynth.calibration.validation import Validation
+    from obsynth.calibration.validity import Validity, validity
+    from obsynth.compare.sensor_sets import SensorSet, SensorSets, sensor_sets
     from obsynth.data.run import DataRun, run_on_data
     from obsynth.errors import (
         InfeasibleError,
@@ -66,18 +70,22 @@ if TYPE_CHECKING:
     from obsynth.observers.dae.batch import DAEBatchEstimates
     from obsynth.observers.dae.estimates import DAEEstimates
     from obsynth.observers.dae.observer import DAEObserver
-    from obsynth.observers.dae.running import RunningDAEObserver
     from obsynth.observers.decisions import decide
-    from obsynth.observers.linear.observer import Estimates, LinearObserver, RunningObserver
+    from obsynth.observers.linear.observer import Estimates, LinearObserver
     from obsynth.observers.linear.sampling import sample_observer
     from obsynth.observers.recursive.estimates import RecursiveEstimates
     from obsynth.observers.recursive.gain_schedule import BatchEstimates
     from obsynth.observers.recursive.observer import Adaptation, RecursiveObserver
-    from obsynth.observers.recursive.running import RunningRecursiveObserver
+    from obsynth.observers.running import RunningObserver
+    from obsynth.observers.running import RunningObserver as RunningDAEObserver
+    from obsynth.observers.running import RunningObserver as RunningRecursiveObserver
+    from obsynth.plants.constants import Constant, ConstantsBox
     from obsynth.plants.dae.model import DAEModel
     from obsynth.plants.descriptor import DescriptorSystem
     from obsynth.plants.fault_models import FaultModel, fault_model
     from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+    from obsynth.plants.uncertain_system import uncertain_system
+    from obsynth.plants.uncertainty import Uncertainty
     from obsynth.report.page import html_report
     from obsynth.results.delta_scan import DeltaScan
     from obsynth.results.design import Certificate, ObserverDesign
@@ -89,11 +97,19 @@ if TYPE_CHECKING:
     from obsynth.simulation.scenario import Scenario
     from obsynth.simulation.time_varying import simulate_time_varying
     from obsynth.spec.loader import Spec, load_spec
+    from obsynth.tolerances.robustness import Robustness, robustness
 
 __version__ = "0.1.0"
 
-# Names are imported when they are first used, so that `import obsynth` stays fast.
+# Names are imported when they are first used, so that `import obsynth` stays fast; ``module:name`` is another name.
 _HOMES = {
+    "Validation": "obsynth.calibration.validation",
+    "Validity": "obsynth.calibration.validity",
+    "validate": "obsynth.calibration.validating",
+    "validity": "obsynth.calibration.validity",
+    "SensorSet": "obsynth.compare.sensor_sets",
+    "SensorSets": "obsynth.compare.sensor_sets",
+    "sensor_sets": "obsynth.compare.sensor_sets",
     "functional_filter": "obsynth.methods.functional_filter.public",
     "CalibratedBox": "obsynth.calibration.box",
     "Calibration": "obsynth.calibration.result",
@@ -107,10 +123,16 @@ _HOMES = {
     "StructuredResidual": "obsynth.analysis.diagnosis.banks",
     "dae_adaptive_observer": "obsynth.methods.dae_adaptive_observer.public",
     "DAETrajectory": "obsynth.simulation.dae",
+    "Constant": "obsynth.plants.constants",
+    "ConstantsBox": "obsynth.plants.constants",
+    "Robustness": "obsynth.tolerances.robustness",
+    "Uncertainty": "obsynth.plants.uncertainty",
+    "robustness": "obsynth.tolerances.robustness",
+    "uncertain_system": "obsynth.plants.uncertain_system",
     "simulate_dae": "obsynth.simulation.dae",
     "DAEBatchEstimates": "obsynth.observers.dae.batch",
     "DAEEstimates": "obsynth.observers.dae.estimates",
-    "RunningDAEObserver": "obsynth.observers.dae.running",
+    "RunningDAEObserver": "obsynth.observers.running:RunningObserver",
     "DAEObserver": "obsynth.observers.dae.observer",
     "Identifiability": "obsynth.analysis.identifiability",
     "identifiability": "obsynth.analysis.identifiability",
@@ -145,8 +167,8 @@ _HOMES = {
     "RecursiveEstimates": "obsynth.observers.recursive.estimates",
     "RecursiveObserver": "obsynth.observers.recursive.observer",
     "RecursiveSimulation": "obsynth.experiments.parameter_simulation",
-    "RunningObserver": "obsynth.observers.linear.observer",
-    "RunningRecursiveObserver": "obsynth.observers.recursive.running",
+    "RunningObserver": "obsynth.observers.running",
+    "RunningRecursiveObserver": "obsynth.observers.running:RunningObserver",
     "Scenario": "obsynth.simulation.scenario",
     "Simulation": "obsynth.experiments.simulation",
     "Sine": "obsynth.simulation.profiles",
@@ -192,6 +214,9 @@ _HOMES = {
     "pd_observer_from_gains": "obsynth.methods.pd_observer.public",
     "run_batch": "obsynth.observers.batches",
     "run_on_data": "obsynth.data.run",
+    "Sweep": "obsynth.sweeps.sweep",
+    "SweepResult": "obsynth.sweeps.sweep",
+    "sweep": "obsynth.sweeps.sweep",
     "sample_observer": "obsynth.observers.linear.sampling",
     "simulate": "obsynth.experiments.simulation",
     "simulate_time_varying": "obsynth.simulation.time_varying",
@@ -209,6 +234,8 @@ __all__ = [
     "Calibration",
     "Certificate",
     "Check",
+    "Constant",
+    "ConstantsBox",
     "DAEBatchEstimates",
     "DAEEstimates",
     "DAEModel",
@@ -243,10 +270,13 @@ __all__ = [
     "RecursiveEstimates",
     "RecursiveObserver",
     "RecursiveSimulation",
+    "Robustness",
     "RunningDAEObserver",
     "RunningObserver",
     "RunningRecursiveObserver",
     "Scenario",
+    "SensorSet",
+    "SensorSets",
     "Simulation",
     "Sine",
     "SolverError",
@@ -256,8 +286,13 @@ __all__ = [
     "Step",
     "StructuredResidual",
     "Stuck",
+    "Sweep",
+    "SweepResult",
     "TimeVaryingDescriptorSystem",
+    "Uncertainty",
     "Uniform",
+    "Validation",
+    "Validity",
     "VerificationError",
     "VerificationReport",
     "adaptive_observer",
@@ -297,22 +332,29 @@ __all__ = [
     "pd_delta_scan",
     "pd_observer",
     "pd_observer_from_gains",
+    "robustness",
     "run_batch",
     "run_on_data",
     "sample_observer",
+    "sensor_sets",
     "simulate",
     "simulate_dae",
     "simulate_time_varying",
     "steady_state_filter",
+    "sweep",
     "ui_pi_observer",
     "ui_pi_observer_from_gains",
+    "uncertain_system",
+    "validate",
+    "validity",
     "verify",
 ]
 
 
 def __getattr__(name: str) -> Any:
     if name in _HOMES:
-        return getattr(import_module(_HOMES[name]), name)
+        module, _, other_name = _HOMES[name].partition(":")
+        return getattr(import_module(module), other_name or name)
     raise AttributeError(f"module 'obsynth' has no attribute {name!r}")
 
 

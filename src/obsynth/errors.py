@@ -79,13 +79,22 @@ class PreconditionError(ObsynthError):
         The eigenvalue or zero at which it fails.
     signals : sequence of str, optional
         Names of the faults, states or outputs involved.
+    add : sequence of sequence of str, optional
+        Sets of states, the measurement of any one of which would make the design possible.
     """
 
     exit_code = 3
 
     def __init__(
-        self, message: str, *, condition: str, mode: complex | None = None, signals: Sequence[str] = ()
+        self,
+        message: str,
+        *,
+        condition: str,
+        mode: complex | None = None,
+        signals: Sequence[str] = (),
+        add: Sequence[Sequence[str]] = (),
     ) -> None:
+        self.add = tuple(tuple(names) for names in add)
         self.condition = self.code = condition
         self.mode = mode
         self.signals = tuple(signals)
@@ -94,7 +103,10 @@ class PreconditionError(ObsynthError):
     def as_dict(self) -> dict[str, Any]:
         """Return the error as plain data, for ``--json``."""
         mode = None if self.mode is None else [complex(self.mode).real, complex(self.mode).imag]
-        return {**super().as_dict(), "condition": self.condition, "mode": mode, "signals": list(self.signals)}
+        return {
+            **super().as_dict(), "condition": self.condition, "mode": mode, "signals": list(self.signals),
+            "add": [list(names) for names in self.add],
+        }  # fmt: skip
 
 
 class InfeasibleError(ObsynthError):

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from paper_filter import PaperState, paper_step
 from time_varying_plants import maximum_likelihood, observer_for, printed, record, textbook, varying
 
 from obsynth import PreconditionError, SpecError, run_batch, simulate_time_varying
 from obsynth.analysis.time_varying import horizon_ranks
 from obsynth.methods.recursive.conditions import residual_condition
-from obsynth.numerics.paper_filter import PaperState, paper_step
 from obsynth.numerics.recursive_least_squares import ParameterState, start_of, update
-from obsynth.observers.recursive.running import RawEstimate
+from obsynth.observers.recursive.recursion import RawEstimate
 
 SAMPLES = 40
 
@@ -292,7 +292,7 @@ class TestReset:
         ).outputs  # fmt: skip
         running = observer_for(plant, adapt={"forgetting": 0.995, "guard": "regularise", **adapt}).start()
         found = np.array([running.raw_step(row, np.zeros(1)).parameters.theta for row in y])
-        return found - theta, 0 if running.alarm is None else running.alarm.resets
+        return found - theta, running.state.resets
 
     def test_a_jump_is_followed_at_once(self) -> None:
         after = slice(self.CHANGE + 15, self.CHANGE + 60)

@@ -11,7 +11,7 @@ from time_varying_plants import maximum_likelihood, observer_for, printed, recor
 
 from obsynth import PreconditionError, SpecError, TimeVaryingDescriptorSystem
 from obsynth.observers.recursive import compiled_run
-from obsynth.observers.recursive.running import RunningRecursiveObserver
+from obsynth.observers.recursive.recursion import Recursion
 
 SAMPLES = 40
 #: Relative to the largest entry of each result: rounding of well-posed problems over a record.
@@ -28,13 +28,13 @@ def kernel() -> None:
 def single_steps(kernel, monkeypatch) -> list[int]:
     """The samples that were taken step by step."""
     taken: list[int] = []
-    plain = RunningRecursiveObserver.raw_step
+    plain = Recursion.advance
 
-    def counted(self, y, u):
-        taken.append(self.k)
-        return plain(self, y, u)
+    def counted(self, state, y, u):
+        taken.append(state.k)
+        return plain(self, state, y, u)
 
-    monkeypatch.setattr(RunningRecursiveObserver, "raw_step", counted)
+    monkeypatch.setattr(Recursion, "advance", counted)
     return taken
 
 
@@ -160,9 +160,9 @@ class TestWhatItLeavesToTheNormalPath:
         tried = []
         plain = compiled_run._kernel_steps
 
-        def counted(running, *rest):
-            tried.append(running.k)
-            return plain(running, *rest)
+        def counted(observer, state, *rest):
+            tried.append(state.k)
+            return plain(observer, state, *rest)
 
         monkeypatch.setattr(compiled_run, "_kernel_steps", counted)
         found = observer.run(y, compiled=True)

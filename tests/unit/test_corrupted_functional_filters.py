@@ -118,6 +118,16 @@ TABLE = {
     "no proof of stability": ("both", matrix("stability", lambda q: np.diag(-np.diag(q) + 1e3)), [STABILITY]),
     "order": ("both", claim(order=1.0), [ORDER]),
     "decay": ("both", claim(decay=1e3), [DECAY]),
+    "a claimed gain": ("both", claim(gamma=1e-9), ["claims covered"]),
+    "a claimed error per unit of a state": (
+        "both", matrix("state_error", lambda found: 0.5 * found), ["stored numbers: states"],
+    ),
+    "a claimed error per unit of an input": (
+        "both", matrix("input_error", lambda found: 0.5 * found), ["stored numbers: inputs"],
+    ),
+    "a claimed error per unit of a disturbance": (
+        "both", matrix("disturbance_error", lambda found: 0.5 * found), ["stored numbers: disturbances"],
+    ),
     "motion": ("both", matrix("tracking", at(0, 0)), [MOTION, MODELS, ERROR_A]),
     "deviations": (
         "both", matrix("deviations", lambda found: 0.5 * found), [NOISE_A, NOISE_B, ERROR_A, ERROR_B],

@@ -123,14 +123,14 @@ def jumps() -> tuple[DAEObserver, np.ndarray, np.ndarray]:
 def test_a_hard_step_is_taken_by_itself_and_the_stretch_goes_on() -> None:
     shipped, y, u = jumps()
     running, alone = shipped.start(), 0
-    careful = running.implicit.solve_carefully
+    careful = shipped.steps.implicit.solve_carefully
 
     def counted(*arguments, **options):
         nonlocal alone
         alone += 1
         return careful(*arguments, **options)
 
-    running.implicit.solve_carefully = counted
+    shipped.steps.implicit.solve_carefully = counted
     steps = [running.raw_step(y[k], u[k]) for k in range(400)]
     assert 5 < alone < 200
     for compiled in (None, True):
@@ -342,11 +342,11 @@ def test_a_step_that_becomes_singular_along_the_run_is_named(compiled) -> None:
     running = shipped.start()
     for k in range(23):
         running.step(y[k], u[k])
-    memory = running.memory
+    memory = running.state.memory
     with pytest.raises(SolverError, match="singular at k = 23"):
         running.step(y[23], u[23])
-    assert running.k == 23
-    assert running.memory is memory
+    assert running.state.k == 23
+    assert running.state.memory is memory
     running.step(y[23], u[22])
 
 

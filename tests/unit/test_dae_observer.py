@@ -15,6 +15,11 @@ from obsynth.plants.dae.step import ImplicitStep
 BALANCES = [(2e-4) ** 2, 75.0**2, 38.0**2, 0.0]  # 0.1 % of the flow, 0.5 % of the heat
 
 
+def part(running, name):
+    """What a running observer remembers under a name."""
+    return running.observer.steps.part(running.state, name)
+
+
 def observer(model=None, **changes) -> DAEObserver:
     model = model or exchanger()
     fields = {
@@ -68,16 +73,16 @@ def test_what_the_parameters_do_not_explain_decays_by_itself(weight) -> None:
         if k:
             x = step.solve(x, u[k], theta).x
         y = step.functions.outputs(x, theta)[0]
-        kept = np.eye(4) - running.K @ running.H
+        kept = np.eye(4) - part(running, "K") @ running.observer.steps.part(running.state, "H")
         row = running.raw_step(y, u[k])
-        z = x - running.x - running.Upsilon @ (theta - running.theta)
+        z = x - part(running, "x") - part(running, "Upsilon") @ (theta - part(running, "theta"))
         if before is not None:
             factor = row.part("F") @ kept
             worst = max(worst, np.abs(z - factor @ before).max())
         before = z
     assert worst < 1e-13
     assert np.abs(factor).max() > 1e-3
-    assert running.theta == pytest.approx(theta, abs=1e-6)
+    assert part(running, "theta") == pytest.approx(theta, abs=1e-6)
 
 
 def record(samples: int = 200, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
@@ -168,17 +173,17 @@ def test_missing_channels_and_samples() -> None:
     y[100:140, 0] = np.nan
     running = observer(guard="none").start()
     for k in range(200):
-        before = running.S.copy()
+        before = part(running, "S").copy()
         row = running.raw_step(y[k], u[k])
         if k == 50:
-            assert np.array_equal(running.S, before)
+            assert np.array_equal(part(running, "S"), before)
             assert row.degrees == 0
             assert row.nis == 0.0
         if k in (100, 139):
             assert row.degrees == 1
             assert np.isnan(row.innovation[0])
-    assert np.isfinite(running.posterior).all()
-    assert running.theta == pytest.approx([0.9, 2e3], abs=250.0)
+    assert np.isfinite(part(running, "posterior")).all()
+    assert part(running, "theta") == pytest.approx([0.9, 2e3], abs=250.0)
 
 
 def test_a_guard_bounds_s_where_excitation_ends() -> None:
@@ -192,7 +197,7 @@ def test_a_guard_bounds_s_where_excitation_ends() -> None:
         running = observer(model, R=[[1e4]], guard=guard, forgetting=0.97).start()
         for k in range(400):
             running.raw_step(y[k], u[k])
-        ends[guard] = np.linalg.eigvalsh(running.S / np.outer([0.1, 1e3], [0.1, 1e3]))[-1]
+        ends[guard] = np.linalg.eigvalsh(part(running, "S") / np.outer([0.1, 1e3], [0.1, 1e3]))[-1]
     assert ends["regularise"] <= 1.0 + 1e-9
     assert ends["none"] > 3.0
 
@@ -254,7 +259,7 @@ def test_bad_records_are_named() -> None:
     running = observer().start()
     with pytest.raises(SpecError, match="at k = 0"):
         running.step(y[0], u[7])
-    assert running.k == 0
+    assert running.state.k == 0
 
 
 def test_an_impossible_input_names_its_sample() -> None:

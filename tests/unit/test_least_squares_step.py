@@ -8,11 +8,11 @@ import mpmath
 import numpy as np
 import pytest
 from filterpy.kalman import KalmanFilter
+from paper_filter import paper_gains
 
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.covariances import covariance_factor
 from obsynth.numerics.least_squares_step import LeastSquaresStep, least_squares_step, rank_revealing_step
-from obsynth.numerics.paper_filter import paper_gains
 
 #: Working digits of the reference: 50 are left after the worst cancellation below (sizes from 1e-32 to 1e20).
 DIGITS = 120

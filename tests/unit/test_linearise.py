@@ -9,10 +9,14 @@ from ruamel.yaml import YAML
 
 from obsynth import DAEModel, PreconditionError, SpecError, linearise
 
+#: Published constants of the tanks, which their calibration replaces.
+PUBLISHED = {"a1": 0.0227, "a2": 0.0241, "b1": 0.0334, "b2": 0.0360}
+
 
 def tanks(**changes) -> DAEModel:
     document = YAML(typ="safe").load((DESIGNS / "threetank" / "plant.yaml").read_text(encoding="utf-8"))
     fields = {key: value for key, value in document.items() if key not in ("schema_version", "kind")}
+    fields["constants"] |= PUBLISHED
     return DAEModel(**{**fields, **changes})
 
 

@@ -218,9 +218,9 @@ class TestBadInput:
 
     def test_adaptation(self) -> None:
         for changes, part in (
-            ({"forgetting": 0.0}, r"lambda in \(0, 1\]"),
-            ({"forgetting": 1.01}, r"lambda in \(0, 1\]"),
-            ({"forgetting": float("nan")}, r"lambda in \(0, 1\]"),
+            ({"forgetting": 0.0}, "above 0 and at most 1"),
+            ({"forgetting": 1.01}, "above 0 and at most 1"),
+            ({"forgetting": float("nan")}, "above 0 and at most 1"),
             ({"form": "magic"}, "form is 'magic'"),
             ({"guard": "prayer"}, "guard is 'prayer'"),
             ({"window": 0}, "window is 0"),

@@ -12,6 +12,7 @@ import scipy.sparse as sp
 
 import obsynth
 from obsynth.analysis.transformations.elimination import eliminated_by_sparsity
+from obsynth.methods.designing import check
 from obsynth.numerics.sparse_factor import SparseFactor
 from obsynth.numerics.sparse_structure import blocks_of, coarse_structure
 from obsynth.spec.loader import load_spec
@@ -177,6 +178,36 @@ class TestIdleVariables:
         with pytest.raises(obsynth.PreconditionError) as caught:
             obsynth.eliminate_algebraic_states(plant)
         assert caught.value.condition == "regularity"
+
+
+class TestMethods:
+    def test_a_small_sparse_plant_is_designed_for_as_written(self):
+        plant = obsynth.DescriptorSystem(
+            sp.diags_array([1.0, 0.0]).tocsr(),
+            sp.csr_array([[0.5, 0.2], [0.1, 1.0]]),
+            C=np.eye(2),
+            Bf=[[1], [0]],
+            dt=1.0,
+        )
+        ours = obsynth.fault_estimation_filter(plant)
+        assert ours.report.passed
+        assert isinstance(ours.plant.A, np.ndarray)
+        np.testing.assert_array_equal(ours.observer.Az, obsynth.fault_estimation_filter(plant.dense()).observer.Az)
+
+    def test_a_large_one_is_reduced_first(self):
+        network = random_network(520, 20, 7)
+        design = obsynth.pd_observer(network.plant(Bd=None, disturbance_names=None))
+        assert design.report.passed
+        assert design.plant.state_names == network.dynamic
+        assert set(design.recovery.names) == set(network.names) - set(network.idle)
+        assert any(network.idle[0] in note for note in design.notes)
+
+    def test_check_says_why_a_large_one_cannot_be_reduced(self):
+        network = random_network(520, 20, 8)
+        plant = network.plant(C=[*network.outputs, network.idle[0]], Dw=None)
+        reports = check(plant)
+        assert all(not report.passed for report in reports.values())
+        assert all(report.failures[0].name.endswith("index") for report in reports.values())
 
 
 class TestNumerics:

@@ -127,6 +127,7 @@ def calibrate(
     _check_options(method, integration, level, starts, input_delay)
     note = progress or (lambda text: None)
     whole = read_log(log, model.input_names, model.output_names, rows=rows, columns=columns, scales=scales, dt=dt)
+    digest = whole.digest
     whole = whole.shifted(input_delay) if isinstance(input_delay, int) else whole
     problem = calibration_problem(
         model, whole, unknown=unknown, priors=priors, noisy=noisy, Q=Q, R=R, initial_state=initial_state,
@@ -146,7 +147,7 @@ def calibrate(
     if method == "innovations" and input_delay == "auto" and model.nu:
         problem, fits, timing = chosen_timing(problem, fits, seed, note)
     fit = innovations_fit(problem, fits, level, note) if method == "innovations" else None
-    return reported(problem, fits[0], fit, level=level, timing=timing, error=error)
+    return reported(problem, fits[0], fit, level=level, timing=timing, error=error, digest=digest)
 
 
 def _step_error(problem: Problem, fit: Fit) -> IntegrationError | None:

@@ -45,14 +45,18 @@ class Consistency:
 
 def consistency(whitened: FloatArray, seen: Any, *, level: float = 0.95) -> Consistency:
     """Return the mean square of whitened innovations where they were seen, with its chi-square interval."""
+    return consistency_of(float((whitened[seen] ** 2).sum()), int(np.sum(seen)), level=level)
+
+
+def consistency_of(squares: float, count: int, *, level: float = 0.95) -> Consistency:
+    """Return a sum of squares of whitened innovations over their number, with its chi-square interval."""
     from scipy.stats import chi2
 
-    count = int(np.sum(seen))
     if not count:
         return Consistency(float("nan"), 0.0, float("inf"), 0)
     share = (1.0 - level) / 2.0
     low, high = chi2.ppf([share, 1.0 - share], count) / count
-    return Consistency(float((whitened[seen] ** 2).sum() / count), float(low), float(high), count)
+    return Consistency(squares / count, float(low), float(high), count)
 
 
 def whiteness(column: FloatArray) -> Whiteness:
@@ -77,11 +81,13 @@ def change_of_mean(whitened: FloatArray, *, confidence: float = CHANGE_CONFIDENC
 
     w = np.nan_to_num(whitened)
     n, m = w.shape
+    # Where a variance is wrong, that is another sentence: the mean is judged by what each column really does.
+    w = w / np.maximum(np.sqrt((w**2).mean(axis=0)), 1.0)
     if n < LEAST_ROWS:
         return None
     total = np.cumsum(w, axis=0)
     k = np.arange(CHANGE_MARGIN, n - CHANGE_MARGIN)
     before, after = total[k - 1] / k[:, None], (total[-1] - total[k - 1]) / (n - k)[:, None]
-    statistic = ((before - after) ** 2).sum(axis=1) * k * (n - k) / n / max(float((w**2).mean()), 1.0)
+    statistic = ((before - after) ** 2).sum(axis=1) * k * (n - k) / n
     limit = chi2.ppf(1.0 - (1.0 - confidence) / n, m)
     return int(k[int(np.argmax(statistic))]) if statistic.max() > limit else None

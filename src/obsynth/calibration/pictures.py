@@ -10,6 +10,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from obsynth.calibration.result import Calibration
+    from obsynth.calibration.validation import Validation
+    from obsynth.calibration.validity import Validity
 
 #: Deviations within which 95 % of white normal innovations lie.
 BAND = 1.96
@@ -59,3 +61,56 @@ def _boxes(panel: object, found: Calibration) -> None:
     panel.set_xlabel("per cent of the value")
     panel.set_title(f"{100 * found.box.level:g} % box, all at once (arrows: open)", fontsize=10, loc="left")
     panel.grid(True, axis="x", color="0.9", linewidth=0.6)
+
+
+def validation_figure(found: Validation) -> Figure:
+    """Return measured and predicted signals, innovations in their band, and each estimate with its own."""
+    import matplotlib.pyplot as plt
+
+    names, time = list(found.sensors), found.log["rows"][0] + np.arange(len(found.innovations))
+    count = 2 * len(names) + len(found.estimates)
+    figure, panels = plt.subplots(
+        count, 1, layout="constrained", squeeze=False, sharex=True, figsize=(7.5, 0.6 + 1.5 * count)
+    )
+    for i, name in enumerate(names):
+        signals, said = panels[2 * i, 0], panels[2 * i + 1, 0]
+        signals.plot(time, found.measured[:, i], color="0.7", linewidth=3.0, label="measured")
+        signals.plot(time, found.predicted[:, i], color="black", linewidth=1.0, linestyle="--", label="predicted")
+        signals.set_ylabel(name)
+        signals.legend(fontsize=8, loc="upper left", frameon=False, ncols=2)
+        band = BAND * found.deviations[:, i]
+        said.fill_between(time, -band, band, color="tab:blue", alpha=0.15, linewidth=0.0)
+        said.plot(time, found.innovations[:, i], color="black", linewidth=0.8, marker=".", markersize=3)
+        said.set_ylabel(f"innovation\nof {name}")
+    for panel, (name, columns) in zip(panels[2 * len(names) :, 0], found.estimates.items(), strict=True):
+        value, band = columns[:, 0], BAND * columns[:, 1]
+        panel.fill_between(time, value - band, value + band, color="tab:blue", alpha=0.25, linewidth=0.0)
+        panel.plot(time, value, color="black", linewidth=1.1)
+        panel.set_ylabel(name)
+    for panel in panels[:, 0]:
+        panel.grid(True, color="0.9", linewidth=0.6)
+    panels[-1, 0].set_xlabel("row of the log")
+    return figure
+
+
+def validity_figure(found: Validity) -> Figure:
+    """Return outputs of plant and linear model, and their difference in deviations of the sensor."""
+    import matplotlib.pyplot as plt
+
+    names = list(found.by_sensor)
+    figure, panels = plt.subplots(
+        2 * len(names), 1, layout="constrained", squeeze=False, sharex=True, figsize=(7.5, 0.6 + 3.0 * len(names))
+    )
+    for i, name in enumerate(names):
+        signals, apart = panels[2 * i, 0], panels[2 * i + 1, 0]
+        signals.plot(found.time, found.nonlinear[:, i], color="0.7", linewidth=3.0, label="nonlinear")
+        signals.plot(found.time, found.linear[:, i], color="black", linewidth=1.0, linestyle="--", label="linear")
+        signals.set_ylabel(name)
+        signals.legend(fontsize=8, loc="best", frameon=False, ncols=2)
+        apart.axhspan(-1.0, 1.0, color="tab:blue", alpha=0.15, linewidth=0.0)
+        apart.plot(found.time, (found.linear - found.nonlinear)[:, i] / found.deviations[name], color="black")
+        apart.set_ylabel(f"difference of\n{name} (deviations)")
+    for panel in panels[:, 0]:
+        panel.grid(True, color="0.9", linewidth=0.6)
+    panels[-1, 0].set_xlabel("time (s)")
+    return figure

@@ -122,7 +122,7 @@ def calibration_problem(
                       f"{variances} variances; at least {needed} are needed. Take more rows, fewer unknowns, or state "
                       "Q and R.")  # fmt: skip
     whole = promoted(model, names)
-    x0 = _state(model, initial_state)
+    x0 = initial_state_of(model, initial_state)
     graphs = sample_graphs(whole, names, log.dt, integration=integration, substeps=substeps, samples=log.samples)
     return Problem(
         whole, log, names, np.array([values[name] for name in names]), low, high, means, weights, equations, known_Q,
@@ -172,7 +172,8 @@ def _variances(given: Mapping[str, float | None] | None, names: Sequence[str], w
     return found
 
 
-def _state(model: DAEModel, value: Any) -> FloatArray:
+def initial_state_of(model: DAEModel, value: Any) -> FloatArray:
+    """Return a state ``(nx,)`` from an array or from values by name; nominal where nothing is said."""
     if not isinstance(value, Mapping):
         return finite_vector(value, model.state_names, model.nominal_state, "initial_state")
     x = np.array(model.nominal_state)

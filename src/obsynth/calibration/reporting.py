@@ -24,7 +24,7 @@ NOTED_NATS = 2.0
 
 def reported(
     problem: Problem, start: Fit, fit: InnovationsFit | None, *, level: float, timing: Timing,
-    error: IntegrationError | None,
+    error: IntegrationError | None, digest: str,
 ) -> Calibration:  # fmt: skip
     """Return the calibration of a fit of innovations, or of a simulation where there is none."""
     found = fit if fit is not None else _of_simulation(problem, start, level)
@@ -42,8 +42,7 @@ def reported(
     nominal = {name: float(value) for name, value in zip(names, found.t, strict=True)}
     box = CalibratedBox(
         nominal, {name: min(pair[0].value, nominal[name]) for name, pair in sides.items()},
-        {name: max(pair[1].value, nominal[name]) for name, pair in sides.items()}, open_sides, level,
-        problem.log.digest,
+        {name: max(pair[1].value, nominal[name]) for name, pair in sides.items()}, open_sides, level, digest,
     )  # fmt: skip
     Q = {name: float(value) for name, value in zip(problem.noisy, found.Q, strict=True)} if fit is not None else {}
     R = {name: float(value) for name, value in zip(problem.output_names, found.R, strict=True)}
@@ -59,7 +58,7 @@ def reported(
         dict(zip(problem.output_names, problem.quanta.tolist(), strict=True)), at_end, problem.integration,
         problem.substeps, "innovations" if fit is not None else "simulation", -found.value, tuple(verdict),
         read_only(whitened), read_only(problem.y - found.innovations), read_only(np.sqrt(found.variances)),
-        {"source": problem.log.source, "rows": list(problem.log.rows), "digest": problem.log.digest,
+        {"source": problem.log.source, "rows": list(problem.log.rows), "digest": digest,
          "samples": problem.log.samples, "dt": problem.log.dt},
         {name: problem.model.units.get(name, "1") for name in names}, problem.output_names,
     )  # fmt: skip

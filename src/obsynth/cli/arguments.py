@@ -23,6 +23,11 @@ def add_json(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print JSON on stdout, for programs; errors too")
 
 
+def add_verbose(parser: argparse.ArgumentParser, what: str) -> None:
+    """Add ``-v``."""
+    parser.add_argument("-v", "--verbose", action="store_true", help=f"print {what} as well")
+
+
 def add_quiet(parser: argparse.ArgumentParser, what: str = "no progress") -> None:
     """Add ``--quiet``."""
     parser.add_argument("--quiet", action="store_true", help=f"print {what}")

@@ -12,6 +12,7 @@ import numpy as np
 from obsynth.cli.arguments import output_file
 from obsynth.cli.output import print_json, progress, stdout_console
 from obsynth.errors import PreconditionError, SpecError, VerificationError
+from obsynth.files.outputs import write_atomically
 
 if TYPE_CHECKING:
     from obsynth.analysis.structure import Structure
@@ -22,27 +23,55 @@ if TYPE_CHECKING:
 
 def run_design(options: argparse.Namespace) -> int:
     """Run ``design``: spec in, report and gain set out."""
-    from obsynth.results.gain_sets import GAIN_SET, design_as_dict
+    from obsynth.results.gain_sets import GAIN_SET, design_as_dict, gain_set_bytes, place_of
 
     with progress(quiet=options.quiet) as report_stage:
         report_stage(f"reading {options.system}")
         from obsynth.spec import load_spec
 
         spec = load_spec(options.system)
-        wanted = Path(f"{spec.name}.gains.json") if options.output is None else options.output
+        wanted = default_gains(spec) if options.output is None else options.output
         target = spec_output(wanted, GAIN_SET, spec, options, option="--output")
         design = designed(spec, report_stage)
-        file = design.save(target)
+        file = write_atomically(target, gain_set_bytes(design, spec=spec.path))
+    from obsynth.report.summary import summary
+
     if options.json:
         print_json({
             "command": "design", "spec": str(spec.path), "file": str(file), "passed": design.report.passed,
-            "gain_set": design_as_dict(design),
+            "summary": summary(design, everything=True).as_dict(),
+            "gain_set": {"written_for": place_of(spec.path), **design_as_dict(design)},
         }, is_plain=True)  # fmt: skip
         return 0
-    from obsynth.report import design_report
-
-    design_report(design, console=stdout_console(), file=file)
+    _print_design(design, file, verbose=options.verbose)
     return 0
+
+
+def _print_design(design: ObserverDesign, file: Path, *, verbose: bool) -> None:
+    """Print the answer first; every claim and check if asked for, and what fails in any case."""
+    from obsynth.report import design_report
+    from obsynth.report.summary import print_summary, summary
+    from obsynth.report.verification import checks_table
+
+    console = stdout_console()
+    if verbose:
+        design_report(design, console=console)
+        console.print()
+    print_summary(summary(design, file=file, everything=verbose), console=console)
+    if not verbose and not design.report.passed:
+        console.print(checks_table(design.report.failures, width=console.width))
+
+
+def default_gains(spec: Spec) -> Path:
+    """Return ``<name>.gains.json``, or a name with that of the spec's file where the first is another spec's."""
+    from obsynth.results.gain_sets import place_of, written_for
+
+    names = (f"{spec.name}.gains.json", f"{spec.name}.{spec.path.stem}.gains.json")
+    for name in names:
+        target = Path(name)
+        if not target.is_file() or written_for(target) in (None, place_of(spec.path)):
+            return target
+    raise SpecError(f"{' and '.join(names)} are of other specs called {spec.name!r}: give --output.", path=names[0])
 
 
 def designed(spec: Spec, report_stage: Any) -> ObserverDesign:
@@ -50,9 +79,11 @@ def designed(spec: Spec, report_stage: Any) -> ObserverDesign:
     from obsynth.methods.designing import design
 
     recovery = None if spec.transformation is None else spec.transformation.recovery
-    return design(
+    found = design(
         spec.plant, spec.method, name=spec.name, recovery=recovery, progress=report_stage, **dict(spec.options)
     )
+    noted = () if spec.transformation is None else spec.transformation.notes
+    return found.replace(notes=(*noted, *found.notes)) if noted else found
 
 
 def designed_or_loaded(spec: Spec, gains: Path | None, report_stage: Any) -> ObserverDesign:
@@ -88,6 +119,7 @@ def run_check(options: argparse.Namespace) -> int:
     from obsynth.analysis.diagnosis.diagnosing import diagnose
     from obsynth.analysis.structure import analyse_structure
     from obsynth.methods.designing import check
+    from obsynth.methods.registry import AUTO
     from obsynth.plants.descriptor import DescriptorSystem
 
     # A pencil, its eigenvalues and its index are those of one matrix pair: a plant that changes with k has none.
@@ -99,8 +131,9 @@ def run_check(options: argparse.Namespace) -> int:
     if spec.transformation is not None:
         structures = {"as written": analyse_structure(spec.transformation.source), **structures}
     done = "" if spec.transformation is None else spec.transformation.description
-    methods = check(spec.plant, {spec.method: spec.options})
-    passed = methods[spec.method].passed
+    methods = check(spec.plant, {} if spec.method == AUTO else {spec.method: spec.options})
+    own = methods.values() if spec.method == AUTO else [methods[spec.method]]
+    passed = any(report.passed for report in own)
     if options.json:
         print_json({
             "command": "check", "spec": str(spec.path), "method": spec.method, "passed": passed,
@@ -111,10 +144,16 @@ def run_check(options: argparse.Namespace) -> int:
     else:
         from obsynth.report import check_report
         from obsynth.report.diagnosis import diagnosis_report
+        from obsynth.report.existence import print_methods
 
+        console = stdout_console()
         if diagnosis is not None:
-            diagnosis_report(diagnosis, console=stdout_console())
-        check_report(spec.plant, structures, methods, console=stdout_console(), transformation=done)
+            diagnosis_report(diagnosis, console=console, everything=options.verbose)
+            console.print()
+        if options.verbose:
+            check_report(spec.plant, structures, methods, console=console, transformation=done)
+            console.print()
+        print_methods(methods, own=spec.method, console=console)
     return 0 if passed else PreconditionError.exit_code
 
 

@@ -47,20 +47,20 @@ def add_data_verbs(verbs: Any) -> None:
         "--out", default="-", metavar="FILE", help="CSV or Parquet file for the estimates (default: - for stdout)"
     )
     run.add_argument(
-        "--map", type=_pair, action="append", default=[], metavar="SIGNAL=COLUMN",
+        "--map", type=pair, action="append", default=[], metavar="SIGNAL=COLUMN",
         help="column of a signal (or of time) where the names differ; may be repeated",
     )  # fmt: skip
     run.add_argument(
-        "--scale", type=_pair, action="append", default=[], metavar="SIGNAL=FACTOR",
+        "--scale", type=pair, action="append", default=[], metavar="SIGNAL=FACTOR",
         help="the column's value times the factor is in the signal's unit; may be repeated",
     )  # fmt: skip
     run.add_argument(
-        "--threshold", type=_pair, action="append", default=[], metavar="COLUMN=LEVEL",
+        "--threshold", type=pair, action="append", default=[], metavar="COLUMN=LEVEL",
         help="alarm when the absolute value of a column of the output passes a level; may be repeated",
     )  # fmt: skip
     add_monitor_arguments(run)
     run.add_argument(
-        "--nominal", type=_pair, action="append", default=[], metavar="NAME=VALUE",
+        "--nominal", type=pair, action="append", default=[], metavar="NAME=VALUE",
         help="monitor of a recursive design: nominal value of a parameter; may be repeated",
     )  # fmt: skip
     run.add_argument(
@@ -92,7 +92,7 @@ def add_data_verbs(verbs: Any) -> None:
     )
     export.add_argument("--fmi", choices=("2.0", "3.0"), default="2.0", help="version of FMI for .fmu (default: 2.0)")
     export.add_argument(
-        "--threshold", type=_pair, action="append", default=[], metavar="OUTPUT=LEVEL",
+        "--threshold", type=pair, action="append", default=[], metavar="OUTPUT=LEVEL",
         help="for .fmu: alarm when the absolute value of an output, such as fhat[pump], passes a level",
     )  # fmt: skip
     export.add_argument("--warm-up", type=float, metavar="SECONDS", help="for .fmu: no alarms in these seconds")
@@ -114,7 +114,7 @@ def add_monitor_arguments(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("monitor")
     group.add_argument("--monitor", metavar="KIND", help="watch the residual (or the parameters) by a threshold")
     group.add_argument(
-        "--disturbance", type=_pair, action="append", default=[], metavar="NAME=BOUND",
+        "--disturbance", type=pair, action="append", default=[], metavar="NAME=BOUND",
         help="largest absolute value of a disturbance; may be repeated",
     )  # fmt: skip
     group.add_argument("--noise-bound", type=float, metavar="N", help="standard deviations that no noise exceeds")
@@ -130,7 +130,8 @@ def add_monitor_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
-def _pair(text: str) -> tuple[str, str]:
+def pair(text: str) -> tuple[str, str]:
+    """Return the two sides of NAME=VALUE."""
     # A column of the output, such as fhat[a=b], may hold an equals sign; a number or a plain column does not.
     name, mark, value = text.rpartition("=")
     if not mark or not name or not value:

@@ -11,11 +11,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from obsynth import __version__
-from obsynth.cli.arguments import add_force, add_json, add_quiet, add_system
+from obsynth.cli.arguments import add_force, add_json, add_quiet, add_system, add_verbose
+from obsynth.cli.calibration import add_calibration_verbs
 from obsynth.cli.data_arguments import add_data_verbs
 from obsynth.cli.evaluate import add_evaluate_verb
 from obsynth.cli.output import print_error, print_json
 from obsynth.cli.process import told_error, unwritable_output, usable_streams
+from obsynth.cli.sweep import add_sweep_verb
 from obsynth.errors import ObsynthError
 from obsynth.files.inputs import protected_inputs
 
@@ -62,6 +64,7 @@ def _parser() -> argparse.ArgumentParser:
 
     check = verbs.add_parser("check", help=_CHECK, description=_CHECK)
     add_system(check)
+    add_verbose(check, "the structure of the plant and every condition")
     add_json(check)
     check.set_defaults(verb="check")
 
@@ -85,7 +88,9 @@ def _parser() -> argparse.ArgumentParser:
     add_quiet(simulate)
     simulate.set_defaults(verb="simulate")
     add_evaluate_verb(verbs)
+    add_sweep_verb(verbs)
     add_data_verbs(verbs)
+    add_calibration_verbs(verbs)
     return parser
 
 
@@ -95,6 +100,7 @@ def _add_design_arguments(parser: argparse.ArgumentParser) -> None:
         "--output", type=Path, metavar="FILE",
         help="where to write the gain set (default: <name of the spec>.gains.json in the current folder)",
     )  # fmt: skip
+    add_verbose(parser, "every claim and every check")
     add_json(parser)
     add_force(parser)
     add_quiet(parser)
@@ -113,7 +119,7 @@ def _digits(text: str) -> int:
 
 
 def _verb(name: str) -> Callable[[argparse.Namespace], int]:
-    from obsynth.cli import commands, data_commands, evaluate, simulate
+    from obsynth.cli import calibration, commands, data_commands, evaluate, simulate, sweep
 
     return {
         "design": commands.run_design,
@@ -121,9 +127,13 @@ def _verb(name: str) -> Callable[[argparse.Namespace], int]:
         "verify": commands.run_verify,
         "simulate": simulate.run_simulate,
         "evaluate": evaluate.run_evaluate,
+        "sweep": sweep.run_sweep,
         "run": data_commands.run_run,
         "export": data_commands.run_export,
         "report": data_commands.run_report,
+        "linearise": calibration.run_linearise,
+        "calibrate": calibration.run_calibrate,
+        "validate": calibration.run_validate,
     }[name]
 
 

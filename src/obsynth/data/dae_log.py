@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -11,8 +12,8 @@ from obsynth.errors import SolverError, SpecError
 from obsynth.experiments.monitors.online import Evidence
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.estimates import DAEEstimates
-from obsynth.observers.dae.running import RunningDAEObserver
 from obsynth.observers.linear.warm_up import FORGOTTEN, checked_warm_up
+from obsynth.observers.running import RunningObserver
 from obsynth.results.design import ObserverDesign
 
 
@@ -34,7 +35,7 @@ class DAEDataObserver(SteppingEngine[DAEEstimates]):
             dt=self.observer.dt, warm_up=checked_warm_up(warm_up, steps * self.observer.dt), may_restart=True,
         )  # fmt: skip
 
-    def started(self) -> RunningDAEObserver:
+    def started(self) -> RunningObserver[Any, Any, Any]:
         """Return the running observer, at k = 0."""
         return self.observer.start()
 

@@ -10,7 +10,7 @@ import numpy as np
 from obsynth.analysis.transformations import eliminate_algebraic_states
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.observers.linear.sampling import first_order_hold
+from obsynth.numerics.holds import first_order_hold
 from obsynth.plants.descriptor import DescriptorSystem
 
 

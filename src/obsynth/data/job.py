@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Mapping
 from typing import Any
@@ -56,9 +57,13 @@ class Job:
             monitor.require_fit(len(residuals), engine.fault_names)
         self.header = (
             TIME, "status", *(f"time of {name}" for name, _ in lags), *names,
-            *(("statistic", "threshold") if monitor is not None else ()),
+            *(("statistic", "threshold", *monitor.columns) if monitor is not None else ()),
             *(("alarm",) if thresholds or monitor is not None else ()),
         )  # fmt: skip
+        # Intervals of faults are in their own units, like the estimates.
+        point = dict(zip(engine.fault_names, self._point[self._faults].tolist(), strict=True))
+        ends = {f"{end} {name}": value for name, value in point.items() for end in ("lowest", "highest")}
+        self._shifts = np.array([ends.get(name, 0.0) for name in (() if monitor is None else monitor.columns)])
         self.first, self.rows = OperatingPointCheck(signals), 0
         self.statuses, self.alarms, self.isolated = Counter[str](), dict[str, float](), ""
 
@@ -102,7 +107,8 @@ class Job:
                 time, deciding=deciding, skipped=row.skipped, residuals=row.values[self._residuals],
                 faults=row.values[self._faults], evidence=row.evidence,
             )  # fmt: skip
-            cells = [seen.statistic, seen.threshold]
+            more = seen.more or (math.nan,) * len(self.monitor.columns)
+            cells = [seen.statistic, seen.threshold, *(np.array(more) + self._shifts).tolist()]
             if seen.alarm:
                 if self.monitor.kind not in self.alarms:
                     self.alarms[self.monitor.kind], self.isolated = time, seen.fault

@@ -15,9 +15,10 @@ from obsynth.data.linear_signals import LinearSignalNames
 from obsynth.data.log_estimator import GAP, LONGEST_BRIDGE, OK, RECOVERING, WARM_UP, Row, estimate_columns
 from obsynth.data.observer_holds import KeptHolds
 from obsynth.errors import ObsynthError, SpecError
+from obsynth.experiments.monitors.online import LinearSample
 from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray
-from obsynth.observers.linear.sampling import first_order_hold
+from obsynth.numerics.holds import first_order_hold
 from obsynth.observers.linear.warm_up import checked_warm_up, transient
 from obsynth.results.design import ObserverDesign
 
@@ -98,7 +99,8 @@ class DataObserver(LinearSignalNames):
             self._restart()
             return Row(GAP, self._held(), missing)
         self.fault = found[self.observer.fault_rows].copy()
-        return Row(status, found, missing)
+        sample = LinearSample(found, values[: self.nu], values[self.nu :])
+        return Row(status, found, missing, sample)
 
     def _measured(self, seconds: float, v: FloatArray) -> FloatArray:
         if self.observer.dt == 0.0:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple, Protocol
 
-from obsynth.experiments.monitors.online import Evidence
+from obsynth.experiments.monitors.online import Evidence, LinearSample
 from obsynth.numerics.arrays import FloatArray
 
 #: What a row of estimates is.
@@ -28,7 +28,7 @@ class Row(NamedTuple):
     status: str
     values: FloatArray
     skipped: int = 0
-    evidence: Evidence | None = None
+    evidence: Evidence | LinearSample | None = None
 
 
 class Engine(Protocol):

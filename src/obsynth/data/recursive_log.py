@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -13,8 +14,9 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.warm_up import FORGOTTEN, checked_warm_up
 from obsynth.observers.recursive.estimates import deviations_of
 from obsynth.observers.recursive.records import require_horizon
-from obsynth.observers.recursive.running import RawEstimate, RunningRecursiveObserver
+from obsynth.observers.recursive.recursion import RawEstimate
 from obsynth.observers.recursive.transients import MOST_STEPS, transient_steps
+from obsynth.observers.running import RunningObserver
 from obsynth.results.design import ObserverDesign
 
 
@@ -49,7 +51,7 @@ class RecursiveDataObserver(SteppingEngine[RawEstimate]):
             )
         self.theta = np.zeros(len(self.fault_names))
 
-    def started(self) -> RunningRecursiveObserver:
+    def started(self) -> RunningObserver[Any, Any, Any]:
         """Return the running observer, at k = 0."""
         return self.observer.start()
 
@@ -59,8 +61,8 @@ class RecursiveDataObserver(SteppingEngine[RawEstimate]):
         Shapes: ``y (ny,)``, ``u (nu,)``.
         """
         try:
-            require_horizon(self.plant.horizon, self.running.k + 1, early=self.observer.early_constraints)
-            self.theta = self.running.parameters.theta
+            require_horizon(self.plant.horizon, self.running.state.k + 1, early=self.observer.early_constraints)
+            self.theta = self.running.state.parameters.theta
             found: RawEstimate = self.running.raw_step(y, u)
         except SpecError as error:
             raise SpecError(f"Row {row}: {error}", path=f"row {row}") from error

@@ -15,7 +15,7 @@ from obsynth.data.signals import Signals
 from obsynth.data.sinks import FrameSink, Sink, TextSink, file_sink
 from obsynth.data.sources import Data, chunks
 from obsynth.data.start import engine_of
-from obsynth.errors import SpecError
+from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.monitors.online import OnlineMonitor
 from obsynth.files.outputs import check_output, require_distinct
 from obsynth.files.signals import HeldSignals, ending_signals
@@ -216,7 +216,7 @@ def _run_stream(
                         sink.write(found)
                 if progress is not None:
                     progress(job.rows)
-        except SpecError:
+        except ObsynthError:
             # A refused row has changed nothing.
             is_whole = True
             raise

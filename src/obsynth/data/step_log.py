@@ -11,10 +11,10 @@ import numpy as np
 
 from obsynth.data.clock import Clock
 from obsynth.data.log_estimator import GAP, LONGEST_BRIDGE, OK, PARTIAL, RECOVERING, WARM_UP, Row, estimate_columns
-from obsynth.data.observer_state import captured_state, resume
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.monitors.online import Evidence
 from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.running import RunningObserver, state_as_data, state_from_data
 
 Found = TypeVar("Found")
 
@@ -39,12 +39,12 @@ class SteppingEngine(ABC, Generic[Found]):
         self.scales: Mapping[str, float] = {}
         self.notes: tuple[str, ...] = ()
         self.clock = Clock(dt, None)
-        self.running: Any = self.started()
+        self.running: RunningObserver[Any, Any, Any] = self.started()
         self.u: FloatArray | None = None
         self.settled_at, self.phase = math.inf, WARM_UP
 
     @abstractmethod
-    def started(self) -> Any:
+    def started(self) -> RunningObserver[Any, Any, Any]:
         """Return the running observer, at k = 0."""
 
     @abstractmethod
@@ -65,12 +65,12 @@ class SteppingEngine(ABC, Generic[Found]):
 
     def step(self, time: float, values: FloatArray, row: int) -> Row:
         """Take one row of data."""
-        before, stamps = captured_state(self.running), (self.clock.last, self.clock.longest)
+        before, stamps = self.running.state, (self.clock.last, self.clock.longest)
         try:
             return self._step(time, values, row)
         except ObsynthError:
             # A row that is refused leaves nothing behind: a run may go on after it.
-            resume(self.running, before)
+            self.running.state = before
             self.clock.last, self.clock.longest = stamps
             raise
 
@@ -134,11 +134,11 @@ class SteppingEngine(ABC, Generic[Found]):
 
     def _safe(self, y: FloatArray, u: FloatArray, row: int) -> Found | None:
         """Take one sample, or none of it: what overflows leaves the state as it was."""
-        before = captured_state(self.running)
+        before = self.running.state
         with np.errstate(all="ignore"):
             found = self.taken(y, u, row)
         if found is None or isinstance(found, Exception):
-            resume(self.running, before)
+            self.running.state = before
             return None
         return found
 
@@ -158,7 +158,7 @@ class SteppingEngine(ABC, Generic[Found]):
     def as_dict(self) -> dict[str, Any]:
         """Return the state that goes from row to row, as data."""
         return {
-            "last": self.clock.last, "longest": self.clock.longest, "observer": captured_state(self.running),
+            "last": self.clock.last, "longest": self.clock.longest, "observer": state_as_data(self.running.state),
             "u": self.u, "settled_at": self.settled_at, "phase": self.phase, "warm_up": self.warm_up,
         }  # fmt: skip
 
@@ -167,5 +167,5 @@ class SteppingEngine(ABC, Generic[Found]):
         if data["warm_up"] != self.warm_up:
             raise SpecError("The saved state is of a run with another warm-up: use the same option.", path="state")
         self.clock.last, self.clock.longest = data["last"], data["longest"]
-        resume(self.running, data["observer"])
+        self.running.state = state_from_data(self.running.state, data["observer"])
         self.u, self.settled_at, self.phase = data["u"], data["settled_at"], data["phase"]

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
 from typing import Any, TypeAlias
 
 import numpy as np
 
 from obsynth.analysis.conditions import Condition
-from obsynth.analysis.transformations import StateRecovery
-from obsynth.errors import SpecError, VerificationError
+from obsynth.analysis.transformations import StateRecovery, eliminate_algebraic_states
+from obsynth.analysis.transformations.elimination import MANY_VARIABLES
+from obsynth.errors import PreconditionError, SpecError, VerificationError
+from obsynth.methods.advice import with_advice
+from obsynth.methods.choosing.automatic import automatic_design
 from obsynth.methods.method_spec import MethodSpec, PlantKind
-from obsynth.methods.registry import REGISTRY, method_spec, methods_for
+from obsynth.methods.registry import AUTO, REGISTRY, method_spec, methods_for
 from obsynth.methods.synthesis_result import Synthesis
 from obsynth.methods.verifying import verify
 from obsynth.numerics.failures import failed_computations
@@ -40,7 +45,7 @@ def _silent(_: str) -> None:
 
 def design(
     plant: Plant,
-    method: str = "fault-estimation-filter",
+    method: str = AUTO,
     *,
     name: str = "design",
     recovery: StateRecovery | None = None,
@@ -52,9 +57,11 @@ def design(
     Parameters
     ----------
     plant : DescriptorSystem, TimeVaryingDescriptorSystem or DAEModel
-        The plant.
+        The plant.  Of one with sparse matrices and 500 states or more the algebraic states are eliminated first.
     method : str, optional
-        Method id; for its options see the function of the same name, such as `fault_estimation_filter`.
+        Method id; for its options see the function of the same name, such as `fault_estimation_filter`.  By default
+        ``auto``: every method that exists and has the options given is designed, and the best by closed-form figures
+        (reach of a step, leak of the unknown inputs, noise against delay) is taken; the design names it.
     name : str, optional
         Name of the design.
     recovery : StateRecovery, optional
@@ -74,7 +81,8 @@ def design(
     SpecError
         Unknown method or option, or an option out of range.
     PreconditionError
-        No such observer exists for this plant; the failing condition, mode and signals are named.
+        No such observer exists for this plant; the failing condition, mode and signals are named, and what to measure
+        (or to leave out) so that one does.
     InfeasibleError
         A checked certificate proves that what was asked cannot be reached.
     SolverError
@@ -83,14 +91,56 @@ def design(
         Gains were found, but the shipped realisation fails a check.
     """
     report_stage = progress or _silent
+
+    def made(plant: Plant, method: str, options: Mapping[str, Any], *, advise: bool = False) -> ObserverDesign:
+        return _designed(plant, method, options, name=name, recovery=recovery, progress=report_stage, advise=advise)
+
+    if method == AUTO:
+        report_stage("designing by every method that exists")
+        kind_of(plant)
+        with failed_computations(), one_thread_if_small(plant.nx):
+            plant, recovery, _ = _with_arrays(plant, recovery, report_stage)
+            return automatic_design(plant, options, made, partial(made, advise=True))
+    return made(plant, method, options, advise=True)
+
+
+def _designed(
+    plant: Plant, method: str, options: Mapping[str, Any], *, name: str, recovery: StateRecovery | None,
+    progress: Callable[[str], None], advise: bool,
+) -> ObserverDesign:  # fmt: skip
+    """Return the verified design of one method; with ``advise`` a refusal says what would help."""
+    report_stage = progress
     spec = method_spec(method)
     asked = spec.read_options(options)
     for condition in _kind_conditions(plant, spec):
         condition.require()
     with failed_computations(), one_thread_if_small(plant.nx):
-        found = spec.load("synthesise")(plant, asked, progress=report_stage)
+        plant, recovery, notes = _with_arrays(plant, recovery, report_stage)
+        try:
+            found = spec.load("synthesise")(plant, asked, progress=report_stage)
+        except PreconditionError as error:
+            if not isinstance(plant, DescriptorSystem) or not advise:
+                raise
+            report_stage("looking for what would make it possible")
+            raise with_advice(error, plant, spec, asked.as_given()) from None
+        if notes:
+            found = replace(found, notes=(*notes, *found.notes))
         report_stage("verifying the shipped realisation")
         return verified(plant, method, found, name=name, recovery=recovery)
+
+
+def _with_arrays(
+    plant: Plant, recovery: StateRecovery | None, progress: Callable[[str], None]
+) -> tuple[Plant, StateRecovery | None, tuple[str, ...]]:
+    """Return the plant that methods work on, the way back from it, and what a user should know about it."""
+    if not isinstance(plant, DescriptorSystem) or not plant.is_sparse:
+        return plant, recovery, ()
+    if plant.nx < MANY_VARIABLES:
+        return plant.dense(), recovery, ()
+    progress("eliminating the algebraic states")
+    found = eliminate_algebraic_states(plant)
+    through = found.recovery if recovery is None else recovery.then(found.recovery)
+    return found.plant, through, found.notes
 
 
 def check(plant: Plant, options: Mapping[str, Mapping[str, Any]] | None = None) -> dict[str, VerificationReport]:
@@ -98,17 +148,30 @@ def check(plant: Plant, options: Mapping[str, Mapping[str, Any]] | None = None) 
 
     Malformed options are a `SpecError`, numbers beyond double precision a `SolverError`.
     """
+    kind_of(plant)
+    try:
+        with failed_computations(), one_thread_if_small(plant.nx):
+            return _checked(_with_arrays(plant, None, _silent)[0], options or {})
+    except PreconditionError as error:
+        # The sparse plant as written has no reduced form for any method.
+        row = Condition(
+            error.condition, "algebraic states that can be eliminated", False, np.nan, np.nan, "plant", str(error),
+            signals=error.signals,
+        )  # fmt: skip
+        return {method: VerificationReport.of(condition_rows((row,))) for method in REGISTRY}
+
+
+def _checked(plant: Plant, options: Mapping[str, Mapping[str, Any]]) -> dict[str, VerificationReport]:
     found = {}
     for method in REGISTRY:
         spec = method_spec(method)
-        asked = {} if method not in (options or {}) else spec.read_options((options or {})[method]).as_given()
+        asked = {} if method not in options else spec.read_options(options[method]).as_given()
         conditions = _kind_conditions(plant, spec)
         if not conditions:
             judge = spec.load("conditions")
             known = set(inspect.signature(judge).parameters)
             given = {name: value for name, value in asked.items() if name in known}
-            with failed_computations():
-                conditions = judge(plant, **given)
+            conditions = judge(plant, **given)
         found[method] = VerificationReport.of(condition_rows(conditions))
     return found
 

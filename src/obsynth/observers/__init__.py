@@ -1,5 +1,6 @@
 """Observers that run: a realisation from measured signals to estimates."""
 
-from obsynth.observers.linear.observer import Estimates, LinearObserver, RunningObserver
+from obsynth.observers.linear.observer import Estimates, LinearObserver
+from obsynth.observers.running import RunningObserver
 
 __all__ = ["Estimates", "LinearObserver", "RunningObserver"]

@@ -14,6 +14,7 @@ from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.sparse import dense, is_sparse
 from obsynth.plants.origin import carry_origin
 from obsynth.plants.reading import plant_fields
+from obsynth.plants.uncertainty import UNCERTAIN_MATRICES, Uncertainty, uncertainty_of
 from obsynth.plants.validation import expected_shapes
 
 MatrixOrNames = ArrayLike | Sequence[str] | None
@@ -67,6 +68,8 @@ class DescriptorSystem:
 
     sensor_noise : mapping, optional
         Standard deviation of the noise of named outputs, per sample: adds a column to ``Dw`` for each.
+    uncertainty : Uncertainty, optional
+        Constants with tolerances in the matrices, see `obsynth.uncertain_system`.
 
     Raises
     ------
@@ -102,6 +105,7 @@ class DescriptorSystem:
     operating_point: Mapping[str, float]
     scales: Mapping[str, float]
     units: Mapping[str, str]
+    uncertainty: Uncertainty | None
 
     def __init__(
         self,
@@ -128,6 +132,7 @@ class DescriptorSystem:
         scales: Mapping[str, float] | None = None,
         units: Mapping[str, str] | None = None,
         sensor_noise: Mapping[str, float] | None = None,
+        uncertainty: Uncertainty | Mapping[str, Any] | None = None,
     ) -> None:
         if A is None:
             raise SpecError("A is missing: give the matrix (nx, nx) of the dynamics.", path="A")
@@ -139,6 +144,7 @@ class DescriptorSystem:
         values = plant_fields(
             asked, names, dt=dt, operating_point=operating_point, scales=scales, units=units, sensor_noise=sensor_noise
         )
+        values["uncertainty"] = uncertainty_of(uncertainty)
         for field, value in values.items():
             object.__setattr__(self, field, read_only(value) if isinstance(value, np.ndarray) else value)
 
@@ -190,18 +196,28 @@ class DescriptorSystem:
         return self.dt > 0.0
 
     def as_dict(self) -> dict[str, Any]:
-        """Return every field, as the constructor takes it."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
+        """Return every field, as the constructor takes it; `uncertainty` only where there is one."""
+        found = {field.name: getattr(self, field.name) for field in fields(self)}
+        if self.uncertainty is None:
+            del found["uncertainty"]
+        else:
+            found["uncertainty"] = self.uncertainty.as_dict()
+        return found
 
     def replace(self, **changes: Any) -> DescriptorSystem:
         """Return a plant with some fields changed, checked again as a whole.
+
+        Tolerances are those of the matrices as they were: they are dropped with a change of one of these.
 
         Parameters
         ----------
         **changes
             Any argument of the constructor.
         """
-        return carry_origin(self, DescriptorSystem(**{**self.as_dict(), **changes}))
+        kept = self.as_dict()
+        if self.uncertainty is not None and changes.keys() & {*UNCERTAIN_MATRICES, "dt"}:
+            del kept["uncertainty"]
+        return carry_origin(self, DescriptorSystem(**{**kept, **changes}))
 
     def __repr__(self) -> str:
         time = f"dt={self.dt:g} s" if self.is_discrete else "continuous"

@@ -97,6 +97,40 @@ def estimate_gains(design: ObserverDesign, *, to: str = "faults") -> EstimateGai
     return EstimateGains(frequencies, gains, least)
 
 
+@dataclass(frozen=True, eq=False)
+class FaultGains:
+    """What reaches each fault estimate of a linear design.
+
+    Fields: leaks: ``(nf, nd)``: largest gain over the frequency from each unknown input, zero where only rounding is
+    left; steady: ``(nf,)``: share of a step of the fault that its estimate shows in the end.
+    """
+
+    leaks: FloatArray
+    steady: FloatArray
+
+
+def fault_gains(design: ObserverDesign) -> FaultGains:
+    """Return what reaches each fault estimate of a linear design that estimates faults."""
+    plant, observer = design.linear
+    rows, frequencies = observer.fault_rows, frequency_grid(observer)[1:]
+    points = boundary_points(frequencies, observer.dt)
+    to_estimate = response(observer.Az, observer.By, observer.Cz[rows], observer.Dy[rows], points)
+
+    def seen(b: FloatArray, d: FloatArray) -> tuple[ComplexArray, FloatArray]:
+        outputs = plant.C @ _state_response(plant, b, points) + d
+        return np.asarray(to_estimate @ outputs), _sizes(to_estimate) * _sizes(outputs)
+
+    leaks = np.zeros((len(observer.fault_names), plant.nd))
+    if plant.nd:
+        found, terms = seen(plant.Bd, plant.Dd)
+        sizes = np.abs(found)
+        leaks = np.where(sizes > ROUNDING_SHARE * terms[:, None, None], sizes, 0.0).max(axis=0)
+    own = [plant.fault_names.index(name) for name in observer.fault_names]
+    slowest, _ = seen(plant.Bf, plant.Df)
+    steady = slowest[0].real[np.arange(len(own)), own]
+    return FaultGains(leaks, np.asarray(steady))
+
+
 def _sizes(matrices: ComplexArray) -> FloatArray:
     return np.asarray(np.linalg.norm(matrices, axis=(1, 2)))
 
@@ -168,7 +202,10 @@ def plot_gains(design: ObserverDesign, *, to: str = "faults", axes: Axes | None 
     plain_decades(panel)
     panel.set_xlabel("frequency (rad/s)")
     panel.set_ylabel("singular value")
-    panel.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False)
+    if found.gains:
+        panel.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False)
+    else:
+        panel.set_title("The plant states no faults, disturbances or noise.")
     tidy(panel)
     return panel
 

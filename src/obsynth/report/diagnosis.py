@@ -15,12 +15,12 @@ from obsynth.report.layout import headed_table, print_section
 MOST_ROWS = 12
 
 
-def diagnosis_report(diagnosis: Diagnosis, *, console: Console) -> None:
-    """Print what can be diagnosed: verdicts, isolability, banks, and the sentences behind them."""
+def diagnosis_report(diagnosis: Diagnosis, *, console: Console, everything: bool = True) -> None:
+    """Print what can be diagnosed: verdicts and sentences; isolability and banks with ``everything``."""
     if not diagnosis.faults:
         return
     print_section(console, diagnosis.heading, _table(diagnosis.verdict_rows()))
-    if len(diagnosis.faults) > 1:
+    if everything and len(diagnosis.faults) > 1:
         rows = diagnosis.bank_rows()
         print_section(console, "Which fault can be told from which", _table(diagnosis.isolability_rows()))
         more = len(rows) - 1 - MOST_ROWS

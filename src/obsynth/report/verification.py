@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from io import StringIO
 
 from rich.console import Console, Group, RenderableType
 from rich.padding import Padding
@@ -78,6 +79,14 @@ def verdict_line(report: VerificationReport) -> Text:
         return Text("FAILS: the report is empty, so nothing is verified.", style="bold red")
     failed = ", ".join(check.name for check in report.failures)
     return Text(f"FAILS: {len(report.failures)} of {len(real)} checks do not hold: {failed}.", style="bold red")
+
+
+def report_text(report: VerificationReport, *, width: int = 120) -> str:
+    """Return what ``print(report)`` shows: the table of the checks, and the verdict."""
+    console = Console(file=StringIO(), width=width, markup=False, highlight=False, emoji=False, color_system=None)
+    verification_report(report, console=console)
+    text: str = console.file.getvalue()  # type: ignore[attr-defined]
+    return "\n".join(line.rstrip() for line in text.splitlines())
 
 
 def verification_report(report: VerificationReport, *, console: Console) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from importlib import import_module
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
@@ -44,7 +45,7 @@ class Certificate:
         object.__setattr__(self, "claims", MappingProxyType(dict(self.claims)))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class ObserverDesign:
     """A finished design: gains to read, an observer to run, a certificate and a report.
 
@@ -131,6 +132,18 @@ class ObserverDesign:
             raise SpecError(f"Design {self.name!r} is no observer of a nonlinear plant.", path="observer")
         return self.plant, self.observer
 
+    def __repr__(self) -> str:
+        """Return name, method and verdict in one line; ``print(design)`` shows the summary."""
+        verdict = "verified" if self.report.passed else "NOT verified"
+        return f"<ObserverDesign {self.name!r} by {self.method}: {verdict}>"
+
+    def __str__(self) -> str:
+        """Return the summary: what it is, what each estimate is worth, what it rests on."""
+        return str(_shown("design_text", self))
+
+    def _repr_html_(self) -> str:
+        return str(_shown("design_html", self))
+
     def replace(self, **changes: Any) -> ObserverDesign:
         """Return the design with some fields changed (its report stays until `verify` is run again).
 
@@ -199,3 +212,8 @@ class ObserverDesign:
             states=[f"z[{i + 1}]" for i in range(observer.order)],
             name=self.name,
         )
+
+
+def _shown(what: str, design: ObserverDesign) -> Any:
+    """Return a view of a design; the tables are above the results, and are loaded when they are asked for."""
+    return getattr(import_module("obsynth.report.summary"), what)(design)

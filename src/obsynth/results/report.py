@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
+from importlib import import_module
 from typing import Any, Literal
 
 CheckKind = Literal["proved", "equality", "computed", "condition", "information"]
@@ -127,6 +128,10 @@ class VerificationReport:
             if check.name == name:
                 return check
         raise KeyError(f"no check named {name!r}; there are: {', '.join(c.name for c in self.checks)}")
+
+    def __str__(self) -> str:
+        """Return the table of the checks."""
+        return str(import_module("obsynth.report.verification").report_text(self))
 
     def as_dict(self) -> dict[str, Any]:
         """Return the report as plain data."""

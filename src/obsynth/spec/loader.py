@@ -8,17 +8,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from obsynth.errors import SpecError
+from obsynth.numerics.threads import one_thread_if_small
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.spec.checking import DocumentProblems, checked_plant, checked_spec
 from obsynth.spec.documents import read_yaml
-from obsynth.spec.plants import built_plant, read_value, transformed
+from obsynth.spec.plants import built_plant, linearised, read_value, transformed
 from obsynth.spec.scenarios import built_scenario
 
 if TYPE_CHECKING:
     from obsynth.analysis.transformations import Transformation
     from obsynth.simulation.scenario import Scenario
+    from obsynth.spec.schema import TransformSection
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +45,10 @@ class Spec:
         The options of the method that the spec gives, checked.
     scenario : Scenario, optional
         What `obsynth.simulate` is asked to let happen.
+    model : DAEModel, optional
+        The nonlinear plant as written, where the plant is one, or is linearised from one.
+    calibrate : mapping, optional
+        What `obsynth.calibrate` is asked to find, as written; its log is looked up beside the spec.
     """
 
     name: str
@@ -53,6 +59,23 @@ class Spec:
     method: str
     options: Mapping[str, Any]
     scenario: Scenario | None = None
+    model: DAEModel | None = None
+    calibrate: Mapping[str, Any] | None = None
+
+
+def load_model(path: str | Path) -> tuple[DAEModel, Spec | None]:
+    """Return the nonlinear plant of a spec, with the spec, or of a file that holds a plant alone."""
+    source = Path(path)
+    document = read_yaml(source)
+    if "method" in document or "plant" in document:
+        spec = load_spec(source)
+        model = spec.model
+    else:
+        spec, found = None, built_plant(checked_plant(document, source), source, "")
+        model = found if isinstance(found, DAEModel) else None
+    if model is None:
+        raise SpecError(f"{source} holds no nonlinear plant (kind: dae).", path=str(source))
+    return model, spec
 
 
 def load_spec(path: str | Path) -> Spec:
@@ -77,13 +100,19 @@ def load_spec(path: str | Path) -> Spec:
         The plant cannot be transformed as asked, for example because its index is not one.
     """
     source = Path(path)
-    checked, raw_options = checked_spec(read_yaml(source), source)
+    return spec_of(read_yaml(source), source)
+
+
+def spec_of(document: Mapping[str, Any], source: Path, *, plant_changes: Mapping[str, Any] | None = None) -> Spec:
+    """Return the spec that a document stands for, as if it were in ``source``; a plant in a file may be changed."""
+    checked, raw_options = checked_spec(document, source)
     section: Any = checked.plant
     plant_source, prefix = source, "plant"
     reference = section if hasattr(section, "file") else None
     if reference is not None:
         plant_source, prefix = source.parent / reference.file, ""
-        section = checked_plant(read_yaml(plant_source, where="plant.file"), plant_source)
+        plant_document = changed_document(read_yaml(plant_source, where="plant.file"), plant_changes or {})
+        section = checked_plant(plant_document, plant_source)
     problems = DocumentProblems(source, what="spec")
     options = {
         name: read_value(value, source.parent, f"method.options.{name}", problems)
@@ -91,14 +120,23 @@ def load_spec(path: str | Path) -> Spec:
     }
     problems.raise_if_any()
     plant, transformation = built_plant(section, plant_source, prefix), None
+    # A plant may serve several methods: the spec's own transform takes the place of the plant's.
+    asked: tuple[TransformSection | None, Path, str] = (getattr(section, "transform", None), plant_source, prefix)
+    if reference is not None and reference.transform is not None:
+        asked = (reference.transform, source, "plant")
+    model = plant if isinstance(plant, DAEModel) else None
+    if model is not None:
+        linear = linearised(asked[0], model, *asked[1:])
+        plant = plant if linear is None else linear
+    elif asked[0] is not None and asked[0].linearise is not None:
+        raise SpecError(f"{asked[1]}: transform.linearise is for nonlinear plants (kind: dae): remove it.",
+                        path="plant.transform.linearise")  # fmt: skip
     if isinstance(plant, DescriptorSystem):
-        if reference is not None and reference.transform is not None:
-            # A plant may serve several methods: the spec's own transform takes the place of the plant's.
-            transformation = transformed(reference.transform, plant, source, "plant")
-        else:
-            transformation = transformed(section.transform, plant, plant_source, prefix)
-        plant = plant.dense() if transformation is None else transformation.plant
-    elif reference is not None and reference.transform is not None:
+        if asked[0] is not None:
+            with one_thread_if_small(plant.nx):
+                transformation = transformed(asked[0], plant, *asked[1:])
+        plant = plant if transformation is None else transformation.plant
+    elif model is None and reference is not None and reference.transform is not None:
         raise SpecError(
             f"{source}: plant.transform is for linear plants with constant matrices, which {plant_source.name} is not: "
             "remove it.", path="plant.transform",
@@ -106,5 +144,21 @@ def load_spec(path: str | Path) -> Spec:
     return Spec(
         name=checked.name, description=checked.description or "", path=source, plant=plant,
         transformation=transformation, method=checked.method.id, options=options,
-        scenario=built_scenario(checked.scenario, plant, source),
+        scenario=built_scenario(checked.scenario, plant, source), model=model,
+        calibrate=None if checked.calibrate is None else checked.calibrate.model_dump(exclude_none=True),
     )  # fmt: skip
+
+
+def changed_document(document: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a document with values at dotted paths put in place of those there; mappings on the way are made."""
+    changed = dict(document)
+    for path, value in changes.items():
+        first, _, rest = path.partition(".")
+        if not rest:
+            changed[first] = value
+            continue
+        inner = changed.get(first)
+        if inner is not None and not isinstance(inner, Mapping):
+            raise SpecError(f"{path} cannot be set: {first} is no section with entries of its own.", path=path)
+        changed[first] = changed_document(inner or {}, {rest: value})
+    return changed

@@ -13,6 +13,7 @@ from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.spec.checking import DocumentProblems
+from obsynth.spec.constants import with_constants
 from obsynth.spec.documents import read_names
 from obsynth.spec.matrices import read_matrices, read_matrix
 
@@ -102,7 +103,7 @@ def _varying_plant(section: TimeVaryingSection, source: Path, prefix: str) -> Ti
 
 
 def _nonlinear_plant(section: DAESection, source: Path, prefix: str) -> DAEModel:
-    arguments = section.model_dump(exclude={"kind", "schema_version"}, exclude_none=True)
+    arguments = section.model_dump(exclude={"kind", "schema_version", "transform"}, exclude_none=True)
     return _placed(lambda: DAEModel(**arguments), source, prefix)
 
 
@@ -119,7 +120,26 @@ def _invariant_plant(section: PlantSection, source: Path, prefix: str) -> Descri
         if isinstance(arguments[matrix], list) and arguments[names] is None:
             arguments[names] = arguments[matrix]
 
-    return _placed(lambda: DescriptorSystem(**arguments), source, prefix)
+    return _placed(lambda: with_constants(DescriptorSystem(**arguments), section), source, prefix)
+
+
+def linearised(wanted: TransformSection | None, model: DAEModel, source: Path, prefix: str) -> DescriptorSystem | None:
+    """Return the linear model of a nonlinear plant where a section asks for one."""
+    if wanted is None:
+        return None
+    where = _joined(prefix, "transform")
+    if wanted.linearise is None:
+        raise SpecError(
+            f"{source}: {where} is for linear plants: say where this one is linearised, such as linearise: {{at: "
+            "equilibrium}, or remove it.", path=where,
+        )  # fmt: skip
+    from obsynth.analysis.transformations.linearisation import linearise
+
+    arguments = wanted.linearise.model_dump(exclude_none=True)
+    try:
+        return linearise(model, **arguments)
+    except SpecError as error:
+        raise SpecError(f"{source}: {where}.linearise: {error}", path=f"{where}.linearise") from error
 
 
 def transformed(

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import Discriminator, Field, Tag
+from pydantic import Discriminator, Field, Tag, model_validator
 
+from obsynth.spec.constants import with_entries
 from obsynth.spec.schema_values import (
     EquationMatrix,
     Matrix,
@@ -35,11 +36,40 @@ def _kind_of_plant(value: Any) -> str:
     return _FILE if isinstance(value, dict) and "file" in value else _INLINE
 
 
+class LineariseSection(Section):
+    """Where a nonlinear plant is linearised: arguments of `obsynth.linearise`."""
+
+    at: Literal["equilibrium", "point"] | None = None
+    given: dict[Text, float] | None = None
+    free: list[Text] | dict[Text, Annotated[list[float], Field(min_length=2, max_length=2)]] | None = None
+    faults: list[Text] | None = None
+    disturbances: list[Text] | None = None
+    start: dict[Text, float] | None = None
+    drift: bool | None = None
+
+
 class TransformSection(Section):
     """What is done to the plant before a method sees it, in this order."""
 
+    linearise: LineariseSection | None = None
     eliminate_algebraic_states: bool = False
     sample_time: Positive | None = None
+
+
+class EntrySection(Section):
+    """One entry of a matrix as an expression in the constants: row and column by name, or by number from 1."""
+
+    row: Text | int
+    column: Text | int
+    value: Text | float
+
+
+class BoxSection(Section):
+    """Where the tolerances come from."""
+
+    source: Literal["stated", "set-membership", "calibrated"]
+    level: float | None = None
+    digest: Text | None = None
 
 
 class PlantSection(Section):
@@ -67,7 +97,18 @@ class PlantSection(Section):
     scales: dict[Text, float] | None = None
     units: dict[Text, str] | None = None
     sensor_noise: dict[Text, Positive] | None = None
+    constants: dict[Text, Any] | None = None
+    entries: dict[Text, list[EntrySection]] | None = None
+    tolerance: dict[Text, Text | float] | None = None
+    variation: Literal["constant", "varying"] | None = None
+    box: BoxSection | None = None
     transform: TransformSection | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _expressions(cls, data: Any) -> Any:
+        """Take expressions in the constants out of rows of numbers."""
+        return with_entries(data)
 
 
 class PlantDocument(PlantSection):
@@ -116,6 +157,7 @@ class DAESection(Section):
     parameters: dict[Text, float] | None = None
     constants: dict[Text, float] | None = None
     definitions: dict[Text, Text] | None = None
+    transform: TransformSection | None = None
 
 
 class DAEDocument(DAESection):
@@ -134,7 +176,7 @@ class PlantReference(Section):
 class MethodSection(Section):
     """The method and its options; the options have a schema per method."""
 
-    id: Text
+    id: Text = "auto"
     options: dict[str, Any] = Field(default_factory=dict)
 
 
@@ -187,6 +229,34 @@ class ScenarioSection(Section):
     stabilise: bool = False
 
 
+Range = Annotated[list[float], Field(min_length=2, max_length=2)]
+
+
+class CalibrateSection(Section):
+    """The log, and what of the plant it is to find: arguments of `obsynth.calibrate`."""
+
+    log: Text | None = None
+    rows: Text | Annotated[list[int], Field(min_length=2, max_length=2)] | None = None
+    columns: dict[Text, Text] | None = None
+    scales: dict[Text, float] | None = None
+    dt: Positive | None = None
+    unknown: dict[Text, Range] = Field(min_length=1)
+    priors: dict[Text, Range] | None = None
+    noisy: Names | None = None
+    Q: dict[Text, Positive] | None = None
+    R: dict[Text, Positive] | None = None
+    initial_state: dict[Text, float] | None = None
+    initial_covariance: Positive | dict[Text, Annotated[float, Field(ge=0.0)]] | None = None
+    input_delay: int | Literal["auto"] | None = None
+    method: Literal["innovations", "simulation"] | None = None
+    integration: Literal["auto", "backward-euler", "radau"] | None = None
+    substeps: Annotated[int, Field(ge=1)] | None = None
+    level: Annotated[float, Field(gt=0.0, lt=1.0)] | None = None
+    starts: Annotated[int, Field(ge=1)] | None = None
+    seed: Annotated[int, Field(ge=0)] | None = None
+    digest: Text | None = None
+
+
 class SpecDocument(Section):
     """A whole spec."""
 
@@ -200,5 +270,6 @@ class SpecDocument(Section):
         | Annotated[DAESection, Tag(_NONLINEAR)],
         Discriminator(_kind_of_plant),
     ]
-    method: MethodSection
+    method: MethodSection = Field(default_factory=MethodSection)
     scenario: ScenarioSection | None = None
+    calibrate: CalibrateSection | None = None

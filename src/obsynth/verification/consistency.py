@@ -15,7 +15,6 @@ import numpy as np
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.recursive.gain_schedule import GainStep, gain_steps
 from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.observers.recursive.running import RunningRecursiveObserver
 from obsynth.observers.recursive.step_model import EarlyConstraintSteps, StepMatrices
 from obsynth.results.report import Check, upper_bound_check
 
@@ -35,11 +34,12 @@ _SOURCE = "recomputed, Monte Carlo with a fixed seed"
 def consistency(stated: RecursiveObserver, shipped: RecursiveObserver, steps: int) -> Iterator[Check]:
     """Yield NEES, NIS and whiteness of a shipped observer on noise as it is stated."""
     rng = np.random.default_rng(SEED)
-    truth = RunningRecursiveObserver(stated)
+    truth = stated.init()
     nq = len(truth.parameters.theta)
     x = rng.standard_normal((TRIALS, truth.factor.shape[1])) @ truth.factor.T
     theta = rng.standard_normal((TRIALS, nq)) @ truth.parameters.spread.T
-    model, early = truth.model, isinstance(truth.model, EarlyConstraintSteps)
+    model = stated.recursion.model
+    early = isinstance(model, EarlyConstraintSteps)
     nis, pairs = [], []
     scores: dict[int, Scores] = {}
     before = np.zeros((TRIALS, 0))

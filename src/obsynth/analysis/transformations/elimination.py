@@ -24,6 +24,7 @@ from obsynth.numerics.scaling import equilibrate_pencil, power_of_two_below
 from obsynth.numerics.sparse import is_sparse
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.origin import with_origin
+from obsynth.plants.uncertainty import ELIMINATED
 from obsynth.proofs.written_numbers import computed_entries
 
 #: Arrays of plants from this size on, with at most this share of entries that are not zero, are treated as sparse.
@@ -65,6 +66,8 @@ def eliminate_algebraic_states(plant: DescriptorSystem) -> Transformation:
         return eliminated_by_sparsity(plant)
     arrays = plant.dense()
     found = eliminated_exactly(arrays) or _eliminated_in_floating_point(arrays)
+    if not found.dropped:
+        found = found.with_tolerances(ELIMINATED)
     return found if arrays is plant else replace(found, source=plant)
 
 
@@ -150,6 +153,12 @@ def eliminated_exactly(plant: DescriptorSystem, basis: FloatArray | None = None)
     return Transformation(plant, with_origin(new, exact.origin), _description(plant, count), recovery)
 
 
+def dynamic_coordinates(plant: DescriptorSystem) -> FloatArray | None:
+    """Return the basis ``(nx, count)`` of dynamic states that elimination takes; ``None`` for given states."""
+    count = int(np.linalg.matrix_rank(equilibrate_pencil(plant.E, plant.A).E))
+    return None if int(np.sum(plant.E.any(axis=0))) == count else _coordinates(plant, count)[1]
+
+
 def _eliminated_in_floating_point(plant: DescriptorSystem) -> Transformation:
     try:
         count = _dynamic_count(plant)
@@ -183,6 +192,13 @@ def _eliminated_densely(plant: DescriptorSystem, count: int) -> Transformation:
         state_point(plant),
     )  # fmt: skip
     return Transformation(plant, new, _description(plant, count), recovery)
+
+
+def algebraic_coordinates(plant: DescriptorSystem) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the row transformation and the bases of dynamic and algebraic states that an elimination uses."""
+    if _is_identity(plant.E):
+        return np.eye(plant.nx), np.eye(plant.nx), np.zeros((plant.nx, 0))
+    return _coordinates(plant, _dynamic_count(plant))[:3]
 
 
 def _dynamic_count(plant: DescriptorSystem) -> int:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.uncertainty import matrices_of
 
 if TYPE_CHECKING:
     from obsynth.analysis.transformations.recovery_operator import RecoveryOperator
@@ -121,6 +122,14 @@ class Transformation:
     dropped: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     bounds: SolutionBounds | None = None
+
+    def with_tolerances(self, kind: str, size: float = 0.0) -> Transformation:
+        """Return the step with the tolerances of its source carried on to its plant."""
+        before = self.source.uncertainty
+        if before is None:
+            return self
+        after = before.then(matrices_of(self.source), kind, size)
+        return replace(self, plant=self.plant.replace(uncertainty=after))
 
     def then(self, later: Transformation) -> Transformation:
         """Return both steps as one, for a ``later`` that starts from this one's plant."""

@@ -17,6 +17,7 @@ from obsynth.numerics.scaling import power_of_two_below
 from obsynth.numerics.sparse import dense
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.origin import with_origin
+from obsynth.plants.uncertainty import SAMPLED
 
 
 def discretise(plant: DescriptorSystem, sample_time: float) -> Transformation:
@@ -85,7 +86,8 @@ def discretise(plant: DescriptorSystem, sample_time: float) -> Transformation:
     noise_kept = np.hstack([np.zeros((smooth.nw, factor.shape[1])), np.eye(smooth.nw)[:, direct]])
     recovery = unchanged_states(smooth, sampled, from_state=np.eye(smooth.nx), noise_kept=noise_kept)
     description = f"sampled every {sample_time:g} s (zero-order hold)"
-    return first.then(Transformation(smooth, sampled, description, recovery))
+    step = Transformation(smooth, sampled, description, recovery)
+    return first.then(step.with_tolerances(SAMPLED, sample_time))
 
 
 def sampling_zero_warnings(plant: DescriptorSystem) -> tuple[str, ...]:

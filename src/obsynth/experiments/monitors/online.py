@@ -23,6 +23,7 @@ class Seen(NamedTuple):
     threshold: float
     alarm: bool
     fault: str
+    more: tuple[float, ...] = ()
 
 
 class Evidence(NamedTuple):
@@ -36,6 +37,14 @@ class Evidence(NamedTuple):
     covariance: FloatArray
     innovation: FloatArray
     regressor: FloatArray
+
+
+class LinearSample(NamedTuple):
+    """What a linear observer took and gave at one row: its own rows, known inputs, outputs; deviations."""
+
+    rows: FloatArray
+    inputs: FloatArray
+    outputs: FloatArray
 
 
 UNDECIDED = Seen(math.nan, math.nan, False, "")
@@ -88,6 +97,12 @@ class OnlineMonitor:
         self._residuals, self._names, self._scales = residuals, fault_names, fault_scales
         self._decided = False
 
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Columns of a run besides statistic, threshold and alarm: those of an adaptive threshold."""
+        plan = getattr(self._rule, "plan", None)
+        return () if plan is None else tuple(plan.columns)
+
     def require_fit(self, residuals: int, fault_names: tuple[str, ...]) -> None:
         """Refuse a design that this monitor was not made for.
 
@@ -128,14 +143,15 @@ class OnlineMonitor:
             self._rule.restart()
         self._decided = deciding
         statistic, threshold, which = self._rule.take(time, residuals, evidence, deciding=deciding)
+        more = tuple(getattr(self._rule, "cells", ()))
         # A statistic that has overflowed has passed any threshold.
         if math.isnan(statistic) or not math.isfinite(threshold):
-            return UNDECIDED
+            return UNDECIDED._replace(threshold=threshold if more else math.nan, more=more)
         if statistic <= threshold:
-            return Seen(statistic, threshold, False, "")
+            return Seen(statistic, threshold, False, "", more)
         if which is None and self._names and np.isfinite(faults).all():
             which = int(np.argmax(np.abs(faults) / self._scales))
-        return Seen(statistic, threshold, True, "" if which is None else self._names[which])
+        return Seen(statistic, threshold, True, "" if which is None else self._names[which], more)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the state that goes from row to row, as data."""

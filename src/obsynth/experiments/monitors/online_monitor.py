@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
-from obsynth.errors import SpecError
+from obsynth.errors import PreconditionError, SpecError
+from obsynth.experiments.monitors.adaptive_monitor import EXACT, adaptive_plan, adaptive_statement
+from obsynth.experiments.monitors.adaptive_rule import AdaptiveRule
 from obsynth.experiments.monitors.monitor import KINDS, statement_of
 from obsynth.experiments.monitors.online import OnlineMonitor, Rule
 from obsynth.experiments.monitors.parameter_rules import PARAMETER_KINDS, ParameterRule
@@ -18,12 +21,13 @@ from obsynth.experiments.monitors.unlimited_horizon import samples_of, unlimited
 from obsynth.experiments.monitors.whitening import cusum_whitener, steady_mean, whitener_of, window_covariance
 from obsynth.numerics.arguments import is_finite_number, require_kind, require_mapping
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.holds import first_order_hold
 from obsynth.observers.dae.observer import DAEObserver
-from obsynth.observers.linear.sampling import first_order_hold
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.plants.names import index_of
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario
+from obsynth.tolerances.robustness import with_tolerances
 
 _FORGOTTEN = ", once the error at the start, which is not stated, is forgotten (else give a longer warm-up)"
 _AFTER_A_GAP = " (after a gap, too, while the error there is no larger than stated for the start)"
@@ -53,6 +57,8 @@ def online_monitor(
     change: float = 1.0,
     nominal: Mapping[str, float] | None = None,
     sample_time: float | None = None,
+    constants: Any = None,
+    initial_set: Mapping[str, Any] | None = None,
 ) -> OnlineMonitor:
     """Return a monitor for measured data, for `run_on_data`: its threshold holds however long the data are.
 
@@ -83,6 +89,13 @@ def online_monitor(
         Nominal value of parameters by name; those at the observer's start by default.
     sample_time : float, optional, seconds
         Continuous designs: between the rows of the data; the scenario's by default.
+    constants : mapping, ConstantsBox or DescriptorSystem, optional
+        ``pointwise``, discrete linear designs: tolerances instead of the plant's own, as `obsynth.uncertain_system`
+        takes them.  Where there are tolerances, the threshold adapts to the signals and holds for every plant within
+        them; columns of `run_on_data` tell thresholds, guaranteed intervals of faults, and shares of the constants.
+    initial_set : mapping, optional
+        ``pointwise``, discrete linear designs: bounds of the plant's states at the first row (deviations), each a
+        number or ``[low, high]``; the threshold then holds from the first row on.
 
     Returns
     -------
@@ -93,6 +106,8 @@ def online_monitor(
     ------
     SpecError
         The kind does not go with the design, an option is out of range, or a signal has no bound or covariance.
+    PreconditionError
+        No bound exists over the tolerances: the message says why.
     """
     require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
     if scenario is not None:
@@ -110,6 +125,7 @@ def online_monitor(
         )
     if nominal:
         raise SpecError("nominal is for recursive designs, which estimate parameters.", path="nominal")
+    design, adaptive = _tolerances(design, kind, constants, initial_set, initial_error)
     model, dt = _endless_model(design, scenario, window, sample_time)
     bounds = bounds_of(design, model, disturbance_bounds)
     if scenario is None:
@@ -133,7 +149,10 @@ def online_monitor(
                 "(thresholds).",
                 path="noise_bound",
             )  # fmt: skip
-        rule = NormRule(table, limit, window=window if kind == "window" else 1, dt=dt, irregular=irregular)
+        norm = NormRule(table, limit, window=window if kind == "window" else 1, dt=dt, irregular=irregular)
+        if adaptive:
+            return _adaptive(design, norm, model, bounds, noise_bound, initial_error, initial_set)
+        rule = norm
         ending = _FORGOTTEN if initial_error is None else _AFTER_A_GAP
     else:
         rule = _whitened(kind, model, bounds if scenario is None else None, window, change, false_alarms, dt)
@@ -142,10 +161,49 @@ def online_monitor(
         # The noise of the plant itself is what is gathered between samples: the closer they are, the less, but in all
         # the more of it that is of one sign.
         ending += _NOT_CLOSER if model.Bw[:, model.sensor_noise[0].shape[1] :].any() else ""
-    statement = statement_of(kind, continuous=model.flow is not None) + ending
+    statement = statement_of(kind, continuous=model.flow is not None) + ending + EXACT
     return OnlineMonitor(
         kind, statement, rule, residuals=len(model.C), fault_names=design.linear[1].fault_names,
         fault_scales=model.fault_scales(),
+    )  # fmt: skip
+
+
+def _tolerances(
+    design: ObserverDesign, kind: str, constants: Any, initial_set: Mapping[str, Any] | None,
+    initial_error: float | None,
+) -> tuple[ObserverDesign, bool]:  # fmt: skip
+    """Return the design with the tolerances asked for, and whether its threshold adapts to the signals."""
+    asked = [name for name, given in (("constants", constants), ("initial_set", initial_set)) if given is not None]
+    if asked and kind != "pointwise":
+        raise SpecError(f"{asked[0]} is for the pointwise monitor.", path=asked[0])
+    if initial_set is not None and initial_error is not None:
+        raise SpecError("Give initial_set or initial_error, not both.", path="initial_set")
+    found, plant = with_tolerances(design, constants)
+    if not plant.is_discrete:
+        if asked:
+            raise PreconditionError(
+                "The design is continuous in time: thresholds over tolerances are for sampled designs. Sample the "
+                "plant first (transform: sample_time, or obsynth.discretise).", condition="discrete time",
+            )  # fmt: skip
+        return design, False
+    uncertain = plant.uncertainty is not None and bool(plant.uncertainty.box.names)
+    return found, kind == "pointwise" and (uncertain or initial_set is not None)
+
+
+def _adaptive(
+    design: ObserverDesign, norm: NormRule, model: ResidualModel, bounds: FloatArray, noise_bound: float | None,
+    initial_error: float | None, initial_set: Mapping[str, Any] | None,
+) -> OnlineMonitor:  # fmt: skip
+    """Return the monitor whose threshold holds for every plant within its tolerances."""
+    first, later = adaptive_plan(
+        design, bounds, noise_bound or 0.0, initial_error=initial_error, initial_set=initial_set
+    )
+    start = _FORGOTTEN if initial_error is None and initial_set is None else _AFTER_A_GAP if initial_set is None else (
+        "; it holds from the first row on, and after a gap once the error there is forgotten"
+    )  # fmt: skip
+    return OnlineMonitor(
+        "pointwise", adaptive_statement(first, design) + start, AdaptiveRule(first, later, norm),
+        residuals=len(model.C), fault_names=design.linear[1].fault_names, fault_scales=model.fault_scales(),
     )  # fmt: skip
 
 

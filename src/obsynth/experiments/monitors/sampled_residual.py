@@ -21,8 +21,9 @@ from obsynth.analysis.transformations import discretise
 from obsynth.errors import SpecError
 from obsynth.methods.pd_observer.augmentation import with_faults_as_states
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.holds import first_order_hold
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.observers.linear.sampling import first_order_hold, sample_observer
+from obsynth.observers.linear.sampling import sample_observer
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.error_system import ErrorSystem

@@ -29,7 +29,7 @@ from obsynth.methods.synthesis_result import Synthesis
 from obsynth.observers.dae.building import dae_observer_from_options, resolved_options
 from obsynth.observers.dae.nominal_run import NOMINAL_STEPS, DAEFacts, dae_facts
 from obsynth.observers.dae.observer import DAEObserver
-from obsynth.observers.dae.running import PROJECTION_NOTICE
+from obsynth.observers.dae.steps import PROJECTION_NOTICE
 from obsynth.plants.dae.model import DAEModel
 from obsynth.results.design import Certificate
 

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.conditions import Condition
-from obsynth.analysis.diagnosis.additions import estimable, least_additions, listed, state_sensors
 from obsynth.analysis.diagnosis.columns import Question, question
 from obsynth.analysis.diagnosis.diagnosing import model_points, rest_point
 from obsynth.analysis.diagnosis.hidden_motions import hidden_motion
@@ -19,7 +18,12 @@ _SOURCE = "left null space of [A - sE, Bd, Bf; C, Dd, Df]"
 
 
 def conditions(
-    plant: DescriptorSystem, *, fault_model: Any = "step", faults: Any = None, residuals: Any = None
+    plant: DescriptorSystem,
+    *,
+    fault_model: Any = "step",
+    faults: Any = None,
+    residuals: Any = None,
+    exactly: bool | None = None,
 ) -> tuple[Condition, ...]:
     """Return the existence conditions, one or two for each fault asked for."""
     from obsynth.methods.functional_filter.options import FunctionalFilterOptions
@@ -31,21 +35,25 @@ def conditions(
             Condition("faults", "the plant has a fault", False, 0.0, 1.0, _SOURCE, "there is none: give Bf or Df."),
         )
     if sets is not None:
-        return tuple(condition for seen in sets for condition in _residual_conditions(plant, seen))
+        return tuple(condition for seen in sets for condition in _residual_conditions(plant, seen, exactly))
     given = isinstance(fault_model, Exosystem)
     model = fault_model if given else exosystem(fault_model, plant.fault_names, plant.dt)
     return tuple(
-        condition for fault in asked.chosen_faults(plant) for condition in fault_conditions(plant, model, fault)
+        condition
+        for fault in asked.chosen_faults(plant)
+        for condition in fault_conditions(plant, model, fault, exactly)
     )
 
 
-def fault_conditions(plant: DescriptorSystem, model: Exosystem, fault: int) -> tuple[Condition, ...]:
+def fault_conditions(
+    plant: DescriptorSystem, model: Exosystem, fault: int, exactly: bool | None = None
+) -> tuple[Condition, ...]:
     """Return whether one fault can be estimated, free of the unknown inputs and of every other fault."""
     name = plant.fault_names[fault]
-    asked = question(plant, [j for j in range(plant.nf) if j != fault], fault)
+    asked = _asked(plant, [j for j in range(plant.nf) if j != fault], fault, exactly)
     seen = Condition(
         f"{name} shows", f"{name} shows free of {_rest(plant, fault)}", asked.visible, float(asked.visible), 1.0,
-        _SOURCE, _gap(asked) if asked.visible else _hidden(plant, asked, rest_point(plant.dt)) + _advice(plant, fault),
+        _SOURCE, _gap(asked) if asked.visible else _hidden(plant, asked, rest_point(plant.dt)),
         signals=() if asked.visible else (name,),
     )  # fmt: skip
     if not asked.visible:
@@ -54,18 +62,18 @@ def fault_conditions(plant: DescriptorSystem, model: Exosystem, fault: int) -> t
     kept = Condition(
         f"{name} follows its model", f"{name} has no zero at a pole of its model ({model.descriptions[fault]})",
         not lost, float(len(lost)), 0.0, _SOURCE,
-        _gap(asked) if not lost else _hidden(plant, asked, lost[0]) + _advice(plant, fault),
+        _gap(asked) if not lost else _hidden(plant, asked, lost[0]),
         mode=lost[0] if lost else None, signals=(name,) if lost else (),
     )  # fmt: skip
     return seen, kept
 
 
-def _residual_conditions(plant: DescriptorSystem, seen: Sequence[int]) -> list[Condition]:
+def _residual_conditions(plant: DescriptorSystem, seen: Sequence[int], exactly: bool | None) -> list[Condition]:
     """Return whether each fault of a set shows in residuals that are blind to all others."""
     removed = [j for j in range(plant.nf) if j not in seen]
     found = []
     for fault in seen:
-        asked = question(plant, removed, fault)
+        asked = _asked(plant, removed, fault, exactly)
         name = plant.fault_names[fault]
         blind = [*plant.disturbance_names, *(plant.fault_names[j] for j in removed)]
         found.append(
@@ -76,7 +84,7 @@ def _residual_conditions(plant: DescriptorSystem, seen: Sequence[int]) -> list[C
                 float(asked.visible),
                 1.0,
                 _SOURCE,
-                _gap(asked) if asked.visible else _hidden(plant, asked, rest_point(plant.dt)) + _advice(plant, fault),
+                _gap(asked) if asked.visible else _hidden(plant, asked, rest_point(plant.dt)),
                 signals=() if asked.visible else (name,),
             )
         )
@@ -95,12 +103,12 @@ def _gap(asked: Question) -> str:
 def _hidden(plant: DescriptorSystem, asked: Question, point: complex) -> str:
     motion = hidden_motion(plant, asked.number, point, asked.removed)
     if motion is None:
-        return "nothing shows it. "
-    return (
-        f"{motion} ({'z' if plant.dt > 0.0 else 's'} = {point.real:.4g}{f'{point.imag:+.4g}j' if point.imag else ''}). "
-    )
+        return "nothing shows it."
+    place = f"{point.real:.4g}{f'{point.imag:+.4g}j' if point.imag else ''}"
+    return f"{motion} ({'z' if plant.dt > 0.0 else 's'} = {place})."
 
 
-def _advice(plant: DescriptorSystem, fault: int) -> str:
-    found = least_additions(plant, state_sensors(plant), estimable(fault, step=True))
-    return f"Add one of: {listed(found)}." if found else "No further state or pair of states helps."
+def _asked(plant: DescriptorSystem, removed: Sequence[int], fault: int, exactly: bool | None) -> Question:
+    if exactly is None:
+        return question(plant, removed, fault)
+    return Question(plant, tuple(removed), fault, exactly)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from obsynth.methods.method_spec import ClaimMeaning, MethodSpec
 
 CLAIMS = {
-    "order": ClaimMeaning("", "states of the filter"),
-    "decay": ClaimMeaning("1/s", "rate of the slowest pole: every error decays at least like this in the end"),
+    "order": ClaimMeaning("", "states of the filter", "order"),
+    "decay": ClaimMeaning("1/s", "rate of the slowest pole: every error decays at least like this in the end", "decay"),
 }
 
 METHOD = MethodSpec(
@@ -21,4 +21,6 @@ METHOD = MethodSpec(
     synthesise="obsynth.methods.functional_filter.synthesis:synthesise",
     checks="obsynth.methods.functional_filter.checks:checks",
     claims=CLAIMS,
+    witnesses=frozenset({"T", "T0", "Phi", "Cw", "walks", "stability", "tracking", "deviations"}),
+    tracked="obsynth.methods.functional_filter.checks:tracked_plant",
 )

@@ -6,22 +6,22 @@ The loop is that of `obsynth.numerics.newton` and `obsynth.plants.dae.step`, wit
 from __future__ import annotations
 
 from collections.abc import Iterable
+from importlib.resources import files
 from typing import Any
 
 import numpy as np
 
 from obsynth.numerics import newton
 from obsynth.numerics.arrays import FloatArray
-from obsynth.observers.dae.c_template import ADVANCE, RECORD
 from obsynth.observers.dae.memory_layout import initial_memory
 from obsynth.observers.dae.observer import DAEObserver
-from obsynth.observers.dae.running import PROJECTION_NOTICE, PROJECTION_SHARE
 from obsynth.observers.dae.step_graph import ObserverGraph
+from obsynth.observers.dae.steps import PROJECTION_NOTICE, PROJECTION_SHARE
 from obsynth.plants.dae import step as implicit_step
 from obsynth.plants.dae.functions import DAEFunctions
 from obsynth.plants.dae.step_graph import step_graph
 
-#: What `RECORD` hands out of a batch, in this order.
+#: What ``record.c`` hands out of a batch, in this order.
 BATCH_PARTS = ("posterior", "theta", "spread", "innovation", "nis", "residual")
 _NUMBERS_PER_LINE = 4
 
@@ -33,7 +33,7 @@ def observer_code(observer: DAEObserver) -> str:
     functions = {"project": short.newton, "newton": graph.step.newton, "first": graph.first, "sample": graph.sample}
     return "\n".join([
         "#include <math.h>", "", *_constants(observer, graph, functions.values()), "", _generated(functions), "",
-        ADVANCE,
+        _template("advance"),
     ])  # fmt: skip
 
 
@@ -46,9 +46,14 @@ def record_code(observer: DAEObserver) -> str:
         size = part.stop - part.start
         copies.append(f"    copy(out + {total}, {source} + {part.start}, {size});")
         total += size
-    return observer_code(observer) + "\n" + RECORD.replace("/* PARTS */", "\n".join(copies)).replace(
+    return observer_code(observer) + "\n" + _template("record").replace("/* PARTS */", "\n".join(copies)).replace(
         "PARTS_SIZE", str(total)
     )  # fmt: skip
+
+
+def _template(name: str) -> str:
+    """Return the C that stands around the functions that CasADi writes: ``advance`` or ``record``."""
+    return files("obsynth.observers.dae").joinpath("c", f"{name}.c").read_text(encoding="utf-8")
 
 
 def _constants(observer: DAEObserver, graph: ObserverGraph, functions: Iterable[Any]) -> list[str]:

@@ -113,6 +113,9 @@ class DAEEstimates:
         S is none: with forgetting it says how much is still remembered.
     innovations : FloatArray
         ``(samples, ny)``, in units of the outputs; NaN where a sample is missing.
+    innovation_covariances : FloatArray
+        ``(samples, ny, ny)``: what is expected of the innovations; rows and columns of missing samples are those of the
+        identity.
     nis, nis_degrees : FloatArray
         ``(samples,)``: squared innovations in units of their covariance, and degrees of freedom.
     excitation : FloatArray
@@ -134,6 +137,7 @@ class DAEEstimates:
     parameters: FloatArray
     parameter_covariances: FloatArray
     innovations: FloatArray
+    innovation_covariances: FloatArray
     nis: FloatArray
     nis_degrees: FloatArray
     excitation: FloatArray
@@ -206,7 +210,7 @@ def _columns(rows: DAERow) -> dict[str, FloatArray]:
     return {
         "states": rows.x, "state_deviations": np.sqrt(np.maximum(variances, 0.0)),
         "parameters": rows.theta, "parameter_covariances": rows.parameter_covariance,
-        "innovations": rows.innovation, "nis": rows.nis,
+        "innovations": rows.innovation, "innovation_covariances": rows.part("expected"), "nis": rows.nis,
         "nis_degrees": rows.seen.sum(axis=1).astype(np.float64), "residuals": rows.part("residual")[:, 0],
         "conditions": rows.conditions, "contraction": rows.contractions, "information": rows.part("information"),
     }  # fmt: skip

@@ -51,11 +51,11 @@ class DAEFacts:
 
 def dae_facts(observer: DAEObserver) -> DAEFacts:
     """Run an observer on its own model at nominal inputs and parameters."""
-    model, running = observer.model, observer.start()
+    model = observer.model
     u = np.array(model.nominal_input)
     truth = _nominal_outputs(observer, u)
     gathered = GatheredRows(observer)
-    advanced(running, truth, np.tile(u, (len(truth), 1)), gathered.add)
+    end = advanced(observer, truth, np.tile(u, (len(truth), 1)), gathered.add)
     found = gathered.estimates()
     covariance = found.parameter_covariances[-1]
     deviations = np.sqrt(np.diag(covariance))
@@ -69,13 +69,14 @@ def dae_facts(observer: DAEObserver) -> DAEFacts:
         index_report(model, observer.dt, x=found.states[-1], u=u, theta=found.parameters[-1]),
         float(found.conditions.max()), int(np.argmax(found.conditions)), float(found.residuals.max()),
         float(found.contraction[-1]), read_only(deviations), read_only(covariance / np.outer(safe, safe)),
-        found.projection, identifiable, read_only(running.K), read_only(running.Upsilon),
+        found.projection, identifiable, read_only(observer.steps.part(end, "K")),
+        read_only(observer.steps.part(end, "Upsilon")),
     )  # fmt: skip
 
 
 def _nominal_outputs(observer: DAEObserver, u: FloatArray) -> FloatArray:
     """Return the outputs of the model from the observer's initial state, without noise."""
-    step = observer.start().implicit
+    step = observer.steps.implicit
     x, theta = np.array(observer.initial_state), np.array(observer.initial_parameters)
     outputs = []
     for k in range(NOMINAL_STEPS + 1):

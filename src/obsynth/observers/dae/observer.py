@@ -15,14 +15,15 @@ from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.covariances import covariance_factor, is_definite
 from obsynth.numerics.value_types import Count, ForgettingFactor, Positive, checked_value
 from obsynth.observers.recursive.records import measured_record
-from obsynth.plants.dae.checks import checked_inputs, finite_vector, step_length
+from obsynth.observers.running import RunningObserver
+from obsynth.plants.dae.checks import checked_inputs, finite_vector, require_known, step_length
 from obsynth.plants.dae.model import DAEModel
 
 if TYPE_CHECKING:
     from obsynth.observers.dae.compiled_library import DAELibrary
-    from obsynth.observers.dae.estimates import DAEEstimates
-    from obsynth.observers.dae.running import RunningDAEObserver
+    from obsynth.observers.dae.estimates import DAEEstimates, DAERow
     from obsynth.observers.dae.step_graph import ObserverGraph
+    from obsynth.observers.dae.steps import DAEState, Steps
 
 Form: TypeAlias = Literal["forgetting", "random-walk", "augmented-kalman"]
 Guard: TypeAlias = Literal["regularise", "none"]
@@ -183,11 +184,66 @@ class DAEObserver:
         """
         return cls(**{**data, "model": DAEModel(**data["model"])})
 
-    def start(self) -> RunningDAEObserver:
-        """Return a running observer, at k = 0."""
-        from obsynth.observers.dae.running import RunningDAEObserver
+    @cached_property
+    def steps(self) -> Steps:
+        """What follows from the observer alone, made when it is first needed."""
+        from obsynth.observers.dae.steps import Steps
 
-        return RunningDAEObserver(self)
+        return Steps(self)
+
+    def init(self) -> DAEState:
+        """Return the state before the first sample, k = 0."""
+        return self.steps.first
+
+    def advance(self, state: DAEState, y: FloatArray, u: FloatArray) -> tuple[DAEState, DAERow]:
+        """Return the next state and what is said at a sample, without checking it.
+
+        Parameters
+        ----------
+        state : DAEState
+            Before the sample.
+        y, u : FloatArray
+            ``(ny,)``, NaN for what is missing, and ``(nu,)``.
+        """
+        return self.steps.advance(state, y, u)
+
+    def step(self, state: DAEState, y: ArrayLike, u: ArrayLike = ()) -> tuple[DAEState, DAEEstimates]:
+        """Return the state after a sample, and the estimates at it.
+
+        Parameters
+        ----------
+        state : DAEState
+            Before the sample; it is not changed.
+        y : array_like
+            Outputs ``(ny,)``; NaN marks a missing one.
+        u : array_like, optional
+            Known inputs ``(nu,)`` during the step that ends at this sample.
+
+        Raises
+        ------
+        SpecError
+            A sample has the wrong length, or an input is not finite.
+        SolverError
+            The step has no solution; k, iteration and worst equation are named.
+        """
+        from obsynth.observers.dae.estimates import GatheredRows
+
+        outputs = measured_record(np.atleast_2d(np.asarray(y)), self.model.ny)[0]
+        try:
+            inputs = np.atleast_1d(np.asarray(u, dtype=np.float64))
+        except (TypeError, ValueError):
+            inputs = np.zeros((0, 0))
+        if inputs.shape != (self.model.nu,):
+            raise SpecError(f"u must be {self.model.nu} finite number(s) at k = {state.k}.", path="u")
+        require_known(self.model, inputs[None], state.k)
+        after, row = self.advance(state, outputs, inputs)
+        found = GatheredRows(self)
+        found.add_regular(row)
+        return after, found.estimates(np.array(after.informations))
+
+    def start(self) -> RunningObserver[DAEState, DAERow, DAEEstimates]:
+        """Return a running observer, at k = 0."""
+        return RunningObserver(self)
 
     @cached_property
     def graph(self) -> ObserverGraph:

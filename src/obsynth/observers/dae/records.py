@@ -10,8 +10,9 @@ from obsynth.errors import SolverError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.estimates import DAEEstimates, DAERow, GatheredRows
 from obsynth.observers.dae.observer import DAEObserver
-from obsynth.observers.dae.running import RunningDAEObserver
+from obsynth.observers.dae.steps import DAEState
 from obsynth.observers.progress import shown_progress
+from obsynth.observers.running import RunningObserver
 from obsynth.plants.dae.functions import Compiled
 from obsynth.plants.dae.stretches import take_samples
 
@@ -27,14 +28,15 @@ def run_record(
 
     Shapes: ``y (samples, ny)``, ``u (samples, nu)``.
     """
-    running, found = observer.start(), GatheredRows(observer)
+    found = GatheredRows(observer)
     found.add(_nothing(observer))
     with shown_progress(progress, len(y), "samples") as note:
         if compiled:
-            _in_c(running, y, u, found.add_regular, note)
+            _in_c(observer, y, u, found.add_regular, note)
         elif compiled is None:
-            advanced(running, y, u, found.add_regular, note)
+            advanced(observer, y, u, found.add_regular, note)
         else:
+            running = RunningObserver(observer)
             for k in range(len(y)):
                 found.add_regular(running.raw_step(y[k], u[k]))
                 note(k + 1)
@@ -49,44 +51,46 @@ def _nothing(observer: DAEObserver) -> DAERow:
 
 
 def _in_c(
-    running: RunningDAEObserver, y: FloatArray, u: FloatArray, keep: Callable[[DAERow], object],
+    observer: DAEObserver, y: FloatArray, u: FloatArray, keep: Callable[[DAERow], object],
     note: Callable[[int], object],
 ) -> None:  # fmt: skip
-    library, moved = running.observer.library, np.zeros(0)
+    library, moved = observer.library, np.zeros(0)
     state = library.started()
     for begin in range(0, len(y), SAMPLES_PER_CALL):
         heard = y[begin : begin + SAMPLES_PER_CALL]
         after, said = library.record(state, heard, u[begin : begin + SAMPLES_PER_CALL])
         if len(after) < len(heard):
             # Go there again where the message is written.
-            advanced(running, y, u, bool, note)
+            advanced(observer, y, u, bool, note)
             raise SolverError(f"The C stops at k = {begin + len(after)}, but CasADi goes on: leave compiled=True out.")
         if begin == 0:
-            moved = running.projected(u[0])[1]
-        keep(DAERow(running.graph, begin, after, said, ~np.isnan(heard[: len(after)]), moved))
+            moved = observer.steps.projected(observer.init(), u[0])[1]
+        keep(DAERow(observer.graph, begin, after, said, ~np.isnan(heard[: len(after)]), moved))
         note(begin + len(heard))
 
 
 def advanced(
-    running: RunningDAEObserver, y: FloatArray, u: FloatArray, keep: Callable[[DAERow], object],
+    observer: DAEObserver, y: FloatArray, u: FloatArray, keep: Callable[[DAERow], object],
     note: Callable[[int], object] = bool,
-) -> None:  # fmt: skip
-    """Lead an observer that was just started through a record.
+) -> DAEState:  # fmt: skip
+    """Lead an observer from its start through a record; return its state at the end.
 
     Shapes: ``y (samples, ny)``, ``u (samples, nu)``.
     """
     calls: dict[int, Compiled] = {}
+    running = RunningObserver(observer)
 
     def alone(k: int) -> None:
         keep(running.raw_step(y[k], u[k]))
 
     def together(k: int, length: int) -> int:
         if length not in calls:
-            calls[length] = Compiled(running.graph.over(length))
-        rows = running.stretch(y[k : k + length], u[k : k + length], calls[length])
+            calls[length] = Compiled(observer.graph.over(length))
+        running.state, rows = observer.steps.stretch(running.state, y[k : k + length], u[k : k + length], calls[length])
         keep(rows)
         return len(rows.memory)
 
     if len(y):
         alone(0)
     take_samples(1, len(y), together, alone, note)
+    return running.state

@@ -149,7 +149,8 @@ class _Update:
         else:
             covariance = Sigma + Omega @ found["spread"] @ Omega.T
         return {
-            **found, "innovation": e, "nis": e.T @ definite_solved(covariance, e), "Sigma": Sigma, "Omega": Omega,
+            **found, "innovation": e, "expected": covariance, "nis": e.T @ definite_solved(covariance, e),
+            "Sigma": Sigma, "Omega": Omega,
             "information": Omega.T @ definite_solved(Sigma, Omega), "seen H": H, "seen L": L,
         }  # fmt: skip
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,6 +13,16 @@ from numpy.typing import ArrayLike
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.observers.linear.checking import NAME_FIELDS, checked_record, checked_sample, is_delay, require_names
+from obsynth.observers.running import RunningObserver
+
+
+class LinearState(NamedTuple):
+    """The state of a linear observer.
+
+    Fields: z: ``(nz,)``, before the next sample.
+    """
+
+    z: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,15 +127,70 @@ class LinearObserver:
         }
         return cls(**values)
 
-    def start(self, initial_state: ArrayLike | None = None) -> RunningObserver:
-        """Return an observer that takes one sample at a time.
+    def init(self, initial_state: ArrayLike | None = None) -> LinearState:
+        """Return the state before the first sample.
+
+        Parameters
+        ----------
+        initial_state : array_like, optional
+            ``z(0)``, ``(nz,)``; zero by default.
+
+        Raises
+        ------
+        SpecError
+            The observer is a continuous-time one, or the initial state has the wrong length.
+        """
+        if self.dt <= 0.0:
+            raise SpecError(
+                "This observer is continuous in time: it must be discretised before it can step.", path="dt"
+            )
+        start = np.zeros(self.order) if initial_state is None else initial_state
+        return LinearState(checked_sample(start, self.order, "initial_state").copy())
+
+    def start(self, initial_state: ArrayLike | None = None) -> RunningObserver[LinearState, FloatArray, Estimates]:
+        """Return a running observer, which takes one sample at a time.
 
         Parameters
         ----------
         initial_state : array_like, optional
             ``z(0)``, ``(nz,)``; zero by default.
         """
-        return RunningObserver(self, initial_state)
+        return RunningObserver(self, self.init(initial_state))
+
+    def advance(self, state: LinearState, y: FloatArray, u: FloatArray) -> tuple[LinearState, FloatArray]:
+        """Return the next state and the row ``[xhat, fhat, r]``, without checking the sample.
+
+        Parameters
+        ----------
+        state : LinearState
+            Before the sample.
+        y, u : FloatArray
+            ``(ny,)`` and ``(nu,)``, finite.
+        """
+        row = self.Cz @ state.z + self.Du @ u + self.Dy @ y
+        return LinearState(self.Az @ state.z + self.Bu @ u + self.By @ y), np.asarray(row)
+
+    def step(self, state: LinearState, y: ArrayLike, u: ArrayLike = ()) -> tuple[LinearState, Estimates]:
+        """Return the state after a sample, and the estimates at it.
+
+        Parameters
+        ----------
+        state : LinearState
+            Before the sample; it is not changed.
+        y : array_like
+            Outputs ``(ny,)``.
+        u : array_like, optional
+            Known inputs ``(nu,)``.
+
+        Raises
+        ------
+        SpecError
+            A sample has the wrong length or is not finite.
+        """
+        outputs = checked_sample(y, len(self.output_names), "y")
+        inputs = checked_sample(u, len(self.input_names), "u")
+        after, row = self.advance(state, outputs, inputs)
+        return after, Estimates.split(self, row[None, :])
 
     def run(self, y: ArrayLike, u: ArrayLike | None = None, *, initial_state: ArrayLike | None = None) -> Estimates:
         """Run over a whole record of a discrete-time observer.
@@ -154,69 +219,11 @@ class LinearObserver:
         inputs = checked_record(known, len(self.input_names), "u")
         if len(inputs) != len(outputs):
             raise SpecError(f"u has {len(inputs)} samples and y has {len(outputs)}: give the same number.", path="u")
-        running = self.start(initial_state)
+        state = self.init(initial_state)
         rows = np.empty((len(outputs), self.Cz.shape[0]))
         for k in range(len(outputs)):
-            rows[k] = running.raw_step(outputs[k], inputs[k])
+            state, rows[k] = self.advance(state, outputs[k], inputs[k])
         return Estimates.split(self, rows)
-
-
-class RunningObserver:
-    """A running linear observer: `step` takes y(k) and u(k) and returns the estimates at k.
-
-    Parameters
-    ----------
-    observer : LinearObserver
-        The realisation; discrete time.
-    initial_state : array_like, optional
-        ``z(0)``, ``(nz,)``; zero by default.
-
-    Raises
-    ------
-    SpecError
-        The observer is a continuous-time one, or the initial state has the wrong length.
-    """
-
-    def __init__(self, observer: LinearObserver, initial_state: ArrayLike | None = None) -> None:
-        if observer.dt <= 0.0:
-            raise SpecError(
-                "This observer is continuous in time: it must be discretised before it can step.", path="dt"
-            )
-        start = np.zeros(observer.order) if initial_state is None else initial_state
-        self.state = checked_sample(start, observer.order, "initial_state").copy()
-        self.observer = observer
-
-    def raw_step(self, y: FloatArray, u: FloatArray) -> FloatArray:
-        """Return the row ``[xhat, fhat, r]`` and advance, without checking the samples.
-
-        Parameters
-        ----------
-        y, u : FloatArray
-            ``(ny,)`` and ``(nu,)``, finite.
-        """
-        system = self.observer
-        row = system.Cz @ self.state + system.Du @ u + system.Dy @ y
-        self.state = system.Az @ self.state + system.Bu @ u + system.By @ y
-        return np.asarray(row)
-
-    def step(self, y: ArrayLike, u: ArrayLike = ()) -> Estimates:
-        """Take ``y (ny,)`` and ``u (nu,)`` of one sample; return the estimates at that sample.
-
-        Parameters
-        ----------
-        y : array_like
-            Outputs ``(ny,)``.
-        u : array_like, optional
-            Known inputs ``(nu,)``.
-
-        Raises
-        ------
-        SpecError
-            A sample has the wrong length or is not finite; the state is left as it was.
-        """
-        outputs = checked_sample(y, len(self.observer.output_names), "y")
-        inputs = checked_sample(u, len(self.observer.input_names), "u")
-        return Estimates.split(self.observer, self.raw_step(outputs, inputs)[None, :])
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_finite_number, require_kind
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.holds import first_order_hold
 from obsynth.observers.linear.observer import LinearObserver
 
 
@@ -52,17 +52,3 @@ def sample_observer(observer: LinearObserver, dt: float) -> LinearObserver:
         observer, Az=transition, Bu=into[:, :inputs], By=into[:, inputs:], Du=through[:, :inputs],
         Dy=through[:, inputs:], dt=dt,
     )  # fmt: skip
-
-
-def first_order_hold(a: FloatArray, b: FloatArray, dt: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    r"""Return the matrices of ``x' = a x + b v`` over an interval in which v is linear.
-
-    Shapes: ``a (n, n)``, ``b (n, m)``.
-    """
-    from scipy.linalg import expm
-
-    n, m = b.shape
-    chain = np.zeros((n + 2 * m, n + 2 * m))
-    chain[:n, :n], chain[:n, n : n + m], chain[n : n + m, n + m :] = a * dt, b * dt, np.eye(m)
-    row = expm(chain)[:n]
-    return row[:, :n], row[:, n : n + m], row[:, n + m :]

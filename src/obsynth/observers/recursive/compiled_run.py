@@ -20,7 +20,7 @@ from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.least_squares_step import SUSPECT_PARITY
 from obsynth.observers.recursive.estimates import RecursiveEstimates, deviations_of, received_in
 from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.observers.recursive.running import RawEstimate, RunningRecursiveObserver
+from obsynth.observers.recursive.recursion import RawEstimate, RecursiveState
 from obsynth.observers.recursive.step_stacks import stacked_matrices, stacked_steps
 
 #: Samples from which the kernel is used unasked: they take seconds without it, which is what loading numba, or the
@@ -66,8 +66,11 @@ def run_record(observer: RecursiveObserver, y: FloatArray, u: FloatArray, compil
     """
     if kernel_is_chosen(observer, len(y), compiled):
         return run_compiled(observer, y, u)
-    running = observer.start()
-    return RecursiveEstimates.of(observer, [running.raw_step(y[k], u[k]) for k in range(len(y))])
+    state, rows = observer.init(), []
+    for k in range(len(y)):
+        state, row = observer.advance(state, y[k], u[k])
+        rows.append(row)
+    return RecursiveEstimates.of(observer, rows)
 
 
 @dataclass
@@ -115,7 +118,7 @@ def run_compiled(observer: RecursiveObserver, y: FloatArray, u: FloatArray) -> R
 
     Shapes: ``y (samples, ny)``, ``u (samples, nu)``.
     """
-    running, plant = observer.start(), observer.plant
+    state, plant = observer.init(), observer.plant
     nq = 0 if observer.adaptation is None else plant.nq
     record = _Record.empty(len(y), plant.nx, nq, plant.ne + plant.ny + nq)
     stretches = _complete_stretches(y)
@@ -123,12 +126,13 @@ def run_compiled(observer: RecursiveObserver, y: FloatArray, u: FloatArray) -> R
     k = 0
     while k < len(y):
         count = min(int(stretches[k]), CHUNK)
-        if pause or count < SHORT_STRETCH or running.diffuse.shape[1]:
-            record.note(k, running.raw_step(y[k], u[k]))
+        if pause or count < SHORT_STRETCH or state.diffuse.shape[1]:
+            state, row = observer.advance(state, y[k], u[k])
+            record.note(k, row)
             k, pause = k + 1, max(pause - 1, 0)
             continue
-        taken = _kernel_steps(running, record, y[k : k + count], u[k - 1 : k + count])
-        k += taken
+        state = _kernel_steps(observer, state, record, y[k : k + count], u[k - 1 : k + count])
+        taken, k = state.k - k, state.k
         if taken < count:
             # A step for the other path; where such steps are the rule, the kernel is tried less and less often.
             pause, patience = patience, 2 * patience
@@ -142,17 +146,19 @@ def _complete_stretches(y: FloatArray) -> FloatArray:
     return np.asarray(after - np.arange(len(y)))
 
 
-def _kernel_steps(running: RunningRecursiveObserver, record: _Record, y: FloatArray, u: FloatArray) -> int:
+def _kernel_steps(
+    observer: RecursiveObserver, state: RecursiveState, record: _Record, y: FloatArray, u: FloatArray
+) -> RecursiveState:
     """Take as many steps as the kernel can; ``u`` begins one sample before ``y``."""
     from obsynth.numerics.compiled_steps import square_root_steps
 
-    first = running.k
-    stack = stacked_steps(stacked_matrices(running.model, first - 1, len(y)), u[:-1], y, u[1:])
+    first = state.k
+    stack = stacked_steps(stacked_matrices(observer.recursion.model, first - 1, len(y)), u[:-1], y, u[1:])
     if stack is None:
-        return 0
+        return state
     count, rows = stack.data.shape
-    n, nx = len(running.x), record.states.shape[1]
-    x, factor = np.array(running.x), np.array(running.factor, order="C")
+    n, nx = len(state.x), record.states.shape[1]
+    x, factor = np.array(state.x), np.array(state.factor, order="C")
     states, innovations = np.empty((count, n)), np.empty((count, rows - n))
     deviations, covariances = np.empty((count, nx)), np.empty((count, n - nx, n - nx))
     taken = square_root_steps(x, factor, *stack, states, innovations, deviations, covariances, SUSPECT_PARITY)
@@ -160,5 +166,4 @@ def _kernel_steps(running: RunningRecursiveObserver, record: _Record, y: FloatAr
     record.states[kept], record.parameters[kept] = states[:taken, :nx], states[:taken, nx:]
     record.deviations[kept], record.covariances[kept] = deviations[:taken], covariances[:taken]
     record.innovations[kept, : rows - n], record.degrees[kept] = innovations[:taken], rows - n
-    running.x, running.factor, running.k, running.u = x, factor, first + taken, u[taken]
-    return taken
+    return state._replace(x=x, factor=factor, k=first + taken, u=u[taken])

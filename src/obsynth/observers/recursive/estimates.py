@@ -13,7 +13,7 @@ from obsynth.numerics.arrays import FloatArray, read_only
 
 if TYPE_CHECKING:
     from obsynth.observers.recursive.observer import RecursiveObserver
-    from obsynth.observers.recursive.running import RawEstimate
+    from obsynth.observers.recursive.recursion import RawEstimate
 
 #: Share of a diffuse direction below which a state is held to be determined: rounding of an orthonormal basis.
 UNDETERMINED_SHARE = 1e-8

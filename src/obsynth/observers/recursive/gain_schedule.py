@@ -18,7 +18,6 @@ from obsynth.numerics.recursive_least_squares import update
 from obsynth.observers.recursive.literal_form import posterior_residual
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.recursive.records import require_horizon
-from obsynth.observers.recursive.running import RunningRecursiveObserver
 from obsynth.observers.recursive.step_model import EarlyConstraintSteps, StepMatrices, require_in_range
 
 
@@ -50,9 +49,9 @@ def gain_steps(
 
     Shapes: ``received (samples, ny)``.
     """
-    start = RunningRecursiveObserver(observer)
+    start, recursion = observer.init(), observer.recursion
     factor, Upsilon, parameters, diffuse = start.factor, start.Upsilon, start.parameters, start.diffuse
-    adaptation, model = observer.adaptation, start.model
+    adaptation, model = observer.adaptation, recursion.model
     first = [model.first()] if isinstance(model, EarlyConstraintSteps) else []
     for k, step in enumerate(chain(first, (model.at(k) for k in range(steps))), 1 - len(first)):
         ne, rows, nq = len(step.A), len(step.H), Upsilon.shape[1]
@@ -76,11 +75,11 @@ def gain_steps(
         learn, forget = np.zeros((nq, rows)), np.eye(nq)
         if adaptation is not None and nq:
             seen, regressor, noise = parity, G, None
-            if start.literal and len(H) > ne:
+            if recursion.literal and len(H) > ne:
                 seen, regressor, noise = posterior_residual(found, H, S, right, ne, unknown=unknown, columns=rows)
             parameters, theta_gain = update(
                 parameters, np.zeros(len(regressor)), regressor, forgetting=adaptation.forgetting,
-                regular=start.regular, directional=start.directional, noise=noise,
+                regular=recursion.regular, directional=recursion.directional, noise=noise,
             )  # fmt: skip
             learn, forget = theta_gain @ seen, np.eye(nq) - theta_gain @ regressor
         yield GainStep(step, gain, parity, G, Upsilon, factor, learn, forget, parameters.spread)
@@ -123,8 +122,8 @@ def run_batch(observer: RecursiveObserver, y: ArrayLike, u: ArrayLike | None = N
         raise SpecError("A batch must be complete: run trials with missing samples one by one.", path="y")
     require_horizon(observer.plant.horizon, samples, early=observer.early_constraints)
     inputs = np.broadcast_to(known, (trials, *known.shape[-2:]))
-    start = RunningRecursiveObserver(observer)
-    early = isinstance(start.model, EarlyConstraintSteps)
+    start = observer.init()
+    early = isinstance(observer.recursion.model, EarlyConstraintSteps)
     x = np.broadcast_to(start.x, (trials, len(start.x)))
     theta = np.broadcast_to(start.parameters.theta, (trials, len(start.parameters.theta)))
     nx = observer.plant.nx

@@ -4,23 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import real_vector, truth
+from obsynth.numerics.arguments import real_array, real_vector, truth
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.covariances import covariance_factor
 from obsynth.numerics.value_types import Count, ForgettingFactor, Probability, checked_value
-from obsynth.observers.recursive.records import require_horizon, whole_record
+from obsynth.observers.recursive.records import measured_record, require_horizon, whole_record
+from obsynth.observers.running import RunningObserver
 from obsynth.plants.sequences import MatrixSequence
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 
 if TYPE_CHECKING:
     from obsynth.observers.recursive.estimates import RecursiveEstimates
-    from obsynth.observers.recursive.running import RunningRecursiveObserver
+    from obsynth.observers.recursive.recursion import RawEstimate, Recursion, RecursiveState
 
 Form: TypeAlias = Literal["innovation", "literal", "random-walk"]
 Guard: TypeAlias = Literal["regularise", "directional", "none"]
@@ -191,11 +193,63 @@ class RecursiveObserver:
             None if data["adaptation"] is None else Adaptation(**data["adaptation"]), data["early_constraints"],
         )  # fmt: skip
 
-    def start(self) -> RunningRecursiveObserver:
-        """Return a running observer, at k = 0."""
-        from obsynth.observers.recursive.running import RunningRecursiveObserver
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what makes it again in another process: its recursion is made there anew."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
 
-        return RunningRecursiveObserver(self)
+    @cached_property
+    def recursion(self) -> Recursion:
+        """What follows from the observer alone, made when it is first needed."""
+        from obsynth.observers.recursive.recursion import Recursion
+
+        return Recursion(self)
+
+    def init(self) -> RecursiveState:
+        """Return the state before the first sample, k = 0."""
+        return self.recursion.first
+
+    def advance(self, state: RecursiveState, y: FloatArray, u: FloatArray) -> tuple[RecursiveState, RawEstimate]:
+        """Return the next state and what is known at a sample, without checking it.
+
+        Parameters
+        ----------
+        state : RecursiveState
+            Before the sample.
+        y, u : FloatArray
+            ``(ny,)``, NaN for what is missing, and ``(nu,)``.
+        """
+        return self.recursion.advance(state, y, u)
+
+    def step(self, state: RecursiveState, y: ArrayLike, u: ArrayLike = ()) -> tuple[RecursiveState, RecursiveEstimates]:
+        """Return the state after a sample, which keeps u(k) for the next, and the estimates at it.
+
+        Parameters
+        ----------
+        state : RecursiveState
+            Before the sample; it is not changed.
+        y : array_like
+            Outputs ``(ny,)``; NaN marks a missing one.  y(0) is not used.
+        u : array_like, optional
+            Known inputs ``(nu,)``.
+
+        Raises
+        ------
+        SpecError
+            A sample has the wrong length, an input is not finite, or the horizon is passed.
+        PreconditionError
+            Rank H_k is lost at this k although no sample is missing.
+        """
+        from obsynth.observers.recursive.estimates import RecursiveEstimates
+
+        outputs = measured_record(np.atleast_2d(real_array(y, "y")), self.plant.ny)[0]
+        inputs = real_vector(u, self.plant.nu, "u")
+        require_horizon(self.plant.horizon, state.k + 1, early=self.early_constraints)
+        after, row = self.advance(state, outputs, inputs)
+        return after, RecursiveEstimates.of(self, [row], window=after.regressors)
+
+    def start(self) -> RunningObserver[RecursiveState, RawEstimate, RecursiveEstimates]:
+        """Return a running observer, at k = 0."""
+        return RunningObserver(self)
 
     def run(self, y: ArrayLike, u: ArrayLike | None = None, *, compiled: bool | None = None) -> RecursiveEstimates:
         """Run over a whole record.

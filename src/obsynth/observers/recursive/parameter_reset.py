@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
-
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
@@ -22,23 +20,25 @@ class ParameterReset:
 
     def __init__(self, probability: float, start: ParameterState) -> None:
         self.probability, self.start = probability, start
-        self.window: deque[tuple[float, int]] = deque(maxlen=RESET_WINDOW)
         self.thresholds: dict[int, float] = {}
-        self.resets = 0
 
-    def watched(self, state: ParameterState, v: FloatArray, G: FloatArray) -> ParameterState:
-        """Return the state to go on with: the same, or one that knows no more than at the start.
+    def surprises(self, before: FloatArray, state: ParameterState, v: FloatArray, G: FloatArray) -> FloatArray:
+        """Return the latest normalised squares with their degrees of freedom, that of this sample last.
 
-        Shapes: ``v (m,)``, ``G (m, nq)``.
+        Shapes: ``before (any, 2)``, ``v (m,)``, ``G (m, nq)``.
         """
         gap, seen = v - G @ state.theta, G @ state.spread
         covariance = np.eye(len(v)) + seen @ seen.T
-        self.window.append((float(gap @ np.linalg.solve(covariance, gap)), len(v)))
-        total, degrees = sum(value for value, _ in self.window), sum(count for _, count in self.window)
-        if degrees == 0 or total <= self._threshold(degrees):
-            return state
-        self.window.clear()
-        self.resets += 1
+        latest = [float(gap @ np.linalg.solve(covariance, gap)), float(len(v))]
+        return np.vstack([before, latest])[-RESET_WINDOW:]
+
+    def is_due(self, surprises: FloatArray) -> bool:
+        """Return whether the innovations are too large for what is known of the parameters."""
+        total, degrees = float(sum(surprises[:, 0])), int(sum(surprises[:, 1]))
+        return degrees > 0 and total > self._threshold(degrees)
+
+    def forgetful(self, state: ParameterState) -> ParameterState:
+        """Return the same estimate, known no better than at the start."""
         return ParameterState(state.theta, self.start.triangle, self.start.spread)
 
     def _threshold(self, degrees: int) -> float:

@@ -22,7 +22,6 @@ from obsynth.numerics.spectra import abscissa
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.recursive.gain_schedule import GainStep, gain_steps
 from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.observers.recursive.running import RunningRecursiveObserver
 
 #: The gains have settled when what is left of their way is below this share of them.
 SETTLED = 1e-13
@@ -137,6 +136,6 @@ def _realised(observer: RecursiveObserver, found: GainStep) -> tuple[LinearObser
         input_names=plant.input_names, output_names=plant.output_names, state_names=plant.state_names,
         fault_names=names, residual_names=residuals, state_delays=(0,) * nx, fault_delays=(0,) * len(names),
     )  # fmt: skip
-    begin = RunningRecursiveObserver(observer)
+    begin = observer.init()
     # z = E x gives back x, as [L K] [E; C] = I, where the first outputs agree with it.
     return realisation, np.concatenate([step.H[:ne] @ begin.x, begin.parameters.theta])

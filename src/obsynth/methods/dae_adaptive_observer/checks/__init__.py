@@ -130,7 +130,7 @@ def _derivative_gap(observer: DAEObserver) -> float:
     sizes = np.concatenate([model.state_scales, priors])
     seen = np.abs(H) @ model.state_scales + np.abs(L) @ priors
     rows = np.concatenate([model.state_scales, np.where(seen > 0.0, seen, 1.0)])
-    step, end = running.implicit, found.part("posterior") - x
+    step, end = observer.steps.implicit, found.part("posterior") - x
 
     def both(point: FloatArray) -> FloatArray:
         """Return the end of a step from a point, and the outputs of the point moved to where the step ends."""

@@ -22,6 +22,7 @@ from obsynth.results.report import Check, lower_bound_check, upper_bound_check
 from obsynth.verification.identities import Identity, equality, relative_tolerance
 from obsynth.verification.lyapunov import prove_stable
 from obsynth.verification.plant import condition_rows, plant_information
+from obsynth.verification.remainder_channel import TrackedPlant
 
 _MATRICES = ("T", "T0", "Phi", "Cw", "walks", "stability", "tracking", "deviations")
 #: A claimed rate may be missed by this share.
@@ -59,6 +60,16 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
         yield equality(name, claim, identity.residual(), "regulator equation, ours", bound=max(tolerance, 1e-8))
     yield from leak_rows(design)
     yield from noise_rows(design)
+
+
+def tracked_plant(design: ObserverDesign) -> TrackedPlant:
+    """Return the plant as the shipped filter tracks it: without a fault every row is to be zero."""
+    (plant, observer), matrices = design.linear, design.certificate.matrices
+    goal = np.zeros((len(observer.Cz), plant.nx))
+    return TrackedPlant(
+        plant.E, plant.A, plant.B, plant.C, plant.D, matrices["T"], goal, plant.state_names, -matrices["T0"], plant.Bd,
+        plant.Dd,
+    )  # fmt: skip
 
 
 def _model(plant: DescriptorSystem, matrices: Mapping[str, FloatArray]) -> Exosystem:
@@ -104,7 +115,7 @@ def _identities(
     scaling = balance_by_least_squares(plant.E, plant.A, outputs=[plant.C])
     units = scaling.states
     # What cancels down to rounding is judged by the terms that it was formed of.
-    size_t, size_t0 = np.abs(t), np.abs(t0)
+    size_t, size_t0 = (_in_equations(matrix, scaling.equations) for matrix in (t, t0))
     yield "state in the error", "Az T E + By C = T A", Identity(
         (az @ (t @ plant.E), by @ plant.C, -t @ plant.A),
         ((az, t, plant.E), (by, plant.C), (size_t, plant.A), (az, t, plant.A)), units,
@@ -134,6 +145,12 @@ def _identities(
         "Dy Dd = T0 Bd",
         Identity((dy @ plant.Dd, -t0 @ plant.Bd), ((dy, plant.Dd), (size_t0, plant.Bd), (cz, t, plant.Bd))),
     )
+
+
+def _in_equations(matrix: FloatArray, equations: FloatArray) -> FloatArray:
+    """Return the largest entry of each row, in the units of each equation: what a row is made of."""
+    sizes = np.max(np.abs(matrix) / equations, axis=1, initial=0.0)
+    return np.asarray(np.outer(sizes, equations))
 
 
 def _tracking(

@@ -9,7 +9,6 @@ from obsynth.numerics.least_squares_step import LeastSquaresStep, least_squares_
 from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.observers.recursive.gain_schedule_summary import looked_at
 from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.observers.recursive.running import RunningRecursiveObserver, step_model_of
 from obsynth.observers.recursive.step_model import EarlyConstraintSteps, StepMatrices
 from obsynth.verification.consistency import data_deviations, state_terms
 
@@ -23,13 +22,13 @@ def batch_residuals(stated: RecursiveObserver, shipped: RecursiveObserver) -> di
     """Return how far the shipped recursion is from the batch solution of the stated problem."""
     steps = min(BATCH_STEPS, looked_at(stated))
     y, u = _record(stated, steps + 1)
-    running, reference = RunningRecursiveObserver(shipped), RunningRecursiveObserver(stated)
+    running, reference = shipped.init(), stated.init()
     for k in range(steps + 1):
         before = reference.x, reference.factor, reference.Upsilon
-        running.raw_step(y[k], u[k])
-        reference.raw_step(y[k], u[k])
+        running, _ = shipped.advance(running, y[k], u[k])
+        reference, _ = stated.advance(reference, y[k], u[k])
     exact = _solved(stated, y, u)
-    made_of = _terms(reference.model.at(steps - 1), before, (y[-1], u[-2], u[-1]))
+    made_of = _terms(stated.recursion.model.at(steps - 1), before, (y[-1], u[-2], u[-1]))
     covariance = exact.factor @ exact.factor.T
     size = made_of[:, 0] + np.abs(exact.estimate[:, 0]) + np.finfo(np.float64).tiny
     found = running.factor @ running.factor.T
@@ -91,8 +90,7 @@ def _solved(observer: RecursiveObserver, y: FloatArray, u: FloatArray) -> LeastS
 
 def _problem(observer: RecursiveObserver, y: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return H, S and data of ``data = H x + S e`` for all states at once."""
-    start = RunningRecursiveObserver(observer)
-    model, steps = step_model_of(observer), len(y) - 1
+    start, model, steps = observer.init(), observer.recursion.model, len(y) - 1
     n, nq = len(start.x), start.Upsilon.shape[1]
     listed: list[tuple[StepMatrices, FloatArray]] = [
         (model.at(k), np.concatenate([model.at(k).B @ u[k], y[k + 1], model.at(k).Dn @ u[k + 1]])) for k in range(steps)

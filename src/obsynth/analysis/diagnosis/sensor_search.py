@@ -1,0 +1,178 @@
+"""Least sets of sensors for detecting, isolating or estimating faults.
+
+Feasible sets grow with every sensor (none hurts), except where added sensors may fail themselves.  Few sets are
+enumerated, which is exact; many are not: greedy choices are not exact (y = (d1, d2, d1 + f): {1, 3} suffices, greedy
+takes three), so what is found then is inclusion-minimal, and said to be that only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from math import comb
+
+import numpy as np
+
+from obsynth.analysis.diagnosis.additions import Sensor, with_sensors
+from obsynth.analysis.diagnosis.columns import Question
+from obsynth.analysis.diagnosis.sensor_responses import SensorResponses
+from obsynth.plants.descriptor import DescriptorSystem
+
+#: What sensors may be wanted for.
+GOALS = ("detect", "isolate", "estimate-step", "estimate")
+#: Sets of one size are enumerated up to so many; the best of each size are confirmed until so many fail in a row.
+MOST_SETS = 40_000
+MOST_CONFIRMED = 400
+
+
+@dataclass(frozen=True)
+class Task:
+    """One thing to be reached: a fault, free of the unknown inputs and of the faults ``beside``."""
+
+    fault: int
+    beside: tuple[int, ...]
+    goal: str
+
+
+@dataclass(frozen=True, eq=False)
+class SensorSearch:
+    """A search over sets of candidate sensors.
+
+    Fields: faults: columns that count; may_fail: every added sensor brings a fault of its own, to be told as well;
+    copies: how often a candidate may be taken.
+    """
+
+    plant: DescriptorSystem
+    sensors: tuple[Sensor, ...]
+    goal: str
+    faults: tuple[int, ...]
+    may_fail: bool
+    copies: int
+
+    def tasks(self, plant: DescriptorSystem, faults: Sequence[int]) -> list[Task]:
+        """Return everything that the goal asks of a plant."""
+        if self.goal == "detect":
+            return [Task(i, (), self.goal) for i in faults]
+        if self.goal == "isolate":
+            pairs = [Task(i, (j,), self.goal) for i in faults for j in range(plant.nf) if j != i]
+            return [*(Task(i, (), self.goal) for i in faults), *pairs]
+        return [Task(i, tuple(j for j in range(plant.nf) if j != i), self.goal) for i in faults]
+
+    def reachable(self) -> list[Task]:
+        """Return the tasks that all candidates together reach: no set can do more."""
+        whole = with_sensors(self.plant, self.sensors)
+        return [task for task in self.tasks(self.plant, self.faults) if reached(whole, task)]
+
+    def equipped(self, chosen: Sequence[int]) -> DescriptorSystem:
+        """Return the plant with a set of candidates, each with a fault of its own where sensors may fail."""
+        names: list[str] = []
+        picked = []
+        for index in chosen:
+            name = self.sensors[index].name
+            names.append(name)
+            again = names.count(name)
+            label = name if again == 1 else f"{name} ({again})"
+            picked.append(replace(self.sensors[index], name=label))
+        plant = with_sensors(self.plant, picked)
+        if not self.may_fail or not picked:
+            return plant
+        count = len(picked)
+        own = np.vstack([np.zeros((self.plant.ny, count)), np.eye(count)])
+        return plant.replace(
+            Bf=np.hstack([plant.Bf, np.zeros((plant.nx, count))]), Df=np.hstack([plant.Df, own]),
+            fault_names=[*plant.fault_names, *(f"sensor {sensor.name}" for sensor in picked)],
+        )  # fmt: skip
+
+    def feasible(self, chosen: Sequence[int], wanted: Sequence[Task]) -> bool:
+        """Whether a set reaches all that is wanted (and all about its own faults)."""
+        plant = self.equipped(chosen)
+        if not all(reached(plant, task) for task in wanted):
+            return False
+        if not self.may_fail:
+            return True
+        own = range(self.plant.nf, plant.nf)
+        more = [task for task in self.tasks(plant, [*self.faults, *own]) if _is_new(task, self.plant.nf)]
+        return all(reached(plant, task) for task in more)
+
+    def minimal_sets(self, wanted: Sequence[Task], largest: int, most: int) -> tuple[list[tuple[int, ...]], bool]:
+        """Return inclusion-minimal sets by size, and whether these are all of them up to the largest size."""
+        responses = None if self.may_fail else SensorResponses.of(self.plant, self.sensors)
+        found: list[tuple[int, ...]] = []
+        count = len(self.sensors)
+        for size in range(largest + 1):
+            if comb(count * self.copies, size) > MOST_SETS:
+                return found, False
+            sets = [s for s in self._sets(size) if not any(_within(f, s) for f in found)]
+            new: list[tuple[int, ...]] = []
+            for tried, chosen in enumerate(self._promising(sets, wanted, responses), start=1):
+                if self.feasible(chosen, wanted):
+                    new.append(chosen)
+                if len(found) + len(new) >= most or tried >= MOST_CONFIRMED:
+                    return [*found, *new], False
+            found += new
+        return found, True
+
+    def _sets(self, size: int) -> Iterator[tuple[int, ...]]:
+        pool = [i for i in range(len(self.sensors)) for _ in range(self.copies)]
+        seen = set[tuple[int, ...]]()
+        for chosen in combinations(pool, size):
+            if chosen not in seen:
+                seen.add(chosen)
+                yield chosen
+
+    def _promising(
+        self, sets: Sequence[tuple[int, ...]], wanted: Sequence[Task], responses: SensorResponses | None
+    ) -> list[tuple[int, ...]]:
+        """Return the sets that pass the rank test, those that show most first."""
+        if responses is None or not sets or self.copies > 1:
+            return list(sets)
+        table = np.array(sets, dtype=np.int64).reshape(len(sets), -1)
+        strength = np.full(len(sets), np.inf)
+        for task in wanted:
+            strength = np.minimum(strength, responses.shows(table, task.fault, task.beside))
+        order = np.argsort(-strength, kind="stable")
+        return [sets[i] for i in order if strength[i] > 0.0]
+
+    def greedy_set(self, wanted: Sequence[Task]) -> tuple[int, ...] | None:
+        """Return one inclusion-minimal set: the sensor that reaches most, again and again; then what is not needed."""
+        chosen: list[int] = []
+        left = list(range(len(self.sensors)))
+        while not self.feasible(chosen, wanted):
+            if not left:
+                return None
+            scores = [self._score([*chosen, i], wanted) for i in left]
+            chosen.append(left.pop(int(np.argmax(scores))))
+        for index in list(chosen):
+            rest = [i for i in chosen if i != index]
+            if self.feasible(rest, wanted):
+                chosen = rest
+        return tuple(sorted(chosen))
+
+    def _score(self, chosen: Sequence[int], wanted: Sequence[Task]) -> float:
+        responses = SensorResponses.of(self.plant, self.sensors)
+        if responses is None:
+            plant = self.equipped(chosen)
+            return float(sum(reached(plant, task) for task in wanted))
+        table = np.array([chosen], dtype=np.int64)
+        shown = [float(responses.shows(table, task.fault, task.beside)[0]) for task in wanted]
+        return sum(value > 0.0 for value in shown) + min([value for value in shown if value > 0.0], default=0.0) / 2.0
+
+
+def reached(plant: DescriptorSystem, task: Task) -> bool:
+    """Whether a plant reaches a task, decided by taking out what must not show."""
+    asked = Question(plant, task.beside, task.fault, False)
+    if not asked.visible:
+        return False
+    if task.goal == "estimate":
+        return not asked.blocking.size
+    rest = 1.0 if plant.dt > 0.0 else 0.0
+    return asked.shows_at(rest) if task.goal == "estimate-step" else True
+
+
+def _is_new(task: Task, count: int) -> bool:
+    return task.fault >= count or any(j >= count for j in task.beside)
+
+
+def _within(small: Sequence[int], large: Sequence[int]) -> bool:
+    return all(small.count(i) <= large.count(i) for i in set(small))

@@ -1,0 +1,182 @@
+"""A plant over the box of its constants: matrices with proved remainders, transformed like the plant itself."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from obsynth.analysis.transformations.elimination import algebraic_coordinates
+from obsynth.errors import PreconditionError
+from obsynth.numerics.arrays import FloatArray
+from obsynth.plants.constants import ConstantsBox
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.uncertainty import SAMPLED, UNCERTAIN_MATRICES, matrices_of
+from obsynth.proofs.affine import AffineMatrix, affine_block, affine_inverse, affine_zero_order_hold
+
+#: Directions of the state that no constant touches are found down to this share of the others.
+UNTOUCHED_SHARE = 1e-7
+#: Their coordinates are rounded to this many digits: any invertible change of coordinates is exact.
+COORDINATE_DIGITS = 9
+#: Inputs, in the order in which they stand side by side.
+_INPUTS, _DIRECT = ("B", "Bf", "Bd"), ("D", "Df", "Dd")
+
+
+@dataclass(frozen=True, eq=False)
+class AffinePlant:
+    """The matrices of a plant over a box, for the state ``x'`` with ``x = coordinates x'``.
+
+    Columns of the state are those of x'; rows are those of the plant.  ``matrices`` has E, A, ..., Dd; ``offsets (p,)``
+    is where the nominal plant is in the unknowns.
+    """
+
+    plant: DescriptorSystem
+    box: ConstantsBox
+    matrices: Mapping[str, AffineMatrix]
+    coordinates: FloatArray
+
+    def __getattr__(self, name: str) -> AffineMatrix:
+        """Return a matrix by its letter."""
+        if name in UNCERTAIN_MATRICES:
+            return self.matrices[name]
+        raise AttributeError(name)
+
+    @property
+    def count(self) -> int:
+        """Number of unknowns."""
+        return len(self.box.names)
+
+    @property
+    def offsets(self) -> FloatArray:
+        """Where the nominal plant is in the unknowns."""
+        return self.box.offsets
+
+
+def affine_plant(plant: DescriptorSystem, box: ConstantsBox | None = None) -> AffinePlant:
+    """Return a plant over the box of its constants, or over another box of these.
+
+    Raises `PreconditionError` where the box makes an algebraic row dynamic, or a matrix that must be inverted singular.
+    """
+    uncertain = plant.uncertainty
+    if uncertain is None:
+        exact = {name: AffineMatrix.exact(matrix, 0) for name, matrix in matrices_of(plant).items()}
+        return AffinePlant(plant, ConstantsBox({}), exact, np.eye(plant.nx))
+    box = uncertain.box if box is None else box
+    written: Mapping[str, FloatArray] = matrices_of(plant) if uncertain.written is None else uncertain.written
+    matrices = uncertain.affine(written, box)
+    steps = uncertain.steps
+    if not steps:
+        basis = untouched_coordinates(_touched(matrices))
+        return AffinePlant(plant, box, _in_coordinates(matrices, basis), basis)
+    first = _reduced(written, matrices, None)
+    basis = untouched_coordinates(_touched(first))
+    reduced = first if np.array_equal(basis, np.eye(len(basis))) else _reduced(written, matrices, basis)
+    for kind, size in steps:
+        if kind == SAMPLED:
+            inputs = affine_block([[reduced[name] for name in _INPUTS]])
+            a, held = affine_zero_order_hold(reduced["A"], inputs, size)
+            reduced = {**reduced, "A": a, **_split(held, reduced, _INPUTS)}
+    back = {name: reduced[name].after(basis) for name in ("E", "A", *_INPUTS)}
+    return AffinePlant(plant, box, {**reduced, **back}, basis)
+
+
+def moving_family(plant: DescriptorSystem, box: ConstantsBox) -> AffineMatrix:
+    """Return A of the plant over a box, with its algebraic states eliminated, E inverted, and before it was sampled."""
+    uncertain = plant.uncertainty
+    if uncertain is None:
+        return AffineMatrix.exact(plant.A, 0)
+    written: Mapping[str, FloatArray] = matrices_of(plant) if uncertain.written is None else uncertain.written
+    return _reduced(written, uncertain.affine(written, box), None)["A"]
+
+
+def untouched_coordinates(touched: FloatArray) -> FloatArray:
+    """Return ``V (n, n)`` such that ``touched V`` has zero columns where ``touched (m, n)`` has a kernel.
+
+    V is the identity but for some columns, so that its inverse is exact: ``2 I - V``.
+    """
+    from scipy.linalg import qr
+
+    n = touched.shape[1]
+    sizes = np.linalg.norm(touched, axis=1)
+    rows = touched[sizes > 0.0] / sizes[sizes > 0.0][:, None]
+    if not len(rows):
+        return np.eye(n)
+    _, values, right = np.linalg.svd(rows, full_matrices=False)
+    rank = int(np.sum(values > UNTOUCHED_SHARE * values[0]))
+    basis = right[:rank]
+    seen = np.flatnonzero(np.abs(basis).max(axis=0) > UNTOUCHED_SHARE)
+    if rank == len(seen):
+        return np.eye(n)
+    pivots = seen[qr(basis[:, seen], pivoting=True, mode="r")[1][:rank]]
+    free = [j for j in seen.tolist() if j not in set(pivots.tolist())]
+    found = np.eye(n)
+    inside = np.round(np.linalg.solve(basis[:, pivots], basis[:, free]), COORDINATE_DIGITS)
+    found[np.ix_(pivots, free)] = -inside
+    return found
+
+
+def _touched(matrices: Mapping[str, AffineMatrix]) -> FloatArray:
+    """Return what the constants multiply the state with, all rows of all of them."""
+    stacked = [matrices[name].parts.reshape(-1, matrices[name].shape[1]) for name in ("E", "A", "C")]
+    return np.vstack(stacked)
+
+
+def _in_coordinates(matrices: Mapping[str, AffineMatrix], basis: FloatArray) -> dict[str, AffineMatrix]:
+    if np.array_equal(basis, np.eye(len(basis))):
+        return dict(matrices)
+    return {**matrices, **{name: matrices[name] @ basis for name in ("E", "A", "C")}}
+
+
+def _split(whole: AffineMatrix, like: Mapping[str, AffineMatrix], names: tuple[str, ...]) -> dict[str, AffineMatrix]:
+    """Return blocks of columns by name, as wide as those of ``like``."""
+    ends = np.cumsum([0, *(like[name].shape[1] for name in names)])
+    return {name: whole[:, ends[i] : ends[i + 1]] for i, name in enumerate(names)}
+
+
+def _reduced(
+    written: Mapping[str, FloatArray], matrices: Mapping[str, AffineMatrix], basis: FloatArray | None
+) -> dict[str, AffineMatrix]:
+    """Return the plant with its algebraic states eliminated and E inverted, in coordinates of its dynamic state.
+
+    With ``x2 = X0 z + xi``, X0 the solution at the middle and z the dynamic state and the inputs, only what the
+    constants change is multiplied by the inverse that depends on them: what they do not touch stays untouched.
+    """
+    n, count = len(written["A"]), matrices["A"].count
+    rows, dynamic, algebraic = algebraic_coordinates(DescriptorSystem(written["E"], written["A"], C=np.zeros((1, n))))
+    nd = dynamic.shape[1]
+    v = np.eye(nd) if basis is None else basis
+    e = matrices["E"].after(rows)
+    _require_algebraic(e[nd:, :], e @ algebraic)
+    whole = affine_block([[matrices["A"] @ np.hstack([dynamic @ v, algebraic]), *(matrices[k] for k in _INPUTS)]])
+    a = whole.after(rows)
+    state, inner = slice(0, nd), slice(nd, n)
+    keep = [*range(nd), *range(n, a.shape[1])]
+    direct = [[matrices["C"] @ (dynamic @ v), *(matrices[k] for k in _DIRECT)]]
+    outputs, top = affine_block(direct), a[state, keep]
+    if nd < n:
+        middle = np.asarray(np.linalg.solve(a.center[inner, nd:n], -a.center[inner][:, keep]), dtype=np.float64)
+        changed = a[inner, keep] + a[inner, inner] @ middle
+        more = -(affine_inverse(a[inner, inner]) @ changed)
+        top = top + a[state, inner] @ middle + a[state, inner] @ more
+        seen = matrices["C"] @ algebraic
+        outputs = outputs + seen @ middle + seen @ more
+    moving = affine_inverse((e @ dynamic)[state, :])
+    top = (moving @ top).after(2.0 * np.eye(nd) - v)
+    like = {"A": AffineMatrix.exact(np.zeros((nd, nd)), count), **{k: matrices[k] for k in (*_INPUTS, *_DIRECT)}}
+    found = _split(top, like, ("A", *_INPUTS))
+    read = _split(outputs, {**like, "C": like["A"]}, ("C", *_DIRECT))
+    return {"E": AffineMatrix.exact(np.eye(nd), count), **found, **read}
+
+
+def _require_algebraic(rows: AffineMatrix, columns: AffineMatrix) -> None:
+    """Refuse a box that puts a derivative into an algebraic row, or of an algebraic state."""
+    for what, found, axis in (("row", rows, 1), ("state", columns, 0)):
+        moving = (np.abs(found.center) + found.spread + found.radius).any(axis=axis)
+        if moving.any():
+            numbers = ", ".join(str(i + 1) for i in np.flatnonzero(moving))
+            raise PreconditionError(
+                f"The tolerances put a derivative into an algebraic equation ({what} {numbers} of those that have "
+                "none at the nominal values): the plant's order would change in the box. Give E no tolerance there.",
+                condition="algebraic rows",
+            )  # fmt: skip

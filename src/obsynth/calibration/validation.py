@@ -1,0 +1,104 @@
+"""Whether a recorded log without faults agrees with a design: the result."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from obsynth.calibration.diagnostics import Consistency, Whiteness
+from obsynth.numerics.arrays import FloatArray
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True)
+class SensorValidation:
+    """What the innovations of one sensor say.
+
+    Parameters
+    ----------
+    nis : Consistency
+        Mean square in units of the expected variance, with its 95 % interval.
+    mean : float
+        Of the innovations, in standard deviations of such a mean for white ones; beyond 3 it is an offset.
+    whiteness : Whiteness
+        Test of Ljung and Box.
+    """
+
+    nis: Consistency
+    mean: float
+    whiteness: Whiteness
+
+
+@dataclass(frozen=True, eq=False)
+class Validation:
+    """Whether a log agrees with a design.
+
+    Parameters
+    ----------
+    passed : bool
+        Whether every check holds.
+    name : str
+        Of the design.
+    nis : Consistency
+        Normalised innovations squared per degree of freedom, with its 95 % interval.
+    sensors : mapping of str to SensorValidation
+        By output.
+    ratios : mapping of str to float
+        Likeliest variance on this log over that of the design, by noisy equation and by sensor, where the log tells
+        them apart clearly.
+    change : int or None
+        Row of the log at which the mean of the innovations changes.
+    verdict : tuple of str
+        A sentence for each thing that was found, with what to change.
+    innovations, deviations, measured, predicted : FloatArray
+        ``(n, ny)``, in units of the outputs; NaN where nothing was measured.
+    estimates : mapping of str to FloatArray
+        ``(n, 2)``: each estimated parameter with its standard deviation.
+    log : mapping
+        ``source``, ``rows``, ``digest``, ``samples`` and ``dt``.
+    """
+
+    passed: bool
+    name: str
+    nis: Consistency
+    sensors: Mapping[str, SensorValidation]
+    ratios: Mapping[str, float]
+    change: int | None
+    verdict: tuple[str, ...]
+    innovations: FloatArray
+    deviations: FloatArray
+    measured: FloatArray
+    predicted: FloatArray
+    estimates: Mapping[str, FloatArray]
+    log: Mapping[str, Any]
+
+    def __str__(self) -> str:
+        rows = f"rows {self.log['rows'][0]}:{self.log['rows'][1]}"
+        state = "agrees" if self.passed else "DOES NOT AGREE"
+        lines = [f"{self.log['source'] or 'The log'}, {rows}, {state} with the design {self.name!r}."]
+        nis = self.nis
+        lines.append(f"  NIS per degree of freedom {nis.value:.3g} (95 %: {nis.low:.2f} to {nis.high:.2f})")
+        width = max(len(name) for name in self.sensors)
+        lines.append(f"  {'':<{width}}  mean square  mean (deviations)  white (p)")
+        for name, found in self.sensors.items():
+            lines.append(f"  {name:<{width}}  {found.nis.value:<11.3g}  {found.mean:<+17.2g}  "
+                         f"{found.whiteness.probability:.2g}")  # fmt: skip
+        return "\n".join([*lines, *(f"  - {sentence}" for sentence in self.verdict)])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything but the records as plain data."""
+        return {
+            "passed": self.passed, "name": self.name, "nis": vars(self.nis) | {"holds": self.nis.holds},
+            "sensors": {name: {"nis": vars(found.nis) | {"holds": found.nis.holds}, "mean": found.mean,
+                               "whiteness": vars(found.whiteness)} for name, found in self.sensors.items()},
+            "ratios": dict(self.ratios), "change": self.change, "verdict": list(self.verdict), "log": dict(self.log),
+        }  # fmt: skip
+
+    def plot(self) -> Figure:
+        """Return a picture: measured and predicted signals, innovations in their band, estimates."""
+        from obsynth.calibration.pictures import validation_figure
+
+        return validation_figure(self)

@@ -1,0 +1,1 @@
+"""Side by side: which method, and which sensors."""

@@ -1,0 +1,301 @@
+"""Which sensors to add, ranked by cost and then by how well the fault can be estimated after design."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from html import escape
+from typing import Any
+
+import numpy as np
+
+from obsynth.analysis.diagnosis.additions import Sensor, state_sensors
+from obsynth.analysis.diagnosis.decoupled import fault_numbers
+from obsynth.analysis.diagnosis.sensor_search import GOALS, SensorSearch, Task, reached
+from obsynth.errors import ObsynthError, PreconditionError, SpecError
+from obsynth.methods.functional_filter.public import functional_filter
+from obsynth.numerics.arguments import is_finite_number, require_kind
+from obsynth.plants.descriptor import DescriptorSystem
+
+#: So many sets are returned at most by default, and so many of them designed for.
+MOST = 24
+
+
+@dataclass(frozen=True)
+class SensorSet:
+    """A set of sensors that reaches the goal.
+
+    Parameters
+    ----------
+    sensors : tuple of str
+        What to measure besides.
+    cost : float
+        Sum of their costs.
+    deviation : float or None
+        Largest standard deviation of the error of an estimate after design, over the faults asked for; ``None`` where
+        noise is not stated, or nothing is estimated.
+    """
+
+    sensors: tuple[str, ...]
+    cost: float
+    deviation: float | None
+
+
+@dataclass(frozen=True)
+class SensorSets:
+    """Sets of sensors that reach a goal, cheapest first; made by `sensor_sets`.
+
+    Parameters
+    ----------
+    goal : str
+        What they are for.
+    sets : tuple of SensorSet
+        Ranked by cost, then by deviation after design.
+    exact : bool
+        Whether these are all inclusion-minimal sets; otherwise each is inclusion-minimal, and others may be cheaper.
+    out_of_reach : tuple of str
+        What not even all candidates together reach, in words.
+    may_be_lost : tuple of str
+        Outputs of the plant that may fail, one at a time, without losing the goal (with no sensor added).
+    notes : tuple of str
+        What was searched.
+    """
+
+    goal: str
+    sets: tuple[SensorSet, ...]
+    exact: bool
+    out_of_reach: tuple[str, ...]
+    may_be_lost: tuple[str, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def best(self) -> SensorSet | None:
+        """The first set, or ``None``."""
+        return self.sets[0] if self.sets else None
+
+    def rows(self) -> tuple[tuple[str, ...], ...]:
+        """Return the table as texts: the header, then one row per set."""
+        body = [
+            (", ".join(found.sensors) or "nothing", f"{found.cost:g}", "-" if found.deviation is None
+             else f"{found.deviation:.3g}")
+            for found in self.sets
+        ]  # fmt: skip
+        return (("add", "cost", "deviation after design"), *body)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the result as plain data."""
+        return {
+            "goal": self.goal, "exact": self.exact, "out_of_reach": list(self.out_of_reach),
+            "may_be_lost": list(self.may_be_lost), "notes": list(self.notes),
+            "sets": [
+                {"sensors": list(found.sensors), "cost": found.cost, "deviation": found.deviation}
+                for found in self.sets
+            ],
+        }  # fmt: skip
+
+    def __str__(self) -> str:
+        rows = self.rows()
+        widths = [max(len(row[j]) for row in rows) for j in range(3)]
+        lines = ["  ".join(text.ljust(w) for text, w in zip(row, widths, strict=True)).rstrip() for row in rows]
+        return "\n".join([f"Sensors to {self.goal}:", *lines, *self.out_of_reach, *self.notes])
+
+    def _repr_html_(self) -> str:
+        rows = self.rows()
+        body = "".join("<tr>" + "".join(f"<td>{escape(text)}</td>" for text in row) + "</tr>" for row in rows[1:])
+        head = "".join(f"<th>{escape(text)}</th>" for text in rows[0])
+        texts = "".join(f"<p>{escape(text)}</p>" for text in (*self.out_of_reach, *self.notes))
+        return f"<table><tr>{head}</tr>{body}</table>{texts}"
+
+
+def sensor_sets(
+    plant: DescriptorSystem,
+    *,
+    goal: str = "estimate",
+    faults: Sequence[str] | None = None,
+    candidates: Sequence[str] | Mapping[str, Any] | None = None,
+    cost: Mapping[str, float] | None = None,
+    noise: float | Mapping[str, float] | None = None,
+    largest: int | None = None,
+    copies: int = 1,
+    may_fail: bool = False,
+    most: int = MOST,
+    progress: Callable[[str], None] | None = None,
+) -> SensorSets:
+    """Find least sets of sensors to add for detecting, isolating or estimating faults.
+
+    Few sets are enumerated, which is exact.  Otherwise what is found is inclusion-minimal (no sensor of a set can be
+    left out) and said to be that only.  Every answer is confirmed on the decoupled plant.
+
+    Parameters
+    ----------
+    plant : DescriptorSystem
+        Either time; its outputs are there already.
+    goal : {"detect", "isolate", "estimate-step", "estimate"}, optional
+        What every fault asked for must be: shown free of the unknown inputs; told from each other fault as well;
+        estimated as a step, or whatever its course, free of all others.
+    faults : sequence of str, optional
+        All by default.
+    candidates : sequence of str or mapping, optional
+        Names of states that can be measured, or a row ``(nx,)`` of C by the name of each sensor; by default every state
+        that is no output.
+    cost : mapping of str to float, optional
+        By candidate, 1 by default.
+    noise : float or mapping of str to float, optional
+        Standard deviation of each candidate: sets of equal cost are then ranked by the error after design.
+    largest : int, optional
+        Most sensors to add; by default as many as can be needed, nd + nf + 1.
+    copies : int, optional
+        How often one candidate may be measured.
+    may_fail : bool, optional
+        Every added sensor may fail: its fault must be told as well.
+    most : int, optional
+        Sets returned at most.
+    progress : callable, optional
+        Called with a text at the start of each stage.
+
+    Returns
+    -------
+    SensorSets
+        Also which outputs may be lost without losing the goal.
+
+    Raises
+    ------
+    SpecError
+        An unknown goal, fault or candidate, or a cost or noise that is no positive number.
+    PreconditionError
+        Not even all candidates together reach anything of the goal.
+
+    References
+    ----------
+    .. [Krysander] M. Krysander, E. Frisk, "Sensor placement for fault diagnosis", IEEE Trans. SMC-A 38, 2008: the
+       question, on structure alone.  Here the numbers decide, zeros included.
+    """
+    require_kind(plant, DescriptorSystem, "plant", "an obsynth.DescriptorSystem")
+    report_stage = progress or (lambda _: None)
+    chosen = tuple(range(plant.nf)) if faults is None else tuple(fault_numbers(plant, faults, "faults"))
+    if goal not in GOALS:
+        raise SpecError(f"goal is {goal!r}: use one of {', '.join(GOALS)}.", path="goal")
+    if not chosen:
+        raise SpecError("The plant has no faults to place sensors for.", path="faults")
+    sensors = _candidates(plant, candidates, noise)
+    costs = _costs(sensors, cost)
+    search = SensorSearch(plant, sensors, goal, chosen, may_fail, copies)
+    report_stage("asking what all candidates together reach")
+    wanted = search.reachable()
+    lost = [task for task in search.tasks(plant, chosen) if task not in wanted]
+    if not wanted:
+        raise PreconditionError(
+            f"Not even all {len(sensors)} candidates together let any fault be had: to {goal} is out of reach. Give "
+            "other candidates, or a weaker goal.",
+            condition="sensors", signals=tuple(plant.fault_names[i] for i in chosen),
+        )  # fmt: skip
+    report_stage("searching for least sets")
+    bound = largest if largest is not None else min(plant.nd + len(chosen) + 1 + may_fail, len(sensors) * copies)
+    found, exact = search.minimal_sets(wanted, bound, most)
+    notes = [_note(search, exact, bound, most, len(found))]
+    if not found:
+        one = search.greedy_set(wanted)
+        found = [] if one is None else [one]
+        exact = False
+    report_stage("designing for each set")
+    ranked = _ranked(search, found, costs, noise is not None and goal.startswith("estimate"))
+    kept = tuple(name for i, name in enumerate(plant.output_names) if _kept_without(search, wanted, i))
+    return SensorSets(goal, ranked, exact, tuple(_in_words(plant, lost)), kept, tuple(notes))
+
+
+def _candidates(
+    plant: DescriptorSystem, given: Sequence[str] | Mapping[str, Any] | None, noise: Any
+) -> tuple[Sensor, ...]:
+    if isinstance(given, Mapping):
+        zero = (np.zeros(plant.nu), np.zeros(plant.nd), np.zeros(plant.nf))
+        rows = {name: np.asarray(row, dtype=np.float64) for name, row in given.items()}
+        wrong = [name for name, row in rows.items() if row.shape != (plant.nx,) or not np.all(np.isfinite(row))]
+        if wrong:
+            raise SpecError(f"{', '.join(wrong)}: give a row of {plant.nx} numbers for C.", path="candidates")
+        sensors: tuple[Sensor, ...] = tuple(Sensor(str(name), row, *zero) for name, row in rows.items())
+    else:
+        listed = None if given is None else list(given)
+        unknown = [name for name in listed or () if name not in plant.state_names]
+        if unknown:
+            raise SpecError(f"{', '.join(map(repr, unknown))}: no such state.", path="candidates")
+        sensors = state_sensors(plant, listed)
+    if noise is None:
+        return sensors
+    levels = noise if isinstance(noise, Mapping) else {sensor.name: noise for sensor in sensors}
+    _require_positive(levels, [sensor.name for sensor in sensors], "noise", whole=True)
+    return tuple(replace(sensor, deviation=float(levels[sensor.name])) for sensor in sensors)
+
+
+def _costs(sensors: Sequence[Sensor], cost: Mapping[str, float] | None) -> list[float]:
+    given = cost or {}
+    _require_positive(given, [sensor.name for sensor in sensors], "cost", whole=False)
+    return [float(given.get(sensor.name, 1.0)) for sensor in sensors]
+
+
+def _require_positive(given: Mapping[str, Any], names: Sequence[str], what: str, *, whole: bool) -> None:
+    unknown = [name for name in given if name not in names]
+    missing = [name for name in names if name not in given] if whole else []
+    wrong = [name for name, value in given.items() if not (is_finite_number(value) and value > 0.0)]
+    if unknown or missing or wrong:
+        raise SpecError(f"{what}: unknown {unknown}, missing {missing}, not a positive number {wrong}.", path=what)
+
+
+def _note(search: SensorSearch, exact: bool, bound: int, most: int, count: int) -> str:
+    if exact:
+        return f"All inclusion-minimal sets of at most {bound} of {len(search.sensors)} candidates."
+    if count >= most:
+        return f"The first {most} inclusion-minimal sets found, those that show most at a generic point first."
+    plain = search.goal == "detect"
+    size = f"; a least set has at most {search.plant.nd + 1} sensors for each fault" if plain else ""
+    return f"Too many sets to try all: each one given is inclusion-minimal, others may be cheaper{size}."
+
+
+def _ranked(
+    search: SensorSearch, found: Sequence[tuple[int, ...]], costs: Sequence[float], with_design: bool
+) -> tuple[SensorSet, ...]:
+    rates: dict[str, float] | None = None
+    rows = []
+    for chosen in found:
+        names = tuple(search.sensors[i].name for i in chosen)
+        deviation = None
+        if with_design:
+            deviation, rates = _deviation(search, chosen, rates)
+        rows.append(SensorSet(names, sum(costs[i] for i in chosen), deviation))
+    return tuple(sorted(rows, key=lambda row: (row.cost, np.inf if row.deviation is None else row.deviation)))
+
+
+def _deviation(
+    search: SensorSearch, chosen: Sequence[int], rates: dict[str, float] | None
+) -> tuple[float | None, dict[str, float] | None]:
+    """Return the largest deviation after design, all sets with the walks that the first of them got by default."""
+    plant = search.equipped(chosen)
+    names = [plant.fault_names[i] for i in search.faults]
+    try:
+        made = functional_filter(plant, faults=names, fault_rate=rates)
+    except ObsynthError:
+        return None, rates
+    if rates is None and made.options["fault_rate_found"] is not None:
+        rates = dict(zip(made.observer.fault_names, made.options["fault_rate_found"], strict=True))
+    return float(np.max(made.certificate.matrices["deviations"][:, 1])), rates
+
+
+def _kept_without(search: SensorSearch, wanted: Sequence[Task], output: int) -> bool:
+    """Whether the plant as it is reaches what is wanted without one of its outputs."""
+    plant = search.plant
+    rest = [i for i in range(plant.ny) if i != output]
+    fewer = plant.replace(
+        C=plant.C[rest], D=plant.D[rest], Dd=plant.Dd[rest], Df=plant.Df[rest], Dw=plant.Dw[rest],
+        output_names=[plant.output_names[i] for i in rest],
+        scales={name: value for name, value in plant.scales.items() if name != plant.output_names[output]},
+        units={}, operating_point={},
+    )  # fmt: skip
+    return all(reached(fewer, task) for task in wanted)
+
+
+def _in_words(plant: DescriptorSystem, lost: Sequence[Task]) -> list[str]:
+    texts = []
+    for task in lost:
+        name = plant.fault_names[task.fault]
+        beside = ", ".join(plant.fault_names[j] for j in task.beside)
+        texts.append(f"{name}: out of reach of all candidates" + (f" (from {beside})." if beside else "."))
+    return texts

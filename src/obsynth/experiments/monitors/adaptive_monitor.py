@@ -1,0 +1,134 @@
+"""From a design with tolerances to an adaptive threshold, and the sentence that says what it promises."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from obsynth.analysis.transformations.uncertain_plant import AffinePlant, affine_plant
+from obsynth.errors import PreconditionError, SpecError
+from obsynth.experiments.monitors.adaptive_bound import Start, adaptive_bound
+from obsynth.experiments.monitors.adaptive_rule import AdaptivePlan
+from obsynth.numerics.arguments import is_finite_number, require_mapping
+from obsynth.numerics.arrays import FloatArray
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.results.design import ObserverDesign
+from obsynth.tolerances.responses import loop_radius
+from obsynth.tolerances.robustness import EXACT_MODEL, structure_of
+from obsynth.tolerances.tracking import Tracking, tracking_of
+
+#: What a statement adds where no tolerance is known.
+EXACT = f"; {EXACT_MODEL}"
+
+
+def adaptive_plan(
+    design: ObserverDesign, bounds: FloatArray, noise_bound: float, *, initial_error: float | None,
+    initial_set: Mapping[str, Any] | None, observer_state: FloatArray | None = None,
+) -> tuple[AdaptivePlan, AdaptivePlan]:  # fmt: skip
+    """Return the plan from the first start on, and the one after a later start; the design's plant has the tolerances.
+
+    Raises `PreconditionError` where there is no bound, with the reason.
+    """
+    plant, observer = design.linear
+    affine = affine_plant(plant)
+    tracking = tracking_of(design, affine)
+    varying = affine.box.variation == "varying"
+    noise = noise_bound if plant.nw else 0.0
+    sizes = np.where(np.isfinite(bounds), bounds, 0.0)
+    structure = structure_of(design, affine, tracking, bounds=sizes, noise_bound=noise)
+    reached = structure.disturbances.magnitude.max(axis=0, initial=0.0)[: plant.nd] > 0.0
+    if np.any(reached & ~np.isfinite(bounds)):
+        raise SpecError("A disturbance has no bound: give disturbance_bounds (--disturbance).",
+                        path="disturbance_bounds")  # fmt: skip
+    z = np.zeros(observer.order) if observer_state is None else observer_state
+    start = _start(plant, tracking, initial_error, initial_set, affine, z)
+    later = Start(observer.order, norm=initial_error, state=z)
+    reason, faults, same = "", None, False
+    try:
+        with_faults = structure_of(design, affine, tracking, bounds=sizes, noise_bound=noise, faults=True)
+        same = affine.Bf.is_certain and affine.Df.is_certain
+        faults = None if same else with_faults
+    except PreconditionError as error:
+        reason = str(error)
+
+    def plan(begin: Start) -> AdaptivePlan:
+        return AdaptivePlan(
+            adaptive_bound(structure, observer, begin, varying=varying),
+            None if faults is None else adaptive_bound(faults, observer, begin, varying=varying), same, reason,
+            begin.norm is None, affine.box.names, observer.fault_names, observer.residual_names,
+        )  # fmt: skip
+
+    return plan(start), plan(later)
+
+
+def _start(
+    plant: DescriptorSystem, tracking: Tracking, initial_error: float | None, initial_set: Mapping[str, Any] | None,
+    affine: AffinePlant, z: FloatArray,
+) -> Start:  # fmt: skip
+    """Return what is known of eps at the start, ``z - T E(q) x`` for x in a box."""
+    if initial_set is None:
+        return Start(len(z), norm=initial_error, state=z)
+    center, radius = initial_box(plant, initial_set)
+    back = 2.0 * np.eye(plant.nx) - affine.coordinates
+    followed = affine.E.after(tracking.T) @ back
+    offset = followed.center @ center
+    size = np.abs(followed.center) @ radius + (followed.spread + followed.radius) @ (np.abs(center) + radius)
+    return Start(len(z), center=z - offset, radius=size * (1.0 + 1e-12), state=z)
+
+
+def initial_box(plant: DescriptorSystem, given: Mapping[str, Any]) -> tuple[FloatArray, FloatArray]:
+    """Return middle and half width of the box of the plant's state at the start, ``(nx,)`` each; deviations.
+
+    States that E does not see need no entry: an algebraic state follows from the others.
+    """
+    require_mapping(given, "initial_set")
+    center, radius = np.zeros(plant.nx), np.zeros(plant.nx)
+    needed = np.abs(plant.E).max(axis=0, initial=0.0) > 0.0
+    unknown = sorted(set(given) - set(plant.state_names))
+    if unknown:
+        raise SpecError(f"initial_set has the unknown state {unknown[0]!r}; there are {', '.join(plant.state_names)}.",
+                        path="initial_set")  # fmt: skip
+    for i, name in enumerate(plant.state_names):
+        if name not in given:
+            if needed[i]:
+                raise SpecError(f"initial_set has no entry for the state {name!r}: give a bound, or [low, high].",
+                                path="initial_set")  # fmt: skip
+            continue
+        low, high = _ends(name, given[name])
+        center[i], radius[i] = (low + high) / 2.0, (high - low) / 2.0
+    return center, radius
+
+
+def _ends(name: str, value: Any) -> tuple[float, float]:
+    ends = list(value) if isinstance(value, (list, tuple, np.ndarray)) else [value]
+    if is_finite_number(value) and value >= 0.0:
+        return -float(value), float(value)
+    if len(ends) == 2 and all(map(is_finite_number, ends)) and ends[0] <= ends[1]:
+        return float(ends[0]), float(ends[1])
+    raise SpecError(f"initial_set of {name!r} is {value!r}: give a bound of its absolute value, or [low, high].",
+                    path="initial_set")  # fmt: skip
+
+
+def adaptive_statement(plan: AdaptivePlan, design: ObserverDesign) -> str:
+    """Return what an alarm proves, and what bounds may do in the long run."""
+    uncertain = design.linear[0].uncertainty
+    box = None if uncertain is None or not uncertain.box.names else uncertain.box
+    outside = "a model that is not exact" if box is None else box.sentence
+    text = (
+        "passed by a fault since the start only, or by "
+        f"{outside}; no plant within its tolerances, disturbance or noise within its bounds and start explains it; a "
+        "fault that passes it need not last: an interval that excludes zero says that it does"
+    )
+    if box is None:
+        return text + EXACT
+    kept = "constants stay the same" if box.variation == "constant" else (
+        "constants may change at each sample (the value at k + 1 multiplies x(k+1))"
+    )  # fmt: skip
+    radius = loop_radius(plan.bound.responses)
+    ever = "" if radius < 1.0 else (
+        f"; the loop through the tolerances has radius {radius:.3g}: the threshold holds at each sample, but may grow"
+    )  # fmt: skip
+    missing = "" if plan.intervals or not plan.fault_names else f"; no guaranteed interval of faults: {plan.reason}"
+    return f"{text}; {kept}{ever}{missing}"

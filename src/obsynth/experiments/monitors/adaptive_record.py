@@ -1,0 +1,162 @@
+"""The adaptive threshold over whole records of one or many runs."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from obsynth.experiments.monitors.adaptive_bound import THRESHOLD_ROUNDING, AdaptiveBound
+from obsynth.numerics.arrays import FloatArray
+
+#: Samples whose dependence on older ones is computed at once.
+BLOCK = 32
+
+
+class Thresholds(NamedTuple):
+    """Bounds of the outputs (fault estimates, then residuals), ``(runs, steps, no)``.
+
+    ``total = nominal + start + sum of first + rest``; ``first (runs, steps, p, no)`` is what each constant adds to
+    first order, ``shift`` where the middle of the interval is (not zero for a box that is not centred).
+    """
+
+    total: FloatArray
+    first: FloatArray
+    shift: FloatArray
+    start: FloatArray
+    rest: FloatArray
+    channels: FloatArray
+
+
+def thresholds_of_records(
+    bound: AdaptiveBound, estimates: FloatArray, inputs: FloatArray, outputs: FloatArray
+) -> Thresholds:
+    """Return the thresholds for records from the start on.
+
+    ``estimates (runs, steps, n)`` of the state (and faults) as `ErrorStructure.reading` gives them, ``inputs (runs,
+    steps, nu)``, ``outputs (runs, steps, ny)``.
+    """
+    _, _, _, m, no = bound.counts
+    v = np.concatenate([estimates, inputs], axis=2)
+    first_channels, first, shift = (_first_varying if bound.varying else _first_constant)(bound, v)
+    steps = v.shape[1]
+    start = np.array([bound.start_at(k) for k in range(steps)]).reshape(steps, m + no)
+    largest = np.concatenate([np.abs(inputs), np.abs(outputs), np.abs(estimates)], axis=2)
+    largest = np.maximum.accumulate(np.concatenate([largest, np.ones((*largest.shape[:2], 1))], axis=2), axis=1)
+    known = bound.known(estimates, inputs)
+    fixed = largest @ bound.rounding.T + known @ bound.same + bound.nominal + start
+    fixed[:, :, :m] += first_channels @ bound.solved.T
+    ring, found = _recursion(bound, fixed[:, :, :m], known)
+    rest = found + largest @ bound.rounding[m:].T + ring @ bound.same[:, m:]
+    total = (bound.nominal[m:] + start[:, m:] + first.sum(axis=2) + np.abs(shift) + rest) * THRESHOLD_ROUNDING
+    return Thresholds(total, first, shift, np.broadcast_to(start[:, m:], total.shape), rest, ring[:, :, :m])
+
+
+def _first_constant(bound: AdaptiveBound, v: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return first-order bounds of channels, ``|phi|`` of each constant, and the shift of the outputs' middle."""
+    p, nz, rows, _, no = bound.counts
+    runs, steps = v.shape[:2]
+    offsets = bound.structure.offsets
+    if not p:
+        zero = np.zeros((runs, steps, no))
+        return np.zeros((runs, steps, bound.counts[3])), np.zeros((runs, steps, 0, no)), zero
+    w = (v @ bound.drive.reshape(-1, v.shape[2]).T).reshape(runs, steps, p, nz + rows + no)
+    psi = _filtered(bound.structure.Az, w[..., :nz])
+    seen = w[..., nz:] + psi @ bound.shown.T
+    channels, phi = seen[..., :rows], seen[..., rows:]
+    shift = -np.tensordot(phi, offsets, axes=(2, 0)) if offsets.any() else np.zeros((runs, steps, no))
+    moved = np.abs(channels).sum(axis=2)
+    if offsets.any():
+        moved += np.abs(np.tensordot(channels, offsets, axes=(2, 0)))
+    return _seen(bound, moved), np.abs(phi), shift
+
+
+def _seen(bound: AdaptiveBound, values: FloatArray) -> FloatArray:
+    return np.moveaxis(bound.structure.seen(np.moveaxis(values, -1, 0)), 0, -1)
+
+
+def _filtered(az: FloatArray, w: FloatArray) -> FloatArray:
+    """Return ``psi(k+1) = Az psi(k) + w(k)`` from zero, ``(runs, steps, p, nz)``; blocks side by side."""
+    runs, steps, p, nz = w.shape
+    size = max(1, int(np.sqrt(steps)))
+    blocks = -(-steps // size)
+    padded = np.zeros((runs, blocks * size, p, nz))
+    padded[:, :steps] = w
+    inside = padded.reshape(runs, blocks, size, p, nz)
+    found = np.zeros((runs, blocks, size + 1, p, nz))
+    turned = np.ascontiguousarray(az.T)
+    for k in range(size):
+        found[:, :, k + 1] = found[:, :, k] @ turned + inside[:, :, k]
+    begin = np.zeros((runs, p, nz))
+    power = np.linalg.matrix_power(turned, size)
+    begins = np.empty((runs, blocks, p, nz))
+    for b in range(blocks):
+        begins[:, b] = begin
+        begin = begin @ power + found[:, b, size]
+    step = begins
+    for k in range(size):
+        found[:, :, k] += step
+        step = step @ turned
+    return np.asarray(found[:, :, :size].reshape(runs, blocks * size, p, nz)[:, :steps])
+
+
+def _first_varying(bound: AdaptiveBound, v: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the same for constants that may change at each sample: sums of absolute values, sample by sample."""
+    p, nz, rows, m, no = bound.counts
+    runs, steps, nv = v.shape
+    zero = np.zeros((runs, steps, no))
+    if not p:
+        return np.zeros((runs, steps, m)), np.zeros((runs, steps, 0, no)), zero
+    inner = bound.drive[:, :nz]
+    whole = np.abs(v @ bound.drive[:, nz:].reshape(-1, nv).T).reshape(runs, steps, p, rows + no)
+    eps = np.zeros((runs, steps + bound.length, nz))
+    for j, power in enumerate(bound.responses.powers[:-1]):
+        if j + 1 > steps:
+            break
+        moved = np.concatenate([bound.shown @ power @ inner, power @ inner], axis=1)
+        sizes = np.abs(v[:, : steps - j - 1] @ moved.reshape(-1, nv).T).reshape(runs, -1, p, rows + no + nz)
+        whole[:, j + 1 :] += sizes[..., : rows + no]
+        eps[:, bound.length + j + 1 :] += np.einsum("rkpz,p->rkz", sizes[..., rows + no :], bound.spans)
+    for k in range(bound.length, steps + bound.length):
+        eps[:, k] += eps[:, k - bound.length] @ bound.responses.tail_eps.T
+    first = whole * bound.spans[:, None]
+    older = eps[:, :steps]
+    channels = _seen(bound, first[..., :rows].sum(axis=2) + older @ bound.tail_rows.T)
+    outputs = first[..., rows:]
+    # What is older than the ring belongs to all constants: it is shared out evenly.
+    outputs = outputs + (older @ bound.responses.tail_outputs.T)[:, :, None, :] / p
+    return channels, outputs, zero
+
+
+def _recursion(bound: AdaptiveBound, fixed: FloatArray, known: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the ring's numbers ``(runs, steps, w)`` and what all older ones add to the outputs."""
+    _, nz, _, m, no = bound.counts
+    runs, steps, w = known.shape
+    length = bound.length
+    ring = np.zeros((runs, steps + length, w))
+    eps = np.zeros((runs, steps + length, nz))
+    found = np.empty((runs, steps, no))
+    kernels, tail = bound.kernels, np.ascontiguousarray(bound.tail.T)
+    for begin in range(0, steps, min(BLOCK, length)):
+        end = min(begin + min(BLOCK, length), steps)
+        size = end - begin
+        older = _windows(ring[:, begin : end + length], size, length) @ kernels
+        older += eps[:, begin:end] @ tail
+        for k in range(size):
+            at = begin + k
+            h = older[:, k, :m] + fixed[:, at]
+            ring[:, at + length, :m] = h + known[:, at, :m]
+            ring[:, at + length, m:] = known[:, at, m:]
+            if k + 1 < size:
+                recent = ring[:, begin + length : at + length + 1].reshape(runs, -1)
+                older[:, k + 1] += recent @ kernels[-recent.shape[1] :]
+        found[:, begin:end] = older[:, :, m : m + no]
+        eps[:, begin + length : end + length] = older[:, :, m + no :]
+    return ring[:, length:], found
+
+
+def _windows(values: FloatArray, size: int, length: int) -> FloatArray:
+    """Return ``(runs, size, length w)``: the samples before each, oldest first (zero where they are not known yet)."""
+    runs, _, w = values.shape
+    view = np.lib.stride_tricks.sliding_window_view(values[:, : size + length - 1], length, axis=1)
+    return np.ascontiguousarray(view.transpose(0, 1, 3, 2)).reshape(runs, size, length * w)

@@ -1,0 +1,160 @@
+"""The rule of an adaptive threshold on a log: norm and rows of the residual, fault estimates, guaranteed intervals."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from obsynth.experiments.monitors.adaptive_bound import THRESHOLD_ROUNDING, AdaptiveBound
+from obsynth.experiments.monitors.adaptive_record import thresholds_of_records
+from obsynth.experiments.monitors.adaptive_step import AdaptiveState, AdaptiveStep, adaptive_step
+from obsynth.experiments.monitors.online import LinearSample
+from obsynth.experiments.monitors.residual_rules import NormRule, require_same
+from obsynth.numerics.arrays import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class AdaptivePlan:
+    """What an adaptive monitor of a design is made of; nothing in it changes online.
+
+    ``bound`` of fault estimates and residuals without a fault; ``faults`` of the errors of fault estimates during one,
+    `None` where there is none (``reason`` says why), or ``same`` as those without; ``names`` of the constants.
+    """
+
+    bound: AdaptiveBound
+    faults: AdaptiveBound | None
+    same: bool
+    reason: str
+    start_beyond_nominal: bool
+    names: tuple[str, ...]
+    fault_names: tuple[str, ...]
+    residual_names: tuple[str, ...]
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Columns of a run: thresholds, intervals, and the share of each constant in them."""
+        watched = (*(f"fhat[{name}]" for name in self.fault_names), *(f"r[{name}]" for name in self.residual_names))
+        faults = [f"{end} {name}" for name in self.fault_names for end in ("lowest", "highest")]
+        return (
+            *(f"threshold {name}" for name in watched), *(faults if self.intervals else ()),
+            *(f"share {name}" for name in self.names),
+        )  # fmt: skip
+
+    @property
+    def intervals(self) -> bool:
+        """Whether faults have guaranteed intervals."""
+        return bool(self.fault_names) and (self.same or self.faults is not None)
+
+    @property
+    def residuals(self) -> slice:
+        """Rows of the outputs that are residuals."""
+        return slice(len(self.fault_names), len(self.fault_names) + len(self.residual_names))
+
+
+def norm_beyond_nominal(plan: AdaptivePlan, found: AdaptiveStep) -> float:
+    """Return what box, start and rounding add to the norm of the residual."""
+    rows = plan.residuals
+    parts = [found.shift[rows], found.rest[rows], plan.bound.more[rows], *found.first[:, rows]]
+    if plan.start_beyond_nominal:
+        parts.append(found.start[rows])
+    return math.fsum(math.hypot(*part) for part in parts)
+
+
+class AdaptiveRule:
+    """The norm of the residual against the nominal bound and what the box adds; rows and fault estimates beside it."""
+
+    def __init__(self, plan: AdaptivePlan, later: AdaptivePlan, nominal: NormRule) -> None:
+        self.plan, self._nominal = plan, nominal
+        self._restarted = later.bound, later.faults
+        self._bound, self._faults = plan.bound, plan.faults
+        self._state = AdaptiveState.of(self._bound)
+        self._fault_state = None if self._faults is None else AdaptiveState.of(self._faults)
+        self.cells: tuple[float, ...] = (math.nan,) * len(plan.columns)
+
+    def take(
+        self, time: float, residuals: FloatArray, evidence: Any, *, deciding: bool
+    ) -> tuple[float, float, int | None]:
+        """Return statistic and threshold: those of the residual's norm, or of the row that is passed most."""
+        if not isinstance(evidence, LinearSample):
+            self.restart()
+            self.cells = (math.nan,) * len(self.plan.columns)
+            return math.nan, math.nan, None
+        reading = self._bound.structure.reading
+        found = adaptive_step(self._bound, self._state, reading @ evidence.rows, evidence.inputs, evidence.outputs)
+        error = found
+        if self._faults is not None and self._fault_state is not None:
+            estimates = self._faults.structure.reading @ evidence.rows
+            error = adaptive_step(self._faults, self._fault_state, estimates, evidence.inputs, evidence.outputs)
+        statistic, nominal, _ = self._nominal.take(time, residuals, None, deciding=deciding)
+        threshold = (nominal + norm_beyond_nominal(self.plan, found)) * THRESHOLD_ROUNDING
+        nf = len(self.plan.fault_names)
+        values = evidence.rows[len(evidence.rows) - len(found.total) :]
+        self.cells = self._cells(values[:nf], found, error)
+        if not deciding:
+            return math.nan, threshold, None
+        ratios = np.abs(values) / found.total
+        worst = int(np.argmax(ratios)) if len(ratios) else 0
+        if statistic <= threshold and len(ratios) and ratios[worst] > 1.0:
+            # The row is passed although the norm is not: it decides, in the scale of the norm's threshold.
+            return threshold * float(ratios[worst]), threshold, worst if worst < nf else None
+        passed = int(np.argmax(ratios[:nf])) if nf and ratios[:nf].max() > 1.0 else None
+        return statistic, threshold, passed
+
+    def _cells(self, faults: FloatArray, found: AdaptiveStep, error: AdaptiveStep) -> tuple[float, ...]:
+        nf = len(faults)
+        cells = found.total.tolist()
+        if self.plan.intervals:
+            width = error.total[:nf] - np.abs(error.shift[:nf])
+            middle = faults - error.shift[:nf]
+            cells += np.stack([middle - width, middle + width], axis=1).ravel().tolist()
+        watched = slice(0, nf) if nf else self.plan.residuals
+        shares = (error.first[:, watched] / error.total[watched]).mean(axis=1) if len(self.plan.names) else np.zeros(0)
+        return (*cells, *shares.tolist())
+
+    def restart(self) -> None:
+        """Begin again: what is known of the error at the first start holds for no other one, but its norm."""
+        self._nominal.restart()
+        self._bound, self._faults = self._restarted
+        self._state = AdaptiveState.of(self._bound)
+        self._fault_state = None if self._faults is None else AdaptiveState.of(self._faults)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the state that goes from row to row, as data."""
+        first = self._bound is self.plan.bound
+        return {
+            "nominal": self._nominal.as_dict(), "first": first, "state": self._state.as_dict(),
+            "faults": None if self._fault_state is None else self._fault_state.as_dict(),
+            "options": [list(self.plan.names), self._bound.varying, float(self._bound.nominal.sum())],
+        }  # fmt: skip
+
+    def resume(self, data: Mapping[str, Any]) -> None:
+        """Go on from what `as_dict` returned."""
+        own = self.as_dict()["options"]
+        require_same(data["options"], own)
+        if not data["first"]:
+            self._bound, self._faults = self._restarted
+        self._nominal.resume(data["nominal"])
+        self._state = AdaptiveState.from_dict(data["state"])
+        if data["faults"] is not None:
+            self._fault_state = AdaptiveState.from_dict(data["faults"])
+
+
+def record_columns(
+    plan: AdaptivePlan, rows: FloatArray, inputs: FloatArray, outputs: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return thresholds of the outputs, and intervals of the faults, over records from the start.
+
+    ``rows (runs, steps, rows of the observer)``; thresholds ``(runs, steps, no)``, intervals ``(runs, steps, nf, 2)``.
+    """
+    found = thresholds_of_records(plan.bound, rows @ plan.bound.structure.reading.T, inputs, outputs)
+    nf, error = len(plan.fault_names), found
+    if plan.faults is not None:
+        error = thresholds_of_records(plan.faults, rows @ plan.faults.structure.reading.T, inputs, outputs)
+    first = rows.shape[2] - found.total.shape[2]
+    middle = rows[:, :, first : first + nf] - error.shift[:, :, :nf]
+    width = error.total[:, :, :nf] - np.abs(error.shift[:, :, :nf])
+    return found.total, np.stack([middle - width, middle + width], axis=3)

@@ -1,0 +1,48 @@
+
+long state_bytes(void)
+{
+    return (long)sizeof(struct observer);
+}
+
+void begin(struct observer *state)
+{
+    reset(state);
+}
+
+/* Go on over some samples; returns the number of those that were taken. */
+int record(struct observer *state, int samples, const double *u, const double *y, double *after, double *said)
+{
+    int k;
+    for (k = 0; k < samples; k++) {
+        if (advance(state, u + k * NU, y + k * NY, after + (long)k * MEMORY, said + (long)k * ROW) != 0) {
+            return k;
+        }
+    }
+    return samples;
+}
+
+static void hand_out(double *out, const double *after, const double *said)
+{
+/* PARTS */
+}
+
+/* Run over several records one after the other, with inputs `apart` numbers apart; returns the first run that
+   cannot be finished, or their number. */
+int batch(int runs, int samples, long apart, const double *u, const double *y, double *out)
+{
+    struct observer state;
+    double after[MEMORY];
+    double said[ROW];
+    int run, k;
+    for (run = 0; run < runs; run++) {
+        reset(&state);
+        for (k = 0; k < samples; k++) {
+            long row = (long)run * samples + k;
+            if (advance(&state, u + run * apart + (long)k * NU, y + row * NY, after, said) != 0) {
+                return run;
+            }
+            hand_out(out + row * PARTS_SIZE, after, said);
+        }
+    }
+    return runs;
+}

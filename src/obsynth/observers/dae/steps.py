@@ -1,0 +1,122 @@
+"""The steps of an observer of a DAE: sample by sample, or whole stretches inside CasADi."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from obsynth.errors import SolverError
+from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.dae.estimates import DAERow
+from obsynth.observers.dae.memory_layout import initial_memory
+from obsynth.observers.dae.observer import DAEObserver
+from obsynth.plants.dae.functions import Compiled, DAEFunctions
+from obsynth.plants.dae.step import ImplicitStep
+
+#: A step of backward Euler this much shorter than dt puts a state onto its constraint and moves it no further.
+PROJECTION_SHARE = 1e-6
+#: Smaller moves, in sizes of the states, are the motion during that step and no projection.
+PROJECTION_NOTICE = 1e-5
+
+
+class DAEState(NamedTuple):
+    """The state of an observer of a DAE.
+
+    Fields: memory: Laid out as `memory_layout` says; k: The next sample; u: ``(nu,)``: the inputs of
+    the sample before; informations: ``(nq, nq)`` each: on the parameters, of the latest samples.
+    """
+
+    memory: FloatArray
+    k: int
+    u: FloatArray
+    informations: tuple[FloatArray, ...]
+
+
+class Steps:
+    """The steps of an observer: what follows from it alone, once for all runs."""
+
+    def __init__(self, observer: DAEObserver) -> None:
+        self.observer, self.graph = observer, observer.graph
+        self.implicit = ImplicitStep(self.graph.functions, observer.dt, largest_move=observer.largest_move)
+        self.first = DAEState(initial_memory(observer, observer.initial_state), 0, np.zeros(observer.model.nu), ())
+
+    def part(self, state: DAEState, name: str) -> FloatArray:
+        """Return a part of what is remembered, by its name in `memory_layout`."""
+        return self.graph.memory.part(state.memory, name)
+
+    def advance(self, state: DAEState, y: FloatArray, u: FloatArray) -> tuple[DAEState, DAERow]:
+        """Return the state after a sample and what is said at it.
+
+        Shapes: ``y (ny,)`` with NaN for what is missing, ``u (nu,)``.
+        """
+        seen = ~np.isnan(y)
+        heard, moved = np.where(seen, y, 0.0), np.zeros(self.observer.model.nx)
+        if state.k == 0:
+            memory, moved = self.projected(state, u)
+            after, said = self._first(memory, heard, seen)
+        else:
+            after, said = self._whole(state.memory, np.concatenate([u, heard, seen]))
+            if said[-1, 0] != 1.0:
+                after, said = self._carefully(state, heard, seen, u)
+        if not np.isfinite(after).all():
+            raise SolverError(
+                f"The matrix of (7), dF/dx' / dt + dF/dx, is singular at k = {state.k}, or the model is not defined "
+                "there: the step has no unique solution.", record={"k": state.k},
+            )  # fmt: skip
+        row = DAERow(self.graph, state.k, after[:, 0], said[:, 0], seen, moved)
+        informations = (*state.informations, row.part("information"))[-self.observer.window :]
+        return DAEState(after[:, 0], state.k + 1, u, informations), row
+
+    def stretch(
+        self, state: DAEState, y: FloatArray, u: FloatArray, run: Callable[..., tuple[FloatArray, ...]]
+    ) -> tuple[DAEState, DAERow]:
+        """Advance over samples until a step is not solved, by `ObserverGraph.whole` over that many samples.
+
+        Return what was reached, which may be nothing.  Shapes: ``y (samples, ny)``, ``u (samples, nu)``.
+        """
+        seen = ~np.isnan(y)
+        arriving = np.hstack([u, np.where(seen, y, 0.0), seen])
+        after, said = (found.T for found in run(state.memory, arriving.ravel()))
+        good = (said[:, -1] == 1.0) & np.isfinite(after).all(axis=1)
+        taken = len(y) if good.all() else int(np.argmin(good))
+        rows = DAERow(self.graph, state.k, after[:taken], said[:taken], seen[:taken], np.zeros(0))
+        if taken:
+            latest = tuple(rows.part("information")[-self.observer.window :])
+            informations = (*state.informations, *latest)[-self.observer.window :]
+            state = DAEState(after[taken - 1].copy(), state.k + taken, u[taken - 1], informations)
+        return state, rows
+
+    def projected(self, state: DAEState, u: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Put the initial state onto the algebraic equations; return the memory and how far it moved.
+
+        Shapes: ``u (nu,)`` at k = 0.
+        """
+        model, start = self.observer.model, self.part(state, "x")
+        short = ImplicitStep(DAEFunctions(model), PROJECTION_SHARE * self.observer.dt)
+        found = short.solve_carefully(start, u, self.part(state, "theta")).x
+        if np.abs((found - start) / model.state_scales).max() <= PROJECTION_NOTICE:
+            return state.memory, np.zeros_like(start)
+        return initial_memory(self.observer, found), found - start
+
+    def _carefully(self, state: DAEState, y: FloatArray, seen: FloatArray, u: FloatArray) -> tuple[FloatArray, ...]:
+        """Take a step that needs damping or a homotopy: solved outside the graph, and all else in it."""
+        posterior, theta = self.part(state, "posterior"), self.part(state, "theta")
+        solution = self.implicit.solve_carefully(posterior, u, theta, before=state.u, k=state.k)
+        after, said = self._sample(state.memory, solution.stages, u, y, seen)
+        said[-2:, 0] = solution.residual, 1.0
+        return after, said
+
+    @cached_property
+    def _first(self) -> Compiled:
+        return Compiled(self.graph.first)
+
+    @cached_property
+    def _sample(self) -> Compiled:
+        return Compiled(self.graph.sample)
+
+    @cached_property
+    def _whole(self) -> Compiled:
+        return Compiled(self.graph.whole)

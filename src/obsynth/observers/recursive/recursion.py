@@ -1,0 +1,228 @@
+"""The recursion: one factorisation per sample gives state, regressor, innovation and its regressor."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from obsynth.analysis.time_varying import early_rows
+from obsynth.errors import PreconditionError
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.covariances import covariance_factor
+from obsynth.numerics.least_squares_step import (
+    LeastSquaresStep,
+    least_squares_step,
+    rank_revealing_step,
+)
+from obsynth.numerics.recursive_least_squares import ParameterState, start_of, update
+from obsynth.observers.recursive.literal_form import posterior_residual
+from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.recursive.parameter_reset import ParameterReset
+from obsynth.observers.recursive.prepared_step import PreparedStep
+from obsynth.observers.recursive.random_walk_parameters import RandomWalkParameterSteps, WalkingEarlySteps
+from obsynth.observers.recursive.step_model import (
+    EarlyConstraintSteps,
+    PlantSteps,
+    StepMatrices,
+    StepModel,
+    require_in_range,
+)
+
+
+class RawEstimate(NamedTuple):
+    """What is known at one sample.
+
+    Fields: k: The sample; x: ``(nx,)``: the state estimate, with the parameters as they are estimated now; factor:
+    ``(nx, any)``: square root of its covariance; diffuse: ``(nx, r)``: directions about which nothing is known;
+    parameters: Estimate and spreads; empty without parameters; innovation: ``(m,)``: whitened parity innovation of the
+    model without parameters; regressor: ``(m, nq)``; nis: Squared length of the innovation at the parameters estimated
+    one sample before; y: ``(ny,)``: the outputs that were given, NaN where one was missing.
+    """
+
+    k: int
+    x: FloatArray
+    factor: FloatArray
+    diffuse: FloatArray
+    parameters: ParameterState
+    innovation: FloatArray
+    regressor: FloatArray
+    nis: float
+    y: FloatArray
+
+
+def step_model_of(observer: RecursiveObserver) -> StepModel:
+    """Return the steps that an observer runs on, with its plant rewritten as its options ask."""
+    parts, adaptation = (observer.plant, observer.Q, observer.R), observer.adaptation
+    walk = None
+    if adaptation is not None and adaptation.form == "random-walk":
+        walk = covariance_factor(adaptation.walk, "walk")
+    if observer.early_constraints:
+        rows = early_rows(observer.plant, early=True)
+        return EarlyConstraintSteps(*parts, rows) if walk is None else WalkingEarlySteps(*parts, rows, walk)
+    return PlantSteps(*parts) if walk is None else RandomWalkParameterSteps(PlantSteps(*parts), walk)
+
+
+class RecursiveState(NamedTuple):
+    """The state of a recursive observer.
+
+    Fields: k: The next sample; x: ``(n,)``: estimate of the model without parameters, or of states and parameters of a
+    random walk; factor: ``(n, any)``: square root of its covariance; Upsilon: ``(nx, nq)``; diffuse: ``(n, r)``:
+    directions about which nothing is known; parameters: Estimate and spreads; u: ``(nu,)``: the inputs of the sample
+    before; regressors: Of the latest samples; surprises: ``(any, 2)``: normalised squares of the latest innovations,
+    and their degrees of freedom, for resets; resets: How many there were.
+    """
+
+    k: int
+    x: FloatArray
+    factor: FloatArray
+    Upsilon: FloatArray
+    diffuse: FloatArray
+    parameters: ParameterState
+    u: FloatArray
+    regressors: tuple[FloatArray, ...]
+    surprises: FloatArray
+    resets: int
+
+
+class Recursion:
+    """The recursion of an observer: what follows from it alone, once for all runs."""
+
+    def __init__(self, observer: RecursiveObserver) -> None:
+        self.observer, self.model = observer, step_model_of(observer)
+        adaptation, nx = observer.adaptation, observer.plant.nx
+        self.random_walk = adaptation is not None and adaptation.form == "random-walk"
+        self.literal = adaptation is not None and adaptation.form == "literal"
+        self.directional = adaptation is not None and adaptation.guard == "directional"
+        self.window = 1 if adaptation is None else adaptation.window
+        self.regular: FloatArray | None = None
+        self.reset: ParameterReset | None = None
+        # The factorisation of a step that stays the same; it follows from the step alone.
+        self._prepared: PreparedStep | None = None
+        factor = covariance_factor(observer.initial_covariance, "initial_covariance")
+        nq = 0 if adaptation is None else observer.plant.nq
+        self.first = RecursiveState(
+            0, observer.initial_state.copy(), factor, np.zeros((nx, nq)), np.zeros((nx, 0)),
+            start_of(np.zeros(0), np.zeros((0, 0))), np.zeros(observer.plant.nu), (), np.zeros((0, 2)), 0,
+        )  # fmt: skip
+        if adaptation is None:
+            return
+        spread = covariance_factor(adaptation.initial_covariance, "initial_covariance")
+        if self.random_walk:
+            joint = np.zeros((nx + nq, nx + nq))
+            joint[:nx, :nx], joint[nx:, nx:] = factor, spread
+            x = np.concatenate([self.first.x, adaptation.initial_parameters])
+            empty = np.zeros((nx + nq, 0))
+            self.first = self.first._replace(x=x, factor=joint, Upsilon=empty, diffuse=empty)
+            return
+        parameters = start_of(adaptation.initial_parameters, spread)
+        self.first = self.first._replace(parameters=parameters)
+        self.reset = ParameterReset(adaptation.reset, parameters) if adaptation.reset else None
+        self.regular = parameters.triangle if adaptation.guard == "regularise" else None
+
+    def advance(self, state: RecursiveState, y: FloatArray, u: FloatArray) -> tuple[RecursiveState, RawEstimate]:
+        """Return the state after a sample and what is known at it.
+
+        Shapes: ``y (ny,)`` with NaN for what is missing, ``u (nu,)``.
+        """
+        theta = state.parameters.theta
+        if state.k > 0:
+            after, v, G = self._stepped(state, self.model.at(state.k - 1), y, u)
+        elif isinstance(self.model, EarlyConstraintSteps):
+            after, v, G = self._stepped(state, self.model.first(), np.zeros(0), u)
+        else:
+            after, v, G = state, np.zeros(0), np.zeros((0, state.Upsilon.shape[1]))
+        gap = v - G @ theta if len(theta) else v
+        row = self._estimate(after, v, G, float(gap @ gap), y)
+        return after._replace(k=state.k + 1, u=u, regressors=(*state.regressors, G)[-self.window :]), row
+
+    def _stepped(
+        self, state: RecursiveState, step: StepMatrices, y: FloatArray, u: FloatArray
+    ) -> tuple[RecursiveState, FloatArray, FloatArray]:
+        """Take the step that ends at the sample ``y``; return also innovation and regressor."""
+        ne, nq = len(step.A), state.Upsilon.shape[1]
+        right = np.empty((len(step.H), 1 + nq), order="F")
+        right[:ne, 0] = step.A @ state.x + step.B @ state.u
+        right[ne : ne + len(y), 0] = y
+        if len(step.Dn):
+            right[ne + len(y) :, 0] = step.Dn @ u
+        if nq:
+            right[:ne, 1:] = step.A @ state.Upsilon + step.Phi
+            right[ne:, 1:] = -step.Psi
+        found, lesson = None, None
+        # The product is NaN exactly if a sample is.
+        if not (self.literal or state.diffuse.shape[1] or math.isnan(y.dot(y))):
+            found = self._fast(state, step, right)
+        if found is None:
+            found, lesson = self._careful(state, step, right)
+        v, G = found.innovation[:, 0], -found.innovation[:, 1:]
+        parameters, surprises, resets = state.parameters, state.surprises, state.resets
+        if nq and self.observer.adaptation is not None:
+            if self.reset is not None:
+                surprises = self.reset.surprises(surprises, parameters, v, G)
+                if self.reset.is_due(surprises):
+                    parameters, surprises, resets = self.reset.forgetful(parameters), surprises[:0], resets + 1
+            seen, regressor, noise = lesson or (v, G, None)
+            parameters, _ = update(
+                parameters, seen, regressor, forgetting=self.observer.adaptation.forgetting, regular=self.regular,
+                directional=self.directional, noise=noise,
+            )  # fmt: skip
+        after = state._replace(
+            x=found.estimate[:, 0], Upsilon=found.estimate[:, 1:], factor=found.factor, diffuse=found.diffuse,
+            parameters=parameters, surprises=surprises, resets=resets,
+        )  # fmt: skip
+        return after, v, G
+
+    def _fast(self, state: RecursiveState, step: StepMatrices, right: FloatArray) -> LeastSquaresStep | None:
+        """Take a step that is complete; what depends on the matrices alone is kept while they stay the same."""
+        prepared = self._prepared
+        if prepared is None or step is not prepared.step:
+            prepared = self._prepared = PreparedStep.of(step, prepared)
+        return prepared.taken(state.factor, right)
+
+    def _careful(
+        self, state: RecursiveState, step: StepMatrices, right: FloatArray
+    ) -> tuple[LeastSquaresStep, tuple[FloatArray, FloatArray, FloatArray] | None]:
+        """Take a step with missing samples, with undetermined directions, with perfect rows, or of the literal form.
+
+        Return also what the literal form learns from.
+        """
+        ne, width, H = len(step.A), state.factor.shape[1], step.H
+        S = np.zeros((len(H), max(width + step.noise.shape[1], len(H))))
+        S[:ne, :width] = step.A @ state.factor
+        S[:, width : width + step.noise.shape[1]] = step.noise
+        require_in_range(S, state.factor, state.k, self.observer.state_names)
+        unknown = np.zeros((len(H), state.diffuse.shape[1]))
+        unknown[:ne] = step.A @ state.diffuse
+        kept = ~np.isnan(right[:, 0])
+        complete = bool(kept.all())
+        if not complete:
+            H, S, right, unknown = H[kept], S[kept], right[kept], unknown[kept]
+        found = None if unknown.shape[1] or S.shape[1] < len(S) else least_squares_step(H, S, right)
+        if found is None:
+            found = rank_revealing_step(H, S, right, unknown)
+            if complete and found.diffuse.shape[1] > unknown.shape[1]:
+                raise PreconditionError(
+                    f"rank H_k is lost at k = {state.k}: the equations and outputs of that step do not determine the "
+                    "state.", condition="rank [E; C]",
+                )  # fmt: skip
+        if not self.literal or len(H) <= ne:
+            return found, None
+        seen, regressor, noise = posterior_residual(found, H, S, right, ne, unknown=unknown)
+        return found, (seen[:, 0], regressor, noise)
+
+    def _estimate(
+        self, state: RecursiveState, innovation: FloatArray, regressor: FloatArray, nis: float, y: FloatArray
+    ) -> RawEstimate:
+        x, factor, diffuse = state.x, state.factor, state.diffuse
+        if self.random_walk:
+            nx = self.observer.plant.nx
+            nq = len(x) - nx
+            known = ParameterState(x[nx:], np.zeros((nq, nq)), factor[nx:])
+            return RawEstimate(state.k, x[:nx], factor[:nx], diffuse[:nx], known, innovation, np.zeros((0, nq)), nis, y)
+        known = state.parameters
+        if len(known.theta):
+            x = x + state.Upsilon @ known.theta
+            factor = np.hstack((factor, state.Upsilon @ known.spread))
+        return RawEstimate(state.k, x, factor, diffuse, known, innovation, regressor, nis, y)

@@ -1,0 +1,120 @@
+"""What every observer is: a first state, and a step from a state and a sample to the next state and the estimates."""
+
+from __future__ import annotations
+
+from typing import Any, Generic, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from obsynth.numerics.arrays import FloatArray
+
+State = TypeVar("State")
+Row = TypeVar("Row", covariant=True)
+Found = TypeVar("Found", covariant=True)
+Kept = TypeVar("Kept", bound=tuple[Any, ...])
+
+#: Marks an array whose columns are contiguous: sums are rounded in another order there.
+BY_COLUMNS = "by columns"
+
+
+class Observer(Protocol[State, Row, Found]):
+    """An observer: values alone, so that one serves any number of runs; a state is a tuple of plain arrays.
+
+    `advance` is `step` without checks of the sample, and returns the row of numbers that the estimates are made of.
+    """
+
+    def init(self) -> State:
+        """Return the state before the first sample."""
+        ...
+
+    def advance(self, state: State, y: FloatArray, u: FloatArray) -> tuple[State, Row]:
+        """Return the state after a sample, and what is known at it."""
+        ...
+
+    def step(self, state: State, y: ArrayLike, u: ArrayLike = ()) -> tuple[State, Found]:
+        """Check a sample; return the state after it, and the estimates at it."""
+        ...
+
+
+class RunningObserver(Generic[State, Row, Found]):
+    """An observer with its state: `step` takes y(k) and u(k) and returns the estimates at k.
+
+    Parameters
+    ----------
+    observer : LinearObserver, RecursiveObserver or DAEObserver
+        What runs.
+    state : NamedTuple, optional
+        Where to begin; ``observer.init()`` by default.
+    """
+
+    def __init__(self, observer: Observer[State, Row, Found], state: State | None = None) -> None:
+        self.observer = observer
+        self.state = observer.init() if state is None else state
+
+    def step(self, y: ArrayLike, u: ArrayLike = ()) -> Found:
+        """Take one sample and return the estimates at it.
+
+        Parameters
+        ----------
+        y : array_like
+            Outputs ``(ny,)``.  Recursive and nonlinear observers take NaN for a missing one.
+        u : array_like, optional
+            Known inputs ``(nu,)``.
+
+        Raises
+        ------
+        SpecError
+            A sample has the wrong length or is not finite, or the plant's horizon is passed.
+        PreconditionError
+            Rank H_k is lost at this k although no sample is missing (recursive observers).
+        SolverError
+            The step has no solution (nonlinear observers).
+
+        Whatever is raised, the state is left as it was.
+        """
+        self.state, found = self.observer.step(self.state, y, u)
+        return found
+
+    def raw_step(self, y: FloatArray, u: FloatArray) -> Row:
+        """Take one sample without checking it; return what is known at it.
+
+        Parameters
+        ----------
+        y, u : FloatArray
+            ``(ny,)`` and ``(nu,)``.
+        """
+        self.state, row = self.observer.advance(self.state, y, u)
+        return row
+
+
+def state_as_data(state: tuple[Any, ...]) -> dict[str, Any]:
+    """Return a state as numbers, arrays, lists and mappings, to be written to a file."""
+    return {name: _as_data(value) for name, value in state._asdict().items()}  # type: ignore[attr-defined]
+
+
+def state_from_data(like: Kept, data: dict[str, Any]) -> Kept:
+    """Return the state of the same kind as ``like`` that `state_as_data` described."""
+    values = {name: _from_data(own, data[name]) for name, own in like._asdict().items()}  # type: ignore[attr-defined]
+    return type(like)(**values)
+
+
+def _as_data(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        by_columns = value.ndim == 2 and value.strides[0] < value.strides[1]
+        return {BY_COLUMNS: np.array(value, order="F")} if by_columns else np.array(value, order="C")
+    if hasattr(value, "_asdict"):
+        return state_as_data(value)
+    return [_as_data(part) for part in value] if isinstance(value, tuple) else value
+
+
+def _from_data(like: Any, value: Any) -> Any:
+    if hasattr(like, "_asdict"):
+        return state_from_data(like, value)
+    if isinstance(like, tuple):
+        return tuple(_array(part) for part in value)
+    return _array(value) if isinstance(like, np.ndarray) else value
+
+
+def _array(value: Any) -> FloatArray:
+    return np.asfortranarray(value[BY_COLUMNS]) if isinstance(value, dict) else np.array(value)

@@ -1,0 +1,284 @@
+"""Physical constants with tolerances: a nominal value, a range, and where both come from."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.numerics.arguments import is_finite_number, is_number
+from obsynth.numerics.arrays import FloatArray
+
+VARIATIONS = ("constant", "varying")
+SOURCES = ("stated", "set-membership", "calibrated")
+_KEYS = ("nominal", "tolerance", "range", "unit")
+_PER_CENT = re.compile(r"\s*([0-9]*\.?[0-9]+(?:[eE][+-]?[0-9]+)?)\s*%\s*")
+
+
+@dataclass(frozen=True)
+class Constant:
+    """A physical constant: what it should be, and what it may be.
+
+    Parameters
+    ----------
+    name : str
+        As expressions use it.
+    nominal : float
+        What a design takes.
+    low, high : float
+        Ends of its range, around the nominal value; equal to it where the constant is known.
+    unit : str, optional
+        Of all three.
+    """
+
+    name: str
+    nominal: float
+    low: float
+    high: float
+    unit: str = ""
+
+    def __post_init__(self) -> None:
+        path = f"constants.{self.name}"
+        for key, value in (("nominal", self.nominal), ("range", self.low), ("range", self.high)):
+            if not is_finite_number(value):
+                raise SpecError(
+                    f"The {key} of {self.name!r} is {value!r}: give finite numbers. A box with an open side bounds "
+                    "nothing.", path=path,
+                )  # fmt: skip
+        if not self.low <= self.nominal <= self.high:
+            raise SpecError(f"The nominal value {self.nominal:g} of {self.name!r} is outside its range {self.low:g} .. "
+                            f"{self.high:g}.", path=path)  # fmt: skip
+
+    @property
+    def half(self) -> float:
+        """Half the width of the range."""
+        return (self.high - self.low) / 2.0
+
+    @property
+    def middle(self) -> float:
+        """Middle of the range."""
+        return self.low + self.half
+
+    @property
+    def certain(self) -> bool:
+        """Whether there is no tolerance."""
+        return self.low == self.high
+
+    def scaled(self, factor: float) -> Constant:
+        """Return the constant with its tolerance times a factor.
+
+        Parameters
+        ----------
+        factor : float
+            0 or more.
+        """
+        low = self.nominal - factor * (self.nominal - self.low)
+        return Constant(self.name, self.nominal, low, self.nominal + factor * (self.high - self.nominal), self.unit)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain data, as `constants_box` reads it."""
+        return {"nominal": self.nominal, "range": [self.low, self.high], "unit": self.unit}
+
+
+@dataclass(frozen=True, eq=False)
+class ConstantsBox:
+    """Constants with their tolerances, whether they vary, and where the box comes from.
+
+    Parameters
+    ----------
+    constants : mapping of str to Constant
+        By name, in order.
+    variation : {"constant", "varying"}, optional
+        ``constant``: unknown, but the same at all times.  ``varying``: anything in its range at each sample, where the
+        value at sample k + 1 multiplies x(k+1): ``E(p_{k+1}) x(k+1) = A(p_k) x(k) + ...``.
+    source : {"stated", "set-membership", "calibrated"}, optional
+        Where the ranges come from.
+    level : float, optional
+        For ``calibrated``: probability that the box holds the truth.
+    digest : str, optional
+        For ``calibrated``: sha256 of the log.
+    """
+
+    constants: Mapping[str, Constant]
+    variation: str = "constant"
+    source: str = "stated"
+    level: float | None = None
+    digest: str = ""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "constants", MappingProxyType(dict(self.constants)))
+        if self.variation not in VARIATIONS:
+            raise SpecError(f"variation is {self.variation!r}: use one of {', '.join(VARIATIONS)}.", path="variation")
+        if self.source not in SOURCES:
+            raise SpecError(f"source is {self.source!r}: use one of {', '.join(SOURCES)}.", path="source")
+        calibrated = self.source == "calibrated"
+        if calibrated and not (is_finite_number(self.level) and 0.0 < float(self.level or 0.0) < 1.0):
+            raise SpecError(f"level is {self.level!r}: a calibrated box needs its probability, between 0 and 1.",
+                            path="level")  # fmt: skip
+        if not calibrated and (self.level is not None or self.digest):
+            raise SpecError("level and digest are for a calibrated box (source: calibrated).", path="level")
+
+    @property
+    def uncertain(self) -> tuple[Constant, ...]:
+        """The constants that have a tolerance."""
+        return tuple(item for item in self.constants.values() if not item.certain)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the constants that have a tolerance: the unknowns q, in order."""
+        return tuple(item.name for item in self.uncertain)
+
+    @property
+    def sentence(self) -> str:
+        """What a statement says about where the box comes from."""
+        if self.source == "calibrated":
+            log = f" of the log {self.digest[:12]}" if self.digest else ""
+            return f"a constant outside its {100.0 * float(self.level or 0.0):g} % box{log}"
+        if self.source == "set-membership":
+            return "a constant outside the set that the log's bounds allow"
+        return "a constant outside its stated tolerance"
+
+    @property
+    def offsets(self) -> FloatArray:
+        """Where the nominal values are in the unknowns q, ``(p,)``: 0 in the middle of a range."""
+        return np.array([(item.nominal - item.middle) / item.half for item in self.uncertain])
+
+    def scaled(self, factors: float | FloatArray) -> ConstantsBox:
+        """Return the box with tolerances times factors.
+
+        Parameters
+        ----------
+        factors : float or FloatArray
+            One for all, or one for each uncertain constant.
+        """
+        names = self.names
+        each = dict(zip(names, np.broadcast_to(factors, (len(names),)).tolist(), strict=True))
+        found = {name: item.scaled(each.get(name, 1.0)) for name, item in self.constants.items()}
+        return ConstantsBox(found, self.variation, self.source, self.level, self.digest)
+
+    def part(self, lower: FloatArray, upper: FloatArray) -> ConstantsBox:
+        """Return the part ``lower <= q <= upper`` of the box; its nominal values are in its middle.
+
+        Parameters
+        ----------
+        lower, upper : FloatArray
+            One for each uncertain constant, in -1 .. 1.
+        """
+        found = dict(self.constants)
+        for item, a, b in zip(self.uncertain, lower, upper, strict=True):
+            low, high = item.middle + float(a) * item.half, item.middle + float(b) * item.half
+            found[item.name] = Constant(item.name, min(max((low + high) / 2.0, low), high), low, high, item.unit)
+        return ConstantsBox(found, self.variation, self.source, self.level, self.digest)
+
+    def values(self, q: FloatArray) -> dict[str, float]:
+        """Return the value of each constant at ``q (p,)`` in -1 .. 1.
+
+        Parameters
+        ----------
+        q : FloatArray
+            One for each uncertain constant.
+        """
+        found = {name: item.nominal for name, item in self.constants.items()}
+        for item, place in zip(self.uncertain, q, strict=True):
+            found[item.name] = item.middle + float(place) * item.half
+        return found
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain data, as `constants_box` reads it."""
+        return {
+            "constants": {name: item.as_dict() for name, item in self.constants.items()}, "variation": self.variation,
+            "source": self.source, "level": self.level, "digest": self.digest,
+        }  # fmt: skip
+
+
+def tolerance_share(value: Any, path: str) -> float:
+    """Return a tolerance as a share, from ``"5 %"`` or a share such as 0.05."""
+    if isinstance(value, str):
+        found = _PER_CENT.fullmatch(value)
+        if found is None:
+            raise SpecError(f"The tolerance {value!r} is no per cent: write it as '5 %'.", path=path)
+        return float(found.group(1)) / 100.0
+    if not (is_finite_number(value) and value >= 0.0):
+        raise SpecError(f"The tolerance is {value!r}: write it as '5 %' (a box with an open side bounds nothing).",
+                        path=path)  # fmt: skip
+    if value >= 1.0:
+        raise SpecError(f"The tolerance is {value!r}, a share of {100.0 * value:g} %: write it as '5 %' or 0.05.",
+                        path=path)  # fmt: skip
+    return float(value)
+
+
+def constant_of(name: str, given: Any, *, nominal: float | None = None) -> Constant:
+    """Return a constant from a number, ``(low, high)`` or a mapping with `nominal`, `tolerance` or `range`, `unit`."""
+    path = f"constants.{name}"
+    if isinstance(given, Constant):
+        return Constant(name, given.nominal, given.low, given.high, given.unit)
+    if is_number(given) and nominal is None:
+        return Constant(name, float(given), float(given), float(given))
+    if isinstance(given, str) or is_number(given):
+        given = {"tolerance": given}
+    if isinstance(given, (tuple, list)):
+        given = {"range": given}
+    if not isinstance(given, Mapping):
+        raise SpecError(f"{name!r} is {given!r}: give nominal and tolerance, or a range.", path=path)
+    for key in given:
+        if key not in _KEYS:
+            raise SpecError(f"{key!r} is unknown: a constant has {', '.join(_KEYS)}.", path=f"{path}.{key}")
+    unit = given.get("unit") or ""
+    if not isinstance(unit, str):
+        raise SpecError(f"The unit of {name!r} is {unit!r}, no text.", path=f"{path}.unit")
+    return _with_range(name, given, given.get("nominal") if given.get("nominal") is not None else nominal, unit)
+
+
+def _with_range(name: str, given: Mapping[str, Any], middle: Any, unit: str) -> Constant:
+    path = f"constants.{name}"
+    if given.get("range") is not None:
+        ends = given["range"]
+        if given.get("tolerance") is not None:
+            raise SpecError(f"{name!r} has both a tolerance and a range: give one of them.", path=path)
+        if isinstance(ends, str) or not hasattr(ends, "__len__") or len(ends) != 2 or not all(map(is_number, ends)):
+            raise SpecError(
+                f"The range of {name!r} is {ends!r}: give [low, high]. A box with an open side bounds nothing.",
+                path=f"{path}.range",
+            )  # fmt: skip
+        low, high = map(float, ends)
+        if not (math.isfinite(low) and math.isfinite(high) and low <= high):
+            raise SpecError(
+                f"The range of {name!r} is [{low:g}, {high:g}]: give finite ends, the lower one first. A box with an "
+                "open side bounds nothing.", path=f"{path}.range",
+            )  # fmt: skip
+        inside = middle is not None and is_finite_number(middle)
+        return Constant(name, float(middle) if inside else (middle or low + (high - low) / 2.0), low, high, unit)
+    if not is_finite_number(middle):
+        raise SpecError(f"{name!r} has no nominal value: give a number, or a range.", path=path)
+    center = float(middle)
+    share = tolerance_share(given.get("tolerance", 0.0), f"{path}.tolerance")
+    if share and center == 0.0:
+        raise SpecError(f"The nominal value of {name!r} is zero, which has no per cent: give a range.",
+                        path=f"{path}.tolerance")  # fmt: skip
+    half = share * abs(center)
+    return Constant(name, center, center - half, center + half, unit)
+
+
+def constants_box(
+    given: Mapping[str, Any] | ConstantsBox, *, known: Mapping[str, Constant] | None = None,
+    variation: str | None = None, source: str | None = None, level: float | None = None, digest: str | None = None,
+) -> ConstantsBox:  # fmt: skip
+    """Return a box from a mapping by name; nominal values that are left out are those of ``known``."""
+    if isinstance(given, ConstantsBox):
+        return given
+    if not isinstance(given, Mapping):
+        raise SpecError(f"constants is {given!r}: give a mapping from names to tolerances.", path="constants")
+    before = dict(known or {})
+    found = dict(before)
+    for name, value in given.items():
+        if not isinstance(name, str) or not name:
+            raise SpecError(f"{name!r} is no name of a constant.", path="constants")
+        found[name] = constant_of(name, value, nominal=before[name].nominal if name in before else None)
+    more = {"variation": variation, "source": source, "level": level, "digest": digest}
+    return ConstantsBox(found, **{key: value for key, value in more.items() if value is not None})  # type: ignore[arg-type]

@@ -1,0 +1,209 @@
+"""From a plant and its constants to a plant that knows its tolerances."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.numerics.arguments import require_mapping
+from obsynth.numerics.arrays import FloatArray
+from obsynth.plants.constants import Constant, ConstantsBox, constant_of, constants_box, tolerance_share
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.uncertainty import (
+    SAME_SHARE,
+    UNCERTAIN_MATRICES,
+    Entry,
+    Uncertainty,
+    expressions_in,
+    matrices_of,
+)
+
+
+def uncertain_system(
+    plant: DescriptorSystem | Mapping[str, Any],
+    constants: Mapping[str, Any] | ConstantsBox | None = None,
+    *,
+    tolerance: Mapping[str, Any] | None = None,
+    variation: str | None = None,
+    source: str | None = None,
+    level: float | None = None,
+    digest: str | None = None,
+) -> DescriptorSystem:
+    """Return a linear plant that knows the tolerances of its constants.
+
+    Parameters
+    ----------
+    plant : DescriptorSystem or mapping
+        A mapping holds the arguments of `DescriptorSystem`, where entries of ``E, A, B, C, D, Bf, Df, Bd, Dd`` may be
+        expressions in the constants, such as ``"-k / mass"``.  A plant that has constants already gets the new
+        tolerances; its nominal values stay where none is given.
+    constants : mapping or ConstantsBox, optional
+        By name: a number (known exactly), ``{nominal, tolerance, unit}`` with a tolerance such as ``"5 %"``,
+        ``{range: [low, high]}`` or ``(low, high)``.  One constant in several entries is one unknown.  The name of a
+        matrix, such as ``{"A": "2 %"}``, stands for a tolerance of each of its entries.
+    tolerance : mapping, optional
+        ``{"A": "2 %"}``: a tolerance of every entry of a matrix that is a number other than zero, each an unknown of
+        its own, named ``A[1,2]``.
+    variation : {"constant", "varying"}, optional
+        Whether constants stay as they are (the default), or may be anything in their ranges at each sample:
+        ``E(p_{k+1}) x(k+1) = A(p_k) x(k) + ...``.  A zero-order hold takes them as constant within a sample.
+    source : {"stated", "set-membership", "calibrated"}, optional
+        Where the box comes from; what is said about it repeats that.
+    level : float, optional
+        For ``calibrated``: the probability that the box holds the truth.
+    digest : str, optional
+        For ``calibrated``: sha256 of the log.
+
+    Returns
+    -------
+    DescriptorSystem
+        With `uncertainty`; matrices are those at the nominal values.  Every method takes it.
+
+    Raises
+    ------
+    SpecError
+        A name is unknown, a tolerance has no nominal value or an open side, or an expression is malformed.
+    PreconditionError
+        A transformation since the plant was written is not defined at the new nominal values.
+
+    Notes
+    -----
+    After Wang et al. 2015 with tolerances of our own: the reference is the theory of robust bounds (Neumaier, *Interval
+    Methods for Systems of Equations*, 1990, and affine arithmetic, de Figueiredo and Stolfi, 2004), with proved
+    remainders.
+
+    Examples
+    --------
+    >>> plant = uncertain_system(
+    ...     {"E": None, "A": [["1 - 0.1 * k / m"]], "C": [[1]], "dt": 0.1},
+    ...     {"k": {"nominal": 2.0, "tolerance": "5 %"}, "m": {"range": [0.9, 1.2], "nominal": 1.0}},
+    ... )
+    >>> plant.A.tolist(), plant.uncertainty.box.names
+    ([[0.8]], ('k', 'm'))
+    """
+    options = {"variation": variation, "source": source, "level": level, "digest": digest}
+    for name, given in (("constants", constants), ("tolerance", tolerance)):
+        if not isinstance(given, ConstantsBox):
+            require_mapping(given, name)
+    if isinstance(plant, DescriptorSystem):
+        system, entries, before = plant, dict[str, list[Entry]](), plant.uncertainty
+        if before is not None:
+            return _with_tolerances(plant, before, constants, tolerance, options)
+    else:
+        require_mapping(plant, "plant")
+        arguments, entries = dict(plant), {}
+        for name in UNCERTAIN_MATRICES:
+            if arguments.get(name) is not None:
+                arguments[name], found = expressions_in(arguments[name])
+                if found:
+                    entries[name] = found
+        try:
+            system = DescriptorSystem(arguments.pop("E", None), arguments.pop("A"), **arguments)
+        except KeyError as error:
+            raise SpecError("plant has no matrix A.", path="plant.A") from error
+        except TypeError as error:
+            raise SpecError(f"plant: {error}.", path="plant") from error
+    return with_expressions(system, entries, constants, tolerance=tolerance, **options)
+
+
+def with_expressions(
+    system: DescriptorSystem, entries: Mapping[str, list[Entry]], constants: Any, *, tolerance: Any = None,
+    **options: Any,
+) -> DescriptorSystem:  # fmt: skip
+    """Return a plant with expressions in some entries, at the nominal values of the constants."""
+    names = set(constants.constants if isinstance(constants, ConstantsBox) else constants or {})
+    # What an expression puts into an entry is no number of its own, to have a tolerance of its own.
+    box, more = _boxed(constants, tolerance, {}, matrices_of(system), entries, options)
+    return filled_plant(system, Uncertainty(box, _joined(entries, more)), names)
+
+
+def filled_plant(system: DescriptorSystem, uncertainty: Uncertainty, stated: set[str]) -> DescriptorSystem:
+    """Return a plant as written with its entries at the nominal values of the constants."""
+    values = {name: item.nominal for name, item in uncertainty.box.constants.items()}
+    matrices = uncertainty.filled(matrices_of(system), values)
+    _require_used(uncertainty, stated)
+    for name, matrix in matrices.items():
+        if not np.isfinite(matrix).all():
+            raise SpecError(f"{name} is not finite at the nominal values of the constants.", path=name)
+    return system.replace(**matrices, uncertainty=uncertainty)
+
+
+def _require_used(uncertainty: Uncertainty, stated: set[str]) -> None:
+    unknown = sorted(name for name in stated - uncertainty.used if name in uncertainty.box.constants)
+    if unknown:
+        raise SpecError(
+            f"The constant {unknown[0]!r} stands in no matrix: write an entry as an expression in it, or remove it.",
+            path=f"constants.{unknown[0]}",
+        )  # fmt: skip
+
+
+def _with_tolerances(
+    plant: DescriptorSystem, before: Uncertainty, constants: Any, tolerance: Any, options: Mapping[str, Any]
+) -> DescriptorSystem:
+    """Return a plant that has constants with new tolerances of these; nominal values may not move."""
+    written = matrices_of(plant) if before.written is None else before.written
+    entries = {name: list(found) for name, found in before.entries.items()}
+    kept = {"variation": before.box.variation, "source": before.box.source, "level": before.box.level,
+            "digest": before.box.digest}  # fmt: skip
+    stated = {key: value for key, value in options.items() if value is not None}
+    if stated.get("source", "calibrated") != "calibrated":
+        kept |= {"level": None, "digest": None}
+    box, more = _boxed(constants, tolerance, before.box.constants, written, entries, kept | stated)
+    after = Uncertainty(box, _joined(entries, more), before.written, before.steps)
+    _require_used(after, set(box.constants))
+    for name, item in before.box.constants.items():
+        if name not in box.constants or abs(box.constants[name].nominal - item.nominal) > SAME_SHARE * abs(
+            item.nominal
+        ):
+            raise SpecError(
+                f"The nominal value of {name!r} is {item.nominal:g} in this plant: its tolerance may change, but "
+                "another nominal value is another plant.", path=f"constants.{name}",
+            )  # fmt: skip
+    return plant.replace(uncertainty=after)
+
+
+def _boxed(
+    constants: Any, tolerance: Any, known: Mapping[str, Constant], matrices: Mapping[str, FloatArray],
+    entries: Mapping[str, list[Entry]], options: Mapping[str, Any],
+) -> tuple[ConstantsBox, dict[str, list[Entry]]]:  # fmt: skip
+    """Return the box, and entries that are constants of their own."""
+    if isinstance(constants, ConstantsBox):
+        if not tolerance:
+            return constants, {}
+        own = {"variation": constants.variation, "source": constants.source, "level": constants.level,
+               "digest": constants.digest}  # fmt: skip
+        options = own | {key: value for key, value in options.items() if value is not None}
+        constants = constants.constants
+    given, shares = {}, dict(tolerance or {})
+    for name, value in (constants or {}).items():
+        if name in UNCERTAIN_MATRICES and name not in known and isinstance(value, (str, int, float)):
+            shares.setdefault(name, value)
+        else:
+            given[name] = value
+    found, more = dict(given), dict[str, list[Entry]]()
+    for matrix, value in shares.items():
+        if matrix not in UNCERTAIN_MATRICES:
+            raise SpecError(f"{matrix!r} is no matrix: {', '.join(UNCERTAIN_MATRICES)} may have a tolerance.",
+                            path=f"tolerance.{matrix}")  # fmt: skip
+        share = tolerance_share(value, f"tolerance.{matrix}")
+        present = {text for _, _, text in entries.get(matrix, ())}
+        taken = {(row, column) for row, column, text in entries.get(matrix, ()) if text != _entry(matrix, row, column)}
+        for row, column in np.argwhere(matrices[matrix] != 0.0).tolist():
+            if (row, column) in taken:
+                continue
+            name, number = _entry(matrix, row, column), float(matrices[matrix][row, column])
+            found[name] = constant_of(name, {"nominal": number, "tolerance": share})
+            if name not in present:
+                more.setdefault(matrix, []).append((row, column, name))
+    return constants_box(found, known=known, **options), more
+
+
+def _entry(matrix: str, row: int, column: int) -> str:
+    return f"{matrix}[{row + 1},{column + 1}]"
+
+
+def _joined(one: Mapping[str, list[Entry]], two: Mapping[str, list[Entry]]) -> dict[str, tuple[Entry, ...]]:
+    return {name: (*one.get(name, ()), *two.get(name, ())) for name in {**one, **two}}

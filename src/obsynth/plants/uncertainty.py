@@ -1,0 +1,209 @@
+"""What is uncertain in a linear plant: constants in its matrices, as written, and the transformations since."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.expressions import Expression, parse_expression
+from obsynth.plants.constants import ConstantsBox, constants_box
+from obsynth.proofs.affine import AffineMatrix
+from obsynth.proofs.affine_numbers import AffineNumber, affine_translation
+
+#: Matrices that may hold constants.
+UNCERTAIN_MATRICES = ("E", "A", "B", "C", "D", "Bf", "Df", "Bd", "Dd")
+#: Transformations that carry tolerances along.
+ELIMINATED, SAMPLED = "eliminate", "sample"
+#: A stored number and the value of its expression may differ by this share: matrices in files have few digits.
+SAME_SHARE = 1e-6
+
+#: Row, column and text of an entry.
+Entry = tuple[int, int, str]
+
+
+@dataclass(frozen=True, eq=False)
+class Uncertainty:
+    """Constants with tolerances in the matrices of a plant.
+
+    Parameters
+    ----------
+    box : ConstantsBox
+        The constants.
+    entries : mapping of str to sequence
+        By matrix: ``(row, column, text)`` of each entry that is an expression, counted from 0.  A text that is the name
+        of a constant stands for it, whatever it looks like.
+    written : mapping, optional
+        Matrices of the plant as written, if what holds this was made from it by ``steps``.
+    steps : sequence, optional
+        ``(kind, seconds)``, kinds ``eliminate`` and ``sample``.
+    """
+
+    box: ConstantsBox
+    entries: Mapping[str, tuple[Entry, ...]]
+    written: Mapping[str, Any] | None = None
+    steps: tuple[tuple[str, float], ...] = ()
+    _parsed: dict[str, Expression] = field(default_factory=dict, repr=False, init=False)
+
+    def __post_init__(self) -> None:
+        found: dict[str, tuple[Entry, ...]] = {}
+        for matrix, entries in self.entries.items():
+            if matrix not in UNCERTAIN_MATRICES:
+                raise SpecError(f"{matrix!r} holds no constants: {', '.join(UNCERTAIN_MATRICES)} may.", path=matrix)
+            found[matrix] = tuple((int(row), int(column), str(text)) for row, column, text in entries)
+            for row, column, text in found[matrix]:
+                self._check(text, f"{matrix}, row {row + 1}, column {column + 1}", matrix)
+        object.__setattr__(self, "entries", MappingProxyType(found))
+        object.__setattr__(self, "steps", tuple((str(kind), float(size)) for kind, size in self.steps))
+        object.__setattr__(self, "written", None if self.written is None else MappingProxyType(dict(self.written)))
+
+    def _check(self, text: str, place: str, matrix: str) -> None:
+        known = self.box.constants
+        if text in known:
+            return
+        expression = self._parsed.setdefault(text, parse_expression(text))
+        unknown = sorted(expression.names - known.keys())
+        if unknown:
+            raise SpecError(
+                f"{place}: {text!r} has the unknown name {unknown[0]!r}; the constants are "
+                f"{', '.join(known) or 'none'}.",
+                path=matrix,
+            )  # fmt: skip
+
+    @cached_property
+    def used(self) -> frozenset[str]:
+        """Names of the constants that stand in some entry."""
+        texts = {text for entries in self.entries.values() for *_, text in entries}
+        direct = {text for text in texts if text in self.box.constants}
+        return frozenset(direct.union(*(self._parsed[text].names for text in texts - direct)))
+
+    def with_box(self, box: ConstantsBox) -> Uncertainty:
+        """Return the same entries with other tolerances.
+
+        Parameters
+        ----------
+        box : ConstantsBox
+            Of the same constants.
+        """
+        return Uncertainty(box, self.entries, self.written, self.steps)
+
+    def then(self, matrices: Mapping[str, FloatArray], kind: str, size: float = 0.0) -> Uncertainty:
+        """Return what is uncertain in a plant made from this one.
+
+        Parameters
+        ----------
+        matrices : mapping of str to FloatArray
+            Of the plant before, which is kept if it is the one as written.
+        kind : str
+            ``eliminate`` or ``sample``.
+        size : float, optional
+            Seconds, for ``sample``.
+        """
+        written = {name: matrices[name] for name in UNCERTAIN_MATRICES} if self.written is None else self.written
+        return Uncertainty(self.box, self.entries, written, (*self.steps, (kind, size)))
+
+    def value(self, text: str, values: Mapping[str, float]) -> float:
+        """Return the value of an entry for values of the constants.
+
+        Parameters
+        ----------
+        text : str
+            The entry.
+        values : mapping
+            Of all constants.
+        """
+        return float(values[text]) if text in values else float(self._parsed[text](values))
+
+    def filled(self, matrices: Mapping[str, FloatArray], values: Mapping[str, float]) -> dict[str, FloatArray]:
+        """Return matrices with every entry at values of the constants.
+
+        Parameters
+        ----------
+        matrices : mapping of str to FloatArray
+            As written.
+        values : mapping
+            Of all constants.
+        """
+        found = {name: np.array(matrices[name], dtype=np.float64) for name in UNCERTAIN_MATRICES}
+        for name, entries in self.entries.items():
+            for row, column, text in entries:
+                found[name][row, column] = self.value(text, values)
+        return found
+
+    def affine(self, matrices: Mapping[str, FloatArray], box: ConstantsBox) -> dict[str, AffineMatrix]:
+        """Return the matrices over a box of the constants.
+
+        Parameters
+        ----------
+        matrices : mapping of str to FloatArray
+            As written.
+        box : ConstantsBox
+            Its uncertain constants are the unknowns, in order.
+
+        Raises
+        ------
+        PreconditionError
+            An expression is not bounded on the box.
+        """
+        unknowns = {name: i for i, name in enumerate(box.names)}
+        count, numbers = len(unknowns), {}
+        for name, item in box.constants.items():
+            parts = np.zeros(count)
+            if name in unknowns:
+                parts[unknowns[name]] = item.half
+            # The middle and the half are rounded.
+            slack = 0.0 if item.certain else 2.0**-51 * max(abs(item.low), abs(item.high))
+            numbers[name] = AffineNumber(item.nominal if item.certain else item.middle, parts, slack)
+        translation, known = affine_translation(count), dict[str, AffineNumber]()
+        found = {name: AffineMatrix.exact(np.array(matrices[name]), count) for name in UNCERTAIN_MATRICES}
+        for name, entries in self.entries.items():
+            at = found[name]
+            parts, radius = at.parts.copy(), at.radius.copy()
+            for row, column, text in entries:
+                if text not in known:
+                    known[text] = numbers[text] if text in numbers else self._number(text, numbers, translation, count)
+                value = known[text]
+                at.center[row, column], parts[:, row, column] = value.center, value.parts
+                radius[row, column] = value.radius
+            found[name] = AffineMatrix(at.center, parts, radius)
+        return found
+
+    def _number(self, text: str, numbers: Mapping[str, AffineNumber], translation: Any, count: int) -> AffineNumber:
+        value = self._parsed[text].translated(numbers, translation)
+        return value if isinstance(value, AffineNumber) else AffineNumber(float(value), np.zeros(count), 0.0)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain data, as `uncertainty_of` reads it."""
+        return {
+            "box": self.box.as_dict(), "entries": {name: [list(item) for item in found]
+                                                   for name, found in self.entries.items()},
+            "written": None if self.written is None else dict(self.written),
+            "steps": [list(step) for step in self.steps],
+        }  # fmt: skip
+
+
+def uncertainty_of(data: Any) -> Uncertainty | None:
+    """Return what `Uncertainty.as_dict` described; `None` and an `Uncertainty` stay as they are."""
+    if data is None or isinstance(data, Uncertainty):
+        return data
+    box = dict(data["box"])
+    return Uncertainty(constants_box(box.pop("constants"), **box), data["entries"], data["written"], data["steps"])
+
+
+def expressions_in(rows: Any) -> tuple[Any, list[Entry]]:
+    """Return rows of numbers and texts as numbers (zero for texts), and the texts with their places."""
+    if not isinstance(rows, (list, tuple)) or not all(isinstance(row, (list, tuple)) for row in rows):
+        return rows, []
+    entries = [(i, j, cell) for i, row in enumerate(rows) for j, cell in enumerate(row) if isinstance(cell, str)]
+    return [[0.0 if isinstance(cell, str) else cell for cell in row] for row in rows], entries
+
+
+def matrices_of(plant: Any) -> dict[str, FloatArray]:
+    """Return the matrices of a plant that may hold constants, by name."""
+    return {name: getattr(plant, name) for name in UNCERTAIN_MATRICES}

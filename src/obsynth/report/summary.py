@@ -1,0 +1,259 @@
+"""A finished design in about twelve lines: what it is, what each fault estimate is worth, what it rests on."""
+
+from __future__ import annotations
+
+import math
+import textwrap
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.text import Text
+
+from obsynth.methods.registry import REGISTRY, method_spec
+from obsynth.observers.linear.warm_up import FORGOTTEN, transient
+from obsynth.plants.dae.model import DAEModel
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.plotting.frequency import FaultGains, fault_gains
+from obsynth.report.layout import number
+from obsynth.report.verification import verdict_line
+from obsynth.results.design import ObserverDesign
+
+#: Faults, warnings and notes that are listed; the others are counted.
+_MOST_FAULTS, _MOST_NOTES = 5, 2
+#: An unknown input that reaches a fault estimate in the fault's own unit with this gain or more looks like the fault.
+NEAR_ONE = 0.5
+#: An estimate follows a step if in the end it misses it by no more than this share.
+FOLLOWS = 0.1
+_LABEL = 10
+#: Claims that say what a design is worth; the others are for -v.
+_PROMISES = ("gamma", "decay")
+
+
+@dataclass(frozen=True)
+class Summary:
+    """The lines of a summary: a verdict, facts by label, a table of the fault estimates, warnings and notes."""
+
+    verdict: str
+    passed: bool
+    facts: tuple[tuple[str, str], ...]
+    headings: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    more: str
+    warnings: tuple[str, ...]
+    notes: tuple[str, ...]
+    file: str = ""
+
+    def lines(self, width: int = 80) -> Iterator[tuple[str, str]]:
+        """Yield text and style of each line, none wider than ``width`` but the file's."""
+        yield self.verdict, "green" if self.passed else "bold red"
+        for label, text in self.facts:
+            yield from ((line, "") for line in _wrapped(label, text, width))
+        if self.rows:
+            yield from _table(self.headings, self.rows, width)
+        if self.more:
+            yield self.more, "dim"
+        for text in self.warnings:
+            yield from ((line, "yellow") for line in _wrapped("warning", text, width))
+        for text in self.notes:
+            yield from ((line, "") for line in _wrapped("note", text, width))
+        if self.file:
+            yield f"Gain set: {self.file}", ""
+
+    def __str__(self) -> str:
+        """Return the lines as plain text."""
+        return "\n".join(text for text, _ in self.lines())
+
+    def html(self) -> str:
+        """Return the summary as a piece of HTML."""
+        colour = "#1a7f37" if self.passed else "#b42318"
+        parts = [f'<p style="color:{colour};font-weight:600">{escape(self.verdict)}</p>', "<table>"]
+        parts += [f'<tr><th style="text-align:left">{escape(label)}</th><td style="text-align:left">{escape(text)}</td>'
+                  "</tr>" for label, text in self.facts]  # fmt: skip
+        parts.append("</table>")
+        if self.rows:
+            head = "".join(f"<th>{escape(text)}</th>" for text in self.headings)
+            body = "".join("<tr>" + "".join(f"<td>{escape(text)}</td>" for text in row) + "</tr>" for row in self.rows)
+            parts.append(f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>")
+        parts += [f"<p>{escape(self.more)}</p>"] if self.more else []
+        parts += [f'<p style="color:#9a6700">Warning: {escape(text)}</p>' for text in self.warnings]
+        parts += [f"<p>Note: {escape(text)}</p>" for text in self.notes]
+        return f'<div class="obsynth-design">{"".join(parts)}</div>'
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the summary as plain data."""
+        return {
+            "verdict": self.verdict, "passed": self.passed, "facts": dict(self.facts),
+            "estimates": [dict(zip(self.headings, row, strict=True)) for row in self.rows],
+            "warnings": list(self.warnings), "notes": list(self.notes),
+        }  # fmt: skip
+
+
+def summary(design: ObserverDesign, *, file: Path | None = None, everything: bool = False) -> Summary:
+    """Return the summary of a design; with ``everything`` no fault and no note is left out."""
+    gains = _gains_if_linear(design)
+    headings, rows = _estimates(design, gains)
+    warnings = tuple(_warnings(design, gains))
+    shown = len(rows) if everything else _MOST_FAULTS
+    notes = design.notes if everything else design.notes[:_MOST_NOTES]
+    more = [f"{len(rows) - shown} more estimates" for _ in (1,) if len(rows) > shown]
+    more += [f"{len(design.notes) - len(notes)} more notes" for _ in (1,) if len(design.notes) > len(notes)]
+    verdict = f"{design.name}: {verdict_line(design.report).plain}"
+    return Summary(
+        verdict, design.report.passed, tuple(_facts(design)), headings, tuple(rows[:shown]),
+        f"{' and '.join(more)} with -v" if more else "", warnings, notes, "" if file is None else str(file),
+    )  # fmt: skip
+
+
+def print_summary(found: Summary, *, console: Console) -> None:
+    """Print a summary; a file's name stays in one piece, so that it can be copied."""
+    for text, style in found.lines(min(console.width, 120)):
+        console.print(Text(text, style=style), soft_wrap=True)
+
+
+def design_text(design: ObserverDesign) -> str:
+    """Return what ``print(design)`` shows."""
+    return str(summary(design))
+
+
+def design_html(design: ObserverDesign) -> str:
+    """Return what a notebook shows of a design."""
+    return summary(design).html()
+
+
+def _facts(design: ObserverDesign) -> Iterator[tuple[str, str]]:
+    known = method_spec(design.method) if design.method in REGISTRY else None
+    yield "method", design.method + (f": {known.summary}" if known else "")
+    yield "plant", _plant(design.plant)
+    yield from _promise(design)
+    yield "slowest", _slowest(design)
+    yield "assumes", "; ".join(_assumptions(design))
+
+
+def _plant(plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel) -> str:
+    if isinstance(plant, DAEModel):
+        counts = ((plant.nx, "state"), (plant.ny, "output"), (plant.nq, "parameter"))
+        return f"nonlinear; {_counted(counts)}"
+    if isinstance(plant, TimeVaryingDescriptorSystem):
+        counts = ((len(plant.state_names), "state"), (len(plant.output_names), "output"),
+                  (len(plant.parameter_names), "parameter"))  # fmt: skip
+        return f"{plant.dt:g} s between samples, changing with time; {_counted(counts)}"
+    time = f"{plant.dt:g} s between samples" if plant.is_discrete else "continuous in time"
+    faults = ((plant.nf, "fault"), (plant.nd, "unknown input"))
+    return f"{time}; {_counted(((plant.nx, 'state'), (plant.ny, 'output'), *faults))}"
+
+
+def _counted(counts: Sequence[tuple[int, str]]) -> str:
+    return ", ".join(f"{count or 'no'} {word}{'' if count == 1 else 's'}" for count, word in counts)
+
+
+def _promise(design: ObserverDesign) -> Iterator[tuple[str, str]]:
+    """Yield the claim that says what is shipped."""
+    known = method_spec(design.method).claims if design.method in REGISTRY else {}
+    claims = design.certificate.claims
+    for name in (name for name in _PROMISES if name in claims and name in known):
+        unit = f" {known[name].unit}" if known[name].unit else ""
+        yield "promise", f"{name} = {number(claims[name])}{unit}, {known[name].meaning}"
+
+
+def _slowest(design: ObserverDesign) -> str:
+    """Return how long the observer remembers its start."""
+    if isinstance(design.plant, DescriptorSystem):
+        seconds = transient(design.linear[1])
+        return (f"mode forgets its start to {FORGOTTEN:.0%} within {number(seconds)} s; observer of order "
+                f"{design.observer.order}")  # fmt: skip
+    factor = design.certificate.claims.get("contraction", math.nan)
+    return f"errors shrink by {number(factor)} per step on average; observer of order {design.observer.order}"
+
+
+def _assumptions(design: ObserverDesign) -> Iterator[str]:
+    yield "an exact model" if isinstance(design.plant, DescriptorSystem) else "a model with the stated noise"
+    model = design.options.get("fault_model")
+    if isinstance(model, str):
+        yield f"faults like the model '{model}'"
+    if isinstance(design.plant, DescriptorSystem):
+        noisy = sum(bool(row.any()) for row in design.plant.Dw)
+        yield f"white noise on {noisy} of {design.plant.ny} sensors" if noisy else "no sensor noise stated"
+
+
+def _gains_if_linear(design: ObserverDesign) -> FaultGains | None:
+    plant = design.plant
+    return fault_gains(design) if isinstance(plant, DescriptorSystem) and design.observer.fault_names else None
+
+
+def _estimates(design: ObserverDesign, gains: FaultGains | None) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Return headings and one row for each fault, or parameter."""
+    observer, units = design.observer, design.plant.units
+    deviations = {check.name: check.value for check in design.report.checks}
+
+    def deviation(name: str, missing: str) -> str:
+        value = deviations.get(f"noise in fhat[{name}]")
+        return missing if value is None else f"{number(value)} {units.get(name, '')}".strip()
+
+    if gains is None or not isinstance(design.plant, DescriptorSystem):
+        return ("parameter", "deviation"), [(name, deviation(name, "-")) for name in observer.fault_names]
+    plant, linear = design.linear
+    none = "none stated" if not plant.nw else "by sampling"
+    noise = "deviation" if plant.is_discrete else "dev. at 1 s"
+    delays = ("samples late", "s late") if plant.is_discrete else ()
+    headings = ("fault", *delays, noise, *(("worst leak",) if plant.nd else ()))
+    rows: list[tuple[str, ...]] = []
+    for i, name in enumerate(linear.fault_names):
+        late = linear.fault_delays[i]
+        delay = (str(late), number(late * plant.dt)) if plant.is_discrete else ()
+        leaks: tuple[str, ...] = ()
+        if plant.nd:
+            worst = int(gains.leaks[i].argmax())
+            leak = float(gains.leaks[i, worst])
+            leaks = (f"{number(leak)} of {plant.disturbance_names[worst]}" if leak else "none",)
+        rows.append((name, *delay, deviation(name, none), *leaks))
+    return headings, rows
+
+
+def _warnings(design: ObserverDesign, gains: FaultGains | None) -> Iterator[str]:
+    """Yield what a user should not overlook: leaks that look like faults, steps that are not followed."""
+    if gains is None:
+        return
+    plant, observer = design.linear
+    units = plant.units
+    for i, fault in enumerate(observer.fault_names):
+        for j, name in enumerate(plant.disturbance_names):
+            leak = float(gains.leaks[i, j])
+            if leak >= NEAR_ONE and units.get(fault) == units.get(name):
+                yield (f"{name} reaches the estimate of {fault} with a gain of up to {number(leak)}: it looks like the "
+                       "fault.")  # fmt: skip
+        followed = float(gains.steady[i])
+        if abs(followed - 1.0) > FOLLOWS:
+            share = number(100.0 * followed, digits=3)
+            yield f"the estimate of {fault} does not follow a step: in the end it shows {share} % of it."
+    for check in design.report.checks:
+        if check.name.startswith("limit at "):
+            yield f"{check.name}: {check.claim}."
+
+
+def _wrapped(label: str, text: str, width: int) -> list[str]:
+    return textwrap.wrap(
+        text, width, initial_indent=f"{label:<{_LABEL}}", subsequent_indent=" " * _LABEL, break_on_hyphens=False
+    )
+
+
+def _table(headings: Sequence[str], rows: Sequence[Sequence[str]], width: int) -> Iterator[tuple[str, str]]:
+    """Yield the lines of a table; long names are cut, and the last column takes what is left."""
+    widths = [max(len(row[i]) for row in (headings, *rows)) for i in range(len(headings))]
+    excess = sum(widths) + 2 * (len(widths) - 1) - width
+    for column in (0, len(widths) - 1):
+        cut = min(max(excess, 0), max(widths[column] - 16, 0))
+        widths[column] -= cut
+        excess -= cut
+
+    def line(row: Sequence[str]) -> str:
+        cells = (text if len(text) <= size else f"{text[: size - 1]}…" for text, size in zip(row, widths, strict=True))
+        return "  ".join(f"{text:<{size}}" for text, size in zip(cells, widths, strict=True)).rstrip()
+
+    yield line(headings), "bold"
+    for row in rows:
+        yield line(row), ""

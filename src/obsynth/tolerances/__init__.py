@@ -1,0 +1,1 @@
+"""What holds for every plant in the box of its constants."""

@@ -1,0 +1,233 @@
+r"""How an uncertain plant drives the error of a fixed observer: robust.md, sections 1, 2 and 8.
+
+With ``eps = z - T E(q) x`` and the plant ``E x+ = A x + B u + Bd d``, ``y = C x + D u + Dd d``,
+
+    eps+ = Az eps + (Az T E + By C - T A) x + (Bu + By D - T B) u + (By Dd - T Bd) d
+    xhat - x = Cx eps + (Cx T E + Dyx C + T0x A - I) x + ...      (fault estimates, residuals: without I)
+
+on every trajectory.  At the nominal plant the brackets vanish; over the box they are affine with remainders, and are
+driven by ``x = xhat - e``: by a signal that is known, and by the error itself through the channels collected here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from obsynth.analysis.transformations.uncertain_plant import AffinePlant
+from obsynth.errors import PreconditionError
+from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.proofs.affine import AffineMatrix, affine_block
+from obsynth.proofs.balls import gamma, rounded_up
+from obsynth.tolerances.tracking import IDENTITY_SHARE, Tracking
+
+#: Remainders below this share of their row's terms are rounding: one common channel is enough for them.
+ROUNDING_SHARE = 1e-9
+#: Singular values of a constant's effect below this share count as zero; what is left out goes into the remainder.
+RANK_SHARE = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorStructure:
+    """The error system over a box, in rows ``[eps; e; outputs]`` (nz, n, no) and columns of the state and the inputs.
+
+    ``state, inputs``: what multiplies x and u; ``disturbances``: what multiplies d, each within its bound.  What is
+    uncertain acts through channels, ``|c e|`` of a row c: those of constants first (``owner`` says whose), then one for
+    each state with a remainder; rows after the first ``single`` share one channel, the largest of them.  ``effects
+    (nz + n + no, m)`` is what a channel does.  ``reading`` takes xhat (and fhat) from the rows of the observer.
+    """
+
+    Az: FloatArray
+    Cx: FloatArray
+    Co: FloatArray
+    state: AffineMatrix
+    inputs: AffineMatrix
+    disturbances: AffineMatrix
+    bounds: FloatArray
+    channel_rows: FloatArray
+    single: int
+    effects: FloatArray
+    owner: tuple[int, ...]
+    offsets: FloatArray
+    reading: FloatArray
+
+    @property
+    def sizes(self) -> tuple[int, int, int]:
+        """``nz, n, no``."""
+        return len(self.Az), len(self.Cx), len(self.Co)
+
+    @property
+    def rows(self) -> tuple[slice, slice, slice]:
+        """Rows of eps, e and the outputs."""
+        nz, n, no = self.sizes
+        return slice(0, nz), slice(nz, nz + n), slice(nz + n, nz + n + no)
+
+    @property
+    def channels(self) -> int:
+        """Number of channels."""
+        return int(self.effects.shape[1])
+
+    def seen(self, values: FloatArray) -> FloatArray:
+        """Return the size of each channel from ``channel_rows`` times something, rows in the first axis."""
+        sizes = np.abs(values)
+        if self.single == len(sizes):
+            return sizes
+        return np.concatenate([sizes[: self.single], sizes[self.single :].max(axis=0, keepdims=True)])
+
+    def effect(self, rows: slice) -> FloatArray:
+        """Return rows of the effects."""
+        return self.effects[rows]
+
+
+def error_structure(
+    observer: LinearObserver, affine: AffinePlant, tracking: Tracking, bounds: FloatArray, noise_bound: float, *,
+    faults: bool = False,
+) -> ErrorStructure:  # fmt: skip
+    """Return the error system of an observer over a box.
+
+    ``bounds (nd,)`` of the disturbances; ``noise_bound`` in standard deviations.  With ``faults``, faults are unknown
+    signals that are estimated like states, and the outputs are the errors of their estimates; else there is no fault,
+    and the outputs are fault estimates and residuals.
+    """
+    plant, count = affine.plant, affine.count
+    t, t0 = tracking
+    nz, n, nf = observer.order, plant.nx, plant.nf if faults else 0
+    shown = observer.fault_rows
+    watched = list(range(shown.start, shown.stop if faults else len(observer.Cz)))
+    picked = np.zeros((n + nf + len(watched), len(observer.Cz)))
+    picked[:n, observer.state_rows] = 2.0 * np.eye(n) - affine.coordinates
+    if faults:
+        picked[n : n + nf, shown] = np.eye(nf)
+    picked[n + nf :, watched] = np.eye(len(watched))
+    c, dy, du, algebraic = picked @ observer.Cz, picked @ observer.Dy, picked @ observer.Du, picked @ t0
+
+    def stacked(inner: AffineMatrix, output: AffineMatrix) -> AffineMatrix:
+        """Return rows of eps and of what is read, for one kind of signal."""
+        top, low = output.after(observer.By) - inner.after(t), output.after(dy) + inner.after(algebraic)
+        return affine_block([[top], [low]])
+
+    target = np.vstack([np.zeros((nz, n)), np.eye(n), np.zeros((len(picked) - n, n))])
+    followed = affine.E.after(t)
+    state = stacked(affine.A, affine.C) + affine_block([[followed.after(observer.Az)], [followed.after(c)]]) + (-target)
+    known = stacked(affine.B, affine.D) + np.vstack([observer.Bu, du])
+    sizes = _sizes(observer, affine, t, c, dy)
+    require_identities(state, known, sizes, affine.offsets)
+    noise = AffineMatrix.exact(plant.Bw, count), AffineMatrix.exact(plant.Dw, count)
+    disturbances = affine_block([[stacked(affine.Bd, affine.Dd), stacked(*noise)]])
+    if faults:
+        direct = stacked(affine.Bf, affine.Df)
+        state = affine_block([[state, _fault_columns(direct, observer, c, n)]])
+    parts, rest = _about_nominal(state, affine.offsets)
+    rows, effects, owner, left = _channels(parts, affine.offsets)
+    rest = rounded_up(rest + left, 3)
+    more, single, remainders = _remainder_channels(rest, sizes)
+    input_parts, input_rest = _about_nominal(known, affine.offsets)
+    return ErrorStructure(
+        observer.Az, c[: n + nf], c[n + nf :], AffineMatrix(np.zeros_like(rest), parts, rest),
+        AffineMatrix(np.zeros_like(input_rest), input_parts, input_rest), disturbances,
+        np.concatenate([bounds, np.full(plant.nw, noise_bound)]), np.vstack([rows, more]), len(rows) + single,
+        np.hstack([effects, remainders]), tuple(owner), affine.offsets, picked[: n + nf],
+    )  # fmt: skip
+
+
+def _sizes(observer: LinearObserver, affine: AffinePlant, t: FloatArray, c: FloatArray, dy: FloatArray) -> FloatArray:
+    """Return the size of the terms of each row, ``(rows, 1)``."""
+    te, absolute = np.abs(t) @ affine.E.magnitude, np.abs
+    top = absolute(observer.Az) @ te + absolute(observer.By) @ affine.C.magnitude + absolute(t) @ affine.A.magnitude
+    low = absolute(c) @ te + absolute(dy) @ affine.C.magnitude
+    return np.asarray(np.vstack([top, low]).max(axis=1, initial=np.finfo(np.float64).tiny)[:, None])
+
+
+def require_identities(state: AffineMatrix, known: AffineMatrix, sizes: FloatArray, offsets: FloatArray) -> None:
+    """Raise `PreconditionError` where the observer is none of the nominal plant."""
+    missed = float(np.max(np.abs(state.at(offsets)) / sizes, initial=0.0))
+    missed = max(missed, float(np.max(np.abs(known.at(offsets)) / (sizes + known.magnitude), initial=0.0)))
+    if not missed <= IDENTITY_SHARE:
+        raise PreconditionError(
+            f"The observer's identities do not hold on the nominal plant (by {missed:.1e} of their terms): a bound "
+            "over tolerances needs z to follow T E x. Run obsynth.verify on the design.", condition="identities",
+        )  # fmt: skip
+
+
+def _fault_columns(direct: AffineMatrix, observer: LinearObserver, c: FloatArray, n: int) -> AffineMatrix:
+    """Return the columns of faults as signals that are estimated, each at its delay: robust.md, correction 8.1.
+
+    A fault that is estimated one sample late counts as a state of the sample after it: what it does to eps by then is
+    taken out of eps.
+    """
+    nz, nf = observer.order, direct.shape[1]
+    target = np.zeros((nz + len(c), nf))
+    target[nz + n : nz + n + nf] = np.eye(nf)
+    target[nz + n + nf :] = np.eye(nf)
+    late = np.array(observer.fault_delays, dtype=np.int64)
+    if (late > 1).any():
+        raise PreconditionError("A fault estimate that lags by more than one sample has no guaranteed interval.",
+                                condition="fault interval")  # fmt: skip
+    into = direct[:nz, :]
+    moved = affine_block([[into.after(observer.Az)], [into.after(c)]])
+    reached = direct.magnitude[nz:, late == 1]
+    if reached.size and reached.max() > RANK_SHARE:
+        raise PreconditionError(
+            "A fault that is estimated one sample late reaches the estimates at once: its estimate has no guaranteed "
+            "interval.", condition="fault interval",
+        )  # fmt: skip
+    chosen = [moved[:, [j]] if late[j] else direct[:, [j]] for j in range(nf)]
+    found = affine_block([chosen]) + (-target)
+    if float(np.max(np.abs(found.center), initial=0.0)) > IDENTITY_SHARE:
+        raise PreconditionError(
+            "The estimate of a fault, or of the state, depends on how the fault came about: it has no guaranteed "
+            "interval (a filter that estimates each sample of a fault on its own has one).", condition="fault interval",
+        )  # fmt: skip
+    return found
+
+
+def _about_nominal(matrix: AffineMatrix, offsets: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the affine parts, which multiply ``q - offsets``, and what remains at the nominal plant."""
+    rounding = gamma(matrix.count + 2) * matrix.magnitude if offsets.any() else 0.0
+    return matrix.parts, rounded_up(np.abs(matrix.at(offsets)) + matrix.radius + rounding, 3)
+
+
+def _channels(parts: FloatArray, offsets: FloatArray) -> tuple[FloatArray, FloatArray, list[int], FloatArray]:
+    """Return rows c, effects b (times how far a constant is from nominal) and owners; and what was left out."""
+    rows_count, n = parts.shape[1:]
+    rows, effects, owner = [np.zeros((0, n))], [np.zeros((rows_count, 0))], []
+    left = np.zeros((rows_count, n))
+    for i, part in enumerate(parts):
+        columns = np.flatnonzero(np.abs(part).sum(axis=0) > 0.0)
+        if not len(columns):
+            continue
+        u, values, v = np.linalg.svd(part, full_matrices=False)
+        rank = int(np.sum(values > RANK_SHARE * values[0]))
+        if len(columns) <= rank:
+            b, c = part[:, columns], np.eye(n)[columns]
+        else:
+            b, c = u[:, :rank] * values[:rank], v[:rank]
+            c = np.where(np.abs(c) < RANK_SHARE, 0.0, c)
+            missed = np.abs(part - b @ c) + gamma(2 * rank + 4) * (np.abs(b) @ np.abs(c))
+            left += (1.0 + abs(offsets[i])) * missed
+        rows.append(c)
+        effects.append((1.0 + abs(offsets[i])) * b)
+        owner += [i] * len(c)
+    return np.vstack(rows), np.hstack(effects), owner, rounded_up(left, len(parts) + 4)
+
+
+def _remainder_channels(rest: FloatArray, sizes: FloatArray) -> tuple[FloatArray, int, FloatArray]:
+    """Return rows, how many of them are channels of their own, and effects: small remainders share one channel."""
+    n = rest.shape[1]
+    share = (rest / sizes).max(axis=0, initial=0.0)
+    large = np.flatnonzero(share > ROUNDING_SHARE)
+    small = np.flatnonzero((share > 0.0) & (share <= ROUNDING_SHARE))
+    rows, effects = [np.eye(n)[large]], [rest[:, large]]
+    if len(small):
+        rows.append(np.eye(n)[small] * share[small][:, None])
+        effects.append(rounded_up((rest[:, small] / share[small]).sum(axis=1, keepdims=True), len(small) + 2))
+    return np.vstack(rows), len(large), np.hstack(effects)
+
+
+def owners(structure: ErrorStructure) -> Sequence[int]:
+    """Return whose each channel is; remainders belong to nobody, which is the number of constants."""
+    count = structure.state.count
+    return [*structure.owner, *([count] * (structure.channels - len(structure.owner)))]

@@ -1,0 +1,160 @@
+"""Responses of an observer's error to its channels: finite sums with a proved tail, and the loop that they close."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from obsynth.errors import PreconditionError
+from obsynth.numerics.arrays import FloatArray
+from obsynth.proofs.balls import gamma
+from obsynth.proofs.nonnegative import inverse_bound, positive_vector, spectral_radius_bound
+from obsynth.tolerances.error_structure import ErrorStructure
+
+#: A ring of L samples is long enough when ``|Az^L|`` is proved to contract this much.
+CONTRACTION = 1e-2
+#: Shortest and longest ring.
+SHORTEST, LONGEST = 8, 8192
+#: Sums of products of doubles are multiplied by this: more than rounding can take from them.
+OUTWARD = 1.0 + 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class Responses:
+    """What channels do, sample by sample.
+
+    ``kernels (L, m, m + no + nz)``: what channel i adds to the channels, the outputs and eps, j + 1 samples later;
+    ``same (m, m)`` and ``direct (no, m)``: at the same sample.  ``powers (L + 1, nz, nz)`` of Az.  What is older than L
+    samples goes on through bounds of eps: ``tail_channels, tail_outputs, tail_eps``.
+    """
+
+    structure: ErrorStructure
+    powers: FloatArray
+    kernels: FloatArray
+    same: FloatArray
+    direct: FloatArray
+    tail_channels: FloatArray
+    tail_outputs: FloatArray
+    tail_eps: FloatArray
+    repeated: FloatArray
+
+    @property
+    def length(self) -> int:
+        """Samples in the ring."""
+        return len(self.kernels)
+
+    @property
+    def loop(self) -> FloatArray:
+        """``H``: what all channels at all times add to the channels, the tail included; see `loop_radius`."""
+        m = len(self.same)
+        no = len(self.direct)
+        gathered = self.kernels.sum(axis=0)
+        older = self.tail_channels @ (self.repeated @ gathered[:, m + no :].T)
+        return np.asarray((self.same + gathered[:, :m].T + older) * OUTWARD)
+
+    def gain(self, left: FloatArray, right: FloatArray, direct: FloatArray | None = None) -> FloatArray:
+        """Return an upper bound of ``|direct| + sum_j |left Az^j right|``, entry by entry."""
+        moved = self.powers[:-1] @ right
+        older = np.abs(left @ self.powers[-1]) @ (self.repeated @ np.abs(moved).sum(axis=0))
+        rounding = self.length * power_rounding(left, self.powers) @ np.abs(right)
+        total = np.abs(left @ moved).sum(axis=0) + older + rounding
+        return np.asarray((total if direct is None else total + np.abs(direct)) * OUTWARD)
+
+    def absolute_gain(self, left: FloatArray, right: FloatArray) -> FloatArray:
+        """Return an upper bound of ``sum_j |left Az^j| right`` for a nonnegative ``right``."""
+        shown = np.abs(left @ self.powers[:-1]).sum(axis=0)
+        size = np.abs(self.powers[:-1]).sum(axis=0)
+        rounding = self.length * power_rounding(left, self.powers)
+        return np.asarray((shown + rounding + np.abs(left @ self.powers[-1]) @ self.repeated @ size) @ right * OUTWARD)
+
+
+def power_rounding(left: FloatArray, powers: FloatArray) -> FloatArray:
+    """Return a bound of what rounding of the computed powers changes in ``left Az^j``, the same for all j.
+
+    With ``P(j+1) = Az P(j) + F(j)`` as computed, ``Az^j - P(j)`` is the sum of ``Az^(j-1-i) F(i)``.
+    """
+    largest, size = np.abs(powers).max(axis=0), gamma(len(powers[0]) + 2)
+    later = np.abs(left @ powers).sum(axis=0) @ np.abs(powers[min(1, len(powers) - 1)])
+    return np.asarray(2.0 * size * (later + np.abs(left)) @ largest)
+
+
+def ring_length(az: FloatArray) -> int:
+    """Return the least power of two L with ``|Az^L|`` proved to contract to `CONTRACTION`."""
+    length = SHORTEST
+    power = np.linalg.matrix_power(az, length)
+    while not spectral_radius_bound(power) < CONTRACTION:
+        length, power = 2 * length, power @ power
+        if length > LONGEST or not np.isfinite(power).all():
+            raise PreconditionError(
+                f"The observer forgets too slowly for a bound over tolerances (not within {LONGEST} samples): ask for "
+                "a faster one, or sample more slowly.", condition="observer's decay",
+            )  # fmt: skip
+    return length
+
+
+def responses_of(structure: ErrorStructure, length: int | None = None) -> Responses:
+    """Return the responses of an error system; the ring is as long as it must be, or as asked."""
+    az = structure.Az
+    wanted = ring_length(az) if length is None else length
+    nz = len(az)
+    powers = np.empty((wanted + 1, nz, nz))
+    powers[0] = np.eye(nz)
+    for j in range(wanted):
+        powers[j + 1] = az @ powers[j]
+    _, state, outputs = structure.rows
+    rows = structure.channel_rows @ structure.Cx
+    kernels = np.concatenate([_sizes(structure, rows, powers[:-1]), _plain(structure, structure.Co, powers[:-1]),
+                              _plain(structure, np.eye(nz), powers[:-1])], axis=1)  # fmt: skip
+    signed = structure.channel_rows @ structure.effects[state]
+    absolute = np.abs(structure.channel_rows) @ np.abs(structure.effects[state])
+    own = len(structure.owner)
+    same = structure.seen(np.hstack([signed[:, :own], absolute[:, own:]]))
+    eye = np.eye(nz)
+    tail = structure.seen(np.abs(rows @ powers[-1]) + power_rounding(rows, powers))
+    out = np.abs(structure.Co @ powers[-1]) + power_rounding(structure.Co, powers)
+    inside = (np.abs(powers[-1]) + power_rounding(eye, powers)) * OUTWARD
+    repeated = inverse_bound(inside)
+    if repeated is None:
+        raise PreconditionError("The observer does not contract within its ring.", condition="observer's decay")
+    return Responses(
+        structure, powers, np.ascontiguousarray(kernels.transpose(0, 2, 1)) * OUTWARD, same * OUTWARD,
+        np.abs(structure.effects[outputs]) * OUTWARD, tail * OUTWARD, out * OUTWARD, inside, repeated,
+    )  # fmt: skip
+
+
+def _plain(structure: ErrorStructure, left: FloatArray, powers: FloatArray) -> FloatArray:
+    """Return ``|left Az^j b|`` (absolute values inside for remainders) for all j."""
+    own, inner = len(structure.owner), structure.effects[structure.rows[0]]
+    shown, slack = left @ powers, power_rounding(left, powers)
+    found = np.concatenate([np.abs(shown @ inner[:, :own]), np.abs(shown) @ np.abs(inner[:, own:])], axis=2)
+    return np.asarray(found + slack @ np.abs(inner))
+
+
+def _sizes(structure: ErrorStructure, rows: FloatArray, powers: FloatArray) -> FloatArray:
+    found = _plain(structure, rows, powers)
+    if structure.single == len(rows):
+        return found
+    largest = found[:, structure.single :].max(axis=1, keepdims=True)
+    return np.concatenate([found[:, : structure.single], largest], axis=1)
+
+
+def loop_radius(responses: Responses) -> float:
+    """Return an upper bound of the loop's radius: below 1, bounds stay finite for ever."""
+    return spectral_radius_bound(responses.loop)
+
+
+def same_sample_inverse(responses: Responses) -> FloatArray:
+    """Return a bound of ``(I - D0)^-1``; `PreconditionError` where the loop at one sample does not contract."""
+    found = inverse_bound(responses.same)
+    if found is None:
+        raise PreconditionError(
+            f"No bound: the loop at one and the same sample has radius {spectral_radius_bound(responses.same):.3g}, "
+            "which must be below 1. Give smaller tolerances of C and D.", condition="same-sample loop",
+        )  # fmt: skip
+    return found
+
+
+def decay_weights(responses: Responses) -> tuple[float, FloatArray]:
+    """Return ``theta`` and ``w > 0`` with ``|Az^L| w <= theta w`` proved."""
+    return positive_vector(responses.tail_eps)

@@ -1,0 +1,361 @@
+"""What a design promises for every plant in the box of its constants."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from obsynth.analysis.transformations.uncertain_plant import AffinePlant, affine_plant, moving_family
+from obsynth.errors import ObsynthError, PreconditionError, SpecError
+from obsynth.numerics.arguments import require_kind
+from obsynth.numerics.arrays import FloatArray
+from obsynth.plants.constants import ConstantsBox
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.uncertain_system import uncertain_system
+from obsynth.proofs.affine import AffineMatrix
+from obsynth.results.design import ObserverDesign
+from obsynth.tolerances.error_structure import ErrorStructure, error_structure
+from obsynth.tolerances.exact_plant import is_sampled, moving_at, plant_at
+from obsynth.tolerances.index_one import index_one_on_box
+from obsynth.tolerances.loop import blame, blamed_rows, largest_factor
+from obsynth.tolerances.responses import Responses, loop_radius, responses_of
+from obsynth.tolerances.subdivision import BoxVerdict, proved_stable
+from obsynth.tolerances.tracking import Tracking, tracking_of
+
+#: A design without tolerances says this.
+EXACT_MODEL = "assumes an exact model"
+#: Vertices beyond this number are drawn at random.
+MOST_VERTICES = 64
+#: Samples over which the gain at a vertex is summed up, at most.
+MOST_GAIN_SAMPLES = 100_000
+#: What is left of a response when its sum ends.
+_GAIN_LEFT = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Robustness:
+    """What holds for every plant in the box; see `obsynth.robustness`.
+
+    Parameters
+    ----------
+    box : ConstantsBox
+        The constants, and where their tolerances come from.
+    assumes_exact_model : bool
+        No constant has a tolerance: nothing below says anything about another plant.
+    regular : str
+        ``proved``, ``refuted`` or ``open``: regular and of index 1 at every point of the box.
+    breaking : mapping of str to float
+        Constants at which the plant is not regular of index 1, or not stable; empty where none was found.
+    loop_radius : float or None
+        Upper bound of the loop's radius: below 1, bounds stay finite for ever.  `None` where no bound exists.
+    largest_factor : float or None
+        Largest common factor on all tolerances with a radius below 1.
+    blame : mapping of str to float
+        Share of each constant in the loop's radius; ``remainders`` for what is not affine.
+    rows : mapping of str to float
+        Share of each row of the plant (named by its state) in the loop's radius.
+    error_per_unit : mapping of str to mapping
+        By estimate or residual: what an amplitude of one unit of each state and input can add to it.
+    vertex_gains : mapping of str to float
+        By fault estimate and residual: the largest peak gain from the disturbances at the vertices; infinite where the
+        plant or the observer at a vertex is unstable.
+    stable : str
+        ``proved``, ``refuted`` or ``open``: the plant is stable at every point of the box.
+    boxes : int
+        Parts into which the box was cut for that.
+    reason : str
+        Why there is no bound; empty where there is one.
+    """
+
+    box: ConstantsBox
+    assumes_exact_model: bool
+    regular: str
+    breaking: Mapping[str, float]
+    loop_radius: float | None
+    largest_factor: float | None
+    blame: Mapping[str, float]
+    rows: Mapping[str, float]
+    error_per_unit: Mapping[str, Mapping[str, float]]
+    vertex_gains: Mapping[str, float]
+    stable: str
+    boxes: int
+    reason: str = ""
+
+    def __post_init__(self) -> None:
+        for name in ("breaking", "blame", "rows", "error_per_unit", "vertex_gains"):
+            object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
+
+    @property
+    def finite_for_ever(self) -> bool:
+        """Whether bounds stay finite however long a run is."""
+        return self.loop_radius is not None and self.loop_radius < 1.0
+
+    @property
+    def largest_tolerance(self) -> float | None:
+        """The largest common tolerance as a share, where all tolerances are the same share of their nominal values."""
+        shares = [item.half / abs(item.nominal) for item in self.box.uncertain if item.nominal]
+        if self.largest_factor is None or len(shares) != len(self.box.uncertain) or not shares:
+            return None
+        common = max(shares) - min(shares) <= 1e-9 * max(shares)
+        return self.largest_factor * shares[0] if common else None
+
+    def facts(self) -> Iterator[tuple[str, str]]:
+        """Yield label and text of what a report shows."""
+        if self.assumes_exact_model:
+            yield "model", EXACT_MODEL
+            return
+        names = ", ".join(self.box.names[:6]) + (", ..." if len(self.box.names) > 6 else "")
+        yield "constants", f"{len(self.box.names)} with a tolerance ({names}), {self.box.variation}, {self.box.source}"
+        yield "regular, index 1", self.regular + (self._where() if self.regular == "refuted" else "")
+        where = self._where() if self.stable == "refuted" and self.regular != "refuted" else ""
+        yield "plant stable", self.stable + where + (f" ({self.boxes} boxes)" if self.boxes else "")
+        if self.loop_radius is None:
+            yield "bounds", f"none: {self.reason}"
+            return
+        ever = "bounds stay finite for ever" if self.finite_for_ever else "bounds hold at each sample, but may grow"
+        yield "loop radius", f"{self.loop_radius:.4g}: {ever}"
+        if self.largest_factor is not None:
+            share = self.largest_tolerance
+            percent = "" if share is None else f" ({100.0 * share:.3g} %)"
+            yield "largest tolerances", f"{self.largest_factor:.4g} times those stated{percent}"
+        yield "to blame", _top(self.blame)
+        yield "rows of the plant", _top(self.rows)
+        for name, gain in self.vertex_gains.items():
+            yield f"worst gain, {name}", f"{gain:.4g} at a vertex, from the disturbances"
+
+    def _where(self) -> str:
+        if not self.breaking:
+            return ""
+        return " at " + ", ".join(f"{name} = {value:.6g}" for name, value in self.breaking.items())
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return everything as plain data."""
+        return {
+            "box": self.box.as_dict(), "assumes_exact_model": self.assumes_exact_model, "regular": self.regular,
+            "breaking": dict(self.breaking), "loop_radius": self.loop_radius, "largest_factor": self.largest_factor,
+            "largest_tolerance": self.largest_tolerance, "blame": dict(self.blame), "rows": dict(self.rows),
+            "error_per_unit": {name: dict(row) for name, row in self.error_per_unit.items()},
+            "vertex_gains": dict(self.vertex_gains), "stable": self.stable, "boxes": self.boxes, "reason": self.reason,
+        }  # fmt: skip
+
+    def __str__(self) -> str:
+        return "\n".join(f"{label}: {text}" for label, text in self.facts())
+
+    def _repr_html_(self) -> str:
+        from html import escape
+
+        rows = "".join(f"<tr><th>{escape(a)}</th><td>{escape(b)}</td></tr>" for a, b in self.facts())
+        return f"<table>{rows}</table>"
+
+
+def _top(shares: Mapping[str, float], most: int = 4) -> str:
+    found = sorted(shares.items(), key=lambda item: -item[1])[:most]
+    return ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in found if share > 5e-3) or "nothing"
+
+
+def with_tolerances(
+    design: ObserverDesign, constants: Any, sample_time: float | None = None
+) -> tuple[ObserverDesign, DescriptorSystem]:
+    """Return a linear design and its plant with the tolerances that are asked for."""
+    require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
+    plant, _ = design.linear
+    del sample_time
+    if constants is None:
+        return design, plant
+    if isinstance(constants, DescriptorSystem):
+        return _of_plant(design, constants)
+    changed = uncertain_system(plant, constants)
+    return design.replace(plant=changed), changed
+
+
+def _of_plant(design: ObserverDesign, given: DescriptorSystem) -> tuple[ObserverDesign, DescriptorSystem]:
+    """Take the tolerances of a plant that is the design's own but for these."""
+    plant, _ = design.linear
+    same = all(
+        getattr(plant, name).shape == getattr(given, name).shape
+        and np.allclose(getattr(plant, name), getattr(given, name), rtol=1e-9, atol=1e-12)
+        for name in ("E", "A", "B", "C", "D", "Bd", "Dd", "Bf", "Df")
+    )
+    if not same or plant.dt != given.dt:
+        raise SpecError("constants is another plant than the design's: its nominal matrices differ.", path="constants")
+    changed = plant.replace(uncertainty=given.uncertainty)
+    return design.replace(plant=changed), changed
+
+
+def robustness(
+    design: ObserverDesign, *, constants: Any = None, progress: Callable[[str], None] | None = None
+) -> Robustness:
+    """Return what a linear discrete-time design promises for every plant in the box of its constants.
+
+    Parameters
+    ----------
+    design : ObserverDesign
+        Linear; of a plant with tolerances (`obsynth.uncertain_system`, or ``constants`` in a spec).
+    constants : mapping, ConstantsBox or DescriptorSystem, optional
+        Tolerances instead of the plant's own, as `obsynth.uncertain_system` takes them.
+    progress : callable, optional
+        Called with a text before each step.
+
+    Returns
+    -------
+    Robustness
+        Print it for a dozen lines.
+
+    Raises
+    ------
+    SpecError
+        The design is not linear, or a tolerance is malformed.
+
+    Notes
+    -----
+    The loop's radius is that of ``H = D0 + sum_j D_j``, what the error adds to itself through what is uncertain, with
+    the tail of the sum proved.  Below 1 all bounds stay finite for ever (sufficient for constant and varying
+    constants).  The largest tolerance is found by bisection, all matrices built anew.  Stability and regularity are
+    proved by cutting the box; a point that refutes them is named.  Theory: M. Khammash and J. Pearson,
+    "Performance robustness of discrete-time systems with structured uncertainty", IEEE TAC 36, 1991.
+    """
+    design, plant = with_tolerances(design, constants)
+    told = progress or (lambda text: None)
+    uncertain = plant.uncertainty
+    if uncertain is None or not uncertain.box.names:
+        empty = ConstantsBox({}) if uncertain is None else uncertain.box
+        return Robustness(empty, True, "open", {}, None, None, {}, {}, {}, {}, "open", 0, EXACT_MODEL)
+    told("regularity over the box")
+    regular = index_one_on_box(plant)
+    reason = ""
+    try:
+        affine = affine_plant(plant)
+        told("stability over the box")
+        stable = _stability(plant, affine)
+    except PreconditionError as error:
+        affine, stable, reason = None, BoxVerdict("open", 0), str(error)
+    breaking = _values(uncertain.box, regular if regular.verdict == "refuted" else stable)
+    radius = factor = None
+    shares, rows, errors = dict[str, float](), dict[str, float](), dict[str, dict[str, float]]()
+    if affine is not None:
+        try:
+            told("loop over the box")
+            tracking = tracking_of(design, affine)
+            responses = responses_of(structure_of(design, affine, tracking))
+            radius = loop_radius(responses)
+            told("largest tolerances")
+            factor = largest_factor(
+                lambda t: structure_of(design, affine_plant(plant, uncertain.box.scaled(t)), tracking), radius
+            )
+            shares = _named((*uncertain.box.names, "remainders"), blame(responses))
+            parts = (affine.E.parts, affine.A.parts)
+            rows = _named(plant.state_names, blamed_rows(responses, tracking.T, parts))
+            errors = _error_per_unit(design, responses, affine)
+        except PreconditionError as error:
+            reason = str(error)
+    told("gains at the vertices")
+    gains = {} if affine is None or not plant.is_discrete else _vertex_gains(design, plant)
+    return Robustness(
+        uncertain.box, False, regular.verdict, breaking, radius, factor, shares, rows, errors, gains, stable.verdict,
+        stable.boxes, reason,
+    )  # fmt: skip
+
+
+def structure_of(
+    design: ObserverDesign, affine: AffinePlant, tracking: Tracking, *, bounds: FloatArray | None = None,
+    noise_bound: float = 0.0, faults: bool = False,
+) -> ErrorStructure:  # fmt: skip
+    """Return the error system of a discrete design over its box."""
+    plant, observer = design.linear
+    if not plant.is_discrete:
+        raise PreconditionError(
+            "The design is continuous in time: bounds over tolerances are for sampled designs. Sample the plant first "
+            "(transform: sample_time, or obsynth.discretise), or give online_monitor the sample time of its data.",
+            condition="discrete time",
+        )  # fmt: skip
+    sizes = np.zeros(plant.nd) if bounds is None else bounds
+    return error_structure(observer, affine, tracking, sizes, noise_bound, faults=faults)
+
+
+def _named(names: tuple[str, ...], shares: FloatArray) -> dict[str, float]:
+    return {name: float(share) for name, share in zip(names, shares, strict=True)}
+
+
+def _values(box: ConstantsBox, found: BoxVerdict) -> dict[str, float]:
+    if found.at is None or found.verdict != "refuted":
+        return {}
+    values = box.values(found.at)
+    return {name: values[name] for name in box.names}
+
+
+def _stability(plant: DescriptorSystem, affine: AffinePlant) -> BoxVerdict:
+    """Return whether the plant is stable on the box; for E that must be inverted, after that."""
+    box, uncertain = affine.box, plant.uncertainty
+    sampled = uncertain is not None and is_sampled(uncertain.steps)
+
+    def exactly(q: FloatArray) -> FloatArray:
+        return moving_at(plant, box.values(q))
+
+    def build(lower: FloatArray, upper: FloatArray) -> AffineMatrix:
+        return moving_family(plant, box.part(lower, upper))
+
+    return proved_stable(build, affine.count, exactly, discrete=plant.is_discrete and not sampled)
+
+
+def _error_per_unit(design: ObserverDesign, responses: Responses, affine: AffinePlant) -> dict[str, dict[str, float]]:
+    """Return by output: what one unit of each state and input adds, first order and remainders, for ever."""
+    plant, observer = design.linear
+    structure = responses.structure
+    inner, _, outputs = structure.rows
+    back = 2.0 * np.eye(plant.nx) - affine.coordinates
+    total = np.zeros((len(structure.Co), plant.nx + plant.nu))
+    for i in range(affine.count):
+        both = np.hstack([structure.state.parts[i] @ back, structure.inputs.parts[i]])
+        total += (1.0 + abs(structure.offsets[i])) * responses.gain(structure.Co, both[inner], both[outputs])
+    rest = np.hstack([structure.state.radius @ np.abs(back), structure.inputs.radius])
+    total += responses.absolute_gain(structure.Co, rest[inner]) + rest[outputs]
+    names = (*plant.state_names, *plant.input_names)
+    labels = (*(f"fhat[{name}]" for name in observer.fault_names), *(f"r[{name}]" for name in observer.residual_names))
+    return {label: _named(names, row) for label, row in zip(labels, total, strict=True)}
+
+
+def _vertex_gains(design: ObserverDesign, plant: DescriptorSystem) -> dict[str, float]:
+    """Return the largest peak (l1) gain from disturbances at the vertices; some drawn where there are too many."""
+    observer, uncertain = design.linear[1], plant.uncertainty
+    labels = (*(f"fhat[{name}]" for name in observer.fault_names), *(f"r[{name}]" for name in observer.residual_names))
+    if uncertain is None or not plant.nd or not labels:
+        return {}
+    count = len(uncertain.box.names)
+    corners = np.array(list(itertools.product((-1.0, 1.0), repeat=count))) if 2**count <= MOST_VERTICES else (
+        np.random.default_rng(0).choice([-1.0, 1.0], (MOST_VERTICES, count))
+    )  # fmt: skip
+    worst = np.zeros(len(labels))
+    for corner in corners:
+        worst = np.maximum(worst, _peak_gain(design, plant_at(plant, uncertain.box.values(corner))))
+    return _named(labels, worst)
+
+
+def _peak_gain(design: ObserverDesign, plant: DescriptorSystem) -> FloatArray:
+    """Return the peak gain of plant and observer in series, infinite where the series is unstable."""
+    from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
+
+    observer = design.linear[1]
+    shown = slice(observer.fault_rows.start, len(observer.Cz))
+    try:
+        smooth = eliminate_algebraic_states(plant).plant
+    except ObsynthError:
+        return np.full(len(observer.Cz) - observer.fault_rows.start, np.inf)
+    nx, nz = smooth.nx, observer.order
+    a = np.block([[smooth.A, np.zeros((nx, nz))], [observer.By @ smooth.C, observer.Az]])
+    b = np.vstack([smooth.Bd, observer.By @ smooth.Dd])
+    c = np.hstack([observer.Dy[shown] @ smooth.C, observer.Cz[shown]])
+    total = np.abs(observer.Dy[shown] @ smooth.Dd).sum(axis=1)
+    if np.max(np.abs(np.linalg.eigvals(a)), initial=0.0) >= 1.0:
+        return np.full(len(c), np.inf)
+    column, size = b, float(np.abs(b).max(initial=0.0))
+    for _ in range(MOST_GAIN_SAMPLES):
+        total = total + np.abs(c @ column).sum(axis=1)
+        column = a @ column
+        if np.abs(column).max(initial=0.0) <= _GAIN_LEFT * size:
+            break
+    return np.asarray(total)

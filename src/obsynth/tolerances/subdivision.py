@@ -1,0 +1,157 @@
+"""Statements about every matrix in a box, by cutting the box until each part is proved, or one point refutes it."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+
+from obsynth.errors import PreconditionError
+from obsynth.numerics.arrays import FloatArray
+from obsynth.proofs.affine import AffineMatrix, affine_inverse
+
+#: Boxes after which a statement is left open.
+MOST_BOXES = 600
+#: The matrix over ``lower <= q <= upper``.
+Build: TypeAlias = Callable[[FloatArray, FloatArray], AffineMatrix]
+#: With more constants than this, not all vertices are looked at first.
+MOST_VERTEX_CONSTANTS = 10
+#: Norms computed in double precision are multiplied by this before they are compared.
+_OUTWARD = 1.0 + 1e-9
+#: What rounding takes from a product of matrices, beside its terms.
+_ROUNDING = 1e-14
+
+
+@dataclass(frozen=True, eq=False)
+class BoxVerdict:
+    """``proved``, ``refuted`` (at a point ``q``) or ``open``, and how many boxes it took."""
+
+    verdict: str
+    boxes: int
+    at: FloatArray | None = None
+
+
+def subdivided(
+    build: Build, count: int, holds_on: Callable[[AffineMatrix], bool], fails_at: Callable[[FloatArray], bool],
+    exact_at: Callable[[FloatArray], FloatArray], *, most: int = MOST_BOXES,
+) -> BoxVerdict:  # fmt: skip
+    """Cut the box along the constant that matters most.
+
+    ``build`` gives the matrix over a part of the box, made anew, so that its remainder shrinks with the part;
+    ``exact_at`` the true matrix at a point.
+    """
+    if count <= MOST_VERTEX_CONSTANTS:
+        for corner in itertools.product((-1.0, 1.0), repeat=count):
+            point = np.array(corner)
+            if fails_at(exact_at(point)):
+                return BoxVerdict("refuted", 0, point)
+    todo = [(-np.ones(count), np.ones(count))]
+    done = 0
+    while todo:
+        lower, upper = todo.pop()
+        done += 1
+        middle = (lower + upper) / 2.0
+        if fails_at(exact_at(middle)):
+            return BoxVerdict("refuted", done, middle)
+        part = _built(build, lower, upper)
+        if part is not None and holds_on(part):
+            continue
+        sizes = upper - lower if part is None else np.abs(part.parts).sum(axis=(1, 2))
+        if done >= most or not sizes.any():
+            return BoxVerdict("open", done)
+        i = int(np.argmax(sizes))
+        cut_above, cut_below = lower.copy(), upper.copy()
+        cut_above[i], cut_below[i] = middle[i], middle[i]
+        todo += [(lower, cut_below), (cut_above, upper)]
+    return BoxVerdict("proved", done)
+
+
+def _built(build: Build, lower: FloatArray, upper: FloatArray) -> AffineMatrix | None:
+    try:
+        return build(lower, upper)
+    except PreconditionError:
+        return None
+
+
+def proved_regular(build: Build, count: int, exact_at: Callable[[FloatArray], FloatArray]) -> BoxVerdict:
+    """Return whether a matrix is nonsingular on the whole box; a change of the determinant's sign refutes it."""
+    middle = exact_at(np.zeros(count))
+    if not middle.size:
+        return BoxVerdict("proved", 0)
+    sign = np.linalg.slogdet(middle)[0]
+
+    def invertible(part: AffineMatrix) -> bool:
+        try:
+            affine_inverse(part)
+        except (PreconditionError, np.linalg.LinAlgError):
+            return False
+        return True
+
+    def singular(point: FloatArray) -> bool:
+        found = np.linalg.slogdet(point)[0]
+        return bool(found * sign <= 0.0)
+
+    return subdivided(build, count, invertible, singular, exact_at)
+
+
+def proved_stable(
+    build: Build, count: int, exact_at: Callable[[FloatArray], FloatArray], *, discrete: bool
+) -> BoxVerdict:
+    """Return whether a matrix is stable on the whole box, in the norm of a Lyapunov function of each part's centre."""
+
+    def stable(part: AffineMatrix) -> bool:
+        return _contracts(part, discrete=discrete)
+
+    def unstable(point: FloatArray) -> bool:
+        values = np.linalg.eigvals(point)
+        return bool(np.max(np.abs(values)) >= 1.0 if discrete else np.max(values.real) >= 0.0)
+
+    return subdivided(build, count, stable, unstable, exact_at)
+
+
+def _contracts(part: AffineMatrix, *, discrete: bool) -> bool:
+    """Return whether ``A'PA - P < 0`` (``A'P + PA < 0``) on a part, P that of its centre for ``-I``."""
+    a = part.center
+    root, inverse = _energy_coordinates(a, discrete=discrete)
+    if not np.isfinite(inverse).all():
+        return False
+    # Once more in the coordinates of the first: there all modes count alike.
+    a = root @ a @ inverse
+    lyapunov = _lyapunov(a, discrete=discrete)
+    if not np.linalg.eigvalsh(lyapunov)[0] > 0.0:
+        return False
+    parts = [root @ item @ inverse for item in part.parts]
+    rest = np.abs(root) @ part.radius @ np.abs(inverse)
+    rest = rest + _ROUNDING * len(a) * (np.abs(root) @ part.magnitude @ np.abs(inverse))
+    size, remainder = np.abs(lyapunov), float(np.linalg.norm(rest, 2))
+    if discrete:
+        first = sum(float(np.linalg.norm(a.T @ lyapunov @ item + item.T @ lyapunov @ a, 2)) for item in parts)
+        spread = np.abs(parts).sum(axis=0) + rest if parts else rest
+        second = float(np.linalg.norm(spread.T @ size @ spread, 2))
+        second += 2.0 * float(np.linalg.norm(np.abs(a.T) @ size, 2)) * remainder
+        middle = a.T @ lyapunov @ a - lyapunov
+    else:
+        first = sum(float(np.linalg.norm(lyapunov @ item + item.T @ lyapunov, 2)) for item in parts)
+        second = 2.0 * float(np.linalg.norm(size, 2)) * remainder
+        middle = lyapunov @ a + a.T @ lyapunov
+    rounding = _ROUNDING * len(a) * float(np.linalg.norm(size, 2)) * (1.0 + float(np.linalg.norm(a, 2)) ** 2)
+    return float(np.linalg.eigvalsh((middle + middle.T) / 2.0)[-1]) + (first + second + rounding) * _OUTWARD < 0.0
+
+
+def _lyapunov(a: FloatArray, *, discrete: bool) -> FloatArray:
+    from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov
+
+    weight = np.eye(len(a))
+    found = solve_discrete_lyapunov(a.T, weight) if discrete else solve_continuous_lyapunov(a.T, -weight)
+    return np.asarray((found + found.T) / 2.0)
+
+
+def _energy_coordinates(a: FloatArray, *, discrete: bool) -> tuple[FloatArray, FloatArray]:
+    """Return S and its inverse, in whose coordinates Lyapunov's function is a sum of squares; NaN if there is none."""
+    values, vectors = np.linalg.eigh(_lyapunov(a, discrete=discrete))
+    if not values[0] > 0.0:
+        return np.full_like(a, np.nan), np.full_like(a, np.nan)
+    return (vectors * np.sqrt(values)).T, vectors / np.sqrt(values)

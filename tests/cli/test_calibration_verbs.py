@@ -1,0 +1,105 @@
+"""``obsynth linearise``, ``calibrate`` and ``validate``: specs and logs in, tables, files and exit codes out."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import obsynth
+from obsynth.cli.main import main
+from obsynth.spec import load_spec
+
+DESIGN = Path(__file__).parents[2] / "designs" / "threetank"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    place = tmp_path_factory.mktemp("threetank")
+    for name in ("plant.yaml", "spec.yaml", "log.csv"):
+        shutil.copy(DESIGN / name, place / name)
+    return place
+
+
+def test_linearise_names_the_combination_that_nothing_can_satisfy(folder, capsys):
+    assert main(["linearise", "--system", str(folder / "plant.yaml")]) == 3
+    assert "tank1 + tank2 + tank3" in capsys.readouterr().err
+
+
+def test_linearise_writes_a_plant_that_a_linear_method_takes(folder, capsys):
+    target = folder / "linear.yaml"
+    arguments = ["--given", "leak=0.03", "--given", "h1=0.7", "--given", "h3=0.65", "--free", "u1=0:1", "--free", "u3"]
+    assert main(["linearise", "--system", str(folder / "spec.yaml"), *arguments, "--out", str(target)]) == 0
+    assert "Operating point" in capsys.readouterr().out
+    (folder / "linear_spec.yaml").write_text(
+        "schema_version: 1\nname: linear\nplant: {file: linear.yaml, transform: {sample_time: 1.0}}\n"
+        "method: {id: pd-observer}\n",
+        encoding="utf-8",
+    )
+    plant = load_spec(folder / "linear_spec.yaml").plant
+    assert plant.is_discrete
+    assert plant.operating_point["h1"] == 0.7
+
+
+def test_a_spec_linearises_its_plant_for_a_linear_method(folder):
+    (folder / "direct.yaml").write_text(
+        "schema_version: 1\nname: direct\n"
+        "plant:\n  file: plant.yaml\n  transform:\n    linearise: {given: {leak: 0.03, h1: 0.7, h3: 0.65}, "
+        "free: [u1, u3]}\n"
+        "    sample_time: 1.0\n"
+        "method: {id: pd-observer}\n",
+        encoding="utf-8",
+    )
+    spec = load_spec(folder / "direct.yaml")
+    model = spec.model
+    linear = obsynth.linearise(model, given={"leak": 0.03, "h1": 0.7, "h3": 0.65}, free=["u1", "u3"])
+    assert np.array_equal(spec.plant.A, obsynth.discretise(linear, 1.0).plant.A)
+    assert spec.plant.fault_names == ("leak",)
+
+
+def test_calibrate_takes_everything_from_the_spec_and_can_be_made_again(folder, capsys):
+    target = folder / "calibration.json"
+    assert main(["calibrate", "--system", str(folder / "spec.yaml"), "--out", str(target), "--quiet"]) == 0
+    found = json.loads(target.read_text(encoding="utf-8"))
+    assert found["constants"]["a1"]["nominal"] == pytest.approx(0.0163, abs=1e-4)
+    assert found["log"]["rows"] == [0, 56]
+    spec = folder / "spec.yaml"
+    text = spec.read_text(encoding="utf-8")
+    spec.write_text(text + f"  digest: {found['log']['digest']}\n", encoding="utf-8")
+    capsys.readouterr()
+    assert main(["calibrate", "--system", str(spec), "--json", "--quiet"]) == 0
+    again = json.loads(capsys.readouterr().out)
+    assert again["constants"] == found["constants"]
+    assert main(["calibrate", "--system", str(spec), "--rows", "0:50", "--quiet"]) == 2
+    assert "digest" in capsys.readouterr().err
+    spec.write_text(text, encoding="utf-8")
+
+
+def test_validate_says_yes_and_no_by_its_exit_code(folder, capsys):
+    gains = folder / "gains.json"
+    assert main(["design", "--system", str(folder / "spec.yaml"), "--output", str(gains), "--quiet"]) == 0
+    columns = ["--map", "u1=u1_held", "--map", "u3=u3_held", "--data", str(folder / "log.csv")]
+    capsys.readouterr()
+    assert main(["validate", "--gains", str(gains), *columns, "--rows", "0:56", "--quiet"]) == 0
+    assert "agrees" in capsys.readouterr().out
+    assert main(["validate", "--gains", str(gains), *columns, "--json", "--quiet"]) == 6
+    assert not json.loads(capsys.readouterr().out)["passed"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code"),
+    [
+        (["calibrate", "--system", "spec.yaml", "--data", "missing.csv"], 2),
+        (["calibrate", "--system", "spec.yaml", "--unknown", "a1=5"], 2),
+        (["calibrate", "--system", "spec.yaml", "--rows", "0:3"], 2),
+        (["linearise", "--system", "plant.yaml", "--given", "h9=1"], 2),
+        (["linearise", "--system", "plant.yaml", "--given", "leak=.03", "--given", "h1=.4", "--given", "h2=.6",
+          "--free", "u1=0:1", "--free", "u3"], 3),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_has_an_exit_code(folder, monkeypatch, arguments, code):
+    monkeypatch.chdir(folder)
+    assert main(arguments) == code

@@ -1,0 +1,189 @@
+"""Thresholds over a box: they hold for exact plants inside it, are tight, and say what they are."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from uncertain_plants import drive, wang
+
+import obsynth
+from obsynth.errors import PreconditionError, SpecError
+from obsynth.experiments.monitors.adaptive_monitor import adaptive_plan
+from obsynth.experiments.monitors.adaptive_record import thresholds_of_records
+from obsynth.experiments.monitors.adaptive_rule import record_columns
+from obsynth.experiments.monitors.adaptive_step import AdaptiveState, adaptive_step
+from obsynth.tolerances.exact_plant import drawn_points, plant_at
+
+START = 0.2
+
+
+def exact_records(design: Any, points: np.ndarray, steps: int, seed: int, *, fault: float = 0.0) -> tuple:
+    """Simulate exact plants of the box, with disturbances and noise at their bounds; return rows, u, y and faults."""
+    plant, observer = design.linear
+    generator = np.random.default_rng(seed)
+    rows, inputs, outputs = [], [], []
+    acting = np.zeros((steps, plant.nf))
+    acting[steps // 2 :] = fault
+    for q in points:
+        true = plant_at(plant, plant.uncertainty.box.values(q))
+        reduced = obsynth.eliminate_algebraic_states(true).plant
+        x = generator.uniform(-START, START, reduced.nx)
+        u = generator.uniform(-1.0, 1.0, (steps, plant.nu))
+        d = 0.1 * generator.choice([-1.0, 1.0], (steps, plant.nd))
+        v = generator.choice([-1.0, 1.0], (steps, plant.nw))
+        y = np.empty((steps, plant.ny))
+        for k in range(steps):
+            y[k] = reduced.C @ x + reduced.D @ u[k] + reduced.Dd @ d[k] + reduced.Df @ acting[k] + reduced.Dw @ v[k]
+            x = reduced.A @ x + reduced.B @ u[k] + reduced.Bd @ d[k] + reduced.Bf @ acting[k] + reduced.Bw @ v[k]
+        estimates = observer.run(y, u if plant.nu else None)
+        rows.append(np.hstack([estimates.states, estimates.faults, estimates.residuals]))
+        inputs.append(u)
+        outputs.append(y)
+    return np.array(rows), np.array(inputs), np.array(outputs), acting
+
+
+def start_set(design: Any) -> dict[str, float]:
+    """Return bounds of all states: algebraic ones are wherever they are."""
+    plant, _ = design.linear
+    moving = plant.E.any(axis=0)
+    return {name: START if moving[i] else 50.0 for i, name in enumerate(plant.state_names)}
+
+
+@pytest.fixture(scope="module", params=["drive", "wang"])
+def design(request) -> Any:
+    return obsynth.fault_estimation_filter({"drive": drive, "wang": wang}[request.param]())
+
+
+@pytest.fixture(scope="module")
+def plan(design) -> Any:
+    return adaptive_plan(design, np.array([0.1]), 1.0, initial_error=None, initial_set=start_set(design))[0]
+
+
+def test_exact_plants_of_the_box_never_pass_their_threshold(design, plan) -> None:
+    points = drawn_points(len(plan.names), 24, 7, vertices=0.7)
+    rows, u, y, _ = exact_records(design, points, 150, 1)
+    total, intervals = record_columns(plan, rows, u, y)
+    values = np.abs(rows[:, :, design.observer.fault_rows.start :])
+    assert np.all(values <= total)
+    assert np.max(values / total) > 0.4
+    assert np.all(intervals[..., 0] <= 0.0)
+    assert np.all(intervals[..., 1] >= 0.0)
+
+
+def test_intervals_hold_during_faults_and_find_them(design, plan) -> None:
+    points = drawn_points(len(plan.names), 8, 11)
+    quiet = record_columns(plan, *exact_records(design, points, 120, 2)[:3])[0]
+    size = 3.0 * float(np.median(quiet[:, 60:]))
+    rows, u, y, faults = exact_records(design, points, 120, 2, fault=size)
+    total, intervals = record_columns(plan, rows, u, y)
+    delay = design.observer.fault_delays[0]
+    for k in range(61 + delay, 120):
+        assert np.all(intervals[:, k, :, 0] <= faults[k - delay])
+        assert np.all(intervals[:, k, :, 1] >= faults[k - delay])
+    alarms = np.abs(rows[:, :, design.observer.fault_rows.start :]) > total
+    assert alarms[:, 60 : 62 + delay].any(axis=(1, 2)).mean() >= 0.9
+
+
+def test_constants_that_vary_need_the_varying_mode() -> None:
+    """With q new at each sample the threshold for constant q is passed; that for varying q is not."""
+    found = {}
+    for variation in ("constant", "varying"):
+        design = obsynth.fault_estimation_filter(wang("5 %", variation=variation))
+        plant, observer = design.linear
+        plan = adaptive_plan(design, np.array([0.0]), 1.0, initial_error=None, initial_set=start_set(design))[0]
+        generator = np.random.default_rng(3)
+        passed = 0
+        for _ in range(2):
+            x, steps = np.zeros(3), 60
+            y, u = np.empty((steps, plant.ny)), generator.uniform(-2.0, 2.0, (steps, plant.nu))
+            for k in range(steps):
+                # E x(k+1) = A(q_k) x(k) + ..., the algebraic row at the value that acts at k.
+                q = generator.choice([-1.0, 1.0], len(plan.names))
+                true = obsynth.eliminate_algebraic_states(plant_at(plant, plant.uncertainty.box.values(q))).plant
+                y[k] = true.C @ x + true.D @ u[k]
+                x = true.A @ x + true.B @ u[k]
+            estimates = observer.run(y, u)
+            rows = np.hstack([estimates.states, estimates.faults, estimates.residuals])[None]
+            total, _ = record_columns(plan, rows, u[None], y[None])
+            passed += bool(np.any(np.abs(rows[:, :, observer.fault_rows.start :]) > total))
+        found[variation] = passed
+    assert found == {"constant": 2, "varying": 0}
+
+
+@pytest.mark.parametrize("variation", ["constant", "varying"])
+def test_a_sample_at_a_time_is_the_record(variation) -> None:
+    design = obsynth.fault_estimation_filter(drive(variation=variation))
+    bound = adaptive_plan(design, np.array([0.1]), 1.0, initial_error=0.3, initial_set=None)[0].bound
+    generator = np.random.default_rng(0)
+    estimates, u, y = (generator.normal(size=(1, 300, n)) for n in (3, 1, 2))
+    record = thresholds_of_records(bound, estimates, u, y)
+    state = AdaptiveState.of(bound)
+    for k in range(300):
+        found = adaptive_step(bound, state, estimates[0, k], u[0, k], y[0, k])
+        assert found.total == pytest.approx(record.total[0, k], rel=1e-12)
+        assert found.first == pytest.approx(record.first[0, k], rel=1e-9, abs=1e-15)
+        if k == 150:
+            state = AdaptiveState.from_dict(state.as_dict())
+
+
+def log_of(design: Any, rows: int = 120) -> pd.DataFrame:
+    plant = design.plant
+    _, u, y, _ = exact_records(design, np.zeros((1, len(plant.uncertainty.box.names))), rows, 4)
+    data = {"time": plant.dt * np.arange(rows)}
+    data |= {name: u[0, :, i] for i, name in enumerate(plant.input_names)}
+    return pd.DataFrame(data | {name: y[0, :, i] for i, name in enumerate(plant.output_names)})
+
+
+def test_tolerance_zero_is_the_nominal_monitor() -> None:
+    design = obsynth.fault_estimation_filter(wang())
+    exact = design.replace(plant=design.plant.replace(uncertainty=None))
+    data = log_of(design)
+    bounds = {"disturbance_bounds": {"w": 0.1}, "initial_error": 0.5}
+    nominal = obsynth.run_on_data(exact, data, monitor=obsynth.online_monitor(exact, **bounds), warm_up=0.0).table
+    zero = obsynth.online_monitor(exact, constants={"A": "0 %"}, **bounds)
+    found = obsynth.run_on_data(exact, data, monitor=zero, warm_up=0.0).table
+    assert found["threshold"].to_numpy() == pytest.approx(nominal["threshold"].to_numpy(), rel=1e-9)
+    tiny = obsynth.online_monitor(exact, constants={"A": "1e-7 %"}, **bounds)
+    near = obsynth.run_on_data(exact, data, monitor=tiny, warm_up=0.0).table
+    assert near["threshold"].to_numpy() == pytest.approx(nominal["threshold"].to_numpy(), rel=1e-4)
+    assert "assumes an exact model" in obsynth.online_monitor(exact, **bounds).statement
+
+
+def test_columns_of_a_run() -> None:
+    design = obsynth.fault_estimation_filter(drive())
+    monitor = obsynth.online_monitor(
+        design, noise_bound=1.0, disturbance_bounds={"load": 0.1}, initial_set={"x1": 0.2, "x2": [-0.2, 0.2], "x3": 0.2}
+    )
+    run = obsynth.run_on_data(design, log_of(design), monitor=monitor, warm_up=0.0)
+    table = run.table
+    assert not run.alarms
+    assert np.all(table["lowest motor"] <= 0.0)
+    assert np.all(table["highest motor"] >= 0.0)
+    assert np.all(np.abs(table["fhat[motor]"]) <= table["threshold fhat[motor]"])
+    shares = table[[f"share {name}" for name in ("J1", "J2", "k", "c", "b")]].to_numpy()
+    assert np.all(shares >= 0.0)
+    assert np.all(shares.sum(axis=1) < 1.0)
+    assert "a constant outside its stated tolerance" in monitor.statement
+    again = obsynth.run_on_data(design, log_of(design), monitor=monitor, warm_up=0.0).table
+    assert again.equals(table)
+
+
+def test_refusals_name_their_reason() -> None:
+    design = obsynth.fault_estimation_filter(drive())
+    with pytest.raises(SpecError, match="no entry for the state 'x2'"):
+        obsynth.online_monitor(design, noise_bound=1.0, disturbance_bounds={"load": 0.1}, initial_set={"x1": 1.0})
+    with pytest.raises(SpecError, match="unknown state"):
+        obsynth.online_monitor(design, noise_bound=1.0, disturbance_bounds={"load": 0.1}, initial_set={"x9": 1.0})
+    with pytest.raises(SpecError, match="stands in no matrix"):
+        obsynth.online_monitor(design, constants={"spring": (1.0, 2.0)}, disturbance_bounds={"load": 0.1})
+    with pytest.raises(SpecError, match="is for the pointwise"):
+        obsynth.online_monitor(design, "window", constants={"k": "1 %"})
+    loud = obsynth.online_monitor(
+        design, noise_bound=1.0, disturbance_bounds={"load": 0.1}, constants={name: "30 %" for name in ("J2", "k")}
+    )
+    assert "may grow" in loud.statement
+    with pytest.raises(PreconditionError, match="not proved regular"):
+        obsynth.online_monitor(design, noise_bound=1.0, disturbance_bounds={"load": 0.1}, constants={"J2": "150 %"})

@@ -1,0 +1,89 @@
+"""What a design promises over its box: largest tolerances, regularity, stability, refusals."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from uncertain_plants import drive, wang
+
+import obsynth
+from obsynth.analysis.transformations.uncertain_plant import affine_plant
+from obsynth.errors import PreconditionError
+from obsynth.tolerances.index_one import index_one_on_box
+
+
+def test_largest_tolerances_are_those_of_the_audit() -> None:
+    found = obsynth.robustness(obsynth.fault_estimation_filter(drive()))
+    assert found.loop_radius == pytest.approx(0.136, abs=1e-3)
+    assert found.largest_tolerance == pytest.approx(0.27, abs=5e-3)
+    assert (found.regular, found.stable) == ("proved", "proved")
+    assert found.finite_for_ever
+    assert sum(found.blame.values()) == pytest.approx(1.0)
+    assert "27" in str(found) or "26.7" in str(found)
+    assert found.vertex_gains["fhat[motor]"] > 0.5
+
+
+def test_a_design_without_tolerances_says_so() -> None:
+    found = obsynth.robustness(obsynth.fault_estimation_filter(wang().replace(uncertainty=None)))
+    assert found.assumes_exact_model
+    assert str(found) == "model: assumes an exact model"
+
+
+def test_constants_may_be_given_to_the_design() -> None:
+    design = obsynth.fault_estimation_filter(wang().replace(uncertainty=None))
+    found = obsynth.robustness(design, constants={"A": "1 %"})
+    assert len(found.blame) == 13
+    assert 0.0 < found.loop_radius < 0.106
+
+
+def test_rows_of_e_are_compressed_before_index_one_is_judged() -> None:
+    plant = obsynth.uncertain_system(
+        {"E": [["m", "m"], ["m", "m"]], "A": [[1, 0], [0, 2]], "C": [[1, 0]], "dt": 1.0},
+        {"m": {"nominal": 1.0, "tolerance": "5 %"}},
+    )
+    assert index_one_on_box(plant).verdict == "proved"
+
+
+def test_a_row_that_becomes_dynamic_is_refused() -> None:
+    plant = obsynth.uncertain_system(
+        {"E": [[1, 0], [0, "e"]], "A": [[0.5, 0], [1, 1]], "C": [[1, 0]], "dt": 1.0},
+        {"e": {"nominal": 0.0, "range": [0.0, 0.1]}},
+    )
+    with pytest.raises(PreconditionError, match="derivative into an algebraic"):
+        index_one_on_box(plant)
+
+
+def test_a_singular_matrix_in_the_box_names_the_value() -> None:
+    plant = obsynth.uncertain_system(
+        {"E": [[1, 0], [0, 0]], "A": [[0.5, 1], [1, "g"]], "C": [[1, 0], [0, 1]], "Bf": [[1], [0]], "dt": 1.0},
+        {"g": {"nominal": 0.5, "range": [-0.5, 1.0]}},
+    )
+    found = index_one_on_box(plant)
+    assert found.verdict == "refuted"
+    assert plant.uncertainty.box.values(found.at)["g"] <= 0.0
+
+
+def test_an_unstable_corner_is_named() -> None:
+    plant = obsynth.uncertain_system(
+        {"E": None, "A": [["a"]], "Bf": [[1]], "C": [[1]], "dt": 1.0}, {"a": {"nominal": 0.9, "range": [0.8, 1.1]}}
+    )
+    found = obsynth.robustness(obsynth.fault_estimation_filter(plant))
+    assert found.stable == "refuted"
+    assert found.breaking["a"] >= 1.0
+
+
+def test_untouched_directions_stay_untouched_through_sampling() -> None:
+    """Two masses in absolute positions: no constant acts on the position of both, however far they drift."""
+    plant = obsynth.uncertain_system(
+        {
+            "E": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, "m", 0], [0, 0, 0, 1]],
+            "A": [[0, 0, 1, 0], [0, 0, 0, 1], ["-k", "k", -1, 0], ["k", "-k", 0, -1]],
+            "C": [[1, 0, 0, 0], [0, 1, 0, 0]], "Bf": [[0], [0], [1], [0]],
+        },
+        {"k": {"nominal": 10.0, "tolerance": "5 %"}, "m": {"nominal": 1.0, "tolerance": "5 %"}},
+    )  # fmt: skip
+    family = affine_plant(obsynth.discretise(plant, 0.05).plant)
+    assert not np.array_equal(family.coordinates, np.eye(4))
+    both = np.linalg.solve(family.coordinates, [1.0, 1.0, 0.0, 0.0])
+    assert np.abs(family.A.parts @ both).max() < 1e-14
+    assert (family.A.radius @ np.abs(both)).max() < 1e-13

@@ -1,0 +1,117 @@
+"""The answer first: the summary of a design, on the terminal, in a REPL and in a notebook."""
+
+from __future__ import annotations
+
+import html
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import obsynth
+from obsynth.cli.main import main
+from obsynth.report.summary import summary
+
+DESIGNS = Path(__file__).parents[2] / "designs"
+
+
+@pytest.fixture(scope="module")
+def network() -> obsynth.ObserverDesign:
+    spec = obsynth.load_spec(DESIGNS / "smib" / "spec.yaml")
+    return obsynth.design(spec.plant, spec.method, name=spec.name, **dict(spec.options))
+
+
+def leaky(gain: float, *, units: dict[str, str] | None = None) -> obsynth.ObserverDesign:
+    """A fault and an unknown input beside it that are hard to tell apart."""
+    plant = obsynth.DescriptorSystem(
+        None, [[0.5, 0.1], [0.0, 0.4]], C=np.eye(2), Bf=[[1.0], [0.0]], Bd=[[gain], [1.0]],
+        Dd=[[0.0], [0.0]], dt=1.0, units=units, Dw=0.1 * np.eye(2), fault_names=["leak"],
+    )  # fmt: skip
+    return obsynth.fault_estimation_filter(plant)
+
+
+def test_a_design_prints_as_about_twelve_lines_of_eighty_columns(network):
+    lines = str(network).splitlines()
+    assert 8 <= len(lines) <= 14
+    assert max(map(len, lines)) <= 80
+    assert lines[0] == f"smib: Verified: all {sum(c.kind != 'information' for c in network.report.checks)} checks hold."
+    text = " ".join(" ".join(lines).split())
+    assert "fault-estimation-filter" in text
+    assert "gamma = 0.3" in text
+    assert re.search(r"tm GENCLS 1 +1 +0\.02 +0\.0402 pu +0\.23\d* of active power Bus 3", "\n".join(lines))
+    assert "white noise on 3 of 3 sensors" in text
+
+
+def test_the_leak_is_that_of_the_norm(network):
+    """With one fault and one unknown input, the worst leak is the H-infinity norm that verification recomputes."""
+    leak = float(summary(network).rows[0][-1].split()[0])
+    assert leak == pytest.approx(network.report["H-infinity norm"].value, rel=2e-3)
+
+
+def test_a_repl_shows_one_line(network):
+    assert repr(network) == "<ObserverDesign 'smib' by fault-estimation-filter: verified>"
+    broken = network.replace(report=obsynth.VerificationReport.of([]))
+    assert "NOT verified" in repr(broken)
+    assert "FAILS" in str(broken).splitlines()[0]
+
+
+def test_a_notebook_shows_the_same_and_escapes_names():
+    plant = obsynth.DescriptorSystem(
+        None, [[0.5]], C=[[1.0]], Bf=[[1.0]], dt=1.0, fault_names=["<b>leak</b>"], Dw=[[0.1]]
+    )  # fmt: skip
+    design = obsynth.fault_estimation_filter(plant)
+    page = design._repr_html_()
+    assert "<b>leak" not in page
+    assert "<b>leak</b>" in html.unescape(page)
+    assert "Verified" in page
+
+
+def test_a_report_prints_as_a_table(network):
+    text = str(network.report)
+    assert "LMI" in text
+    assert text.splitlines()[-1].startswith("Verified: all")
+    assert all(check.name.split()[0] in text for check in network.report.checks)
+
+
+def test_a_leak_in_the_fault_s_unit_is_a_warning():
+    assert any("looks like the fault" in text for text in summary(leaky(5.0)).warnings)
+    assert not summary(leaky(5.0, units={"leak": "kg/s", "d1": "K"})).warnings
+    assert not summary(leaky(0.0)).warnings
+
+
+def test_an_estimate_that_does_not_follow_a_step_is_a_warning():
+    """Half of a step is left where the estimate is scaled by a half."""
+    design = leaky(0.0)
+    observer = design.observer
+    rows = np.ones((observer.Cz.shape[0], 1))
+    rows[observer.fault_rows] = 0.5
+    halved = obsynth.LinearObserver(**{**observer.as_dict(), "Cz": rows * observer.Cz, "Dy": rows * observer.Dy,
+                                       "Du": rows * observer.Du})  # fmt: skip
+    (text,) = summary(design.replace(observer=halved)).warnings
+    assert "does not follow a step" in text
+    assert "shows 50 % of it" in text
+
+
+def test_two_specs_of_one_name_keep_their_gain_sets(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    text = (DESIGNS / "wang2015" / "spec.yaml").read_text().replace("plant.yaml", str(DESIGNS / "wang2015/plant.yaml"))
+    for name, gamma in (("first", 2.5), ("second", 3.0)):
+        (tmp_path / f"{name}.yaml").write_text(f"{text}  options: {{gamma: {gamma}}}\n")
+        assert main(["design", "--system", f"{name}.yaml", "--quiet"]) == 0
+    assert "wang2015.second.gains.json" in capsys.readouterr().out
+    files = {path.name: obsynth.load(path).options["gamma"] for path in tmp_path.glob("*.json")}
+    assert files == {"wang2015.gains.json": 2.5, "wang2015.second.gains.json": 3.0}
+    # The same spec again takes the place of its own.
+    assert main(["design", "--system", "first.yaml", "--quiet"]) == 0
+    assert len(list(tmp_path.glob("*.json"))) == 2
+
+
+def test_check_says_one_line_per_method(capsys):
+    assert main(["check", "--system", str(DESIGNS / "filasova" / "spec.yaml")]) == 0
+    printed = capsys.readouterr().out
+    assert "IMPOSSIBLE" not in printed
+    assert "discrete only: sample the plant first" in " ".join(printed.split())
+    assert "pd-observer" in printed
+    assert main(["check", "--system", str(DESIGNS / "smib" / "spec.yaml")]) == 0
+    assert "sample the observer afterwards" in " ".join(capsys.readouterr().out.split())

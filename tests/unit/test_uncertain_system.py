@@ -1,0 +1,148 @@
+"""Constants with tolerances: what is read, what is refused, and that families of matrices hold every plant."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from uncertain_plants import drive, wang
+
+import obsynth
+from obsynth.analysis.transformations.uncertain_plant import affine_plant
+from obsynth.errors import PreconditionError, SpecError
+from obsynth.numerics.expressions import parse_expression
+from obsynth.plants.uncertainty import UNCERTAIN_MATRICES
+from obsynth.proofs.affine import AffineMatrix, affine_exponential, affine_inverse
+from obsynth.proofs.affine_numbers import AffineNumber, affine_translation
+from obsynth.tolerances.exact_plant import drawn_points, plant_at
+
+ONE = {"E": None, "A": [["1 - 0.1 * k / m"]], "C": [[1]], "dt": 0.1}
+
+
+def test_nominal_values_and_ranges() -> None:
+    plant = obsynth.uncertain_system(ONE, {"k": {"nominal": 2.0, "tolerance": "5 %", "unit": "N/m"}, "m": (0.9, 1.2)})
+    assert pytest.approx(1.0 - 0.2 / 1.05) == plant.A
+    box = plant.uncertainty.box
+    assert box.names == ("k", "m")
+    assert (box.constants["k"].low, box.constants["k"].high) == pytest.approx((1.9, 2.1))
+    assert box.constants["k"].unit == "N/m"
+    assert box.sentence == "a constant outside its stated tolerance"
+
+
+@pytest.mark.parametrize(
+    ("constants", "words"),
+    [
+        ({"k": {"nominal": 0.0, "tolerance": "5 %"}, "m": 1.0}, "zero, which has no per cent"),
+        ({"k": {"range": [1.0, float("inf")]}, "m": 1.0}, "open side"),
+        ({"k": {"range": [1.0]}, "m": 1.0}, "open side"),
+        ({"k": {"range": [1.0, None]}, "m": 1.0}, "open side"),
+        ({"k": {"nominal": 2.0, "tolerance": 5}, "m": 1.0}, "5 %"),
+        ({"k": {"nominal": 2.0, "tolerance": "five"}, "m": 1.0}, "per cent"),
+        ({"k": {"nominal": 2.0, "tolerance": "-5 %"}, "m": 1.0}, "per cent"),
+        ({"k": 2.0}, "unknown name 'm'"),
+        ({"k": 2.0, "m": 1.0, "spring": (1.0, 2.0)}, "'spring' stands in no matrix"),
+        ({"k": {"nominal": 3.0, "range": [1.0, 2.0]}, "m": 1.0}, "outside its range"),
+        ({"k": {"nominal": 2.0, "tolerance": "5 %", "range": [1.0, 2.0]}, "m": 1.0}, "both"),
+        ({"k": {"nominal": 2.0, "spread": 1.0}, "m": 1.0}, "'spread' is unknown"),
+    ],
+)  # fmt: skip
+def test_refused_constants(constants: dict, words: str) -> None:
+    with pytest.raises(SpecError, match=words):
+        obsynth.uncertain_system(ONE, constants)
+
+
+def test_a_divisor_that_can_be_zero_is_refused() -> None:
+    plant = obsynth.uncertain_system(ONE, {"k": 2.0, "m": {"range": [-0.5, 1.5], "nominal": 1.0}})
+    with pytest.raises(PreconditionError, match="can be zero"):
+        affine_plant(plant)
+
+
+def test_entrywise_tolerances_are_unknowns_of_their_own() -> None:
+    plant = wang()
+    assert len(plant.uncertainty.box.names) == 12
+    assert plant.uncertainty.box.names[0] == "A[1,1]"
+    family = affine_plant(plant)
+    assert np.abs(family.A.parts).sum(axis=0) == pytest.approx(0.02 * np.abs(plant.A))
+    with pytest.raises(SpecError, match="is no matrix"):
+        obsynth.uncertain_system(plant.replace(uncertainty=None), tolerance={"Q": "2 %"})
+
+
+def test_new_tolerances_of_a_plant_keep_its_nominal_values() -> None:
+    wider = obsynth.uncertain_system(drive(), {"k": {"tolerance": "10 %"}})
+    assert wider.uncertainty.box.constants["k"].high == pytest.approx(22.0)
+    assert wider.uncertainty.box.constants["c"].high == pytest.approx(0.21)
+    with pytest.raises(SpecError, match="another plant"):
+        obsynth.uncertain_system(drive(), {"k": {"nominal": 25.0, "tolerance": "10 %"}})
+
+
+def test_a_box_says_where_it_comes_from() -> None:
+    plant = drive(source="calibrated", level=0.95, digest="ab" * 32)
+    assert plant.uncertainty.box.sentence == "a constant outside its 95 % box of the log abababababab"
+    with pytest.raises(SpecError, match="probability"):
+        drive(source="calibrated")
+
+
+def test_tolerances_go_through_a_gain_set_and_are_dropped_with_other_matrices(tmp_path) -> None:
+    design = obsynth.fault_estimation_filter(drive())
+    again = obsynth.load(design.save(tmp_path / "g.json")).plant.uncertainty
+    assert again.box.as_dict() == design.plant.uncertainty.box.as_dict()
+    assert again.steps == (("eliminate", 0.0), ("sample", 0.02))
+    assert design.plant.replace(A=2.0 * design.plant.A).uncertainty is None
+
+
+@pytest.mark.parametrize("make", [drive, wang])
+def test_every_plant_of_the_box_is_inside_its_family(make) -> None:
+    plant = make()
+    family, box = affine_plant(plant), plant.uncertainty.box
+    points = drawn_points(len(box.names), 60, 3)
+    used = 0.0
+    for q in points:
+        exact = plant_at(plant, box.values(q))
+        for name in UNCERTAIN_MATRICES:
+            matrix = family.matrices[name]
+            wanted = getattr(exact, name)
+            wanted = wanted @ family.coordinates if name in ("E", "A", "C") else wanted
+            missed = np.abs(wanted - matrix.at(q))
+            # The exact plant itself is computed in double precision.
+            assert np.all(missed <= matrix.radius + 1e-14 * (1.0 + matrix.magnitude))
+            used = max(used, float(np.max(missed / np.maximum(matrix.radius, 1e-9), initial=0.0)))
+    # The remainders are not a hundred times too wide: some plant uses most of them.
+    assert make is wang or used > 0.3
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["a*b + 1", "a / b", "sqrt(a) * sin(b)", "exp(-a) + cos(a*b)", "a**3 - b**-2", "log(a + b)", "tanh(a) + atan(b)",
+     "abs(a*b - 5)", "min(a*a, 10)", "max(a, b*b)", "where(a > 0, b*b, 1/a)", "a**0.5 * log10(b)", "tan(a/4)",
+     "asin(a/4) + acos(b/4)", "cosh(a) - sinh(b)", "2**a"],
+)  # fmt: skip
+def test_expressions_enclose_their_values(text: str) -> None:
+    a = AffineNumber(1.0, np.array([0.1, 0.0]), 0.01)
+    b = AffineNumber(1.3, np.array([0.05, 0.1]), 0.0)
+    expression = parse_expression(text)
+    found = expression.translated({"a": a, "b": b}, affine_translation(2))
+    generator = np.random.default_rng(1)
+    widest = 0.0
+    for _ in range(400):
+        q = generator.choice([-1.0, 1.0], 2) if generator.random() < 0.5 else generator.uniform(-1.0, 1.0, 2)
+        values = {"a": 1.0 + 0.1 * q[0] + generator.uniform(-0.01, 0.01), "b": 1.3 + q @ b.parts}
+        missed = abs(float(expression(values)) - (found.center + q @ found.parts))
+        assert missed <= found.radius + 1e-14
+        widest = max(widest, missed)
+    assert widest >= 0.05 * found.radius
+
+
+def test_inverse_and_exponential_hold_those_of_members() -> None:
+    generator = np.random.default_rng(5)
+    matrix = AffineMatrix(
+        generator.normal(size=(4, 4)) + 4.0 * np.eye(4), 0.05 * generator.normal(size=(3, 4, 4)), np.full((4, 4), 1e-3)
+    )
+    from scipy.linalg import expm
+
+    inverse, exponential = affine_inverse(matrix), affine_exponential(matrix.scaled(0.3))
+    for _ in range(200):
+        q = generator.choice([-1.0, 1.0], 3)
+        member = matrix.at(q) + 1e-3 * generator.choice([-1.0, 1.0], (4, 4))
+        assert np.all(np.abs(np.linalg.inv(member) - inverse.at(q)) <= inverse.radius)
+        assert np.all(np.abs(expm(0.3 * member) - exponential.at(q)) <= exponential.radius)
+    with pytest.raises(PreconditionError, match="not proved regular"):
+        affine_inverse(AffineMatrix(np.eye(2), np.ones((1, 2, 2)), np.zeros((2, 2))))

@@ -1,0 +1,125 @@
+"""Whether a log agrees with a design: wrong variances are named with their factor, and so is what else is wrong."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+from test_calibrate import BOUNDS, LOG
+from test_linearise import tanks
+
+import obsynth
+from obsynth import SpecError, dae_adaptive_observer, linearise, validate, validity
+
+CALIBRATED = {"a1": 0.0163, "a2": 0.0199, "b1": 0.0350, "b2": 0.0354}
+HELD = {"u1": "u1_held", "u3": "u3_held"}
+Q = {"tank1": 2.0e-5, "tank2": 1.2e-5, "tank3": 9.0e-7}
+R = {"v1": 1.7e-5, "v2": 4.8e-6, "v3": 2.7e-5}
+
+
+def designed(Q=Q, R=R, **constants):
+    model = tanks()
+    model = model.replace(constants={**model.constants, **CALIBRATED, **constants})
+    return dae_adaptive_observer(
+        model, dt=1.0, forgetting=0.95, Q=Q, R=R, initial_covariance=1e-4 * np.eye(3),
+        initial_parameter_covariance=[[1e-4]],
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def right():
+    return designed()
+
+
+def test_a_calibrated_design_agrees_with_its_log(right):
+    found = validate(right, LOG, rows="0:56", columns=HELD)
+    assert found.passed
+    assert 0.8 < found.nis.value < 1.2
+    assert not found.ratios
+    assert "agrees" in str(found)
+    figure = found.plot()
+    assert len(figure.axes) == 7
+    import matplotlib.pyplot as plt
+
+    plt.close(figure)
+
+
+def test_process_noise_a_hundred_times_too_large_is_named():
+    found = validate(designed(Q={name: 100.0 * value for name, value in Q.items()}), LOG, rows="0:56", columns=HELD)
+    assert not found.passed
+    assert found.nis.value < 0.2
+    assert set(found.ratios) == set(Q)
+    assert all(1 / 200 < ratio < 1 / 50 for ratio in found.ratios.values())
+    assert any("too large" in sentence for sentence in found.verdict)
+
+
+def test_a_sensor_whose_noise_is_eight_times_too_small_is_named():
+    found = validate(designed(R={**R, "v3": 2.7e-5 / 8}), LOG, rows="0:56", columns=HELD)
+    assert not found.passed
+    assert set(found.ratios) == {"v3"}
+    assert 5.0 < found.ratios["v3"] < 12.0
+    assert any("R of v3" in sentence and "too small" in sentence for sentence in found.verdict)
+
+
+def test_a_leak_in_the_rows_is_found(right):
+    found = validate(right, LOG, columns=HELD)
+    assert not found.passed
+    assert any("leak" in sentence for sentence in found.verdict)
+
+
+def test_a_recursive_design_is_validated_too():
+    linear = linearise(tanks(), at="point", given={"h1": 0.55, "h2": 0.47, "h3": 0.56}, drift=True)
+    plant = obsynth.discretise(linear, 1.0).plant
+    varying = obsynth.TimeVaryingDescriptorSystem.from_descriptor(plant)
+    rng = np.random.default_rng(1)
+    x, rows = np.zeros(3), []
+    for _ in range(150):
+        rows.append([0.47, 0.47, 1.0, *(x + 0.01 * rng.standard_normal(3))])
+        x = plant.A @ x + plant.B @ (np.array(rows[-1][:3]) - [0.4737, 0.4737, 0.0]) + 0.003 * rng.standard_normal(3)
+    columns = dict(zip((*plant.input_names, *plant.output_names), np.array(rows).T, strict=True))
+    point = [plant.operating_point[name] for name in plant.output_names]
+    log = {"time": np.arange(150.0), **columns}
+    for name, value in zip(plant.output_names, point, strict=True):
+        log[name] = log[name] + value
+    for factor, holds in ((1.0, True), (25.0, False)):
+        design = obsynth.adaptive_observer(
+            varying, Q=9e-6 * np.eye(3), R=1e-4 / factor * np.eye(3), forgetting=0.98, initial_state=np.zeros(3),
+            initial_covariance=1e-6 * np.eye(3), initial_parameters=[0.0], initial_parameter_covariance=[[1e-4]],
+        )  # fmt: skip
+        found = validate(design, log)
+        assert found.nis.holds == holds
+        assert set(found.sensors) == set(plant.output_names)
+
+
+def test_bad_requests_are_refused(right):
+    with pytest.raises(SpecError, match="at least"):
+        validate(right, LOG, rows="0:10")
+    with pytest.raises(SpecError, match="no column"):
+        validate(right, pd.DataFrame({"time": [0.0, 1.0]}))
+
+
+def test_validity_along_the_log_is_that_of_the_reference():
+    """Reference, section 1: .75 deviations of 3 mV over rows 30 to 55, 14 over all rows before the leak."""
+    deviations = dict.fromkeys(("v1", "v2", "v3"), 0.003)
+    model = tanks()
+    log = pd.read_csv(LOG)
+    given = dict(zip(("h1", "h2", "h3"), log.loc[40, ["v1", "v2", "v3"]].to_numpy(dtype=float), strict=True))
+    linear = linearise(model, at="point", given=given, drift=True)
+    found = {}
+    for first in (0, 30):
+        start = log.loc[first, ["v1", "v2", "v3"]].to_numpy(dtype=float)
+        found[first] = validity(model, linear, LOG, rows=f"{first}:56", initial_state=start, deviations=deviations)
+    assert found[30].largest < 1.5
+    assert found[0].largest > 5.0
+    assert "deviations" in str(found[0])
+    figure = found[0].plot()
+    assert len(figure.axes) == 6
+    import matplotlib.pyplot as plt
+
+    plt.close(figure)
+    with pytest.raises(SpecError, match="another plant"):
+        validity(model, obsynth.discretise(linear, 1.0).plant, LOG)
+
+
+def test_the_bounds_of_the_calibration_hold_what_the_design_uses():
+    assert all(BOUNDS[name][0] < value < BOUNDS[name][1] for name, value in CALIBRATED.items())
