@@ -64,7 +64,9 @@ def peak_sums(
         total, collected = total + terms[-1], collected + np.abs(powers)
         done = len(terms) >= max(MOST_STEPS, least)
         if done or (len(terms) >= least and (len(terms) % 64 == 0 or not powers.any())):
-            after = contraction.factor * _seen(contraction, powers @ moving, _missed(matrix, np.abs(powers), growth), each)
+            after = contraction.factor * _seen(
+                contraction, powers @ moving, _missed(matrix, np.abs(powers), growth), each
+            )
             after = np.asarray(after * sizes)
             # A column that is nothing but its radius has no terms to compare with.
             if done or np.all((after <= left * total) | idle):
@@ -94,7 +96,9 @@ def _seen(
 ) -> FloatArray:
     """Return bounds on ``|c Q^-1|``: of each row as a column, or of all; with ``summed`` those of sums of rows."""
     if each:
-        return np.array([contraction.seen(rows[i : i + 1], radius[i : i + 1], summed) for i in range(len(rows))])[:, None]
+        return np.array([contraction.seen(rows[i : i + 1], radius[i : i + 1], summed) for i in range(len(rows))])[
+            :, None
+        ]
     return np.array(contraction.seen(rows, radius, summed))
 
 

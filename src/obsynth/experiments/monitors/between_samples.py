@@ -4,15 +4,16 @@ The observer takes known inputs and outputs as straight lines between samples; t
 In the coordinates of the error, ``eps = z - T x`` with ``T = V E``, and with ``x+ = Phi x + q``, ``y = C x + Dd d``,
 
 .. math::
-    \varepsilon^+ = \Phi_z \varepsilon + K x + (\Gamma_1 C - T) q + (\Gamma_0 - \Gamma_1) D_d d + \Gamma_1 D_d d^+, \qquad
+    \varepsilon^+ = \Phi_z \varepsilon + K x + (\Gamma_1 C - T) q + (\Gamma_0 - \Gamma_1) D_d d + \Gamma_1 D_d d^+,
+
     r = C_r \varepsilon + D_r D_d d
 
     K = \Phi_z T + (\Gamma_0 - \Gamma_1) C + \Gamma_1 C \Phi - T \Phi, \qquad
     q = \int_0^h e^{A s} B_d\, d(t + h - s)\, ds
 
-K is what straight lines miss of a free motion of the plant: of third order in h, and zero for constants and ramps.  So x
-enters with a small factor, and only as far as it dies out: `forgotten` splits it, and what is left of the modes that do
-not die out is rounding, or there is no bound.  All sums are proved (`obsynth.proofs.peak_sums`).
+K is what straight lines miss of a free motion of the plant: of third order in h, and zero for constants and ramps.  So
+x enters with a small factor, and only as far as it dies out: what is left of the modes that do not die out is rounding,
+or there is no bound.  All sums are proved (`obsynth.proofs.peak_sums`).
 """
 
 from __future__ import annotations
@@ -25,9 +26,9 @@ import numpy as np
 from obsynth.analysis.transformations import eliminate_algebraic_states
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.holds import first_order_hold
 from obsynth.numerics.peak_gain import peak_gain
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.observers.linear.sampling import first_order_hold
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.balls import Ball, block, rounded_up
 from obsynth.proofs.contraction import Contraction, column_norms, prove_contraction
@@ -64,11 +65,19 @@ class BetweenSamples:
     first: FloatArray
     second: FloatArray
     direct: FloatArray
+    rows: slice
     left: float
 
     @classmethod
     def of(
-        cls, plant: DescriptorSystem, observer: LinearObserver, tracking: FloatArray, dt: float, *, endless: bool = True
+        cls,
+        plant: DescriptorSystem,
+        observer: LinearObserver,
+        tracking: FloatArray,
+        dt: float,
+        *,
+        rows: slice,
+        endless: bool = True,
     ) -> BetweenSamples:
         """Return the design at samples ``dt`` apart, for ``tracking V (nz, nx)``; raise `SpecError` without a bound.
 
@@ -89,13 +98,15 @@ class BetweenSamples:
         earlier = Ball.exact(g0) - Ball.exact(g1)
         ramp = Ball.exact(g1) @ c_plant
         k = Ball.exact(az) @ Ball.exact(t) + earlier @ c_plant + ramp @ phi - Ball.exact(t) @ phi
-        rows = observer.residual_rows
         j = Ball.exact(observer.Cz[rows]) @ Ball.exact(t) + Ball.exact(observer.Dy[rows]) @ c_plant
         terms = np.abs(az) @ np.abs(t) + (np.abs(g0) + 2.0 * np.abs(g1)) @ np.abs(smooth.C) + np.abs(t)
-        parts = (az, g1, earlier), t, (phi, k, j)
-        if not endless:
+        parts = rows, (az, g1, earlier), t, (phi, k, j)
+        try:
+            return _assembled(smooth, dt, observer, *parts, _kept(smooth, dt, k, terms), endless=True)
+        except SpecError:
+            if endless:
+                raise
             return _assembled(smooth, dt, observer, *parts, np.eye(smooth.nx), endless=False)
-        return _assembled(smooth, dt, observer, *parts, _kept(smooth, dt, k, terms), endless=True)
 
     @cached_property
     def per_unit(self) -> FloatArray:
@@ -107,11 +118,13 @@ class BetweenSamples:
         """Which disturbances reach the residual beyond rounding ``(nd,)``."""
         a, b = self.plant.A, self.plant.Bd
         held = np.abs(self.plant.C) @ (np.abs(b) * self.dt + np.abs(a @ b) * self.dt**2) + np.abs(self.plant.Dd)
-        scale = np.linalg.norm(np.abs(self.direct) @ held + np.abs(self.c[:, len(a) :]) @ (np.abs(self.second) @ held), axis=0)
+        scale = np.linalg.norm(
+            np.abs(self.direct) @ held + np.abs(self.c[:, len(a) :]) @ (np.abs(self.second) @ held), axis=0
+        )
         return np.asarray(self.per_unit > UNREACHED * scale)
 
     def of_disturbances(self, sizes: FloatArray, steps: int) -> tuple[FloatArray, FloatArray]:
-        """Return the bounds at samples ``0 .. steps - 1``, and for ever ``(nd,)``, for ``|d_i(t)| <= sizes_i (nd,)``."""
+        """Return the bounds at samples ``0 .. steps - 1``, and for ever ``(nd,)``, for ``|d_i(t)| <= sizes_i``."""
         plant, count = self.plant, self.plant.nd
         if not count:
             return np.zeros(steps), np.zeros(0)
@@ -146,13 +159,32 @@ class BetweenSamples:
         rows, terms = self.c, []
         size = np.abs(columns.midpoint) + columns.radius
         for _ in range(max(steps, 1)):
-            terms.append(np.linalg.norm(rows @ columns.midpoint, axis=0) + FINITE * np.linalg.norm(np.abs(rows) @ size, axis=0))
+            terms.append(
+                np.linalg.norm(rows @ columns.midpoint, axis=0) + FINITE * np.linalg.norm(np.abs(rows) @ size, axis=0)
+            )
             rows = rows @ self.M.midpoint
         partial = np.cumsum(np.array(terms), axis=0)
         return PeakSums(partial, np.full(partial.shape[1], np.inf))
 
+    def input_response(self, observer: LinearObserver) -> InputResponse:
+        """Return what known inputs do to what is watched: held between samples, or in straight lines."""
+        plant, n = self.plant, self.plant.nx
+        _, held, ramp = first_order_hold(plant.A, plant.B, self.dt)
+        _, u0, u1 = first_order_hold(observer.Az, observer.Bu, self.dt)
+        _, y0, y1 = first_order_hold(observer.Az, observer.By, self.dt)
+        into, own = self.into.midpoint, np.zeros((n, plant.nu))
+        before = np.vstack([own, u0 + y0 @ plant.D]) + into @ held
+        rise = np.vstack([own, u1 + y1 @ plant.D])
+        return InputResponse(self.M.midpoint, self.c, before, (rise, rise + into @ ramp))
+
+    def lasting_words(self, limit: float) -> str:
+        """Return what to say of modes that do not die out: up to which state rounding on them does not matter."""
+        if not self.left > 0.0 or not np.isfinite(limit):
+            return ""
+        return f"; while no state of the plant exceeds {ADDED * limit / self.left:.2g} in its unit"
+
     def at_any_stamps(self, sizes: FloatArray, observer: LinearObserver) -> float:
-        """Return what straight lines between outputs add at stamps of any kind, at most ``dt`` apart; may be infinite."""
+        """Return what straight lines between outputs add at any stamps at most ``dt`` apart; may be infinite."""
         plant, h = self.plant, self.dt
         if not plant.nd:
             return 0.0
@@ -168,7 +200,30 @@ class BetweenSamples:
         bent = np.array([np.sum(peak_gain(stable, projector @ plant.Bd * sizes, row[None])) for row in second])
         slope, turn = np.abs(plant.C @ plant.Bd) @ sizes, np.abs(plant.C @ plant.A @ plant.Bd) @ sizes
         missed = 0.25 * h * (2.0 * slope + h * (bent + turn)) + 2.0 * np.abs(plant.Dd) @ sizes
-        return float(peak_gain(observer.Az, observer.By, observer.Cz[observer.residual_rows]) @ missed)
+        return float(peak_gain(observer.Az, observer.By, observer.Cz[self.rows]) @ missed)
+
+
+@dataclass(frozen=True, eq=False)
+class InputResponse:
+    """``s+ = M s + before u + rise (u+ - u)``, ``r = c s``, for a rise of two kinds: a step, and a line."""
+
+    M: FloatArray
+    c: FloatArray
+    before: FloatArray
+    rises: tuple[FloatArray, FloatArray]
+
+    def start(self) -> FloatArray:
+        """Return the states of both kinds, at rest ``(2, n)``."""
+        return np.zeros((2, len(self.M)))
+
+    def advanced(self, states: FloatArray, u: FloatArray, after: FloatArray) -> FloatArray:
+        """Return the states one sample later, for inputs ``u (nu)`` and those of the next sample."""
+        pairs = zip(states, self.rises, strict=True)
+        return np.array([self.M @ s + self.before @ u + rise @ (after - u) for s, rise in pairs])
+
+    def size(self, states: FloatArray) -> float:
+        """Return the larger of what both kinds do to the norm of what is watched."""
+        return float(np.max(np.linalg.norm(states @ self.c.T, axis=1), initial=0.0))
 
 
 def _kept(plant: DescriptorSystem, dt: float, k: Ball, terms: FloatArray) -> FloatArray:
@@ -208,11 +263,12 @@ def _dying(a: FloatArray, dt: float) -> FloatArray | None:
 
 
 def _assembled(
-    plant: DescriptorSystem, dt: float, observer: LinearObserver, held: tuple[FloatArray, FloatArray, Ball],
-    t: FloatArray, found: tuple[Ball, Ball, Ball], kept: FloatArray, *, endless: bool,
+    plant: DescriptorSystem, dt: float, observer: LinearObserver, rows: slice,
+    held: tuple[FloatArray, FloatArray, Ball], t: FloatArray, found: tuple[Ball, Ball, Ball], kept: FloatArray,
+    *, endless: bool,
 ) -> BetweenSamples:  # fmt: skip
     (az, g1, earlier), (phi, k, j), n = held, found, plant.nx
-    rows, exact = observer.residual_rows, Ball.exact
+    exact = Ball.exact
     followed = kept.any()
     projector, others = exact(kept), exact(np.eye(n)) - exact(kept)
     moving = phi @ projector
@@ -221,8 +277,8 @@ def _assembled(
     contraction = prove_contraction(m, discrete=True) if endless else None
     if contraction is None and endless:
         raise SpecError(
-            "The residual at the samples has no bound that double precision could prove: the observer, or a mode of the "
-            "plant that is not straight between samples, dies out too slowly. Sample the plant first "
+            "The residual at the samples has no bound that double precision could prove: the observer, or a mode of "
+            "the plant that is not straight between samples, dies out too slowly. Sample the plant first "
             "(transform.sample_time), or use a statistical monitor.", path="sample_time",
         )  # fmt: skip
     into = block([[projector], [exact(g1) @ exact(plant.C) - exact(t)]])
@@ -237,5 +293,5 @@ def _assembled(
     left = float(np.linalg.norm(np.sum(rounded_up(driven + sizes, 4), axis=1)))
     second = earlier.midpoint
     return BetweenSamples(
-        plant, dt, m, shown, contraction, into, g1, second, observer.Dy[rows], left,
+        plant, dt, m, shown, contraction, into, g1, second, observer.Dy[rows], rows, left,
     )  # fmt: skip

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import cast
 
 import numpy as np
@@ -105,9 +106,14 @@ class ContinuousDesign:
     dt: float
     endless: bool
 
+    rows: slice
+
+    @cached_property
     def between(self) -> BetweenSamples:
-        """Return the design on samples; raise `SpecError` where its residual has no bound."""
-        return BetweenSamples.of(self.plant, self.observer, self.tracking, self.dt, endless=self.endless)
+        """The design on samples; raises `SpecError` where what is watched has no bound."""
+        return BetweenSamples.of(
+            self.plant, self.observer, self.tracking, self.dt, rows=self.rows, endless=self.endless
+        )
 
     def gathered_noise(self, smooth: DescriptorSystem) -> FloatArray:
         """Return a factor ``(n, m)`` of what process noise adds to the states of the plant in a sample."""
@@ -118,8 +124,18 @@ class ContinuousDesign:
         return np.asarray(discretise(whole, self.dt).plant.Bw)
 
 
-def residual_model(design: ObserverDesign, scenario: Scenario, *, endless: bool = False) -> ResidualModel:
-    """Return the model of a design's residual on a scenario; ``endless`` where the record may have any length."""
+def watches_estimates(design: ObserverDesign) -> bool:
+    """Whether the fault estimates are watched, as the residual is made not to see the faults that are modelled."""
+    return "Phi" in design.certificate.matrices
+
+
+def residual_model(
+    design: ObserverDesign, scenario: Scenario, *, endless: bool = False, estimates: bool = False
+) -> ResidualModel:
+    """Return the model of a design's residual on a scenario; ``endless`` where the record may have any length.
+
+    With ``estimates`` it is that of the fault estimates, which are zero without a fault but for their errors.
+    """
     plant, observer = design.linear
     drive = resolve(plant, scenario)
     noisy = plant.replace(
@@ -134,7 +150,8 @@ def residual_model(design: ObserverDesign, scenario: Scenario, *, endless: bool 
     if len(begin) != observer.order:
         raise SpecError(f"observer_state needs {observer.order} numbers, not {len(begin)}.", path="observer_state")
     initial = found.tracking @ (plant.E @ start) - begin
-    shown, _, direct_d, direct_w = errors.residual_output
+    shown, _, direct_d, direct_w = errors.fault_output if estimates else errors.residual_output
+    rows = observer.fault_rows if estimates else observer.residual_rows
     faults, _, faults_d, faults_w = errors.fault_output
     bounds, means, deviations, steady = _disturbances(scenario, plant.disturbance_names, drive.steps, drive.dt)
     a, driven, noise, flow, start_noise, heard = errors.Az, errors.disturbance, errors.noise, None, None, None
@@ -144,8 +161,8 @@ def residual_model(design: ObserverDesign, scenario: Scenario, *, endless: bool 
         a, driven, noise, start_noise = held.A, held.Bd, held.Bw, held.start
         sensors = noisy.Dw.any(axis=0)
         heard = errors.noise[:, sensors], direct_w[:, sensors]
-        continuous = ContinuousDesign(noisy, observer, found.tracking, drive.dt, endless)
-        direct_w, faults_w = held.direct(observer.residual_rows), held.direct(observer.fault_rows)
+        continuous = ContinuousDesign(noisy, observer, found.tracking, drive.dt, endless, rows)
+        direct_w, faults_w = held.direct(rows), held.direct(observer.fault_rows)
     return ResidualModel(
         a, -shown, driven, direct_d, noise, direct_w, -faults, faults_d, faults_w,
         drive.steps, initial, bounds, means, deviations, steady, flow, start_noise, heard, continuous,

@@ -36,11 +36,9 @@ def scaled_inputs(
 
     Shapes: ``bounds (nd,)``.
     """
-    between = None if model.continuous is None else model.continuous.between()
-    if between is None:
-        reached = np.any(model.Bd != 0.0, axis=0) | np.any(model.Dd != 0.0, axis=0)
-    else:
-        reached = between.reached
+    between = None if model.continuous is None else model.continuous.between
+    sampled = np.any(model.Bd != 0.0, axis=0) | np.any(model.Dd != 0.0, axis=0)
+    reached = sampled if between is None else between.reached
     if np.any(reached & ~np.isfinite(bounds)):
         raise SpecError(
             "A disturbance has no bound (a Gaussian one has none): give disturbance_bounds (--disturbance), or use "
@@ -70,9 +68,7 @@ def scaled_inputs(
     return ScaledInputs(factor * model.Bw[:, :count], factor * model.Dw[:, :count], table + noise, limit, start)
 
 
-def _at_any_stamps(
-    model: ResidualModel, between: BetweenSamples, sizes: FloatArray, factor: float
-) -> ScaledInputs:
+def _at_any_stamps(model: ResidualModel, between: BetweenSamples, sizes: FloatArray, factor: float) -> ScaledInputs:
     """Return what drives the residual of a continuous design whose samples may be at any stamps, none further apart."""
     (a, driven), count = model.flow or (model.A, model.Bd), 0
     total = float(np.sum(peak_gain(a, driven * sizes, model.C) + np.linalg.norm(model.Dd * sizes, axis=0)))
