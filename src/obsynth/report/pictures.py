@@ -19,6 +19,7 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.recursive.estimates import RecursiveEstimates
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.plotting.frequency import plot_gains
+from obsynth.plotting.panels import names_as_they_are
 from obsynth.plotting.simulation import plot_simulation
 from obsynth.plotting.spectra import plot_poles
 from obsynth.plotting.states import plot_states
@@ -147,7 +148,10 @@ def _drawn(size: tuple[float, float], panels: int, draw: Callable[[Sequence[Axes
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=size, layout="constrained")
-    draw(list(figure.subplots(panels, 1, sharex=True, squeeze=False)[:, 0]))
+    axes = list(figure.subplots(panels, 1, sharex=True, squeeze=False)[:, 0])
+    draw(axes)
+    for panel in axes:
+        names_as_they_are(panel)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=RESOLUTION)
     return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
