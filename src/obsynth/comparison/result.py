@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from obsynth.files.outputs import FileKind
 from obsynth.methods.choosing.figures import FaultFigures
 from obsynth.numerics.arrays import FloatArray
 from obsynth.results.design import ObserverDesign
@@ -87,6 +88,8 @@ class ComparedMethod:
         return float(np.sqrt(np.mean([found.rms**2 for found in self.faults]))) if self.faults else float("inf")
 
 
+#: What the page of a comparison begins with.
+COMPARISON_PAGE = FileKind("a comparison of obsynth", rb'name="generator" content="obsynth compare"')
 _HEADER = (
     "method", "fault", "order", "50 % s", "90 % s", "at horizon", "peak", "deviation", "leak", "bias", "alarm s",
     "smallest", "rms", "ms",
@@ -231,7 +234,9 @@ class Comparison:
         encoded = b64encode(picture.getvalue()).decode("ascii")
         style = "body{font-family:sans-serif;margin:2em;max-width:75em}td,th{padding:.2em .6em;text-align:right}"
         return (
-            "<!DOCTYPE html><html lang='en'><head><meta charset='utf-8'><title>Comparison of methods</title>"
+            "<!DOCTYPE html><html lang='en'><head><meta charset='utf-8'>"
+            '<meta name="generator" content="obsynth compare">'
+            "<title>Comparison of methods</title>"
             f"<style>{style}</style></head><body><h1>{escape(self.advice)}</h1>{self._repr_html_()}"
             f"<img alt='Estimates of each method' style='max-width:100%' src='data:image/png;base64,{encoded}'></body>"
             "</html>\n"

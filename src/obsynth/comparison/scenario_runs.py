@@ -49,7 +49,8 @@ def drawn_runs(
     seeds = [int(value) for value in rng.integers(0, 2**31, size=runs)]
     random, noise, sensors = drive.drawn(seeds, sampled.nw)
     scales = rng.uniform(-1.0, 1.0, size=(runs, sampled.nd))
-    faulty, healthy = [], []
+    faulty: list[FloatArray] = []
+    healthy: list[FloatArray] = []
     for run in range(runs):
         plant = on_the_clock(_drawn(source, tolerance, rng), sampled.dt) if tolerance else sampled
         signals = drive.left + random[:, run]
@@ -118,11 +119,8 @@ def alarms(
     shown = np.maximum(response[:length], 0.0)
     with np.errstate(divide="ignore", invalid="ignore"):
         needed = np.where(shown > 0.0, (level - quiet[:, first : first + length]) / shown, np.inf)
-    return (
-        level,
-        float(np.median(delays)),
-        float(np.median(np.max([np.min(needed, axis=1), np.zeros(len(needed))], axis=0))),
-    )
+    smallest = np.maximum(np.min(needed, axis=1), 0.0)
+    return level, float(np.median(delays)), float(np.median(smallest))
 
 
 def rms(errors: Sequence[float] | FloatArray) -> float:

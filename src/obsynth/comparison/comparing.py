@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.compare.comparison import ComparedMethod, Comparison, FaultComparison
-from obsynth.compare.scenario_runs import DrawnRuns, alarms, drawn_runs, estimates, rms
+from obsynth.comparison.result import ComparedMethod, Comparison, FaultComparison
+from obsynth.comparison.scenario_runs import DrawnRuns, alarms, drawn_runs, estimates, rms
 from obsynth.errors import SpecError
 from obsynth.methods.choosing.candidates import Candidate, candidate, linear_methods
 from obsynth.methods.choosing.figures import DECOUPLED, on_the_clock, step_responses
@@ -121,7 +121,10 @@ def compare(
         + (f", parameters off by up to {tolerance:.0%}" if tolerance else "")
         + f"; 90 % of a step wanted within {limit:.3g} s"
     )
-    times, truth = (np.arange(len(drawn.faults)) * dt, drawn.faults) if log is None else (log.times, log.truth)
+    times: FloatArray = (
+        np.asarray(np.arange(len(drawn.faults)) * float(dt), dtype=np.float64) if log is None else log.times
+    )
+    truth = drawn.faults if log is None else log.truth
     best = next((entry for entry in compared if not entry.refused), None)
     return Comparison(
         tuple(compared), "" if best is None else best.method, _reason(best, compared, sampled), dt, read_only(times),
@@ -199,7 +202,7 @@ def _log(data: Any, plant: DescriptorSystem) -> _Log:
     truth = np.zeros((len(frame), plant.nf))
     for name in there:
         truth[:, plant.fault_names.index(name)] = frame[name].to_numpy(dtype=np.float64)
-    times = np.arange(len(frame)) * plant.dt
+    times: FloatArray = np.asarray(np.arange(len(frame)) * float(plant.dt), dtype=np.float64)
     return _Log(times, columns(plant.input_names), columns(plant.output_names), truth, bool(there))
 
 
