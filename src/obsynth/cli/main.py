@@ -121,7 +121,7 @@ def _digits(text: str) -> int:
 
 
 def _verb(name: str) -> Callable[[argparse.Namespace], int]:
-    from obsynth.cli import calibration, commands, compare, data_commands, evaluate, simulate, sweep
+    from obsynth.cli import calibration, commands, compare, data_commands, evaluate, plot, simulate, sweep
 
     return {
         "design": commands.run_design,
@@ -133,6 +133,7 @@ def _verb(name: str) -> Callable[[argparse.Namespace], int]:
         "sweep": sweep.run_sweep,
         "run": data_commands.run_run,
         "export": data_commands.run_export,
+        "plot": plot.run_plot,
         "report": data_commands.run_report,
         "linearise": calibration.run_linearise,
         "calibrate": calibration.run_calibrate,
