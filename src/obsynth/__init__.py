@@ -20,7 +20,9 @@ if TYPE_CHECKING:
     from obsynth.calibration.validating import validate
     from obsynth.calibration.validation import Validation
     from obsynth.calibration.validity import Validity, validity
-    from obsynth.compare.sensor_sets import SensorSet, SensorSets, sensor_sets
+    from obsynth.comparison.comparing import compare
+    from obsynth.comparison.result import ComparedMethod, Comparison, FaultComparison
+    from obsynth.comparison.sensor_sets import SensorSet, SensorSets, sensor_sets
     from obsynth.data.run import DataRun, run_on_data
     from obsynth.errors import (
         InfeasibleError,
@@ -47,6 +49,7 @@ if TYPE_CHECKING:
     from obsynth.importing.modelica import from_modelica
     from obsynth.importing.state_space import from_control, from_scipy
     from obsynth.methods.adaptive_observer.public import adaptive_observer
+    from obsynth.methods.choosing.figures import FaultFigures
     from obsynth.methods.dae_adaptive_observer.public import dae_adaptive_observer
     from obsynth.methods.descriptor_kalman.public import descriptor_kalman
     from obsynth.methods.designing import design
@@ -75,7 +78,8 @@ if TYPE_CHECKING:
     from obsynth.observers.linear.sampling import sample_observer
     from obsynth.observers.recursive.estimates import RecursiveEstimates
     from obsynth.observers.recursive.gain_schedule import BatchEstimates
-    from obsynth.observers.recursive.observer import Adaptation, RecursiveObserver
+    from obsynth.observers.recursive.observer import RecursiveObserver
+    from obsynth.observers.recursive.settings import Adaptation
     from obsynth.observers.running import RunningObserver
     from obsynth.observers.running import RunningObserver as RunningDAEObserver
     from obsynth.observers.running import RunningObserver as RunningRecursiveObserver
@@ -103,13 +107,18 @@ __version__ = "0.1.0"
 
 # Names are imported when they are first used, so that `import obsynth` stays fast; ``module:name`` is another name.
 _HOMES = {
+    "ComparedMethod": "obsynth.comparison.result",
+    "Comparison": "obsynth.comparison.result",
+    "FaultComparison": "obsynth.comparison.result",
+    "FaultFigures": "obsynth.methods.choosing.figures",
+    "compare": "obsynth.comparison.comparing",
     "Validation": "obsynth.calibration.validation",
     "Validity": "obsynth.calibration.validity",
     "validate": "obsynth.calibration.validating",
     "validity": "obsynth.calibration.validity",
-    "SensorSet": "obsynth.compare.sensor_sets",
-    "SensorSets": "obsynth.compare.sensor_sets",
-    "sensor_sets": "obsynth.compare.sensor_sets",
+    "SensorSet": "obsynth.comparison.sensor_sets",
+    "SensorSets": "obsynth.comparison.sensor_sets",
+    "sensor_sets": "obsynth.comparison.sensor_sets",
     "functional_filter": "obsynth.methods.functional_filter.public",
     "CalibratedBox": "obsynth.calibration.box",
     "Calibration": "obsynth.calibration.result",
@@ -137,7 +146,7 @@ _HOMES = {
     "Identifiability": "obsynth.analysis.identifiability",
     "identifiability": "obsynth.analysis.identifiability",
     "DAEModel": "obsynth.plants.dae.model",
-    "Adaptation": "obsynth.observers.recursive.observer",
+    "Adaptation": "obsynth.observers.recursive.settings",
     "Alarm": "obsynth.observers.alarms",
     "BatchEstimates": "obsynth.observers.recursive.gain_schedule",
     "Certificate": "obsynth.results.design",
@@ -234,6 +243,8 @@ __all__ = [
     "Calibration",
     "Certificate",
     "Check",
+    "ComparedMethod",
+    "Comparison",
     "Constant",
     "ConstantsBox",
     "DAEBatchEstimates",
@@ -251,7 +262,9 @@ __all__ = [
     "Drift",
     "Estimates",
     "Evaluation",
+    "FaultComparison",
     "FaultDiagnosis",
+    "FaultFigures",
     "FaultModel",
     "Gaussian",
     "Identifiability",
@@ -299,6 +312,7 @@ __all__ = [
     "analyse_structure",
     "apply_adaptation_gain",
     "calibrate",
+    "compare",
     "dae_adaptive_observer",
     "decide",
     "decouple",
