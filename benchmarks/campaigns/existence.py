@@ -9,6 +9,7 @@ A wrong design is one for a plant that has none, or one whose estimates of const
 from __future__ import annotations
 
 import argparse
+import sys
 import warnings
 from collections import Counter
 from dataclasses import dataclass
@@ -98,6 +99,9 @@ def campaign(method: str, count: int, *, first: int = 0) -> tuple[Counter[str], 
                 f"right: {'designed' if drawn.exists else 'refused'}" if result.verdict == "right" else result.verdict
             )
             found[kind] += 1
+            if found.total() % 25 == 0 or result.verdict != "right":
+                told = f"{method} {found.total()} of {count}, seed {seed}: {result.verdict}"
+                print(told, "" if result.verdict == "right" else result.said[:300], file=sys.stderr, flush=True)
             if result.verdict != "right":
                 others.append((seed, result))
         seed += 1
