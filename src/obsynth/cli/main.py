@@ -119,7 +119,7 @@ def _digits(text: str) -> int:
 
 
 def _verb(name: str) -> Callable[[argparse.Namespace], int]:
-    from obsynth.cli import calibration, commands, data_commands, evaluate, simulate, sweep
+    from obsynth.cli import calibration, commands, data_commands, evaluate, plot, simulate, sweep
 
     return {
         "design": commands.run_design,
@@ -130,6 +130,7 @@ def _verb(name: str) -> Callable[[argparse.Namespace], int]:
         "sweep": sweep.run_sweep,
         "run": data_commands.run_run,
         "export": data_commands.run_export,
+        "plot": plot.run_plot,
         "report": data_commands.run_report,
         "linearise": calibration.run_linearise,
         "calibrate": calibration.run_calibrate,
