@@ -10,7 +10,7 @@ from __future__ import annotations
 import random
 from dataclasses import dataclass, field
 from fractions import Fraction
-from itertools import combinations
+from itertools import combinations, count
 
 import numpy as np
 from flint import fmpq, fmpq_mat, fmpq_poly
@@ -31,8 +31,12 @@ class Drawn:
     units: dict[str, np.ndarray] = field(repr=False)
 
 
-def draw(method: str, seed: int) -> Drawn | None:
-    """Return the plant of a seed; ``None`` where the draw is not of the kind that the method takes."""
+def drawn_plant(method: str, seed: int) -> Drawn:
+    """Return the plant of a seed: the first draw that is of the kind that the method takes."""
+    return next(found for attempt in count() if (found := _draw(method, f"{seed} {attempt}")) is not None)
+
+
+def _draw(method: str, seed: str) -> Drawn | None:
     rng = random.Random(f"{method} {seed}")
     matrices = _base(rng, method)
     dt = 0.0 if method == "pd-observer" else 1.0 if method == "fault-estimation-filter" else rng.choice([0.0, 1.0])
