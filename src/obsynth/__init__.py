@@ -377,7 +377,8 @@ _PACKAGES = ("plotting",)
 
 def __getattr__(name: str) -> Any:
     if name in _HOMES:
-        return getattr(import_module(_HOMES[name]), name)
+        module, _, other_name = _HOMES[name].partition(":")
+        return getattr(import_module(module), other_name or name)
     if name in _PACKAGES:
         return import_module(f"obsynth.{name}")
     raise AttributeError(f"module 'obsynth' has no attribute {name!r}")
