@@ -37,7 +37,9 @@ if TYPE_CHECKING:
     from obsynth.calibration.validating import validate
     from obsynth.calibration.validation import Validation
     from obsynth.calibration.validity import Validity, validity
-    from obsynth.compare.sensor_sets import SensorSet, SensorSets, sensor_sets
+    from obsynth.comparison.comparing import compare
+    from obsynth.comparison.result import ComparedMethod, Comparison, FaultComparison
+    from obsynth.comparison.sensor_sets import SensorSet, SensorSets, sensor_sets
     from obsynth.data.run import DataRun, run_on_data
     from obsynth.errors import (
         InfeasibleError,
@@ -64,6 +66,7 @@ if TYPE_CHECKING:
     from obsynth.importing.modelica import from_modelica
     from obsynth.importing.state_space import from_control, from_scipy
     from obsynth.methods.adaptive_observer.public import adaptive_observer
+    from obsynth.methods.choosing.figures import FaultFigures
     from obsynth.methods.dae_adaptive_observer.public import dae_adaptive_observer
     from obsynth.methods.descriptor_kalman.public import descriptor_kalman
     from obsynth.methods.designing import check, design
@@ -121,13 +124,18 @@ __version__ = "0.1.0"
 
 # Names are imported when they are first used, so that `import obsynth` stays fast; ``module:name`` is another name.
 _HOMES = {
+    "ComparedMethod": "obsynth.comparison.result",
+    "Comparison": "obsynth.comparison.result",
+    "FaultComparison": "obsynth.comparison.result",
+    "FaultFigures": "obsynth.methods.choosing.figures",
+    "compare": "obsynth.comparison.comparing",
     "Validation": "obsynth.calibration.validation",
     "Validity": "obsynth.calibration.validity",
     "validate": "obsynth.calibration.validating",
     "validity": "obsynth.calibration.validity",
-    "SensorSet": "obsynth.compare.sensor_sets",
-    "SensorSets": "obsynth.compare.sensor_sets",
-    "sensor_sets": "obsynth.compare.sensor_sets",
+    "SensorSet": "obsynth.comparison.sensor_sets",
+    "SensorSets": "obsynth.comparison.sensor_sets",
+    "sensor_sets": "obsynth.comparison.sensor_sets",
     "functional_filter": "obsynth.methods.functional_filter.public",
     "CalibratedBox": "obsynth.calibration.box",
     "Calibration": "obsynth.calibration.result",
@@ -253,6 +261,8 @@ __all__ = [
     "Calibration",
     "Certificate",
     "Check",
+    "ComparedMethod",
+    "Comparison",
     "Constant",
     "ConstantsBox",
     "DAEBatchEstimates",
@@ -270,7 +280,9 @@ __all__ = [
     "Drift",
     "Estimates",
     "Evaluation",
+    "FaultComparison",
     "FaultDiagnosis",
+    "FaultFigures",
     "FaultModel",
     "Gaussian",
     "Identifiability",
@@ -319,6 +331,7 @@ __all__ = [
     "apply_adaptation_gain",
     "calibrate",
     "check",
+    "compare",
     "dae_adaptive_observer",
     "decide",
     "decouple",
