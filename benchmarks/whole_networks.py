@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
-from networks import random_network, write  # noqa: E402
+from networks import random_network, write
 
 SEEDS = (1, 2, 3)
 #: Variables at fixed dynamic states, for the growth of load and elimination.
@@ -78,9 +78,7 @@ def elimination(folder: Path) -> None:
         print(f"| {variables} | {times[-1]:.2f}, {loads[-1]:.2f} | {memory:.0f} | {shown} |", flush=True)
     start = one(folder / "300-1" / "ui-pi-observer.yaml")["load"]
     exponent = np.polyfit(np.log(GROWTH[1:]), np.log(np.maximum(np.array(times[1:]) - start, 1e-3)), 1)[0]
-    print(
-        f"Exponent from {GROWTH[1]} to {GROWTH[-1]}, what Python takes to start ({start:.2f} s) left out: {exponent:.2f}"
-    )
+    print(f"Exponent from {GROWTH[1]} to {GROWTH[-1]} without the start of Python ({start:.2f} s): {exponent:.2f}")
 
 
 def designs(folder: Path, wanted: str = "") -> None:
