@@ -47,7 +47,9 @@ def design():
     )
     reduced = obsynth.eliminate_algebraic_states(source)
     sampled = obsynth.discretise(reduced.plant, 0.1)
-    return obsynth.design(sampled.plant, name="sampled", recovery=reduced.recovery.then(sampled.recovery))
+    return obsynth.design(
+        sampled.plant, "fault-estimation-filter", name="sampled", recovery=reduced.recovery.then(sampled.recovery)
+    )
 
 
 @pytest.fixture
