@@ -40,6 +40,7 @@ def run_run(options: argparse.Namespace) -> int:
             design, sys.stdin if options.data == STREAM else Path(options.data), out,
             columns=dict(options.map), time_column=options.time_column, scales=numbers_of(options.scale),
             thresholds=numbers_of(options.threshold), monitor=watched, gap=options.gap, warm_up=options.warm_up,
+            outliers=options.outliers,
             state=options.state, progress=progress,
         )  # fmt: skip
     for text in found.warnings:
@@ -188,6 +189,9 @@ def summary_of_run(found: DataRun, watched: OnlineMonitor | None) -> str:
         kinds = Counter(found.recovered.values())
         told = ", ".join(f"{count} {kind.replace('needs', 'with')}" for kind, count in kinds.items())
         lines.append(f"{len(found.recovered)} states as written recovered: {told}.")
+    if found.outliers:
+        told = ", ".join(f"{count} of {name}" for name, count in found.outliers.items())
+        lines.append(f"{sum(found.outliers.values())} outliers: {told}.")
     for name, time in found.alarms.items():
         fault = f"; {found.isolated} stands out" if watched and name == watched.kind and found.isolated else ""
         lines.append(f"Alarm: {name} first above its threshold at {found.stamps.shown(time)}{fault}.")

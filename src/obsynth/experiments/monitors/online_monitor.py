@@ -13,7 +13,7 @@ from obsynth.experiments.monitors.adaptive_rule import AdaptiveRule
 from obsynth.experiments.monitors.monitor import KINDS, statement_of
 from obsynth.experiments.monitors.online import OnlineMonitor, Rule
 from obsynth.experiments.monitors.parameter_rules import PARAMETER_KINDS, ParameterRule
-from obsynth.experiments.monitors.residual_model import ResidualModel, residual_model
+from obsynth.experiments.monitors.residual_model import ResidualModel, residual_model, watches_estimates
 from obsynth.experiments.monitors.residual_monitor import bounds_of, require_options
 from obsynth.experiments.monitors.residual_rules import NormRule, WhitenedRule
 from obsynth.experiments.monitors.thresholds import scaled_inputs
@@ -32,6 +32,7 @@ from obsynth.tolerances.robustness import with_tolerances
 _FORGOTTEN = ", once the error at the start, which is not stated, is forgotten (else give a longer warm-up)"
 _AFTER_A_GAP = " (after a gap, too, while the error there is no larger than stated for the start)"
 _NOT_CLOSER = "; rows must not be closer than the stated sample time, as noise drives the plant itself"
+_REGULAR = ", for rows that are the stated sample time apart (none further apart, where they are not regular)"
 _ANY_LENGTH = " (the run may have any length)"
 _PARAMETER_STATEMENTS = {
     "chi-square": "distance of the parameters from their nominal values in the metric of their covariance: passed in a "
@@ -126,7 +127,8 @@ def online_monitor(
     if nominal:
         raise SpecError("nominal is for recursive designs, which estimate parameters.", path="nominal")
     design, adaptive = _tolerances(design, kind, constants, initial_set, initial_error)
-    model, dt = _endless_model(design, scenario, window, sample_time)
+    estimates = watches_estimates(design) and kind in ("pointwise", "window")
+    model, dt = _endless_model(design, scenario, window, sample_time, estimates=estimates)
     bounds = bounds_of(design, model, disturbance_bounds)
     if scenario is None:
         stated = [name in (disturbance_bounds or {}) for name in design.linear[0].disturbance_names]
@@ -149,7 +151,15 @@ def online_monitor(
                 "(thresholds).",
                 path="noise_bound",
             )  # fmt: skip
-        norm = NormRule(table, limit, window=window if kind == "window" else 1, dt=dt, irregular=irregular)
+        watched, driven = None, None
+        if estimates:
+            watched = design.linear[1].fault_rows
+        if kind != "paper" and model.continuous is not None and design.linear[0].nu:
+            driven = model.continuous.between.input_response(model.continuous.observer)
+        norm = NormRule(
+            table, limit, window=window if kind == "window" else 1, dt=dt, irregular=irregular, watched=watched,
+            driven=driven,
+        )  # fmt: skip
         if adaptive:
             return _adaptive(design, norm, model, bounds, noise_bound, initial_error, initial_set)
         rule = norm
@@ -161,9 +171,11 @@ def online_monitor(
         # The noise of the plant itself is what is gathered between samples: the closer they are, the less, but in all
         # the more of it that is of one sign.
         ending += _NOT_CLOSER if model.Bw[:, model.sensor_noise[0].shape[1] :].any() else ""
-    statement = statement_of(kind, continuous=model.flow is not None) + ending + EXACT
+    if kind in ("pointwise", "window") and model.continuous is not None:
+        ending += _REGULAR + model.continuous.between.lasting_words(limit)
+    statement = statement_of(kind, continuous=model.flow is not None, estimates=estimates) + ending + EXACT
     return OnlineMonitor(
-        kind, statement, rule, residuals=len(model.C), fault_names=design.linear[1].fault_names,
+        kind, statement, rule, residuals=len(design.linear[1].residual_names), fault_names=design.linear[1].fault_names,
         fault_scales=model.fault_scales(),
     )  # fmt: skip
 
@@ -208,7 +220,7 @@ def _adaptive(
 
 
 def _endless_model(
-    design: ObserverDesign, scenario: Scenario | None, window: int, sample_time: float | None
+    design: ObserverDesign, scenario: Scenario | None, window: int, sample_time: float | None, *, estimates: bool
 ) -> tuple[ResidualModel, float]:
     """Return a model with as many samples as an error at the start needs to be forgotten, and their distance."""
     plant, observer = design.linear
@@ -226,7 +238,7 @@ def _endless_model(
         horizon=(steps - 0.5) * dt, sample_time=None if plant.is_discrete else dt, inputs={}, faults={}, sensors={},
         initial_state={}, observer_state=None, stabilise=False,
     )  # fmt: skip
-    return residual_model(design, expected), dt
+    return residual_model(design, expected, endless=True, estimates=estimates), dt
 
 
 def _whitened(
