@@ -74,6 +74,7 @@ if TYPE_CHECKING:
         fault_estimation_filter,
         fault_estimation_filter_from_gains,
     )
+    from obsynth.methods.functional_filter.detection import DetectionFilter, detection_filter
     from obsynth.methods.functional_filter.public import functional_filter
     from obsynth.methods.pd_observer.public import (
         apply_adaptation_gain,
@@ -124,6 +125,8 @@ __version__ = "0.1.0"
 
 # Names are imported when they are first used, so that `import obsynth` stays fast; ``module:name`` is another name.
 _HOMES = {
+    "DetectionFilter": "obsynth.methods.functional_filter.detection",
+    "detection_filter": "obsynth.methods.functional_filter.detection",
     "ComparedMethod": "obsynth.comparison.result",
     "Comparison": "obsynth.comparison.result",
     "FaultComparison": "obsynth.comparison.result",
@@ -276,6 +279,7 @@ __all__ = [
     "DeltaScan",
     "DescriptorSystem",
     "Detection",
+    "DetectionFilter",
     "Diagnosis",
     "Drift",
     "Estimates",
@@ -337,6 +341,7 @@ __all__ = [
     "decouple",
     "descriptor_kalman",
     "design",
+    "detection_filter",
     "diagnose",
     "discretise",
     "eliminate_algebraic_states",

@@ -29,6 +29,7 @@ from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.results.design import Certificate, ObserverDesign
 from obsynth.results.plant_source import source_of
 from obsynth.results.report import VerificationReport
+from obsynth.verification.means import before_the_mean
 from obsynth.verification.plant import condition_rows
 from obsynth.verification.stored_numbers import StoredErrors
 
@@ -282,7 +283,8 @@ def with_stored_errors(draft: ObserverDesign) -> ObserverDesign:
     if not spec.tracked:
         return draft
     with np.errstate(all="ignore"):
-        found = StoredErrors.of(spec.load("tracked")(draft), draft.linear[1])
+        base = before_the_mean(draft)[0] if spec.averaged else draft
+        found = StoredErrors.of(spec.load("tracked")(base), base.linear[1])
     if found is None:
         return draft
     old = draft.certificate
