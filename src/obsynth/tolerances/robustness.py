@@ -263,7 +263,7 @@ def robustness(
 
 def structure_of(
     design: ObserverDesign, affine: AffinePlant, tracking: Tracking, *, bounds: FloatArray | None = None,
-    noise_bound: float = 0.0, faults: bool = False,
+    noise_bound: float = 0.0, faults: bool = False, states: bool = False,
 ) -> ErrorStructure:  # fmt: skip
     """Return the error system of a discrete design over its box."""
     plant, observer = design.linear
@@ -274,7 +274,7 @@ def structure_of(
             condition="discrete time",
         )  # fmt: skip
     sizes = np.zeros(plant.nd) if bounds is None else bounds
-    return error_structure(observer, affine, tracking, sizes, noise_bound, faults=faults)
+    return error_structure(observer, affine, tracking, sizes, noise_bound, faults=faults, states=states)
 
 
 def _named(names: tuple[str, ...], shares: FloatArray) -> dict[str, float]:

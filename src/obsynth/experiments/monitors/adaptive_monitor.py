@@ -43,7 +43,7 @@ def adaptive_plan(
         raise SpecError("A disturbance has no bound: give disturbance_bounds (--disturbance).",
                         path="disturbance_bounds")  # fmt: skip
     z = np.zeros(observer.order) if observer_state is None else observer_state
-    start = _start(plant, tracking, initial_error, initial_set, affine, z)
+    start = start_of(affine, tracking, initial_error, initial_set, z)
     later = Start(observer.order, norm=initial_error, state=z)
     reason, faults, same = "", None, False
     try:
@@ -63,11 +63,12 @@ def adaptive_plan(
     return plan(start), plan(later)
 
 
-def _start(
-    plant: DescriptorSystem, tracking: Tracking, initial_error: float | None, initial_set: Mapping[str, Any] | None,
-    affine: AffinePlant, z: FloatArray,
+def start_of(
+    affine: AffinePlant, tracking: Tracking, initial_error: float | None, initial_set: Mapping[str, Any] | None,
+    z: FloatArray,
 ) -> Start:  # fmt: skip
     """Return what is known of eps at the start, ``z - T E(q) x`` for x in a box."""
+    plant = affine.plant
     if initial_set is None:
         return Start(len(z), norm=initial_error, state=z)
     center, radius = initial_box(plant, initial_set)
