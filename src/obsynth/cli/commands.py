@@ -12,6 +12,7 @@ import numpy as np
 from obsynth.cli.arguments import output_file
 from obsynth.cli.output import print_json, progress, stdout_console
 from obsynth.errors import PreconditionError, SpecError, VerificationError
+from obsynth.files.outputs import write_atomically
 
 if TYPE_CHECKING:
     from obsynth.analysis.structure import Structure
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
 def run_design(options: argparse.Namespace) -> int:
     """Run ``design``: spec in, report and gain set out."""
-    from obsynth.results.gain_sets import GAIN_SET, design_as_dict, save_document, written_by_spec
+    from obsynth.results.gain_sets import GAIN_SET, design_as_dict, gain_set_bytes, place_of
 
     with progress(quiet=options.quiet) as report_stage:
         report_stage(f"reading {options.system}")
@@ -32,14 +33,14 @@ def run_design(options: argparse.Namespace) -> int:
         wanted = default_gains(spec) if options.output is None else options.output
         target = spec_output(wanted, GAIN_SET, spec, options, option="--output")
         design = designed(spec, report_stage)
-        gain_set = written_by_spec(design_as_dict(design), spec.path)
-        file = save_document(gain_set, target)
+        file = write_atomically(target, gain_set_bytes(design, spec=spec.path))
     from obsynth.report.summary import summary
 
     if options.json:
         print_json({
             "command": "design", "spec": str(spec.path), "file": str(file), "passed": design.report.passed,
-            "summary": summary(design, everything=True).as_dict(), "gain_set": gain_set,
+            "summary": summary(design, everything=True).as_dict(),
+            "gain_set": {"written_for": place_of(spec.path), **design_as_dict(design)},
         }, is_plain=True)  # fmt: skip
         return 0
     _print_design(design, file, verbose=options.verbose)

@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
-from concurrent.futures import Executor, ProcessPoolExecutor
-from contextlib import contextmanager
-from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +10,7 @@ from obsynth.cli.arguments import add_json, add_quiet, add_system
 from obsynth.cli.data_arguments import add_monitor_arguments
 from obsynth.cli.output import print_json, progress, stdout_console
 from obsynth.cli.simulate import required_scenario
-from obsynth.errors import SpecError
+from obsynth.cli.sweep import chosen_executor
 
 if TYPE_CHECKING:
     from obsynth.experiments.monitors.monitor import Monitor
@@ -69,7 +65,7 @@ def run_evaluate(options: argparse.Namespace) -> int:
             )  # fmt: skip
         elif options.monitor is not None:
             watched = ParameterMonitor(options.monitor, false_alarms=options.false_alarms, change=options.change)
-        with _executor(options.jobs) as executor:
+        with chosen_executor(options.jobs, None) as executor:
             found = evaluate(
                 design, scenario, runs=options.runs, monitor=watched, executor=executor,
                 progress=lambda done, total: report_stage(f"{done} of {total} runs"), confidence=options.confidence,
@@ -85,18 +81,3 @@ def run_evaluate(options: argparse.Namespace) -> int:
         return 0
     evaluation_report(design.name, found, monitor=watched, console=stdout_console(), units=design.plant.units)
     return 0
-
-
-@contextmanager
-def _executor(jobs: int) -> Iterator[Executor | None]:
-    if jobs < 1:
-        raise SpecError(f"--jobs is {jobs}: give a number of processes, 1 or more.", path="--jobs")
-    if jobs == 1:
-        yield None
-        return
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as executor:
-        try:
-            yield executor
-        except BaseException:
-            executor.shutdown(wait=False, cancel_futures=True)
-            raise

@@ -17,6 +17,7 @@ from obsynth.cli.data_arguments import add_data_verbs
 from obsynth.cli.evaluate import add_evaluate_verb
 from obsynth.cli.output import print_error, print_json
 from obsynth.cli.process import told_error, unwritable_output, usable_streams
+from obsynth.cli.sweep import add_sweep_verb
 from obsynth.errors import ObsynthError
 from obsynth.files.inputs import protected_inputs
 
@@ -87,6 +88,7 @@ def _parser() -> argparse.ArgumentParser:
     add_quiet(simulate)
     simulate.set_defaults(verb="simulate")
     add_evaluate_verb(verbs)
+    add_sweep_verb(verbs)
     add_data_verbs(verbs)
     add_calibration_verbs(verbs)
     return parser
@@ -117,7 +119,7 @@ def _digits(text: str) -> int:
 
 
 def _verb(name: str) -> Callable[[argparse.Namespace], int]:
-    from obsynth.cli import calibration, commands, data_commands, evaluate, simulate
+    from obsynth.cli import calibration, commands, data_commands, evaluate, simulate, sweep
 
     return {
         "design": commands.run_design,
@@ -125,6 +127,7 @@ def _verb(name: str) -> Callable[[argparse.Namespace], int]:
         "verify": commands.run_verify,
         "simulate": simulate.run_simulate,
         "evaluate": evaluate.run_evaluate,
+        "sweep": sweep.run_sweep,
         "run": data_commands.run_run,
         "export": data_commands.run_export,
         "report": data_commands.run_report,

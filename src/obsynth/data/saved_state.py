@@ -10,7 +10,7 @@ from obsynth.errors import SpecError
 from obsynth.files.inputs import read_json
 from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.results.design import ObserverDesign
-from obsynth.results.gain_sets import design_as_dict, digest_of, plain, restored
+from obsynth.results.gain_sets import digest_of, gain_set_digest, plain, restored
 
 KIND = "obsynth run state"
 SCHEMA_VERSION = 4
@@ -19,7 +19,7 @@ STATE = FileKind("a saved state of obsynth", rb'\A\s*\{\s*"kind":\s*"obsynth run
 
 def digest_of_gains(design: ObserverDesign) -> str:
     """Return the sha256 digest of a gain set, as in its file."""
-    return str(design_as_dict(design)["sha256"])
+    return gain_set_digest(design)
 
 
 def save_state(path: Path, job: Job, digest: str) -> None:

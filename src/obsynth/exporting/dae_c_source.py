@@ -15,7 +15,7 @@ from obsynth.files.outputs import write_together
 from obsynth.observers.dae.c_code import observer_code
 from obsynth.plants.dae.model import DAEModel
 from obsynth.results.design import ObserverDesign
-from obsynth.results.gain_sets import design_as_dict
+from obsynth.results.gain_sets import gain_set_digest
 
 _STEP = r"""
 void PREFIX_reset(PREFIX_state *state)
@@ -72,7 +72,7 @@ def require_no_sample_time(design: ObserverDesign, sample_time: float | None) ->
 def dae_c_texts(design: ObserverDesign, prefix: str, header: str) -> tuple[str, str, str]:
     """Return source, header and the digest of the gain set."""
     _, observer = design.nonlinear
-    digest = str(design_as_dict(design)["sha256"])
+    digest = gain_set_digest(design)
     source = "\n".join([
         comment(f"sha256 of the gain set: {digest}"), f'#include "{included(header)}"', "",
         "#define OBSERVER_IS_DECLARED", f"#define observer {prefix}_observer", "", observer_code(observer),

@@ -17,7 +17,7 @@ from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.recursive.steady_state import steady_observer
 from obsynth.plants.dae.model import DAEModel
 from obsynth.results.design import ObserverDesign
-from obsynth.results.gain_sets import design_as_dict
+from obsynth.results.gain_sets import gain_set_digest
 
 #: What a file says about the steady state of a recursion.
 STEADY = (
@@ -45,7 +45,7 @@ class Realisation:
     def of(cls, design: ObserverDesign, sample_time: float | None) -> Realisation:
         """Return the realisation of a design."""
         require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
-        digest = str(design_as_dict(design)["sha256"])
+        digest = gain_set_digest(design)
         if isinstance(design.observer, RecursiveObserver):
             found = steady_observer(design.observer)
             if sample_time is not None:

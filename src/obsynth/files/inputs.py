@@ -120,14 +120,17 @@ def read_json(
     place = where or str(path)
     text = read_text(path, where=place, is_protected=is_protected, most=most)
     try:
-        document = json.loads(
-            text, parse_constant=_refused_constant, parse_int=_ranged_int, object_pairs_hook=_distinct_keys
-        )
+        document = json_data(text)
         if _HALF_CHARACTER.search(text):
             json.dumps(document, ensure_ascii=False).encode()
     except (ValueError, RecursionError) as error:
         raise SpecError(f"{path} is no JSON document ({error}).", path=place) from error
     return document
+
+
+def json_data(text: str) -> Any:
+    """Return what a JSON text says; `ValueError` for NaN, numbers beyond the range of floats and repeated keys."""
+    return json.loads(text, parse_constant=_refused_constant, parse_int=_ranged_int, object_pairs_hook=_distinct_keys)
 
 
 def _refused_constant(name: str) -> float:

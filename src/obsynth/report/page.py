@@ -14,7 +14,7 @@ from obsynth.report.page_tables import check_rows, copied_table, fact_rows, matr
 from obsynth.report.pictures import pictures_of
 from obsynth.report.verification import verdict_line
 from obsynth.results.design import ObserverDesign
-from obsynth.results.gain_sets import design_as_dict
+from obsynth.results.gain_sets import gain_set_digest
 from obsynth.results.report import VerificationReport
 from obsynth.simulation.scenario import Scenario
 
@@ -67,7 +67,7 @@ def _page_text(
     design: ObserverDesign, report: VerificationReport, gains_file: str | None, scenario: Scenario | None,
     system_file: str | None,
 ) -> str:  # fmt: skip
-    digest = str(design_as_dict(design)["sha256"])
+    digest = gain_set_digest(design)
     title = escape(f"{design.name}: {design.method}")
     state = "holds" if report.passed else "fails"
     sections = {

@@ -17,7 +17,7 @@ import numpy as np
 
 from obsynth.analysis.transformations import StateRecovery
 from obsynth.errors import SpecError
-from obsynth.files.inputs import read_json
+from obsynth.files.inputs import input_file, json_data, read_json
 from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.numerics.arguments import is_number
 from obsynth.observers.dae.observer import DAEObserver
@@ -26,6 +26,16 @@ from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.results.binary_members import (
+    MEMBER,
+    count_of_numbers,
+    digest_of_both,
+    is_packed,
+    packed,
+    split,
+    unpacked,
+    with_arrays,
+)
 from obsynth.results.design import Certificate, ObserverDesign
 from obsynth.results.report import VerificationReport
 
@@ -34,7 +44,11 @@ SCHEMA_VERSION = 1
 MAXIMUM_CHARACTERS = 2_000_000_000
 _KIND = "obsynth gain set"
 _PLACE_DIGITS, _HEAD_BYTES = 16, 256
-GAIN_SET = FileKind("a gain set", rb'\A\s*\{\s*"kind":\s*"obsynth gain set"', ending=".gains.json")
+GAIN_SET = FileKind(
+    "a gain set",
+    rb'\A(PK\x03\x04[\s\S]{26}gain_set\.json)?\s*\{\s*"kind":\s*"obsynth gain set"',
+    ending=".gains.json",
+)
 # Linear time-invariant designs have no tag.
 _KINDS: dict[str | None, tuple[Any, Any]] = {
     None: (DescriptorSystem, LinearObserver), "recursive": (TimeVaryingDescriptorSystem, RecursiveObserver),
@@ -42,7 +56,9 @@ _KINDS: dict[str | None, tuple[Any, Any]] = {
 }  # fmt: skip
 # What JSON does not have is marked by these sets of keys; a mapping that happens to have one of them is wrapped.
 _ARRAY, _FLOAT, _MAPPING = {"shape", "data"}, {"float"}, {"mapping"}
-_MARKS = (_ARRAY, _FLOAT, _MAPPING)
+_MARKS = (_ARRAY, _FLOAT, _MAPPING, MEMBER)
+#: From so many numbers on, which are more than a megabyte as text, the arrays of a gain set are a binary member.
+MANY_NUMBERS = 50_000
 
 
 def plain(value: Any) -> Any:
@@ -89,23 +105,26 @@ def digest_of(body: Mapping[str, Any]) -> str:
 
 def design_as_dict(design: ObserverDesign) -> dict[str, Any]:
     """Return the whole gain set as JSON data, digest included."""
-    body = plain(
-        {
-            "name": design.name,
-            "method": design.method,
-            "plant": design.plant.as_dict(),
-            "options": design.options,
-            "gains": design.gains,
-            "observer": design.observer.as_dict(),
-            "certificate": {"matrices": design.certificate.matrices, "claims": design.certificate.claims},
-            "solver": design.solver,
-            "notes": design.notes,
-            "recovery": None if design.recovery is None else _fields_of(design.recovery),
-            "report": design.report.as_dict(),
-            **_tag(design),
-        }
-    )
+    body = plain(_body_of(design))
     return {"kind": _KIND, "schema_version": SCHEMA_VERSION, "sha256": digest_of(body), "design": body}
+
+
+def _body_of(design: ObserverDesign) -> dict[str, Any]:
+    """Return everything that a gain set holds, with arrays."""
+    return {
+        "name": design.name,
+        "method": design.method,
+        "plant": design.plant.as_dict(),
+        "options": design.options,
+        "gains": design.gains,
+        "observer": design.observer.as_dict(),
+        "certificate": {"matrices": design.certificate.matrices, "claims": design.certificate.claims},
+        "solver": design.solver,
+        "notes": design.notes,
+        "recovery": None if design.recovery is None else _fields_of(design.recovery),
+        "report": design.report.as_dict(),
+        **_tag(design),
+    }
 
 
 def _tag(design: ObserverDesign) -> dict[str, str]:
@@ -114,19 +133,33 @@ def _tag(design: ObserverDesign) -> dict[str, str]:
     return {"kind": kinds[0]} if kinds and kinds[0] is not None else {}
 
 
+def gain_set_bytes(design: ObserverDesign, *, spec: Path | None = None) -> bytes:
+    """Return what a file with a gain set holds: JSON, or of a large one a zip with its arrays in binary.
+
+    With ``spec`` it remembers the place of that spec.
+    """
+    place = {} if spec is None else {"written_for": place_of(spec)}
+    body = _body_of(design)
+    if count_of_numbers(body) < MANY_NUMBERS:
+        written = plain(body)
+        document = {"schema_version": SCHEMA_VERSION, "sha256": digest_of(written), "design": written}
+        return (json.dumps({"kind": _KIND, **place, **document}, indent=1, allow_nan=False) + "\n").encode()
+    written, arrays = split(body, plain)
+    document = {"schema_version": SCHEMA_VERSION, "sha256": digest_of_both(written, arrays), "design": written}
+    return packed({"kind": _KIND, **place, **document}, arrays)
+
+
+def gain_set_digest(design: ObserverDesign) -> str:
+    """Return the digest that the file of a design holds."""
+    body = _body_of(design)
+    if count_of_numbers(body) < MANY_NUMBERS:
+        return digest_of(plain(body))
+    return digest_of_both(*split(body, plain))
+
+
 def save(design: ObserverDesign, path: str | Path) -> Path:
     """Write ``design`` to ``path`` atomically and return the path."""
-    return save_document(design_as_dict(design), path)
-
-
-def save_document(document: Mapping[str, Any], path: str | Path) -> Path:
-    """Write what `design_as_dict` returns."""
-    return write_atomically(path, json.dumps(document, indent=1, allow_nan=False) + "\n")
-
-
-def written_by_spec(document: Mapping[str, Any], spec: Path) -> dict[str, Any]:
-    """Return a gain set that remembers the place of its spec, by a digest."""
-    return {"kind": document["kind"], "written_for": place_of(spec), **document}
+    return write_atomically(path, gain_set_bytes(design))
 
 
 def place_of(spec: Path) -> str:
@@ -165,25 +198,55 @@ def load(path: str | Path) -> ObserverDesign:
     if source.is_dir() or not source.exists():
         why = os.strerror(errno.EISDIR if source.is_dir() else errno.ENOENT)
         raise SpecError(f"{source} cannot be read: {why}.", path=str(source))
-    document = read_json(source, most=MAXIMUM_CHARACTERS)
+    document, arrays = _read_members(source)
+    return _design_of(document, arrays, str(source))
+
+
+def loaded(content: bytes, name: str = "the gain set") -> ObserverDesign:
+    """Return the design in what `gain_set_bytes` returned."""
+    try:
+        text, arrays = unpacked(content) if is_packed(content) else (content.decode("utf-8"), None)
+        document = json.loads(text)
+    except ValueError as error:
+        raise SpecError(f"{name} is no gain set of obsynth ({error}).", path=name) from error
+    return _design_of(document, arrays, name)
+
+
+def _read_members(source: Path) -> tuple[Any, bytes | None]:
+    """Return the document of a gain set and, where they are apart, its arrays."""
+    file = input_file(source)
+    with file.open("rb") as stream:
+        start = stream.read(_HEAD_BYTES)
+    if not is_packed(start):
+        return read_json(source, most=MAXIMUM_CHARACTERS), None
+    try:
+        text, arrays = unpacked(file.read_bytes())
+        return json_data(text), arrays
+    except (ValueError, RecursionError) as error:
+        raise SpecError(f"{source} is no gain set of obsynth: {error}.", path=str(source)) from error
+
+
+def _design_of(document: Any, arrays: bytes | None, source: str) -> ObserverDesign:
+    """Return the design in a document whose digest is right."""
     if not isinstance(document, dict) or document.get("kind") != _KIND:
-        raise SpecError(f"{source} is no gain set of obsynth.", path=str(source))
+        raise SpecError(f"{source} is no gain set of obsynth.", path=source)
     if document.get("schema_version") != SCHEMA_VERSION:
         version = document.get("schema_version")
-        raise SpecError(
-            f"{source} has schema version {version!r}; this obsynth reads {SCHEMA_VERSION}.", path=str(source)
-        )
+        raise SpecError(f"{source} has schema version {version!r}; this obsynth reads {SCHEMA_VERSION}.", path=source)
     body = document.get("design")
     try:
-        intact = isinstance(body, dict) and document.get("sha256") == digest_of(body)
+        digest = (
+            None if not isinstance(body, dict) else digest_of(body) if arrays is None else digest_of_both(body, arrays)
+        )
+        intact = digest is not None and document.get("sha256") == digest
     except (ValueError, RecursionError):  # a number too large for a float
         intact = False
     if not intact:
-        raise SpecError(f"{source} was changed after it was written: its digest does not match.", path=str(source))
+        raise SpecError(f"{source} was changed after it was written: its digest does not match.", path=source)
     try:
-        return _design_from(restored(body))
+        return _design_from(restored(body if arrays is None else with_arrays(body, arrays)))
     except (AttributeError, LookupError, TypeError, ValueError, ArithmeticError, RecursionError) as error:
-        raise SpecError(f"{source} is incomplete: {error}.", path=str(source)) from error
+        raise SpecError(f"{source} is incomplete: {error}.", path=source) from error
 
 
 def _fields_of(record: StateRecovery) -> dict[str, Any]:

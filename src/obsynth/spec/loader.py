@@ -100,13 +100,19 @@ def load_spec(path: str | Path) -> Spec:
         The plant cannot be transformed as asked, for example because its index is not one.
     """
     source = Path(path)
-    checked, raw_options = checked_spec(read_yaml(source), source)
+    return spec_of(read_yaml(source), source)
+
+
+def spec_of(document: Mapping[str, Any], source: Path, *, plant_changes: Mapping[str, Any] | None = None) -> Spec:
+    """Return the spec that a document stands for, as if it were in ``source``; a plant in a file may be changed."""
+    checked, raw_options = checked_spec(document, source)
     section: Any = checked.plant
     plant_source, prefix = source, "plant"
     reference = section if hasattr(section, "file") else None
     if reference is not None:
         plant_source, prefix = source.parent / reference.file, ""
-        section = checked_plant(read_yaml(plant_source, where="plant.file"), plant_source)
+        plant_document = changed_document(read_yaml(plant_source, where="plant.file"), plant_changes or {})
+        section = checked_plant(plant_document, plant_source)
     problems = DocumentProblems(source, what="spec")
     options = {
         name: read_value(value, source.parent, f"method.options.{name}", problems)
@@ -141,3 +147,18 @@ def load_spec(path: str | Path) -> Spec:
         scenario=built_scenario(checked.scenario, plant, source), model=model,
         calibrate=None if checked.calibrate is None else checked.calibrate.model_dump(exclude_none=True),
     )  # fmt: skip
+
+
+def changed_document(document: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a document with values at dotted paths put in place of those there; mappings on the way are made."""
+    changed = dict(document)
+    for path, value in changes.items():
+        first, _, rest = path.partition(".")
+        if not rest:
+            changed[first] = value
+            continue
+        inner = changed.get(first)
+        if inner is not None and not isinstance(inner, Mapping):
+            raise SpecError(f"{path} cannot be set: {first} is no section with entries of its own.", path=path)
+        changed[first] = changed_document(inner or {}, {rest: value})
+    return changed

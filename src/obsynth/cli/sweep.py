@@ -1,0 +1,153 @@
+"""The verb ``sweep``: specs and lists of values in, designs, one table and one picture out."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from concurrent.futures import Executor, ProcessPoolExecutor
+from contextlib import contextmanager
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+from obsynth.cli.arguments import add_force, add_json, add_quiet, output_file
+from obsynth.cli.output import print_json, progress, stdout_console
+from obsynth.errors import SpecError
+from obsynth.files.outputs import FileKind, write_together
+
+_SWEEP = "Design and verify for every combination of specs and values; what fails is a row of the table."
+_HELP = """\
+A value list is a YAML list: --set gamma='[0.1, 0.2]' --set plant.transform.sample_time='[0.01, 0.02]'
+--set plant.C.outputs='[[omega 1], [omega 1, omega 2]]'.  A name that begins with no section of a spec is an option of
+its method.  The folder keeps every gain set and result: the same command goes on where another was stopped.
+"""
+TABLE = FileKind("the table of a sweep", rb"\Acase,")
+PICTURE = FileKind("a picture", rb"\A\x89PNG")
+
+
+def add_sweep_verb(verbs: Any) -> None:
+    """Add the parser."""
+    parser = verbs.add_parser(
+        "sweep", help=_SWEEP, description=_SWEEP, epilog=_HELP, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--system", type=Path, required=True, nargs="+", metavar="FILE", help="a spec (YAML), or several"
+    )
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="PATH=LIST", help="an entry of the specs and its values"
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="for gain sets, results, table.csv")
+    parser.add_argument("--claim", metavar="NAME", help="what the picture shows (default: the most frequent claim)")
+    add_executors(parser)
+    add_json(parser)
+    add_force(parser)
+    add_quiet(parser)
+    parser.set_defaults(verb="sweep")
+
+
+def add_executors(parser: argparse.ArgumentParser) -> None:
+    """Add ``--jobs`` and ``--cluster``."""
+    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes (default: 1)")
+    parser.add_argument("--cluster", metavar="ADDRESS", help="of the scheduler of a Dask cluster, instead of --jobs")
+
+
+def run_sweep(options: argparse.Namespace) -> int:
+    """Run ``sweep``; the exit code is 0 when every case was decided, whatever it came to."""
+    from obsynth.sweeps.sweep import sweep
+
+    if options.out.exists() and not options.out.is_dir():
+        raise SpecError(f"{options.out} is no folder: give --out the name of one.", path="--out")
+    parameters = dict(_value_list(text) for text in options.set)
+    options.out.mkdir(parents=True, exist_ok=True)
+    table = output_file(options.out / "table.csv", TABLE, options)
+    picture = output_file(options.out / "sweep.png", PICTURE, options)
+    with progress(quiet=options.quiet) as report_stage, chosen_executor(options.jobs, options.cluster) as executor:
+        found = sweep(
+            options.system, parameters, executor=executor, folder=options.out,
+            progress=lambda done, total: report_stage(f"{done} of {total} designs"),
+        )  # fmt: skip
+        contents: dict[Path, str | bytes] = {table: found.csv()}
+        if any(result.claims for result in found.results):
+            contents[picture] = _png(found, options.claim)
+        files = write_together(contents)
+    if options.json:
+        header, rows = found.rows()
+        print_json({
+            "command": "sweep", "counts": found.counts, "cases": [dict(zip(header, row, strict=True)) for row in rows],
+            "files": [str(file) for file in files],
+        })  # fmt: skip
+        return 0
+    console = stdout_console()
+    console.print(_shown(found))
+    console.print(f"Written: {', '.join(map(str, files))}", soft_wrap=True)
+    return 0
+
+
+@contextmanager
+def chosen_executor(jobs: int, cluster: str | None) -> Iterator[Executor | None]:
+    """Yield where work goes: nowhere else, processes, or a Dask cluster."""
+    if jobs < 1:
+        raise SpecError(f"--jobs is {jobs}: give a number of processes, 1 or more.", path="--jobs")
+    if cluster is not None:
+        from dask import distributed
+
+        connect: Any = distributed.Client
+        try:
+            client = connect(cluster, timeout="10s")
+        except OSError as error:
+            raise SpecError(f"There is no Dask scheduler at {cluster}: {error}.", path="--cluster") from error
+        with client:
+            yield client.get_executor()
+        return
+    if jobs == 1:
+        yield None
+        return
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as executor:
+        try:
+            yield executor
+        except BaseException:
+            executor.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+def _value_list(text: str) -> tuple[str, list[Any]]:
+    """Return the path and the values of ``PATH=LIST``."""
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+
+    name, sign, listed = text.partition("=")
+    try:
+        values = YAML(typ="safe", pure=True).load(listed) if sign else None
+    except (YAMLError, ValueError) as error:
+        raise SpecError(f"--set {text}: {listed!r} is no YAML list.", path="--set") from error
+    if not name or not isinstance(values, list):
+        raise SpecError(f"--set {text!r}: give PATH=[value, value, ...].", path="--set")
+    return name.strip(), values
+
+
+def _png(found: Any, claim: str | None) -> bytes:
+    import io
+
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, stream = found.plot(claim), io.BytesIO()
+    figure.savefig(stream, format="png", dpi=150)
+    plt.close(figure)
+    return stream.getvalue()
+
+
+def _shown(found: Any) -> Any:
+    """Return the table for people: without message and file."""
+    from rich.table import Table
+
+    header, rows = found.rows()
+    kept = [i for i, name in enumerate(header) if name not in ("message", "file")]
+    table = Table(title=", ".join(f"{count} {status}" for status, count in found.counts.items()), title_justify="left")
+    for i in kept:
+        table.add_column(header[i], overflow="fold")
+    for row in rows:
+        table.add_row(*(f"{row[i]:.4g}" if isinstance(row[i], float) else str(row[i]) for i in kept))
+    return table

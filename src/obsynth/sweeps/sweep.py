@@ -1,0 +1,365 @@
+"""Many designs at once: specs or plants, operating points, sensor sets and options, on any executor."""
+
+from __future__ import annotations
+
+import io
+import json
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Executor, as_completed
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from obsynth.errors import ObsynthError, SpecError
+from obsynth.experiments.progress import Progress, shown_progress
+from obsynth.files.inputs import read_json
+from obsynth.files.outputs import FileKind, write_atomically
+from obsynth.files.tables import TableWriter
+from obsynth.methods.designing import Plant, design
+from obsynth.plants.dae.model import DAEModel
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.results.design import ObserverDesign
+from obsynth.results.gain_sets import gain_set_bytes, load, loaded, plain, restored
+from obsynth.spec.loader import spec_of
+from obsynth.sweeps.cases import SweepCase, plant_cases, spec_cases
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+#: What a case came to, by the exit code of its error.
+STATUSES = {0: "designed", 2: "malformed", 3: "impossible", 4: "infeasible", 5: "unknown", 6: "unverified"}
+_KIND = "obsynth sweep result"
+RESULT = FileKind("a result of a sweep", rb'"kind":\s*"obsynth sweep result"', ending=".result.json")
+#: Digits of the digest of a case in the names of its files.
+DIGITS = 16
+_PLANTS = (DescriptorSystem, TimeVaryingDescriptorSystem, DAEModel)
+
+
+@dataclass(frozen=True, eq=False)
+class SweepResult:
+    """What one case of a sweep came to.
+
+    Parameters
+    ----------
+    name : str
+        Of the case: its spec or plant, and what was varied.
+    parameters : mapping
+        Value of each varied parameter.
+    status : str
+        ``designed``, ``impossible`` (a condition fails), ``infeasible`` (proved), ``unknown`` (a solver gave up),
+        ``unverified`` or ``malformed``.
+    message : str
+        Why there is no design; empty otherwise.
+    condition : str
+        The existence condition that fails; empty otherwise.
+    signals : tuple of str
+        The signals it names.
+    claims : mapping of str to float
+        Claims of the certificate; empty without a design.
+    facts : mapping
+        Method, numbers of states, faults and disturbances, and checks passed.
+    seconds : float
+        Processor time of the design and its verification, where it was made.
+    file : Path or None
+        The gain set, where the sweep has a folder.
+    content : bytes or None
+        The gain set, where it has none.
+    """
+
+    name: str
+    parameters: Mapping[str, Any]
+    status: str
+    message: str = ""
+    condition: str = ""
+    signals: tuple[str, ...] = ()
+    claims: Mapping[str, float] = field(default_factory=dict)
+    facts: Mapping[str, Any] = field(default_factory=dict)
+    seconds: float = 0.0
+    file: Path | None = None
+    content: bytes | None = field(default=None, repr=False)
+
+    @property
+    def design(self) -> ObserverDesign:
+        """The design, read back.
+
+        Raises
+        ------
+        SpecError
+            There is none; the message says why.
+        """
+        if self.file is not None:
+            return load(self.file)
+        if self.content is None:
+            raise SpecError(f"The case {self.name!r} has no design: {self.message or self.status}", path="design")
+        return loaded(self.content, self.name)
+
+
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """All results of a sweep, in the order of its cases.
+
+    Parameters
+    ----------
+    results : tuple of SweepResult
+        One for each case.
+    """
+
+    results: tuple[SweepResult, ...]
+
+    def __len__(self) -> int:
+        return len(self.results)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Number of cases by what they came to."""
+        found = [result.status for result in self.results]
+        return {status: found.count(status) for status in STATUSES.values() if status in found}
+
+    def rows(self) -> tuple[list[str], list[list[Any]]]:
+        """Return the header and the rows of the table; what does not apply is empty."""
+        parameters = _in_order(result.parameters for result in self.results)
+        claims = _in_order(result.claims for result in self.results)
+        facts = _in_order(result.facts for result in self.results)
+        header = ["case", *parameters, "status", *facts, *claims, "condition", "signals", "message", "seconds", "file"]
+        rows = [
+            [
+                result.name, *(_cell(result.parameters.get(name, "")) for name in parameters), result.status,
+                *(result.facts.get(name, "") for name in facts),
+                *(result.claims.get(name, float("nan")) for name in claims), result.condition,
+                ", ".join(result.signals), result.message, result.seconds,
+                "" if result.file is None else result.file.name,
+            ]
+            for result in self.results
+        ]  # fmt: skip
+        return header, rows
+
+    def table(self) -> pd.DataFrame:
+        """Return one row per case: parameters, what it came to, claims."""
+        import pandas as pd
+
+        header, rows = self.rows()
+        return pd.DataFrame(rows, columns=header)
+
+    def csv(self) -> str:
+        """Return the table as CSV."""
+        header, rows = self.rows()
+        stream = io.StringIO()
+        TableWriter(stream, header).write(rows)
+        return stream.getvalue()
+
+    def plot(self, claim: str | None = None, *, parameter: str | None = None) -> Figure:
+        """Draw a claim of every case over a parameter; cases without a design are marked by what they came to.
+
+        Parameters
+        ----------
+        claim : str, optional
+            A claim of the certificates; by default the first that most designs have.
+        parameter : str, optional
+            Along the horizontal axis; by default the varied number with most values, or the cases in their order.
+
+        Raises
+        ------
+        SpecError
+            No design claims that, or no such parameter was varied.
+        """
+        from obsynth.plotting.sweep import plot_sweep
+
+        return plot_sweep(self, claim, parameter=parameter)
+
+
+def sweep(
+    cases: str | Path | Sequence[str | Path] | Plant | Mapping[str, Plant],
+    parameters: Mapping[str, Sequence[Any]] | None = None,
+    *,
+    method: str | None = None,
+    executor: Executor | None = None,
+    folder: str | Path | None = None,
+    progress: Progress | bool | None = None,
+) -> Sweep:
+    """Design and verify for every combination of plants and parameters; what fails is a row, not an error.
+
+    Parameters
+    ----------
+    cases : path, sequence of paths, plant, or mapping of str to plant
+        Specs; or plants in memory, with ``method``.
+    parameters : mapping of str to sequence, optional
+        Values by name; all combinations are taken.  Of a spec, the dotted path of an entry, such as
+        ``plant.transform.sample_time``, ``plant.C.outputs`` or ``plant.file`` (a plant in a file of its own is changed
+        as well); of a plant in memory ``plant.A`` and the like, or ``plant.outputs`` (names of its outputs).  Any
+        other name is an option of the method.
+    method : str, optional
+        For plants in memory.
+    executor : concurrent.futures.Executor, optional
+        Where designs are made: processes, threads, or ``dask.distributed.Client(...).get_executor()``; by default here,
+        one after the other.  The results do not depend on it.
+    folder : str or Path, optional
+        Where each gain set and result is written as soon as it is there; what is there already, from the same data and
+        options, is not designed again.  It is made if need be.
+    progress : callable or bool, optional
+        Called with the number of cases done and their total; `True` shows a bar on standard error.
+
+    Returns
+    -------
+    Sweep
+        Results in the order of the cases; equal cases are designed once.
+
+    Raises
+    ------
+    SpecError
+        The cases or parameters are malformed, or the folder cannot be written.
+    """
+    made = _cases(cases, parameters or {}, method)
+    place = None if folder is None else _folder(Path(folder))
+    found: dict[str, SweepResult] = {}
+    if place is not None:
+        found = {case.key: known for case in made if (known := _known(case, place)) is not None}
+    with shown_progress(progress) as told:
+        waiting = [case for case in made if case.key not in found]
+        if told is not None:
+            told(len(found), len(made))
+        for case, result in _made(waiting, executor):
+            found[case.key] = result if place is None else _kept(case, result, place)
+            if told is not None:
+                told(len(found), len(made))
+    return Sweep(tuple(found[case.key] for case in made))
+
+
+def _cases(cases: Any, parameters: Mapping[str, Sequence[Any]], method: str | None) -> list[SweepCase]:
+    from obsynth import __version__
+
+    if not isinstance(parameters, Mapping):
+        raise SpecError("parameters must be a mapping of names to lists of values.", path="parameters")
+    if isinstance(cases, _PLANTS):
+        cases = {"plant": cases}
+    if isinstance(cases, Mapping):
+        wrong = [name for name, plant in cases.items() if not isinstance(plant, _PLANTS)]
+        if wrong or not cases:
+            raise SpecError(f"{wrong or 'nothing'}: give a mapping of names to plants.", path="cases")
+        if method is None:
+            raise SpecError("Plants in memory need a method: give method='...'.", path="method")
+        return plant_cases(dict(cases), method, parameters, __version__)
+    if method is not None:
+        raise SpecError("The specs name their methods: vary 'method.id' instead of giving one.", path="method")
+    paths = [cases] if isinstance(cases, (str, Path)) else list(cases)
+    if not paths or not all(isinstance(path, (str, Path)) for path in paths):
+        raise SpecError("Give one spec or several, or plants.", path="cases")
+    return spec_cases([Path(path) for path in paths], parameters, __version__)
+
+
+def _made(cases: Sequence[SweepCase], executor: Executor | None) -> Iterator[tuple[SweepCase, SweepResult]]:
+    """Yield each case with its result, as they come."""
+    if executor is None:
+        for case in cases:
+            yield case, run_case(case)
+        return
+    waiting = {executor.submit(run_case, case): case for case in cases}
+    try:
+        for future in as_completed(waiting):
+            yield waiting[future], future.result()
+    finally:
+        for future in waiting:
+            future.cancel()
+
+
+def run_case(case: SweepCase) -> SweepResult:
+    """Return what a case comes to; errors of the package are results."""
+    started = time.process_time()
+    result = partial(SweepResult, case.name, case.parameters)
+    try:
+        made = _designed(case)
+    except ObsynthError as error:
+        told = error.as_dict()
+        return result(
+            STATUSES[error.exit_code], message=str(error), condition=str(told.get("condition") or ""),
+            signals=tuple(told.get("signals", ())), seconds=time.process_time() - started,
+        )  # fmt: skip
+    checks = made.report.checks
+    facts = {
+        "method": made.method, "nx": made.plant.nx, "ny": made.plant.ny,
+        "checks": f"{sum(check.passed for check in checks)} of {len(checks)}",
+    }  # fmt: skip
+    return result(
+        STATUSES[0], claims={name: float(value) for name, value in made.certificate.claims.items()}, facts=facts,
+        content=gain_set_bytes(made), seconds=time.process_time() - started,
+    )  # fmt: skip
+
+
+def _designed(case: SweepCase) -> ObserverDesign:
+    if case.plant is not None:
+        return design(case.plant, case.method, name=case.name, **dict(case.options))
+    if case.source is None:
+        raise SpecError(f"The case {case.name!r} has neither a spec nor a plant.", path="cases")
+    spec = spec_of(case.document, case.source, plant_changes=case.plant_changes)
+    recovery = None if spec.transformation is None else spec.transformation.recovery
+    found = design(spec.plant, spec.method, name=case.name, recovery=recovery, **dict(spec.options))
+    notes = () if spec.transformation is None else spec.transformation.notes
+    return found.replace(notes=(*notes, *found.notes)) if notes else found
+
+
+def _folder(folder: Path) -> Path:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise SpecError(f"{folder} cannot be used as a folder: {error.strerror}.", path=str(folder)) from error
+    return folder
+
+
+def _files(case: SweepCase, folder: Path) -> tuple[Path, Path]:
+    stem = "".join(letter if letter.isalnum() or letter in "-_." else "-" for letter in case.name)[:60]
+    name = f"{stem}-{case.key[:DIGITS]}"
+    return folder / f"{name}.result.json", folder / f"{name}.gains.json"
+
+
+def _kept(case: SweepCase, result: SweepResult, folder: Path) -> SweepResult:
+    """Write a gain set, then its result, and return the result with the file."""
+    file, gains = _files(case, folder)
+    written = None
+    if result.content is not None:
+        written = write_atomically(gains, result.content)
+    body = {
+        "kind": _KIND, "key": case.key, "name": result.name, "parameters": result.parameters, "status": result.status,
+        "message": result.message, "condition": result.condition, "signals": result.signals, "claims": result.claims,
+        "facts": result.facts, "seconds": result.seconds, "gains": None if written is None else written.name,
+    }  # fmt: skip
+    write_atomically(file, json.dumps(plain(body), indent=1) + "\n")
+    return SweepResult(**{**vars(result), "file": written, "content": None})
+
+
+def _known(case: SweepCase, folder: Path) -> SweepResult | None:
+    """Return the result of a case that is there already, whole and of the same data; a damaged one is made again."""
+    file, _ = _files(case, folder)
+    if not file.is_file():
+        return None
+    try:
+        body = restored(read_json(file, where=str(file)))
+    except SpecError:
+        return None
+    if not isinstance(body, dict) or body.get("kind") != _KIND or body.get("key") != case.key:
+        return None
+    gains = None if body["gains"] is None else folder / str(body["gains"])
+    if gains is not None:
+        try:
+            load(gains)
+        except SpecError:
+            return None
+    return SweepResult(
+        case.name, case.parameters, body["status"], body["message"], body["condition"], tuple(body["signals"]),
+        body["claims"], body["facts"], body["seconds"], gains,
+    )  # fmt: skip
+
+
+def _in_order(mappings: Any) -> list[str]:
+    """Return every key once, in order of appearance."""
+    return list(dict.fromkeys(name for mapping in mappings for name in mapping))
+
+
+def _cell(value: Any) -> Any:
+    if isinstance(value, (bool, str)) or value is None:
+        return str(value)
+    return value if isinstance(value, (int, float, np.number)) else json.dumps(plain(value))

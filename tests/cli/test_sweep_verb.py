@@ -1,0 +1,57 @@
+"""The verb ``sweep``."""
+
+from __future__ import annotations
+
+import csv
+import json
+
+import pytest
+
+from obsynth.cli.main import main
+
+PLANT = {
+    "schema_version": 1, "name": "small",
+    "plant": {"dt": 1, "A": [[0.5, 0.1], [0, 0.7]], "C": [[1, 0], [0, 1]], "Bf": [[1], [0]], "Bd": [[0], [1]]},
+    "method": {"id": "fault-estimation-filter"},
+}  # fmt: skip
+
+
+@pytest.fixture
+def spec(tmp_path):
+    file = tmp_path / "small.yaml"
+    file.write_text(json.dumps(PLANT))
+    return str(file)
+
+
+def test_folder_table_and_picture(spec, tmp_path, capsys):
+    out = tmp_path / "many"
+    arguments = ["sweep", "--system", spec, "--set", "gamma_margin=[0.05, 0.1, -1]", "--out", str(out)]
+    assert main([*arguments, "--quiet"]) == 0
+    assert "2 designed, 1 malformed" in capsys.readouterr().out
+    rows = list(csv.DictReader((out / "table.csv").read_text().splitlines()))
+    assert [row["status"] for row in rows] == ["designed", "designed", "malformed"]
+    assert float(rows[0]["gamma_margin"]) == 0.05
+    assert (out / "sweep.png").read_bytes().startswith(b"\x89PNG")
+    assert main(["verify", str(out / rows[0]["file"])]) == 0
+    capsys.readouterr()
+    assert main([*arguments, "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["counts"] == {"designed": 2, "malformed": 1}
+    assert [case["gamma_min"] for case in told["cases"][:2]] == [float(row["gamma_min"]) for row in rows[:2]]
+
+
+@pytest.mark.parametrize(
+    ("extra", "path"),
+    [
+        (["--set", "gamma=0.5"], "--set"),
+        (["--set", "gamma=[0.5"], "--set"),
+        (["--jobs", "0"], "--jobs"),
+    ],
+)
+def test_bad_arguments(spec, tmp_path, capsys, extra, path):
+    assert main(["sweep", "--system", spec, "--out", str(tmp_path / "many"), "--json", *extra]) == 2
+    assert json.loads(capsys.readouterr().out)["path"] == path
+
+
+def test_the_folder_is_a_file(spec, tmp_path):
+    assert main(["sweep", "--system", spec, "--out", spec]) == 2
