@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from obsynth.calibration.validation import Validation
     from obsynth.calibration.validity import Validity, validity
     from obsynth.compare.sensor_sets import SensorSet, SensorSets, sensor_sets
+    from obsynth.data.alarm_proof import prove_alarm
     from obsynth.data.run import DataRun, run_on_data
     from obsynth.errors import (
         InfeasibleError,
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
         SpecError,
         VerificationError,
     )
+    from obsynth.experiments.alarm_proofs.certificate import verify_alarm
+    from obsynth.experiments.alarm_proofs.proof import AlarmProof
     from obsynth.experiments.intervals import Interval
     from obsynth.experiments.monitors.monitor import Detection, Monitor
     from obsynth.experiments.monitors.online import OnlineMonitor
@@ -128,6 +131,9 @@ _HOMES = {
     "Robustness": "obsynth.tolerances.robustness",
     "Uncertainty": "obsynth.plants.uncertainty",
     "robustness": "obsynth.tolerances.robustness",
+    "AlarmProof": "obsynth.experiments.alarm_proofs.proof",
+    "prove_alarm": "obsynth.data.alarm_proof",
+    "verify_alarm": "obsynth.experiments.alarm_proofs.certificate",
     "uncertain_system": "obsynth.plants.uncertain_system",
     "simulate_dae": "obsynth.simulation.dae",
     "DAEBatchEstimates": "obsynth.observers.dae.batch",
@@ -229,6 +235,7 @@ _HOMES = {
 __all__ = [
     "Adaptation",
     "Alarm",
+    "AlarmProof",
     "BatchEstimates",
     "CalibratedBox",
     "Calibration",
@@ -332,6 +339,7 @@ __all__ = [
     "pd_delta_scan",
     "pd_observer",
     "pd_observer_from_gains",
+    "prove_alarm",
     "robustness",
     "run_batch",
     "run_on_data",
@@ -348,6 +356,7 @@ __all__ = [
     "validate",
     "validity",
     "verify",
+    "verify_alarm",
 ]
 
 

@@ -137,11 +137,21 @@ def numbers_of(pairs: list[tuple[str, str]]) -> Mapping[str, float]:
     return found
 
 
+def ranges_of(pairs: list[tuple[str, str]]) -> dict[str, float | tuple[float, float]]:
+    """Return bounds by name, from arguments of the form NAME=BOUND or NAME=LOW:HIGH."""
+    found: dict[str, float | tuple[float, float]] = {}
+    for name, text in pairs:
+        low, colon, high = text.partition(":")
+        ends = numbers_of([(name, low), (name, high)] if colon else [])
+        found[name] = (numbers_of([(name, low)])[name], ends[name]) if colon else numbers_of([(name, text)])[name]
+    return found
+
+
 def _monitor(design: ObserverDesign, options: argparse.Namespace) -> OnlineMonitor | None:
     """Return the monitor that is asked for."""
     if options.monitor is None:
         asked = [name for name in ("system", "noise_bound", "initial_error", "sample_time") if getattr(options, name)]
-        asked += [name for name in ("disturbance", "nominal") if getattr(options, name)]
+        asked += [name for name in ("disturbance", "nominal", "initial") if getattr(options, name)]
         if asked:
             flag = f"--{asked[0].replace('_', '-')}"
             raise SpecError(f"{flag} is for a monitor: say which one by --monitor.", path=flag)
@@ -161,7 +171,7 @@ def _monitor(design: ObserverDesign, options: argparse.Namespace) -> OnlineMonit
         design, options.monitor, scenario=scenario, disturbance_bounds=numbers_of(options.disturbance),
         noise_bound=options.noise_bound, initial_error=options.initial_error, window=options.window,
         false_alarms=options.false_alarms, change=options.change, nominal=numbers_of(options.nominal),
-        sample_time=options.sample_time,
+        sample_time=options.sample_time, initial_set=ranges_of(options.initial) or None,
     )  # fmt: skip
 
 

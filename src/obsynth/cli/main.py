@@ -17,6 +17,7 @@ from obsynth.cli.data_arguments import add_data_verbs
 from obsynth.cli.evaluate import add_evaluate_verb
 from obsynth.cli.output import print_error, print_json
 from obsynth.cli.process import told_error, unwritable_output, usable_streams
+from obsynth.cli.prove_alarm import add_prove_alarm_verb
 from obsynth.cli.sweep import add_sweep_verb
 from obsynth.errors import ObsynthError
 from obsynth.files.inputs import protected_inputs
@@ -69,7 +70,9 @@ def _parser() -> argparse.ArgumentParser:
     check.set_defaults(verb="check")
 
     verify = verbs.add_parser("verify", help=_VERIFY, description=_VERIFY)
-    verify.add_argument("gains", type=Path, metavar="FILE", help="a gain set (JSON) that design wrote")
+    verify.add_argument(
+        "gains", type=Path, metavar="FILE", help="a gain set that design wrote, or an alarm's certificate"
+    )
     verify.add_argument(
         "--printed-digits", type=_digits, metavar="N",
         help="judge the gains as numbers that were printed with N decimals",
@@ -91,6 +94,7 @@ def _parser() -> argparse.ArgumentParser:
     add_sweep_verb(verbs)
     add_data_verbs(verbs)
     add_calibration_verbs(verbs)
+    add_prove_alarm_verb(verbs)
     return parser
 
 
@@ -119,7 +123,7 @@ def _digits(text: str) -> int:
 
 
 def _verb(name: str) -> Callable[[argparse.Namespace], int]:
-    from obsynth.cli import calibration, commands, data_commands, evaluate, simulate, sweep
+    from obsynth.cli import calibration, commands, data_commands, evaluate, prove_alarm, simulate, sweep
 
     return {
         "design": commands.run_design,
@@ -134,6 +138,7 @@ def _verb(name: str) -> Callable[[argparse.Namespace], int]:
         "linearise": calibration.run_linearise,
         "calibrate": calibration.run_calibrate,
         "validate": calibration.run_validate,
+        "prove-alarm": prove_alarm.run_prove_alarm,
     }[name]
 
 

@@ -13,7 +13,7 @@ from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.alarm_proofs.proof import Question, statement
 from obsynth.files.inputs import read_json
 from obsynth.files.outputs import FileKind
-from obsynth.results.gain_sets import design_from_document, digest_of, restored
+from obsynth.results.gain_sets import digest_of, loaded, restored
 from obsynth.results.report import Check, VerificationReport
 
 SCHEMA_VERSION = 1
@@ -71,7 +71,7 @@ def verify_alarm(path: str | Path) -> VerificationReport:
 
 def _checked(body: Mapping[str, Any]) -> list[Check]:
     data = restored({name: value for name, value in body.items() if name != "gain_set"})
-    design = design_from_document(body["gain_set"])
+    design = loaded(json.dumps(body["gain_set"]).encode(), "the certificate's gain set")
     plant, _ = design.linear
     u = np.asarray(data["u"], dtype=np.float64).reshape(-1, plant.nu)
     y = np.asarray(data["y"], dtype=np.float64).reshape(-1, plant.ny)

@@ -128,11 +128,14 @@ def window_programme(plant: AffinePlant, bounds: FloatArray, data: WindowData) -
         builder.dynamics(k, equal, below)
         builder.outputs(k, below)
         builder.products(k, below)
+        builder.state(k, below)
     lower, upper = np.zeros(at.count), np.zeros(at.count)
-    lower[: at.d], upper[: at.d] = data.low.ravel(), data.high.ravel()
+    # The bounds of the state are rows that t relaxes; the variables themselves have room for that.
+    lower[: at.d], upper[: at.d] = (data.low - LARGEST_RELAXATION).ravel(), (data.high + LARGEST_RELAXATION).ravel()
     upper[at.d : at.q] = np.tile(bounds, steps)
     upper[at.q : at.products] = 1.0
-    upper[at.products : at.t] = np.concatenate([size[k, [j for _, j in pairs]] for k in range(steps)])
+    sizes = [size[k, [j for _, j in pairs]] for k in range(steps)]
+    upper[at.products : at.t] = np.concatenate(sizes) + LARGEST_RELAXATION
     lower[at.d : at.t] = -upper[at.d : at.t]
     upper[at.t] = LARGEST_RELAXATION
     return Window(equal, below, lower, upper)
@@ -199,6 +202,13 @@ class _Builder:
                 row = {column: sign * value for column, value in entries.items()}
                 row[at.t] = -1.0
                 below.add(row, sign * right + loose)
+
+    def state(self, k: int, below: Rows) -> None:
+        """Add the bounds of the state, relaxed by t."""
+        for i in range(self.at.n):
+            place = self.at.state(k, i)
+            below.add({place: 1.0, self.at.t: -1.0}, float(self.data.high[k, i]))
+            below.add({place: -1.0, self.at.t: -1.0}, -float(self.data.low[k, i]))
 
     def products(self, k: int, below: Rows) -> None:
         """Add the four planes of McCormick of each product, relaxed by t."""
