@@ -16,7 +16,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
 from obsynth.tolerances.responses import loop_radius
-from obsynth.tolerances.robustness import EXACT_MODEL, structure_of
+from obsynth.tolerances.robustness import EXACT_MODEL, structure_of, with_tolerances
 from obsynth.tolerances.tracking import Tracking, tracking_of
 
 #: What a statement adds where no tolerance is known.
@@ -133,3 +133,25 @@ def adaptive_statement(plan: AdaptivePlan, design: ObserverDesign) -> str:
     )  # fmt: skip
     missing = "" if plan.intervals or not plan.fault_names else f"; no guaranteed interval of faults: {plan.reason}"
     return f"{text}; {kept}{ever}{missing}"
+
+
+def tolerances_of(
+    design: ObserverDesign, kind: str, constants: Any, initial_set: Mapping[str, Any] | None,
+    initial_error: float | None,
+) -> tuple[ObserverDesign, bool]:  # fmt: skip
+    """Return the design with the tolerances asked for, and whether its threshold adapts to the signals."""
+    asked = [name for name, given in (("constants", constants), ("initial_set", initial_set)) if given is not None]
+    if asked and kind != "pointwise":
+        raise SpecError(f"{asked[0]} is for the pointwise monitor.", path=asked[0])
+    if initial_set is not None and initial_error is not None:
+        raise SpecError("Give initial_set or initial_error, not both.", path="initial_set")
+    found, plant = with_tolerances(design, constants)
+    if not plant.is_discrete:
+        if asked:
+            raise PreconditionError(
+                "The design is continuous in time: thresholds over tolerances are for sampled designs. Sample the "
+                "plant first (transform: sample_time, or obsynth.discretise).", condition="discrete time",
+            )  # fmt: skip
+        return design, False
+    uncertain = plant.uncertainty is not None and bool(plant.uncertainty.box.names)
+    return found, kind == "pointwise" and (uncertain or initial_set is not None)
