@@ -78,7 +78,8 @@ if TYPE_CHECKING:
     from obsynth.observers.linear.sampling import sample_observer
     from obsynth.observers.recursive.estimates import RecursiveEstimates
     from obsynth.observers.recursive.gain_schedule import BatchEstimates
-    from obsynth.observers.recursive.observer import Adaptation, RecursiveObserver
+    from obsynth.observers.recursive.observer import RecursiveObserver
+    from obsynth.observers.recursive.settings import Adaptation
     from obsynth.observers.running import RunningObserver
     from obsynth.observers.running import RunningObserver as RunningDAEObserver
     from obsynth.observers.running import RunningObserver as RunningRecursiveObserver
@@ -143,7 +144,7 @@ _HOMES = {
     "Identifiability": "obsynth.analysis.identifiability",
     "identifiability": "obsynth.analysis.identifiability",
     "DAEModel": "obsynth.plants.dae.model",
-    "Adaptation": "obsynth.observers.recursive.observer",
+    "Adaptation": "obsynth.observers.recursive.settings",
     "Alarm": "obsynth.observers.alarms",
     "BatchEstimates": "obsynth.observers.recursive.gain_schedule",
     "Certificate": "obsynth.results.design",

@@ -92,9 +92,18 @@ def test_a_rate_that_cannot_be_had_says_what_is_left() -> None:
         ui_pi_observer(plant, decay=1e4)
 
 
-def test_a_fault_model_that_is_lost_in_rounding_is_no_fixed_mode() -> None:
-    options = {"fault_model": {"polynomial": 12}}
-    with pytest.raises(PreconditionError, match=r"order 13.*Lower its order") as error:
+def test_a_long_fault_model_that_exists_is_designed() -> None:
+    design = ui_pi_observer(PAPER, fault_model={"polynomial": 12})
+    s = 0.01
+    y = PAPER.C @ np.linalg.solve(s * PAPER.E - PAPER.A, PAPER.Bf[:, 0])
+    observer = design.observer
+    z = np.linalg.solve(s * np.eye(observer.order) - observer.Az, observer.By @ y)
+    assert (observer.Cz @ z + observer.Dy @ y)[observer.fault_rows] == pytest.approx(1.0, abs=1e-6)
+
+
+def test_a_fault_model_that_is_lost_in_rounding_is_unclear() -> None:
+    options = {"fault_model": {"polynomial": 14}}
+    with pytest.raises(PreconditionError, match=r"^Unclear: .*order 15.*Lower its order") as error:
         ui_pi_observer(PAPER, **options)
     assert error.value.mode == pytest.approx(0.5, rel=1e-2)
     assert not check(PAPER, {"ui-pi-observer": options})["ui-pi-observer"].passed

@@ -16,7 +16,8 @@ class Condition:
     Fields: name: Short name, as in the paper where it has one; claim: What must hold, in words; holds: The verdict;
     value, bound: The deciding number and what it is compared with; source: Paper and equation, or the finding it rests
     on; detail: The evidence (singular-value gap, the eigenvalue) and, when it fails, what to do; mode: The eigenvalue
-    or zero at which it fails; signals: Names of the signals involved.
+    or zero at which it fails; signals: Names of the signals
+    involved; unclear: Whether it does not hold only as far as double precision can tell.
     """
 
     name: str
@@ -28,13 +29,18 @@ class Condition:
     detail: str = ""
     mode: complex | None = None
     signals: tuple[str, ...] = ()
+    unclear: bool = False
 
     def require(self) -> None:
         """Raise `PreconditionError` when the condition fails."""
         if not self.holds:
+            opening = (
+                f"Unclear: whether the condition {self.name!r} holds ({self.source}) is below what the data can tell. "
+                if self.unclear
+                else f"No observer of this kind exists: the condition {self.name!r} fails ({self.source}). "
+            )
             raise PreconditionError(
-                f"No observer of this kind exists: the condition {self.name!r} fails ({self.source}). "
-                f"Needed: {self.claim}. Found: {self.detail}{_involved(self.signals, self.detail)}",
+                f"{opening}Needed: {self.claim}. Found: {self.detail}{_involved(self.signals, self.detail)}",
                 condition=self.name,
                 mode=self.mode,
                 signals=self.signals,
@@ -66,4 +72,5 @@ def rank_condition(
         source,
         decision.describe() + ("" if decision.full else f": {remedy}"),
         signals=() if decision.full else signals,
+        unclear=decision.means == "unclear",
     )

@@ -21,6 +21,8 @@ from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.exosystems import Exosystem
 
+#: Given units in which the natural factors differ by more than this are no units to design in.
+FAR_UNITS = 256.0
 #: Weight of inputs and outputs beside equations and states, which they scale only where A and E leave that open.
 SIGNALS_WEIGHT = 1e-3
 
@@ -80,6 +82,12 @@ class PlantUnits:
         )  # fmt: skip
 
     @property
+    def spread(self) -> float:
+        """Largest ratio of two factors of the same kind: how far the given units are from these."""
+        kinds = (self.equations, self.states, self.outputs)
+        return max(float(np.max(part) / np.min(part)) for part in kinds if part.size)
+
+    @property
     def rate(self) -> float:
         """What eigenvalues are multiplied by: those of sampled plants have no unit."""
         return 1.0 if self.discrete else self.time
@@ -127,6 +135,14 @@ class PlantUnits:
             Df=shown * plant.Df * self.faults, Dd=shown * plant.Dd * self.disturbances, Dw=shown * plant.Dw / spread,
             dt=1.0 if self.discrete else 0.0,
         )  # fmt: skip
+
+    def scaled_pencil(
+        self, e: FloatArray, a: FloatArray, inputs: FloatArray | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return a system pencil ``(nx + ny, nx + nu)`` with rows and columns in these units, and its own time."""
+        rows = np.concatenate([self.equations, self.outputs])[:, None]
+        columns = np.concatenate([self.states, np.ones(0) if inputs is None else inputs])
+        return rows * e * columns, rows * a * columns
 
     def scaled_model(self, model: Exosystem) -> Exosystem:
         """Return the fault model in these units."""

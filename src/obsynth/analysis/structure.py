@@ -9,9 +9,10 @@ from types import MappingProxyType
 
 import numpy as np
 
+from obsynth.analysis.existence.hidden import hidden_modes
 from obsynth.analysis.zeros import are_outside
 from obsynth.numerics.arrays import ComplexArray, FloatArray
-from obsynth.numerics.pencils import FiniteZeros, finite_zeros, pencil_structure
+from obsynth.numerics.pencils import FiniteZeros, pencil_structure
 from obsynth.numerics.ranks import RankDecision, decide_rank
 from obsynth.numerics.scaling import equilibrate_pencil
 from obsynth.plants.descriptor import DescriptorSystem
@@ -88,9 +89,8 @@ def analyse_structure(plant: DescriptorSystem) -> Structure:
     impulse_free = pencil.index is not None and pencil.index <= 1
 
     tall_e, tall_a = np.vstack([E, np.zeros_like(C)]), np.vstack([A, C])
-    hidden = finite_zeros(tall_e, tall_a)
-    modes = tuple(complex(value) for value in hidden.values)
-    undetectable = _selected(modes, are_outside(tall_e, tall_a, hidden, plant.dt))
+    hidden = hidden_modes(plant)
+    modes, undetectable = hidden.modes, hidden.undetectable
     seen = hidden.normal_rank == plant.nx
 
     rank_e = decide_rank(E, expected=plant.nx)

@@ -113,7 +113,7 @@ def invariant_zeros(
 
     Shapes: ``E (nx, nx)``, ``A (nx, nx)``, ``B (nx, nu)``, ``C (ny, nx)``, ``D (ny, nu)``.
     """
-    wide_e, wide_a = _system_pencil(E, A, B, C, D)
+    wide_e, wide_a = system_pencil(E, A, B, C, D)
     return _with_directions(wide_e, wide_a, system_zeros(wide_e, wide_a, nx=E.shape[0]), nx=E.shape[0])
 
 
@@ -121,26 +121,42 @@ def fault_zeros(plant: DescriptorSystem) -> FaultZeros:
     """Return the invariant zeros from the faults of ``plant`` to its outputs."""
     plant = plant.dense()
     found, zeros, outside = zeros_of_system(plant.E, plant.A, plant.Bf, plant.C, plant.Df, dt=plant.dt)
-    e, a = _system_pencil(plant.E, plant.A, plant.Bf, plant.C, plant.Df)
+    e, a = system_pencil(plant.E, plant.A, plant.Bf, plant.C, plant.Df)
     missing = plant.nx + plant.nf - found.normal_rank
     direction, names = _hidden(e, a, plant, missing=missing) if missing else (None, ())
     return FaultZeros(zeros, outside, missing == 0, direction, names, found.decisions)
+
+
+def zero_at(E: FloatArray, A: FloatArray, value: complex, B: FloatArray, C: FloatArray, D: FloatArray) -> Zero:
+    """Return the zero of ``[A - z E, B; C, D]`` that is known to be at a point, with its direction there."""
+    wide_e, wide_a = system_pencil(E, A, B, C, D)
+    nx = E.shape[0]
+    pencil = equilibrated_at(wide_e, wide_a, value, nx=nx)
+    basis = _smallest_part_first(_kernel(pencil, value, least=1), slice(nx, None))
+    return _zero_along(basis[:, 0], value, pencil.columns, nx=nx)
+
+
+def hidden_direction(plant: DescriptorSystem, *, missing: int) -> tuple[FloatArray, tuple[str, ...]]:
+    """Return the faults that never show, for a pencil from faults to outputs of which ``missing`` ranks are lost."""
+    e, a = system_pencil(plant.E, plant.A, plant.Bf, plant.C, plant.Df)
+    return _hidden(e, a, plant, missing=missing)
 
 
 def zeros_of_system(
     E: FloatArray, A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray | None, *, dt: float
 ) -> tuple[FiniteZeros, tuple[Zero, ...], tuple[Zero, ...]]:
     """Return what `finite_zeros` says of ``[A - z E, B; C, D]``, the zeros, and those not strictly stable."""
-    e, a = _system_pencil(E, A, B, C, D)
+    e, a = system_pencil(E, A, B, C, D)
     found = system_zeros(e, a, nx=E.shape[0])
     zeros = _with_directions(e, a, found, nx=E.shape[0])
     outside = tuple(zero for zero, out in zip(zeros, are_outside(e, a, found, dt), strict=True) if out)
     return found, zeros, outside
 
 
-def _system_pencil(
+def system_pencil(
     E: FloatArray, A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray | None
 ) -> tuple[FloatArray, FloatArray]:
+    """Return ``[A - z E, B; C, D]`` as its two matrices."""
     feedthrough = np.zeros((C.shape[0], B.shape[1])) if D is None else D
     padded = np.zeros((E.shape[0] + C.shape[0], E.shape[1] + B.shape[1]))
     padded[: E.shape[0], : E.shape[1]] = E

@@ -119,6 +119,7 @@ def run_check(options: argparse.Namespace) -> int:
     from obsynth.analysis.diagnosis.diagnosing import diagnose
     from obsynth.analysis.structure import analyse_structure
     from obsynth.methods.designing import check
+    from obsynth.methods.registry import AUTO
     from obsynth.plants.descriptor import DescriptorSystem
 
     # A pencil, its eigenvalues and its index are those of one matrix pair: a plant that changes with k has none.
@@ -130,8 +131,9 @@ def run_check(options: argparse.Namespace) -> int:
     if spec.transformation is not None:
         structures = {"as written": analyse_structure(spec.transformation.source), **structures}
     done = "" if spec.transformation is None else spec.transformation.description
-    methods = check(spec.plant, {spec.method: spec.options})
-    passed = methods[spec.method].passed
+    methods = check(spec.plant, {} if spec.method == AUTO else {spec.method: spec.options})
+    own = methods.values() if spec.method == AUTO else [methods[spec.method]]
+    passed = any(report.passed for report in own)
     if options.json:
         print_json({
             "command": "check", "spec": str(spec.path), "method": spec.method, "passed": passed,
@@ -145,13 +147,13 @@ def run_check(options: argparse.Namespace) -> int:
         from obsynth.report.existence import print_methods
 
         console = stdout_console()
+        if diagnosis is not None:
+            diagnosis_report(diagnosis, console=console, everything=options.verbose)
+            console.print()
         if options.verbose:
             check_report(spec.plant, structures, methods, console=console, transformation=done)
             console.print()
         print_methods(methods, own=spec.method, console=console)
-        if diagnosis is not None:
-            console.print()
-            diagnosis_report(diagnosis, console=console, everything=options.verbose)
     return 0 if passed else PreconditionError.exit_code
 
 

@@ -13,9 +13,12 @@ _EXPORT = (
     "Write a gain set for Simulink (.mat), numpy (.npz), C99 (.c and .h), or as a functional mock-up unit for "
     "co-simulation (.fmu); of a recursive design for a time-invariant plant, its steady state."
 )
+_PLOT = "Run a design on measured data and draw it: outputs, estimates, residuals, thresholds and alarms."
 _REPORT = "Verify a gain set again and write one self-contained HTML page about it."
 _RUN_DETAILS = """\
-The data have a column 'time' in seconds and one for each known input and output, by name.
+The data have a column 'time', in seconds or as dates and times (ISO 8601), and one for each known input and output,
+by name. Columns of text are separated by commas, semicolons, tabs or bars; numbers may have a decimal comma where
+commas separate nothing.
 Each row of estimates has a status:
   ok          all is well
   warm-up     the start is not forgotten yet
@@ -44,38 +47,12 @@ def add_data_verbs(verbs: Any) -> None:
         "run", help=_RUN, description=_RUN, epilog=_RUN_DETAILS, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     add_gains(run)
-    run.add_argument("--data", required=True, metavar="FILE", help="CSV or Parquet file; - for CSV on standard input")
+    _add_data(run, required=True, what="text (.csv, .tsv), Parquet, TDMS or MDF file; - for text on standard input")
     run.add_argument(
         "--out", default="-", metavar="FILE", help="CSV or Parquet file for the estimates (default: - for stdout)"
     )
-    run.add_argument(
-        "--map", type=pair, action="append", default=[], metavar="SIGNAL=COLUMN",
-        help="column of a signal (or of time) where the names differ; may be repeated",
-    )  # fmt: skip
-    run.add_argument(
-        "--scale", type=pair, action="append", default=[], metavar="SIGNAL=FACTOR",
-        help="the column's value times the factor is in the signal's unit; may be repeated",
-    )  # fmt: skip
-    run.add_argument(
-        "--threshold", type=pair, action="append", default=[], metavar="COLUMN=LEVEL",
-        help="alarm when the absolute value of a column of the output passes a level; may be repeated",
-    )  # fmt: skip
-    add_monitor_arguments(run)
-    run.add_argument(
-        "--nominal", type=pair, action="append", default=[], metavar="NAME=VALUE",
-        help="monitor of a recursive design: nominal value of a parameter; may be repeated",
-    )  # fmt: skip
-    run.add_argument(
-        "--sample-time", type=float, metavar="SECONDS", help="monitor of a continuous design: between the rows"
-    )
-    run.add_argument(
-        "--system",
-        type=Path,
-        metavar="FILE",
-        help="spec (YAML) whose scenario tells what is to be expected",
-    )
-    run.add_argument("--gap", type=float, metavar="SECONDS", help="continuous designs: longer intervals are gaps")
-    run.add_argument("--warm-up", type=float, metavar="SECONDS", help="how long to mark the start, and after gaps")
+    _add_data_options(run)
+    _add_scenario(run)
     run.add_argument(
         "--state", type=Path, metavar="FILE", help="go on from this saved state if it exists, and save the new one"
     )
@@ -102,13 +79,72 @@ def add_data_verbs(verbs: Any) -> None:
     add_json(export)
     export.set_defaults(verb="export")
 
+    plot = verbs.add_parser("plot", help=_PLOT, description=_PLOT)
+    add_gains(plot)
+    _add_data(plot, required=True, what="text (.csv, .tsv), Parquet, TDMS or MDF file; - for text on standard input")
+    plot.add_argument("--out", type=Path, metavar="FILE", help="picture (.png, .svg or .pdf); without it, a window")
+    plot.add_argument(
+        "--show", metavar="PARTS", default="outputs,faults,residuals,statistic",
+        help="what is drawn, of outputs,faults,residuals,statistic (default: all there is)",
+    )  # fmt: skip
+    _add_data_options(plot)
+    _add_scenario(plot)
+    add_force(plot)
+    add_json(plot)
+    add_quiet(plot)
+    plot.set_defaults(verb="plot")
+
     report = verbs.add_parser("report", help=_REPORT, description=_REPORT)
     add_gains(report)
     report.add_argument("--out", type=Path, required=True, metavar="FILE", help="the page (HTML)")
     report.add_argument("--system", type=Path, metavar="SPEC", help="show the design on the scenario of this spec")
+    _add_data(report, required=False, what="show the design on this log as well: text, Parquet, TDMS or MDF file")
+    _add_data_options(report)
     add_force(report)
     add_json(report)
     report.set_defaults(verb="report")
+
+
+def _add_data(parser: argparse.ArgumentParser, *, required: bool, what: str) -> None:
+    parser.add_argument("--data", required=required, metavar="FILE", help=what)
+
+
+def _add_scenario(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--system",
+        type=Path,
+        metavar="FILE",
+        help="spec (YAML) whose scenario tells what is to be expected",
+    )
+
+
+def _add_data_options(parser: argparse.ArgumentParser) -> None:
+    """Add what says how a log is read, and what is watched in it."""
+    parser.add_argument(
+        "--map", type=pair, action="append", default=[], metavar="SIGNAL=COLUMN",
+        help="column of a signal (or of time) where the names differ; may be repeated",
+    )  # fmt: skip
+    parser.add_argument(
+        "--time-column", metavar="COLUMN", help="column of the time, in seconds or as dates (ISO 8601); default: time"
+    )
+    parser.add_argument(
+        "--scale", type=pair, action="append", default=[], metavar="SIGNAL=FACTOR",
+        help="the column's value times the factor is in the signal's unit; may be repeated",
+    )  # fmt: skip
+    parser.add_argument(
+        "--threshold", type=pair, action="append", default=[], metavar="COLUMN=LEVEL",
+        help="alarm when the absolute value of a column of the output passes a level; may be repeated",
+    )  # fmt: skip
+    add_monitor_arguments(parser)
+    parser.add_argument(
+        "--nominal", type=pair, action="append", default=[], metavar="NAME=VALUE",
+        help="monitor of a recursive design: nominal value of a parameter; may be repeated",
+    )  # fmt: skip
+    parser.add_argument(
+        "--sample-time", type=float, metavar="SECONDS", help="monitor of a continuous design: between the rows"
+    )
+    parser.add_argument("--gap", type=float, metavar="SECONDS", help="continuous designs: longer intervals are gaps")
+    parser.add_argument("--warm-up", type=float, metavar="SECONDS", help="how long to mark the start, and after gaps")
 
 
 def add_monitor_arguments(parser: argparse.ArgumentParser) -> None:

@@ -32,14 +32,15 @@ def run_run(options: argparse.Namespace) -> int:
         raise SpecError("--json and the estimates cannot both go to stdout: give --out a file.", path="--json")
     out = _target(options)
     design = load(options.gains)
-    watched = _monitor(design, options)
+    watched = monitor_of(design, options)
     from obsynth.data.run import run_on_data
 
-    with _rows_done(options.data, quiet=options.quiet or out is sys.stdout) as progress:
+    with rows_done(options.data, quiet=options.quiet or out is sys.stdout) as progress:
         found = run_on_data(
             design, sys.stdin if options.data == STREAM else Path(options.data), out,
-            columns=dict(options.map), scales=numbers_of(options.scale), thresholds=numbers_of(options.threshold),
-            monitor=watched, gap=options.gap, warm_up=options.warm_up, state=options.state, progress=progress,
+            columns=dict(options.map), time_column=options.time_column, scales=numbers_of(options.scale),
+            thresholds=numbers_of(options.threshold), monitor=watched, gap=options.gap, warm_up=options.warm_up,
+            state=options.state, progress=progress,
         )  # fmt: skip
     for text in found.warnings:
         print(f"Warning: {text}", file=sys.stderr)
@@ -55,7 +56,7 @@ def run_run(options: argparse.Namespace) -> int:
         )
     elif not options.quiet:
         # The estimates themselves may be on stdout.
-        print(_summary(found, watched), file=sys.stderr if out is sys.stdout else sys.stdout)
+        print(summary_of_run(found, watched), file=sys.stderr if out is sys.stdout else sys.stdout)
     return 0
 
 
@@ -93,9 +94,17 @@ def run_report(options: argparse.Namespace) -> int:
     system = None if options.system is None else str(options.system)
     output_file(options.out, PAGE, options)
     report = verify(design)
+    run, watched = None, None
+    if options.data is not None:
+        from obsynth.cli.plot import protect_inputs, run_in_memory
+
+        protect_inputs(options)
+        output_file(options.out, PAGE, options)
+        run, watched = run_in_memory(design, options)
     file = html_report(
-        design, options.out, report=report, gains_file=options.gains.name, scenario=scenario, system_file=system
-    )
+        design, options.out, report=report, gains_file=options.gains.name, scenario=scenario, system_file=system,
+        run=run, data_file=options.data, statement="" if watched is None else watched.statement,
+    )  # fmt: skip
     if options.json:
         print_json({"command": "report", "gains": str(options.gains), "file": str(file), "passed": report.passed})
     else:
@@ -147,10 +156,16 @@ def ranges_of(pairs: list[tuple[str, str]]) -> dict[str, float | tuple[float, fl
     return found
 
 
-def _monitor(design: ObserverDesign, options: argparse.Namespace) -> OnlineMonitor | None:
+def monitor_of(
+    design: ObserverDesign, options: argparse.Namespace, *, has_scenario: bool = False
+) -> OnlineMonitor | None:
     """Return the monitor that is asked for."""
     if options.monitor is None:
-        asked = [name for name in ("system", "noise_bound", "initial_error", "sample_time") if getattr(options, name)]
+        asked = [
+            name
+            for name in (*(() if has_scenario else ("system",)), "noise_bound", "initial_error", "sample_time")
+            if getattr(options, name)
+        ]
         asked += [name for name in ("disturbance", "nominal", "initial") if getattr(options, name)]
         if asked:
             flag = f"--{asked[0].replace('_', '-')}"
@@ -175,7 +190,8 @@ def _monitor(design: ObserverDesign, options: argparse.Namespace) -> OnlineMonit
     )  # fmt: skip
 
 
-def _summary(found: DataRun, watched: OnlineMonitor | None) -> str:
+def summary_of_run(found: DataRun, watched: OnlineMonitor | None) -> str:
+    """Return what a run was, in a few lines."""
     counts = ", ".join(f"{count} {status}" for status, count in found.statuses.items())
     lines = [f"{found.rows} rows: {counts}."]
     if found.recovered:
@@ -184,7 +200,7 @@ def _summary(found: DataRun, watched: OnlineMonitor | None) -> str:
         lines.append(f"{len(found.recovered)} states as written recovered: {told}.")
     for name, time in found.alarms.items():
         fault = f"; {found.isolated} stands out" if watched and name == watched.kind and found.isolated else ""
-        lines.append(f"Alarm: {name} first above its threshold at {time:g} s{fault}.")
+        lines.append(f"Alarm: {name} first above its threshold at {found.stamps.shown(time)}{fault}.")
     if watched is not None:
         if watched.kind not in found.alarms:
             lines.append(f"No alarm by {watched.kind}.")
@@ -196,7 +212,7 @@ def _summary(found: DataRun, watched: OnlineMonitor | None) -> str:
 
 
 @contextmanager
-def _rows_done(data: str, *, quiet: bool) -> Iterator[Callable[[int], None] | None]:
+def rows_done(data: str, *, quiet: bool) -> Iterator[Callable[[int], None] | None]:
     """Show a bar on a terminal: how many rows are done, of how many where that can be known."""
     if quiet or not sys.stderr.isatty():
         yield None

@@ -123,7 +123,7 @@ def _digits(text: str) -> int:
 
 
 def _verb(name: str) -> Callable[[argparse.Namespace], int]:
-    from obsynth.cli import calibration, commands, data_commands, evaluate, prove_alarm, simulate, sweep
+    from obsynth.cli import calibration, commands, data_commands, evaluate, plot, prove_alarm, simulate, sweep
 
     return {
         "design": commands.run_design,
@@ -134,6 +134,7 @@ def _verb(name: str) -> Callable[[argparse.Namespace], int]:
         "sweep": sweep.run_sweep,
         "run": data_commands.run_run,
         "export": data_commands.run_export,
+        "plot": plot.run_plot,
         "report": data_commands.run_report,
         "linearise": calibration.run_linearise,
         "calibrate": calibration.run_calibrate,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
@@ -15,7 +16,19 @@ BROKEN_PIPE = 141
 
 @contextmanager
 def usable_streams() -> Iterator[None]:
-    """Let texts go to nowhere where a standard stream is closed, and print characters that an encoding lacks."""
+    """Let texts go to nowhere where a stream is closed, print characters that an encoding lacks, warn in one line."""
+    with warnings.catch_warnings():
+        warnings.showwarning = _told_warning
+        _prepare_streams()
+        yield
+
+
+def _told_warning(message: Warning | str, *_: object, **__: object) -> None:
+    # Where in a library it arose is no use to the user.
+    print(f"Warning: {message}", file=sys.stderr)
+
+
+def _prepare_streams() -> None:
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if stream is None:
@@ -23,7 +36,6 @@ def usable_streams() -> Iterator[None]:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115
         elif hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")
-    yield
 
 
 def unwritable_output(error: OSError) -> int:

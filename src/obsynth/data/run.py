@@ -9,11 +9,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
+import numpy as np
+
 from obsynth.data.job import Job
 from obsynth.data.saved_state import digest_of_gains, resume_state, save_state
-from obsynth.data.signals import Signals
+from obsynth.data.signals import TIME, Signals
 from obsynth.data.sinks import FrameSink, Sink, TextSink, file_sink
 from obsynth.data.sources import Data, chunks
+from obsynth.data.stamps import Stamps
 from obsynth.data.start import engine_of
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.monitors.online import OnlineMonitor
@@ -53,6 +56,12 @@ class DataRun:
         sha256 of the gain set.
     table : pandas.DataFrame or None
         The estimates, when they were not written anywhere.
+    measured : pandas.DataFrame or None
+        Time and the signals that were read, in their units, beside that table.
+    stamps : Stamps
+        Whether the log has seconds, or dates and times: ``stamps.shown(time)`` is a time as the log writes it.
+    thresholds : mapping of str to float
+        Those that were given.
     """
 
     rows: int
@@ -63,11 +72,15 @@ class DataRun:
     warnings: tuple[str, ...]
     digest: str
     table: pd.DataFrame | None = field(default=None, repr=False)
+    measured: pd.DataFrame | None = field(default=None, repr=False)
+    stamps: Stamps = field(default_factory=Stamps, repr=False)
+    thresholds: Mapping[str, float] = field(default_factory=dict, repr=False)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the summary as plain data, without the table."""
         return {
             "rows": self.rows, "statuses": dict(self.statuses), "alarms": dict(self.alarms),
+            "alarm_stamps": {name: self.stamps.shown(time) for name, time in self.alarms.items()},
             "isolated": self.isolated, "recovered": dict(self.recovered), "warnings": list(self.warnings),
             "gains_sha256": self.digest,
         }  # fmt: skip
@@ -79,6 +92,7 @@ def run_on_data(
     out: str | Path | TextIO | None = None,
     *,
     columns: Mapping[str, str] | None = None,
+    time_column: str | None = None,
     scales: Mapping[str, float] | None = None,
     thresholds: Mapping[str, float] | None = None,
     monitor: OnlineMonitor | None = None,
@@ -99,12 +113,18 @@ def run_on_data(
     design : ObserverDesign
         Of any method.
     data : path, text stream or pandas.DataFrame
-        With a column ``time`` in seconds and a column for each known input and output.  Files are CSV or Parquet by
-        their suffix; a stream is CSV and is answered row by row.
+        With a column ``time`` and a column for each known input and output.  Files are text (``.csv``, ``.tsv``),
+        Parquet, TDMS or MDF (``.mf4``, ``.mdf``, ``.dat``) by their suffix; a stream is text and is answered row by
+        row.  Columns of text are separated by commas, semicolons, tabs or bars, and numbers may have a decimal comma
+        where commas separate nothing.  The time is in seconds, or dates and times of ISO 8601 with or without a zone
+        (taken as UTC without one), which are written back as such; the index of a frame is the time where it is a
+        DatetimeIndex.
     out : path or text stream, optional
         CSV or Parquet file, written whole or not at all; or a stream for CSV.  By default a data frame is returned.
     columns : mapping, optional
         Column of a signal (or of ``time``) where their names differ.
+    time_column : str, optional
+        Column of the time, the same as ``columns={"time": ...}``.
     scales : mapping, optional, signal's unit per column's unit
         Factor of a signal's column; by default the plant's.
     thresholds : mapping, optional
@@ -170,15 +190,20 @@ def run_on_data(
     })  # fmt: skip
     if state is not None:
         check_output(state)
+    if time_column is not None:
+        require_kind(time_column, str, "time_column", "the name of a column")
+        columns = {**(columns or {}), TIME: time_column}
     engine = engine_of(design, gap=gap, warm_up=warm_up)
+    stamps = Stamps()
     # The monitor is not used up: a second run may begin with it.
     watched = None if monitor is None else copy.deepcopy(monitor)
     job = Job(engine, Signals.of(engine, columns, scales), design.recovery, thresholds or {}, watched)
     digest = digest_of_gains(design)
     if state is not None and Path(state).exists():
         resume_state(Path(state), job, digest)
-    rows = chunks(data, job.signals, chunk_rows)
-    with _sink(out, job.header) as sink:
+    kept: list[FloatArray] | None = [] if out is None else None
+    rows = _kept(chunks(data, job.signals, stamps, chunk_rows), kept)
+    with _sink(out, job.header, stamps) as sink:
         if state is None or out is None or isinstance(out, str | Path):
             _run_rows(job, rows, sink, progress)
         else:
@@ -189,8 +214,29 @@ def run_on_data(
     recovered = {} if job.recovered is None else dict(job.recovered.flags)
     return DataRun(
         job.rows, dict(job.statuses), dict(job.alarms), job.isolated, recovered,
-        (*engine.notes, *job.first.warnings()), digest, table,
+        (*engine.notes, *job.first.warnings()), digest, table, _measured(kept, job.signals, stamps), stamps,
+        dict(thresholds or {}),
     )  # fmt: skip
+
+
+def _kept(rows: Iterator[FloatArray], kept: list[FloatArray] | None) -> Iterator[FloatArray]:
+    for chunk in rows:
+        if kept is not None:
+            kept.append(chunk)
+        yield chunk
+
+
+def _measured(kept: list[FloatArray] | None, signals: Signals, stamps: Stamps) -> pd.DataFrame | None:
+    """Return what was read, in the signals' units."""
+    if kept is None:
+        return None
+    import pandas as pd
+
+    rows = np.concatenate(kept)
+    frame = pd.DataFrame(signals.scale * rows[:, 1:], columns=list(signals.names))
+    times = [stamps.moment(time) for time in rows[:, 0].tolist()] if stamps.is_dated else rows[:, 0]
+    frame.insert(0, TIME, times)
+    return frame
 
 
 def _run_rows(job: Job, rows: Iterator[FloatArray], sink: Sink, progress: Callable[[int], None] | None) -> None:
@@ -226,11 +272,11 @@ def _run_stream(
 
 
 @contextmanager
-def _sink(out: str | Path | TextIO | None, header: tuple[str, ...]) -> Iterator[Sink]:
+def _sink(out: str | Path | TextIO | None, header: tuple[str, ...], stamps: Stamps) -> Iterator[Sink]:
     if isinstance(out, str | Path):
-        with file_sink(Path(out), header, {"status", "alarm"}) as sink:
+        with file_sink(Path(out), header, {"status", "alarm"}, stamps) as sink:
             yield sink
     elif out is None:
-        yield FrameSink(header)
+        yield FrameSink(header, stamps)
     else:
-        yield TextSink(out, header)
+        yield TextSink(out, header, stamps)

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from obsynth.data.job import Job
 from obsynth.errors import SpecError
 from obsynth.files.inputs import read_json
 from obsynth.files.outputs import FileKind, write_atomically
+from obsynth.numerics.arguments import is_number
+from obsynth.observers.running import BY_COLUMNS
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import digest_of, gain_set_digest, plain, restored
 
@@ -45,7 +51,37 @@ def resume_state(path: Path, job: Job, digest: str) -> None:
         raise SpecError(f"{path} was changed after it was written: its digest does not match.", path=str(path))
     if body.get("gains") != digest:
         raise SpecError(f"{path} is the state of a run with another gain set.", path=str(path))
+    own = job.as_dict()
     try:
-        job.resume(restored(body["state"]))
-    except (AttributeError, LookupError, TypeError, ValueError, ArithmeticError) as error:
-        raise SpecError(f"{path} is incomplete: {error}.", path=str(path)) from error
+        state = restored(body.get("state"))
+        job.resume(state)
+        fits = _fits(own, state)
+    except (AttributeError, LookupError, TypeError, ValueError, ArithmeticError):
+        fits = False
+    if not fits:
+        raise SpecError(f"{path} is damaged: it is no state of this design and these options.", path=str(path))
+
+
+def _fits(own: Any, saved: Any) -> bool:
+    """Whether a saved state has the parts of a run's own one; what has no value yet may hold numbers and arrays."""
+    if isinstance(own, np.ndarray):
+        found = saved.get(BY_COLUMNS) if isinstance(saved, dict) else saved
+        return isinstance(found, np.ndarray) and _alike(own.shape, found.shape)
+    if isinstance(own, Mapping):
+        return (
+            isinstance(saved, dict) and saved.keys() == own.keys() and all(_fits(own[key], saved[key]) for key in own)
+        )
+    if isinstance(own, (bool, np.bool_)):
+        return isinstance(saved, bool)
+    if isinstance(own, str):
+        return isinstance(saved, str)
+    if isinstance(own, (list, tuple)):
+        return isinstance(saved, list)
+    return saved is None or is_number(saved) or (own is None and isinstance(saved, (np.ndarray, dict, list)))
+
+
+def _alike(own: tuple[int, ...], saved: tuple[int, ...]) -> bool:
+    """Whether an array can stand for another one: windows fill up, and factors of covariances change their width."""
+    if len(own) == 2 and len(saved) == 2:
+        return own[0] == saved[0] or own[1] == saved[1]
+    return own == saved

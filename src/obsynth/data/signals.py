@@ -64,7 +64,7 @@ class Signals:
         if missing:
             raise SpecError(
                 f"The data have no column {', '.join(map(repr, missing))}; they have "
-                f"{', '.join(map(repr, header)) or 'none'}. {_advice(header)}",
+                f"{', '.join(map(repr, header)) or 'none'}. {_advice(header, missing)}",
                 path="data",
             )
         repeated = sorted({name for name in self.columns if header.count(name) > 1})
@@ -79,7 +79,14 @@ class Signals:
         return np.array(values + [0.0] * (len(engine.columns) - len(named)))
 
 
-def _advice(header: tuple[str, ...]) -> str:
-    if len(header) == 1 and any(mark in header[0] for mark in ";\t|"):
-        return "Separate columns by commas."
+#: How columns of time stamps are often called.
+_TIMES = ("timestamp", "datetime", "date", "t", "zeit", "time")
+
+
+def _advice(header: tuple[str, ...], missing: list[str]) -> str:
+    if len(header) == 1 and any(mark in header[0] for mark in ":#~^ "):
+        return "Separate columns by commas, semicolons, tabs or bars."
+    found = next((name for kind in _TIMES for name in header if name.lower().startswith(kind)), None)
+    if TIME in missing and found is not None:
+        return f"If {found!r} is the time: --time-column {found!r}, or columns={{'time': {found!r}}}."
     return "Map signals to columns where their names differ."

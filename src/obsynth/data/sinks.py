@@ -3,17 +3,33 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Protocol, TextIO
 
+from obsynth.data.signals import TIME
 from obsynth.data.sources import check_suffix
+from obsynth.data.stamps import Stamps
 from obsynth.files.outputs import FileKind, replacement_of
 from obsynth.files.tables import TableWriter
 
 #: A table that a run on measured data has written, as CSV or as Parquet.
 ESTIMATES = FileKind("a table of estimates of obsynth", rb"\Atime,status,|\APAR1(?s:.*)status(?s:.*)hat\[")
+
+
+def time_columns(header: Sequence[str]) -> tuple[int, ...]:
+    """Return which columns hold times."""
+    return tuple(i for i, name in enumerate(header) if name == TIME or name.startswith(f"{TIME} of "))
+
+
+def dated(rows: Sequence[Sequence[Any]], places: Sequence[int], shown: Callable[[float], Any]) -> list[list[Any]]:
+    """Return rows in which the times are dates."""
+    found = [list(row) for row in rows]
+    for row in found:
+        for place in places:
+            row[place] = shown(row[place])
+    return found
 
 
 class Sink(Protocol):
@@ -27,30 +43,32 @@ class Sink(Protocol):
 class TextSink:
     """CSV to a text stream, flushed after each call.
 
-    Fields: stream: Where to; header: Names of the columns.
+    Fields: stream: Where to; header: Names of the columns; stamps: Dates are written back as such.
     """
 
-    def __init__(self, stream: TextIO, header: Sequence[str]) -> None:
-        self._stream, self._writer = stream, TableWriter(stream, header)
+    def __init__(self, stream: TextIO, header: Sequence[str], stamps: Stamps) -> None:
+        self._stream, self._writer, self._stamps = stream, TableWriter(stream, header), stamps
+        self._times = time_columns(header)
 
     def write(self, rows: Sequence[Sequence[Any]]) -> None:
         """Write rows; floats so that they are read back bit for bit."""
-        self._writer.write(rows)
+        self._writer.write(dated(rows, self._times, self._stamps.date) if self._stamps.is_dated else rows)
         self._stream.flush()
 
 
 class FrameSink:
     """Rows to a data frame.
 
-    Fields: header: Names of the columns.
+    Fields: header: Names of the columns; stamps: Dates stay dates.
     """
 
-    def __init__(self, header: Sequence[str]) -> None:
-        self._header, self._rows = list(header), list[Sequence[Any]]()
+    def __init__(self, header: Sequence[str], stamps: Stamps) -> None:
+        self._header, self._rows, self._stamps = list(header), list[Sequence[Any]](), stamps
+        self._times = time_columns(header)
 
     def write(self, rows: Sequence[Sequence[Any]]) -> None:
         """Keep rows."""
-        self._rows.extend(rows)
+        self._rows.extend(dated(rows, self._times, self._stamps.moment) if self._stamps.is_dated else rows)
 
     def frame(self) -> Any:
         """Return the data frame."""
@@ -86,8 +104,11 @@ class ParquetSink:
 
 
 @contextmanager
-def file_sink(path: Path, header: Sequence[str], texts: set[str]) -> Iterator[Sink]:
-    """Give a sink for a file that replaces ``path`` when all went well, and leaves nothing behind otherwise."""
+def file_sink(path: Path, header: Sequence[str], texts: set[str], stamps: Stamps) -> Iterator[Sink]:
+    """Give a sink for a file that replaces ``path`` when all went well, and leaves nothing behind otherwise.
+
+    In a Parquet file times are seconds, since 1970 where the log has dates.
+    """
     check_suffix(path)
     with replacement_of(path) as (handle, temporary):
         if path.suffix.lower() == ".parquet":
@@ -99,4 +120,4 @@ def file_sink(path: Path, header: Sequence[str], texts: set[str]) -> Iterator[Si
                 sink.close()
         else:
             with os.fdopen(handle, "w", encoding="utf-8", newline="") as stream:
-                yield TextSink(stream, header)
+                yield TextSink(stream, header, stamps)

@@ -1,22 +1,20 @@
-"""Where rows come from: CSV and Parquet files in chunks, data frames, and text streams row by row."""
+"""Where rows come from: text, Parquet, TDMS and MDF files in chunks, data frames, and text streams row by row."""
 
 from __future__ import annotations
 
-import csv
-import itertools
-import re
-import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, TextIO, TypeAlias
+from typing import TYPE_CHECKING, Any, TextIO, TypeAlias
 
 import numpy as np
 
-from obsynth.data.signals import Signals
+from obsynth.data.signals import TIME, Signals
+from obsynth.data.stamps import Stamps
+from obsynth.data.text_logs import Dialect, stream_rows, text_chunks
 from obsynth.errors import SpecError
 from obsynth.files.inputs import input_file
-from obsynth.files.tables import as_meant
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray
 
@@ -24,30 +22,36 @@ if TYPE_CHECKING:
     import pandas as pd
     from typing_extensions import TypeIs
 
-#: What a missing sample may look like in a stream; data frames know more words.
-MISSING = frozenset({"", "nan", "na", "n/a", "null", "none"})
+#: Files that are read as text, and those that need a package: its name and the extra that installs it.
+TEXTS = (".csv", ".tsv")
+PACKAGES = {
+    ".parquet": ("pyarrow", "parquet"), ".tdms": ("nptdms", "tdms"), ".mf4": ("asammdf", "mdf"),
+    ".mdf": ("asammdf", "mdf"), ".dat": ("asammdf", "mdf"),
+}  # fmt: skip
+#: Files that estimates are written to.
 SUFFIXES = (".csv", ".parquet")
-#: Lines that may end with CR alone.
-_OLD_LINES = re.compile(r"[^\r]*\r\n?|[^\r]+")
 
 Data: TypeAlias = "str | Path | TextIO | pd.DataFrame"
 
 
-def chunks(data: Data, signals: Signals, rows: int) -> Iterator[FloatArray]:
+def chunks(data: Data, signals: Signals, stamps: Stamps, rows: int) -> Iterator[FloatArray]:
     """Yield ``(rows, 1 + nu + ny)``: time and signals, in order; NaN where a sample is missing."""
     if isinstance(data, str | Path):
         path = Path(data)
-        check_suffix(path)
+        check_suffix(path, (*TEXTS, *PACKAGES))
         with _readable(path):
-            frames = _parquet(path, signals, rows) if path.suffix.lower() == ".parquet" else _csv(path, rows)
-            yield from _converted(frames, signals)
+            if path.suffix.lower() in TEXTS:
+                yield from text_chunks(path, signals, stamps, rows)
+            else:
+                _require_beginning(path)
+                yield from _converted(_READERS[path.suffix.lower()](path, signals, rows), signals, stamps)
     elif is_stream(data):
-        yield from _stream(data, signals)
+        yield from stream_rows(data, signals, stamps)
     else:
         import pandas as pd
 
         require_kind(data, pd.DataFrame, "data", "the name of a file, a text stream or a pandas.DataFrame")
-        yield from _converted(iter([data]), signals)
+        yield from _converted(iter([_with_time(data, signals)]), signals, stamps)
 
 
 def is_stream(data: TextIO | pd.DataFrame) -> TypeIs[TextIO]:
@@ -55,16 +59,17 @@ def is_stream(data: TextIO | pd.DataFrame) -> TypeIs[TextIO]:
     return hasattr(data, "readline")
 
 
-def check_suffix(path: Path) -> None:
-    """Raise `SpecError` unless a file is CSV or Parquet by its name, and Parquet can be handled."""
+def check_suffix(path: Path, suffixes: tuple[str, ...] = SUFFIXES) -> None:
+    """Raise `SpecError` unless a file is of a known kind by its name, and its package is installed."""
     suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
-        raise SpecError(f"{path} has an unknown suffix: use {' or '.join(SUFFIXES)}.", path=str(path))
-    if suffix == ".parquet":
+    if suffix not in suffixes:
+        raise SpecError(f"{path} has an unknown suffix: use one of {', '.join(suffixes)}.", path=str(path))
+    if suffix in PACKAGES:
+        package, extra = PACKAGES[suffix]
         try:
-            import pyarrow  # noqa: F401
+            import_module(package)
         except ImportError:
-            raise SpecError("Parquet needs pyarrow: pip install 'obsynth[parquet]', or use CSV.",
+            raise SpecError(f"{suffix} files need {package}: pip install 'obsynth[{extra}]', or use CSV.",
                             path=str(path)) from None  # fmt: skip
 
 
@@ -81,40 +86,8 @@ def _readable(path: Path) -> Iterator[None]:
         raise SpecError(f"{path} is no UTF-8 text (byte {error.start}).", path=str(path)) from error
     except OSError as error:
         raise SpecError(f"{path} cannot be read: {error.strerror or error}.", path=str(path)) from error
-    except (ValueError, Warning) as error:  # pandas: empty files, ragged rows; pyarrow: no Parquet file
+    except (ValueError, KeyError, IndexError, AttributeError, Warning) as error:
         raise SpecError(f"{path} cannot be read: {' '.join(str(error).split())}", path=str(path)) from error
-
-
-def _csv(path: Path, rows: int) -> Iterator[pd.DataFrame]:
-    import pandas as pd
-
-    # The header is read as data, since pandas would rename a repeated column.
-    header = pd.read_csv(path, header=None, nrows=1, dtype=str, keep_default_na=False, encoding="utf-8-sig")
-    names = [as_meant(str(name).strip()) for name in header.iloc[0]]
-    if not _has_rows(path):
-        return
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", pd.errors.ParserWarning)
-        # Text: every release of pandas reads the same, and a file gives the same numbers as a stream.
-        reader = pd.read_csv(
-            path, header=None, skiprows=1, chunksize=rows, dtype=str, keep_default_na=False, encoding="utf-8-sig",
-            index_col=False, names=list(range(len(names))),
-        )  # fmt: skip
-    with reader:
-        while True:
-            with warnings.catch_warnings():
-                # More cells than columns, which pandas would only warn of.
-                warnings.simplefilter("error", pd.errors.ParserWarning)
-                frame = next(reader, None)
-            if frame is None:
-                return
-            yield frame.set_axis(names, axis=1)
-
-
-def _has_rows(path: Path) -> bool:
-    with path.open(encoding="utf-8-sig") as stream:
-        stream.readline()
-        return any(line.strip() for line in stream)
 
 
 def _parquet(path: Path, signals: Signals, rows: int) -> Iterator[pd.DataFrame]:
@@ -126,14 +99,112 @@ def _parquet(path: Path, signals: Signals, rows: int) -> Iterator[pd.DataFrame]:
             yield batch.to_pandas()
 
 
-def _converted(frames: Iterator[pd.DataFrame], signals: Signals) -> Iterator[FloatArray]:
+def _tdms(path: Path, signals: Signals, rows: int) -> Iterator[pd.DataFrame]:
+    """Yield the channels of a TDMS file; where no channel is the time, that of the waveforms is."""
+    from nptdms import TdmsFile
+
+    with TdmsFile.open(path) as file:
+        channels = {channel.name: channel for group in file.groups() for channel in group.channels()}
+        wanted = {name: channels[name] for name in signals.columns if name in channels}
+        frame: dict[str, Any] = {name: channel[:] for name, channel in wanted.items()}
+        time = signals.columns[0]
+        if time not in frame and wanted:
+            first = next(iter(wanted.values()))
+            if "wf_increment" in first.properties:
+                frame = {time: first.time_track(), **frame}
+        lengths = {name: len(values) for name, values in frame.items()}
+        if len(set(lengths.values())) > 1:
+            told = ", ".join(f"{name!r} {count}" for name, count in lengths.items())
+            raise SpecError(f"{path}: the channels have different numbers of samples: {told}.", path=str(path))
+        others = {name: np.zeros(0) for name in channels if name not in frame}
+        yield from _frames(frame, others, signals, rows)
+
+
+def _mdf(path: Path, signals: Signals, rows: int) -> Iterator[pd.DataFrame]:
+    """Yield the channels of an MDF file on one raster: that of the time channel, else of the first signal."""
+    from asammdf import MDF
+
+    with MDF(path) as file:
+        known = [name for name in file.channels_db if file.channels_db[name]]
+        wanted = [name for name in signals.columns[1:] if name in known]
+        frame: dict[str, Any] = {}
+        if wanted:
+            raster = file.get(wanted[0]).timestamps
+            frame[signals.columns[0]] = raster
+            for name in wanted:
+                signal = file.get(name)
+                if len(signal.timestamps) != len(raster) or not np.array_equal(signal.timestamps, raster):
+                    signal = signal.interp(raster)
+                frame[name] = np.asarray(signal.samples, dtype=np.float64)
+        yield from _frames(frame, dict.fromkeys(known), signals, rows)
+
+
+def _frames(found: dict[str, Any], others: dict[str, Any], signals: Signals, rows: int) -> Iterator[pd.DataFrame]:
+    """Yield columns in chunks; names that are not there are told with all that are."""
+    import pandas as pd
+
+    if not set(signals.columns) <= set(found):
+        signals.positions(tuple(dict.fromkeys((*found, *others))))
+    frame = pd.DataFrame(found)
+    for start in range(0, max(len(frame), 1), rows):
+        yield frame.iloc[start : start + rows]
+
+
+#: How files of these kinds begin.
+_BEGINNINGS = {".tdms": b"TDSm", ".mf4": b"MDF ", ".mdf": b"MDF ", ".dat": b"MDF "}
+
+
+def _require_beginning(path: Path) -> None:
+    """Raise `SpecError` for a file that is something else than its name says: its package would read nothing."""
+    wanted = _BEGINNINGS.get(path.suffix.lower())
+    if wanted is None:
+        return
+    with path.open("rb") as stream:
+        if stream.read(len(wanted)) != wanted:
+            raise SpecError(f"{path} cannot be read: it is no {path.suffix} file.", path=str(path))
+
+
+_READERS: dict[str, Callable[[Path, Signals, int], Iterator[Any]]] = {
+    ".parquet": _parquet, ".tdms": _tdms, ".mf4": _mdf, ".mdf": _mdf, ".dat": _mdf,
+}  # fmt: skip
+
+
+def _with_time(frame: pd.DataFrame, signals: Signals) -> pd.DataFrame:
+    """Return a frame whose index of dates, of time differences, or called as the time, is a column."""
+    import pandas as pd
+
+    time, names = signals.columns[0], [str(name) for name in frame.columns]
+    dated = isinstance(frame.index, (pd.DatetimeIndex, pd.TimedeltaIndex))
+    if time in names or not (dated or frame.index.name == time):
+        return frame
+    if time != TIME and frame.index.name != time:
+        return frame
+    return frame.assign(**{time: frame.index}).reset_index(drop=True)
+
+
+def _converted(frames: Iterator[pd.DataFrame], signals: Signals, stamps: Stamps) -> Iterator[FloatArray]:
     done = 0
     for frame in frames:
         places = signals.positions(tuple(str(name) for name in frame.columns))
-        yield np.column_stack([_numbers(frame.iloc[:, place], done) for place in places])
+        times = _times(frame.iloc[:, places[0]], done, stamps)
+        yield np.column_stack([times, *(_numbers(frame.iloc[:, place], done) for place in places[1:])])
         done += len(frame)
     if done == 0:
         raise SpecError("The data have no rows.", path="data")
+
+
+def _times(column: pd.Series, done: int, stamps: Stamps) -> FloatArray:
+    """Return a column of time stamps as seconds."""
+    import pandas as pd
+
+    found = stamps.read_column(column, done)
+    if found is not None:
+        return found
+    if pd.api.types.is_numeric_dtype(column):
+        stamps.is_dated = False
+        return _numbers(column, done)
+    texts = ["" if pd.isna(cell) else str(cell) for cell in column]
+    return np.array([stamps.read(text, done + i + 1, str(column.name)) for i, text in enumerate(texts)])
 
 
 def _numbers(column: pd.Series, done: int) -> FloatArray:
@@ -143,58 +214,5 @@ def _numbers(column: pd.Series, done: int) -> FloatArray:
     if pd.api.types.is_numeric_dtype(column) and not pd.api.types.is_bool_dtype(column):
         return np.asarray(column.to_numpy(dtype=np.float64, na_value=np.nan))
     texts = [None if pd.isna(cell) else str(cell) for cell in column]
-    return np.array([_number(text, done + i + 1, str(column.name)) for i, text in enumerate(texts)])
-
-
-def _number(text: str | None, row: int, column: str) -> float:
-    if text is None or text.strip().lower() in MISSING:
-        return float("nan")
-    try:
-        return float(text)
-    except ValueError:
-        # What looks like a date is most likely the time.
-        advice = " Give the time in seconds." if ":" in text else ""
-        raise SpecError(f"Row {row}, column {column!r}: {text!r} is no number.{advice}", path=f"row {row}") from None
-
-
-def _stream(stream: TextIO, signals: Signals) -> Iterator[FloatArray]:
-    # Line by line: a reader of its own would wait for more than one.
-    lines = _cells(stream)
-    header = tuple(as_meant(name.strip()) for name in next(lines, []))
-    places = signals.positions(header)
-    row = 0
-    for cells in lines:
-        if not any(cell.strip() for cell in cells):
-            continue
-        row += 1
-        if len(cells) > len(header):
-            raise SpecError(f"Row {row} has {len(cells)} cells, but the header has {len(header)}.", path=f"row {row}")
-        cells += [""] * (len(header) - len(cells))
-        yield np.array([[_number(cells[place], row, header[place]) for place in places]])
-    if row == 0:
-        raise SpecError("The data have no rows.", path="data")
-
-
-def _cells(stream: TextIO) -> Iterator[list[str]]:
-    """Yield the cells of each line; what is no text, or no table, is a `SpecError`."""
-    lines = csv.reader(_text_lines(stream))
-    for row in itertools.count():
-        try:
-            cells = next(lines, None)
-        except csv.Error as error:
-            raise SpecError(f"Row {row} of the data cannot be read: {error}.", path=f"row {row}") from error
-        except UnicodeDecodeError as error:
-            raise SpecError(f"The data are no UTF-8 text after row {row}.", path=f"row {row}") from error
-        if cells is None:
-            return
-        yield cells
-
-
-def _text_lines(stream: TextIO) -> Iterator[str]:
-    """Yield lines as they come; lines that end with CR alone, as of old, come together where a stream keeps these."""
-    is_first = True
-    for block in iter(stream.readline, ""):
-        for line in _OLD_LINES.findall(block):
-            # A byte order mark is no part of the first name.
-            yield line.removeprefix("\ufeff") if is_first else line
-            is_first = False
+    plain = Dialect(",")
+    return np.array([plain.number(text, done + i + 1, str(column.name)) for i, text in enumerate(texts)])

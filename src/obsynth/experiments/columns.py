@@ -64,3 +64,9 @@ def projected_note(change: float) -> str:
     return (
         f"The initial state did not satisfy the algebraic equations: it was projected, a change of {change:.3g} (norm)."
     )
+
+
+def root_mean_square(errors: FloatArray) -> float:
+    """Return the root mean square of what is not NaN."""
+    known = errors[~np.isnan(errors)]
+    return float(np.sqrt(np.mean(known**2))) if known.size else float("nan")

@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.experiments.columns import SignalTable, named_columns, projected_note
+from obsynth.experiments.columns import SignalTable, named_columns, projected_note, root_mean_square
 from obsynth.experiments.parameter_batch_simulation import RowEstimates, make_recursive_bench
-from obsynth.experiments.simulation import root_mean_square
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.recursive.observer import RecursiveObserver

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from obsynth.experiments.batch_simulation import Bench, make_bench
-from obsynth.experiments.columns import SignalTable, named_columns, projected_note
+from obsynth.experiments.columns import SignalTable, named_columns, projected_note, root_mean_square
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.observer import Estimates, LinearObserver
@@ -190,12 +190,6 @@ def aligned_errors(estimates: FloatArray, truth: FloatArray, delays: tuple[int, 
     for i, delay in enumerate(delays):
         errors[delay:, ..., i] = estimates[delay:, ..., i] - truth[: len(truth) - delay, ..., i]
     return errors
-
-
-def root_mean_square(errors: FloatArray) -> float:
-    """Return the root mean square of what is not NaN."""
-    known = errors[~np.isnan(errors)]
-    return float(np.sqrt(np.mean(known**2))) if known.size else float("nan")
 
 
 def _largest(errors: FloatArray) -> float:

@@ -75,7 +75,7 @@ def dae_c_texts(design: ObserverDesign, prefix: str, header: str) -> tuple[str, 
     digest = gain_set_digest(design)
     source = "\n".join([
         comment(f"sha256 of the gain set: {digest}"), f'#include "{included(header)}"', "",
-        "#define OBSERVER_IS_DECLARED", f"#define observer {prefix}_observer", "", observer_code(observer),
+        "#define OBSERVER_IS_DECLARED", f"#define observer {prefix}_observer", "", observer_code(observer.steps),
         _step_text(prefix, design.nonlinear[0]),
     ])  # fmt: skip
     return source, "\n".join(_header(design, prefix, digest)) + "\n", digest

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -14,8 +15,9 @@ from obsynth.analysis.transformations import StateRecovery, eliminate_algebraic_
 from obsynth.analysis.transformations.elimination import MANY_VARIABLES
 from obsynth.errors import PreconditionError, SpecError, VerificationError
 from obsynth.methods.advice import with_advice
+from obsynth.methods.choosing.automatic import automatic_design
 from obsynth.methods.method_spec import MethodSpec, PlantKind
-from obsynth.methods.registry import REGISTRY, method_spec, methods_for
+from obsynth.methods.registry import AUTO, REGISTRY, method_spec, methods_for
 from obsynth.methods.synthesis_result import Synthesis
 from obsynth.methods.verifying import verify
 from obsynth.numerics.failures import failed_computations
@@ -43,7 +45,7 @@ def _silent(_: str) -> None:
 
 def design(
     plant: Plant,
-    method: str = "fault-estimation-filter",
+    method: str = AUTO,
     *,
     name: str = "design",
     recovery: StateRecovery | None = None,
@@ -57,7 +59,9 @@ def design(
     plant : DescriptorSystem, TimeVaryingDescriptorSystem or DAEModel
         The plant.  Of one with sparse matrices and 500 states or more the algebraic states are eliminated first.
     method : str, optional
-        Method id; for its options see the function of the same name, such as `fault_estimation_filter`.
+        Method id; for its options see the function of the same name, such as `fault_estimation_filter`.  By default
+        ``auto``: every method that exists and has the options given is designed, and the best by closed-form figures
+        (reach of a step, leak of the unknown inputs, noise against delay) is taken; the design names it.
     name : str, optional
         Name of the design.
     recovery : StateRecovery, optional
@@ -87,6 +91,25 @@ def design(
         Gains were found, but the shipped realisation fails a check.
     """
     report_stage = progress or _silent
+
+    def made(plant: Plant, method: str, options: Mapping[str, Any], *, advise: bool = False) -> ObserverDesign:
+        return _designed(plant, method, options, name=name, recovery=recovery, progress=report_stage, advise=advise)
+
+    if method == AUTO:
+        report_stage("designing by every method that exists")
+        kind_of(plant)
+        with failed_computations(), one_thread_if_small(plant.nx):
+            plant, recovery, _ = _with_arrays(plant, recovery, report_stage)
+            return automatic_design(plant, options, made, partial(made, advise=True))
+    return made(plant, method, options, advise=True)
+
+
+def _designed(
+    plant: Plant, method: str, options: Mapping[str, Any], *, name: str, recovery: StateRecovery | None,
+    progress: Callable[[str], None], advise: bool,
+) -> ObserverDesign:  # fmt: skip
+    """Return the verified design of one method; with ``advise`` a refusal says what would help."""
+    report_stage = progress
     spec = method_spec(method)
     asked = spec.read_options(options)
     for condition in _kind_conditions(plant, spec):
@@ -96,7 +119,7 @@ def design(
         try:
             found = spec.load("synthesise")(plant, asked, progress=report_stage)
         except PreconditionError as error:
-            if not isinstance(plant, DescriptorSystem):
+            if not isinstance(plant, DescriptorSystem) or not advise:
                 raise
             report_stage("looking for what would make it possible")
             raise with_advice(error, plant, spec, asked.as_given()) from None

@@ -7,6 +7,8 @@ from importlib import import_module
 from obsynth.errors import SpecError
 from obsynth.methods.method_spec import MethodSpec, PlantKind
 
+#: What a spec and `obsynth.design` call the choice between all methods that exist.
+AUTO = "auto"
 #: Method id -> where its declaration is; a method is its own folder and a line here.
 REGISTRY: dict[str, str] = {
     "fault-estimation-filter": "obsynth.methods.fault_estimation_filter.method",

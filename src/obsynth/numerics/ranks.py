@@ -7,6 +7,7 @@ that a reader sees how clear it was.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -61,6 +62,7 @@ class RankDecision:
     smallest_kept: float
     largest_dropped: float
     gap: float
+    means: Literal["tolerance", "exact", "unclear"] = "tolerance"
 
     @property
     def full(self) -> bool:
@@ -72,8 +74,23 @@ class RankDecision:
         """Whether the gap is large enough to trust the decision without a second look."""
         return self.gap >= CLEAR_GAP
 
+    @property
+    def _margin(self) -> str:
+        values = self.singular_values
+        if not 0 < self.expected <= len(values) or values[0] == 0.0:
+            return ""
+        return f", least singular value {values[self.expected - 1] / values[0]:.1e}"
+
     def describe(self) -> str:
         """Return one line for a report, such as ``rank 4 of 4 (gap 2.1e+09)``."""
+        if self.means == "exact":
+            lost = "on the numbers as written; if their last digits are off, any gains would be about 1e16"
+            return f"rank {self.rank} of {self.expected} (exactly{self._margin if self.full else f', {lost}'})"
+        if self.means == "unclear":
+            return (
+                f"rank {self.expected} exactly, but less of data that differ by rounding{self._margin}; data with more "
+                "digits, or other units of what they describe, would decide it"
+            )
         note = "" if self.clear else ", unclear: check the scaling of the data"
         return f"rank {self.rank} of {self.expected} (gap {self.gap:.1e}{note})"
 

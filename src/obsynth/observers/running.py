@@ -15,7 +15,7 @@ Found = TypeVar("Found", covariant=True)
 Kept = TypeVar("Kept", bound=tuple[Any, ...])
 
 #: Marks an array whose columns are contiguous: sums are rounded in another order there.
-_BY_COLUMNS = "by columns"
+BY_COLUMNS = "by columns"
 
 
 class Observer(Protocol[State, Row, Found]):
@@ -102,7 +102,7 @@ def state_from_data(like: Kept, data: dict[str, Any]) -> Kept:
 def _as_data(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         by_columns = value.ndim == 2 and value.strides[0] < value.strides[1]
-        return {_BY_COLUMNS: np.array(value, order="F")} if by_columns else np.array(value, order="C")
+        return {BY_COLUMNS: np.array(value, order="F")} if by_columns else np.array(value, order="C")
     if hasattr(value, "_asdict"):
         return state_as_data(value)
     return [_as_data(part) for part in value] if isinstance(value, tuple) else value
@@ -117,4 +117,4 @@ def _from_data(like: Any, value: Any) -> Any:
 
 
 def _array(value: Any) -> FloatArray:
-    return np.asfortranarray(value[_BY_COLUMNS]) if isinstance(value, dict) else np.array(value)
+    return np.asfortranarray(value[BY_COLUMNS]) if isinstance(value, dict) else np.array(value)

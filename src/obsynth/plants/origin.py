@@ -26,10 +26,13 @@ class PlantOrigin:
         The `DECISIVE` matrices.
     sample_time : Fraction or None, seconds
         Where ``exact`` is a continuous plant and the plant itself is that one sampled with a zero-order hold.
+    computed : bool
+        Whether some of the numbers behind them were computed in floating point.
     """
 
     exact: Mapping[str, tuple[tuple[Fraction, ...], ...]]
     sample_time: Fraction | None = None
+    computed: bool = False
 
 
 def origin_of(plant: DescriptorSystem) -> PlantOrigin | None:

@@ -1,5 +1,6 @@
 """Pictures of results, readable without colour; nothing is shown or saved here."""
 
+from obsynth.plotting.data import plot_data
 from obsynth.plotting.delta_scan import plot_delta_scan
 from obsynth.plotting.faults import plot_faults, plot_residuals
 from obsynth.plotting.frequency import estimate_gains, plot_gains
@@ -11,6 +12,7 @@ from obsynth.plotting.trade_off import plot_trade_off
 
 __all__ = [
     "estimate_gains",
+    "plot_data",
     "plot_decision",
     "plot_delta_scan",
     "plot_detection",

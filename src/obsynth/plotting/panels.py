@@ -62,6 +62,14 @@ def tidy(panel: Axes) -> None:
     for side in ("top", "right"):
         panel.spines[side].set_visible(False)
     panel.margins(x=0.01)
+    names_as_they_are(panel)
+
+
+def names_as_they_are(panel: Axes) -> None:
+    """Show dollars in names as dollars: two of them would begin and end a formula, which most names are not."""
+    legend = panel.get_legend()
+    for text in (panel.title, panel.xaxis.label, panel.yaxis.label, *(legend.get_texts() if legend else ())):
+        text.set_parse_math(False)
 
 
 def legend_above(panel: Axes) -> None:
@@ -79,6 +87,7 @@ def legend_above(panel: Axes) -> None:
         loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns, frameon=False, fontsize="small",
         borderaxespad=0.1, columnspacing=1.4, handlelength=2.4,
     )  # fmt: skip
+    names_as_they_are(panel)
 
 
 def _letters(labels: Sequence[str], columns: int) -> int:

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
 
-from flint import fmpq, fmpq_mat, fmpq_poly, fmpz_mat, fmpz_poly, nmod_mat
+from flint import fmpq, fmpq_mat, fmpq_poly, fmpz_mat, fmpz_poly, nmod_mat, nmod_poly
 
 from obsynth.numerics.arrays import FloatArray
 from obsynth.proofs.exact_matrices import (
@@ -79,6 +79,8 @@ class ExactPencil:
         """Primitive polynomial whose roots, with multiplicity, are the finite zeros; 1 where there are none."""
         rank = self.normal_rank
         if rank == 0 or self._degree == 0:
+            return fmpz_poly([1])
+        if self._has_no_zero_modulo(rank):
             return fmpz_poly([1])
         found = self._compressed_determinant(rank)
         if self.shape == (rank, rank):
@@ -172,7 +174,26 @@ class ExactPencil:
     def _rng(self) -> random.Random:
         return random.Random(_SEED)
 
-    def _compressed_determinant(self, rank: int) -> fmpz_poly:
+    def _has_no_zero_modulo(self, rank: int) -> bool:
+        """Whether two compressions have coprime determinants modulo a prime that keeps the degree: then they are."""
+        if self.shape == (rank, rank):
+            return False
+        prime, found = _PRIMES[0], list[nmod_poly]()
+        shift = self._rng.randrange(prime)
+        for _ in range(2):
+            e, a = (nmod_mat(part, prime) for part in self._compressed(rank))
+            start = a - e * shift
+            if start.rank() < rank:
+                return False
+            # det(start - t e) / det(start) is the reversed characteristic polynomial of start^-1 e.
+            coefficients = start.solve(e).charpoly().coeffs()
+            found.append(nmod_poly([int(value) for value in coefficients[::-1]], prime))
+        # A common factor keeps its degree where the leading coefficient that it divides is not zero.
+        full = found[0].degree() == min(self._degree, rank)
+        return full and found[0].gcd(found[1]).degree() == 0
+
+    def _compressed(self, rank: int) -> tuple[fmpz_mat, fmpz_mat]:
+        """Return both matrices with rows and columns compressed at random to the normal rank."""
         e, a = self._integers
         rows, columns = self.shape
         if rows > rank:
@@ -181,6 +202,10 @@ class ExactPencil:
         if columns > rank:
             right = self._random(columns, rank)
             e, a = e * right, a * right
+        return e, a
+
+    def _compressed_determinant(self, rank: int) -> fmpz_poly:
+        e, a = self._compressed(rank)
         return _determinant(e, a, min(self._degree, rank))
 
     def _random(self, rows: int, columns: int) -> fmpz_mat:

@@ -71,8 +71,16 @@ def fractions_of(matrix: fmpq_mat) -> tuple[tuple[Fraction, ...], ...]:
 def nearest_doubles(matrix: fmpq_mat) -> FloatArray:
     """Return a rational matrix with every entry rounded once."""
     shape = (matrix.nrows(), matrix.ncols())
-    values = [int(entry.p) / int(entry.q) for entry in matrix.entries()]
+    values = [_nearest_double(int(entry.p), int(entry.q)) for entry in matrix.entries()]
     return np.array(values, dtype=np.float64).reshape(shape)
+
+
+def _nearest_double(numerator: int, denominator: int) -> float:
+    """Return the quotient, infinite where it is larger than any double."""
+    try:
+        return numerator / denominator
+    except OverflowError:
+        return float("inf") if numerator > 0 else float("-inf")
 
 
 def _as_fmpq(value: Fraction) -> fmpq:

@@ -6,12 +6,15 @@ from collections.abc import Iterator, Sequence
 from html import escape
 from pathlib import Path
 
+from obsynth.data.run import DataRun
 from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.methods.registry import REGISTRY, method_spec
 from obsynth.report.designs import fault_estimates_table, plant_facts, promises, recovered_states
+from obsynth.report.own_data import data_section
 from obsynth.report.page_style import STYLE
 from obsynth.report.page_tables import check_rows, copied_table, fact_rows, matrix_rows, value_text
 from obsynth.report.pictures import pictures_of
+from obsynth.report.summary import summary
 from obsynth.report.verification import verdict_line
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import gain_set_digest
@@ -29,6 +32,7 @@ MOST_ENTRIES = 900
 def html_report(
     design: ObserverDesign, path: str | Path, *, report: VerificationReport | None = None,
     gains_file: str | None = None, scenario: Scenario | None = None, system_file: str | None = None,
+    run: DataRun | None = None, data_file: str | None = None, statement: str = "",
 ) -> Path:  # fmt: skip
     """Write one HTML page about a design, complete in itself: it needs no network and no other file.
 
@@ -46,6 +50,12 @@ def html_report(
         What the design is shown on; by default each fault in turn.
     system_file : str, optional
         Name of the spec with that scenario, for the same command.
+    run : DataRun, optional
+        What `run_on_data` returned without ``out``: the design on measured data, shown first.
+    data_file : str, optional
+        Name of the log, for the same command.
+    statement : str, optional
+        What the monitor of that run promises.
 
     Returns
     -------
@@ -60,24 +70,27 @@ def html_report(
         The plant cannot be simulated on the scenario.
     """
     shown = design.report if report is None else report
-    return write_atomically(path, _page_text(design, shown, gains_file, scenario, system_file))
+    own = list(data_section(design, run, statement)) if run is not None else []
+    return write_atomically(path, _page_text(design, shown, gains_file, scenario, system_file, own, data_file))
 
 
 def _page_text(
     design: ObserverDesign, report: VerificationReport, gains_file: str | None, scenario: Scenario | None,
-    system_file: str | None,
+    system_file: str | None, own: Sequence[str], data_file: str | None,
 ) -> str:  # fmt: skip
     digest = gain_set_digest(design)
     title = escape(f"{design.name}: {design.method}")
     state = "holds" if report.passed else "fails"
     sections = {
+        "On your data": list(own),
+        "In short": list(_in_short(design.replace(report=report))),
+        "Pictures": list(_pictures(design, scenario, report)),
         "What is promised": [*fact_rows(promises(design)), *_fault_estimates(design), *_recovered(design)],
         "Notes": list(_notes(design.notes)),
         "The plant": list(fact_rows(plant_facts(design.plant))),
         "Checks": list(check_rows(report.checks)) if report.checks else [],
         "Gains": list(_gains(design)),
-        "Pictures": list(_pictures(design, scenario, report)),
-        "How to reproduce this": list(_reproduction(design, digest, gains_file, system_file)),
+        "How to reproduce this": list(_reproduction(design, digest, gains_file, system_file, data_file)),
     }
     shown = {heading: lines for heading, lines in sections.items() if lines}
     links = "".join(f'<a href="#{_anchor(heading)}">{heading}</a>' for heading in shown)
@@ -92,6 +105,13 @@ def _page_text(
     for heading, lines in shown.items():
         parts += [f'<section id="{_anchor(heading)}">', f"<h2>{heading}</h2>", *lines, "</section>"]
     return "\n".join([*parts, "</body>", "</html>"]) + "\n"
+
+
+def _in_short(design: ObserverDesign) -> Iterator[str]:
+    """Yield the facts of the summary and its warnings; what else it says stands in sections of its own."""
+    found = summary(design)
+    yield from fact_rows(found.facts)
+    yield from (f'<p class="warning">Warning: {escape(text)}</p>' for text in found.warnings)
 
 
 def _anchor(heading: str) -> str:
@@ -153,7 +173,7 @@ def _gains(design: ObserverDesign) -> Iterator[str]:
 
 
 def _reproduction(
-    design: ObserverDesign, digest: str, gains_file: str | None, system_file: str | None
+    design: ObserverDesign, digest: str, gains_file: str | None, system_file: str | None, data_file: str | None
 ) -> Iterator[str]:
     import shlex
 
@@ -164,6 +184,8 @@ def _reproduction(
     again = f"obsynth report --gains {file} --out report.html"
     if system_file is not None:
         again += f" --system {shlex.quote(system_file)}"
+    if data_file is not None:
+        again += f" --data {shlex.quote(data_file)}"
     yield f"<pre>{escape(f'obsynth verify {file}')}\n{escape(again)}</pre>"
     yield from fact_rows([("obsynth", __version__)])
     yield f'<p class="soft">sha256 of the gain set</p><p class="digest">{digest}</p>'

@@ -13,6 +13,7 @@ h1 { font-size: 1.75rem; line-height: 1.2; margin: 0; }
 h2 { font-size: 1.25rem; margin: 3rem 0 0.9rem; padding-bottom: 0.3rem; border-bottom: 2px solid var(--ink); }
 h3 { font-size: 1rem; margin: 1.6rem 0 0.5rem; }
 p { max-width: 46rem; margin: 0.5rem 0; } ul { max-width: 46rem; padding-left: 1.2rem; }
+.warning { color: #8a5300; }
 .soft { color: var(--soft); font-weight: 400; }
 .under { margin: 0.2rem 0 1.2rem; color: var(--soft); }
 .verdict { max-width: none; border-left: 0.5rem solid; border-radius: 3px; padding: 0.9rem 1.2rem; margin: 1rem 0 0;
@@ -48,6 +49,7 @@ pre { background: var(--shade); border: 1px solid var(--hair); border-radius: 3p
   margin: 0.6rem 0; overflow-x: auto; font: 0.9rem/1.5 ui-monospace, "Liberation Mono", Menlo, Consolas, monospace; }
 .digest { font-family: ui-monospace, "Liberation Mono", Menlo, Consolas, monospace; overflow-wrap: anywhere; }
 @media (max-width: 56rem) {
+  .copied th, .copied td:first-child { white-space: normal; } .copied th, .copied td { padding-right: 0.7rem; }
   body { padding: 1.1rem 1.1rem 3rem; } h1 { font-size: 1.4rem; } h2 { margin-top: 2.2rem; }
   .verdict { font-size: 1.1rem; padding: 0.7rem 0.9rem; }
   .checks thead { display: none; }

@@ -19,6 +19,7 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.recursive.estimates import RecursiveEstimates
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.plotting.frequency import plot_gains
+from obsynth.plotting.panels import names_as_they_are
 from obsynth.plotting.simulation import plot_simulation
 from obsynth.plotting.spectra import plot_poles
 from obsynth.plotting.states import plot_states
@@ -61,7 +62,7 @@ def pictures_of(design: ObserverDesign, *, scenario: Scenario | None = None) -> 
         region = "inside the circle" if sampled else "left of the dashed line"
         yield Picture(
             "Spectrum", f"Eigenvalues of the observer: it forgets its start where all are {region}.",
-            _drawn((HALF, 5.4 if sampled else 4.2), 1, lambda axes: plot_poles(design, axes=axes[0])),
+            drawn((HALF, 5.4 if sampled else 4.2), 1, lambda axes: plot_poles(design, axes=axes[0])),
         )  # fmt: skip
     if design.observer.fault_names:
         yield _gains(
@@ -77,7 +78,7 @@ def pictures_of(design: ObserverDesign, *, scenario: Scenario | None = None) -> 
 
 
 def _gains(design: ObserverDesign, to: str, title: str, text: str) -> Picture:
-    return Picture(title, text, _drawn((HALF, 4.2), 1, lambda axes: plot_gains(design, to=to, axes=axes[0])))
+    return Picture(title, text, drawn((HALF, 4.2), 1, lambda axes: plot_gains(design, to=to, axes=axes[0])))
 
 
 def _at_work(design: ObserverDesign, scenario: Scenario | None) -> Iterator[Picture]:
@@ -101,14 +102,14 @@ def _at_work(design: ObserverDesign, scenario: Scenario | None) -> Iterator[Pict
     seen = [*_watched(design, shown, simulation)] if given else []
     panels = faults + len(seen)
     if panels:
-        yield Picture("The design at work", text, _drawn(
+        yield Picture("The design at work", text, drawn(
             (WIDE, PANEL * panels + MARGIN), panels,
             lambda axes: plot_simulation(simulation, detections=seen, units=units, axes=axes),
         ), wide=True)  # fmt: skip
     if 0 < len(states) <= MOST_STATES:
         run = "in the same run" if panels else "in a run with the stated noise"
         bands = "" if linear else ", with 95 % bands"
-        yield Picture("States", f"States {run}, and their estimates{bands}.", _drawn(
+        yield Picture("States", f"States {run}, and their estimates{bands}.", drawn(
             (WIDE, PANEL * len(states) + MARGIN), len(states),
             lambda axes: plot_states(simulation.estimates, states=simulation.states, dt=dt, units=units, axes=axes),
         ), wide=True)  # fmt: skip
@@ -142,12 +143,15 @@ def _story(scenario: Scenario, *, given: bool, linear: bool) -> str:
     )
 
 
-def _drawn(size: tuple[float, float], panels: int, draw: Callable[[Sequence[Axes]], Any]) -> str:
+def drawn(size: tuple[float, float], panels: int, draw: Callable[[Sequence[Axes]], Any]) -> str:
     """Return what ``draw`` puts on panels one above the other, as a data URL."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=size, layout="constrained")
-    draw(list(figure.subplots(panels, 1, sharex=True, squeeze=False)[:, 0]))
+    axes = list(figure.subplots(panels, 1, sharex=True, squeeze=False)[:, 0])
+    draw(axes)
+    for panel in axes:
+        names_as_they_are(panel)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=RESOLUTION)
     return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")

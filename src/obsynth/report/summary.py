@@ -30,6 +30,8 @@ NEAR_ONE = 0.5
 #: An estimate follows a step if in the end it misses it by no more than this share.
 FOLLOWS = 0.1
 _LABEL = 10
+#: The check without which observer and plant say nothing of one another.
+_FITS = "fits the plant"
 #: Claims that say what a design is worth; the others are for -v.
 _PROMISES = ("gamma", "decay")
 
@@ -181,8 +183,10 @@ def _assumptions(design: ObserverDesign) -> Iterator[str]:
 
 
 def _gains_if_linear(design: ObserverDesign) -> FaultGains | None:
-    plant = design.plant
-    return fault_gains(design) if isinstance(plant, DescriptorSystem) and design.observer.fault_names else None
+    """Return the gains of a linear design that estimates faults of its plant; a broken one has none."""
+    if not isinstance(design.plant, DescriptorSystem) or not design.observer.fault_names:
+        return None
+    return None if any(check.name == _FITS for check in design.report.failures) else fault_gains(design)
 
 
 def _estimates(design: ObserverDesign, gains: FaultGains | None) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:

@@ -19,7 +19,6 @@ from obsynth.analysis.transformations import StateRecovery
 from obsynth.errors import SpecError
 from obsynth.files.inputs import input_file, json_data, read_json
 from obsynth.files.outputs import FileKind, write_atomically
-from obsynth.numerics.arguments import is_number
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
@@ -37,6 +36,7 @@ from obsynth.results.binary_members import (
     with_arrays,
 )
 from obsynth.results.design import Certificate, ObserverDesign
+from obsynth.results.gain_set_parts import checked_parts, made
 from obsynth.results.report import VerificationReport
 
 SCHEMA_VERSION = 1
@@ -244,9 +244,9 @@ def _design_of(document: Any, arrays: bytes | None, source: str) -> ObserverDesi
     if not intact:
         raise SpecError(f"{source} was changed after it was written: its digest does not match.", path=source)
     try:
-        return _design_from(restored(body if arrays is None else with_arrays(body, arrays)))
-    except (AttributeError, LookupError, TypeError, ValueError, ArithmeticError, RecursionError) as error:
-        raise SpecError(f"{source} is incomplete: {error}.", path=source) from error
+        return _design_from(checked_parts(restored(body if arrays is None else with_arrays(body, arrays))))
+    except (SpecError, AttributeError, LookupError, TypeError, ValueError, ArithmeticError, RecursionError) as error:
+        raise SpecError(f"{source} is incomplete: {str(error).rstrip('.')}.", path=source) from error
 
 
 def _fields_of(record: StateRecovery) -> dict[str, Any]:
@@ -254,31 +254,22 @@ def _fields_of(record: StateRecovery) -> dict[str, Any]:
 
 
 def _design_from(data: dict[str, Any]) -> ObserverDesign:
-    if data.get("kind") not in _KINDS:
+    if not isinstance(data.get("kind"), (str, type(None))) or data.get("kind") not in _KINDS:
         raise SpecError(f"A design of the kind {data['kind']!r} is unknown to this obsynth.", path="kind")
-    for name in ("name", "method"):
-        if not isinstance(data[name], str):
-            raise TypeError(f"{name} is {data[name]!r}, not a text")
-    claims, gains = data["certificate"]["claims"], data["gains"]
-    if not all(is_number(value) for value in claims.values()):
-        raise TypeError("a claim is no number")
-    if not all(
-        isinstance(matrix, np.ndarray) for matrix in [*gains.values(), *data["certificate"]["matrices"].values()]
-    ):
-        raise TypeError("a gain or a matrix of the certificate is no array of numbers")
     plant, observer = _KINDS[data.get("kind")]
+    recovery = data["recovery"]
     return ObserverDesign(
         name=data["name"],
         method=data["method"],
-        plant=plant(**data["plant"]),
+        plant=made("plant", plant, **data["plant"]),
         options=data["options"],
         gains=data["gains"],
-        observer=observer.from_dict(data["observer"]),
-        certificate=Certificate(**data["certificate"]),
+        observer=made("observer", observer.from_dict, data["observer"]),
+        certificate=made("certificate", Certificate, **data["certificate"]),
         solver=data["solver"],
         notes=tuple(data["notes"]),
         recovery=None
-        if data["recovery"] is None
-        else StateRecovery(**{**data["recovery"], "names": tuple(data["recovery"]["names"])}),
-        report=VerificationReport.from_dict(data["report"]),
+        if recovery is None
+        else made("recovery", StateRecovery, **{**recovery, "names": tuple(recovery["names"])}),
+        report=made("report", VerificationReport.from_dict, data["report"]),
     )

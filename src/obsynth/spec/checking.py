@@ -53,22 +53,25 @@ class DocumentProblems:
 
 def checked_spec(document: Mapping[str, Any], source: Path) -> tuple[SpecDocument, dict[str, Any]]:
     """Check a whole spec, and the options of its method."""
-    from obsynth.methods.registry import REGISTRY
+    from obsynth.methods.registry import AUTO, REGISTRY
     from obsynth.spec.options import options_schema
     from obsynth.spec.schema import SpecDocument
 
     problems = DocumentProblems(source, what="spec")
     _check_version(document, problems)
     checked = _validated(SpecDocument, document, problems)
-    method = document.get("method")
+    method = document.get("method", {"id": AUTO})
     raw_options: Any = {}
     identifier = None
     if isinstance(method, dict):
-        identifier, raw_options = method.get("id"), method.get("options", {})
+        identifier, raw_options = method.get("id", AUTO), method.get("options", {})
     options = None
+    if identifier == AUTO and isinstance(raw_options, dict) and checked is not None:
+        problems.raise_if_any()
+        return checked, _options_of_any(raw_options, source)
     if isinstance(identifier, str) and identifier not in REGISTRY:
         close = _suggestion(identifier, list(REGISTRY))
-        known = ", ".join(sorted(REGISTRY))
+        known = ", ".join(sorted([*REGISTRY, AUTO]))
         problems.add("method.id", f"unknown method {identifier!r}; the known methods are: {known}.{close}")
     elif isinstance(identifier, str) and isinstance(raw_options, dict):
         options = _validated(options_schema(identifier), raw_options, problems, prefix="method.options")
@@ -76,6 +79,24 @@ def checked_spec(document: Mapping[str, Any], source: Path) -> tuple[SpecDocumen
     if checked is None or options is None:
         raise SpecError(f"{source} is no valid spec.", path=str(source))
     return checked, {name: getattr(options, name) for name in options.model_fields_set}
+
+
+def _options_of_any(given: dict[str, Any], source: Path) -> dict[str, Any]:
+    """Return options as the first method reads them that has them all; `auto` decides between those that do."""
+    from obsynth.methods.registry import REGISTRY
+    from obsynth.spec.options import options_schema
+
+    if not given:
+        return {}
+    for method in REGISTRY:
+        problems = DocumentProblems(source, what="spec")
+        found = _validated(options_schema(method), given, problems, prefix="method.options")
+        if not problems.found and found is not None:
+            return {name: getattr(found, name) for name in found.model_fields_set}
+    raise SpecError(
+        f"{source}: no single method has the options {', '.join(sorted(given))} with these values: name the method "
+        "that they are for.", path="method.options",
+    )  # fmt: skip
 
 
 def checked_plant(document: Mapping[str, Any], source: Path) -> PlantDocument | TimeVaryingDocument | DAEDocument:

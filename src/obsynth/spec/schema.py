@@ -176,7 +176,7 @@ class PlantReference(Section):
 class MethodSection(Section):
     """The method and its options; the options have a schema per method."""
 
-    id: Text
+    id: Text = "auto"
     options: dict[str, Any] = Field(default_factory=dict)
 
 
@@ -270,6 +270,6 @@ class SpecDocument(Section):
         | Annotated[DAESection, Tag(_NONLINEAR)],
         Discriminator(_kind_of_plant),
     ]
-    method: MethodSection
+    method: MethodSection = Field(default_factory=MethodSection)
     scenario: ScenarioSection | None = None
     calibrate: CalibrateSection | None = None

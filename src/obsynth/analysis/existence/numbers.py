@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any
-
-import numpy as np
 
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.origin import DECISIVE, origin_of
@@ -36,6 +34,8 @@ class SystemFacts:
         Finite zeros on or outside the stability boundary, the most unstable first, and all of them.
     exact : bool
         Whether all was decided in rational arithmetic.
+    computed : bool
+        Whether some of the data were computed in floating point.
     """
 
     normal_rank: int
@@ -43,6 +43,7 @@ class SystemFacts:
     outside: tuple[complex, ...]
     zeros: tuple[complex, ...]
     exact: bool
+    computed: bool = False
 
     @property
     def full(self) -> bool:
@@ -54,7 +55,9 @@ class PlantNumbers(ABC):
     """Matrices of a plant, ranks and zeros of what is made of them."""
 
     exact: bool
+    computed: bool
     discrete: bool
+    rational: Mapping[str, fmpq_mat]
 
     @abstractmethod
     def matrix(self, name: str) -> Any:
@@ -84,6 +87,23 @@ class PlantNumbers(ABC):
     def system(self, inputs: Any, direct: Any) -> SystemFacts:
         """Return facts on ``[A - s E, inputs; C, direct]``."""
 
+    @property
+    @abstractmethod
+    def regular_rank(self) -> int:
+        """Normal rank of ``A - s E``."""
+
+    @abstractmethod
+    def with_matrices(self, changes: Mapping[str, Any], *, rational: Mapping[str, fmpq_mat]) -> PlantNumbers:
+        """Return the same with some matrices replaced, and what is rational of those of a sampled plant."""
+
+    @abstractmethod
+    def as_own(self, matrix: fmpq_mat) -> Any:
+        """Return a rational matrix as one of these numbers."""
+
+    @abstractmethod
+    def width(self, matrix: Any) -> int:
+        """Return the number of columns."""
+
     def is_zero(self, matrix: Any) -> bool:
         """Whether all entries are zero."""
         return self.rank(matrix) == 0
@@ -99,15 +119,47 @@ class PlantNumbers(ABC):
 
 @dataclass(frozen=True, eq=False)
 class WrittenNumbers(PlantNumbers):
-    """Rational matrices."""
+    """Rational matrices; ``computed`` where some were computed in floating point and are known to their last digit."""
 
     matrices: Mapping[str, fmpq_mat]
     discrete: bool
     exact: bool = True
+    computed: bool = False
+
+    @property
+    def rational(self) -> Mapping[str, fmpq_mat]:  # type: ignore[override]
+        """All matrices."""
+        return self.matrices
 
     def matrix(self, name: str) -> fmpq_mat:
         """Return a matrix by its name."""
         return self.matrices[name]
+
+    @property
+    def regular_rank(self) -> int:
+        """Normal rank of ``A - s E``."""
+        from obsynth.proofs.exact_pencils import ExactPencil
+
+        return ExactPencil(self.matrices["E"], self.matrices["A"]).normal_rank
+
+    @property
+    def index(self) -> int | None:
+        """Index of ``A - s E``; ``None`` where it is not regular."""
+        from obsynth.proofs.exact_pencils import ExactPencil
+
+        return ExactPencil(self.matrices["E"], self.matrices["A"]).index
+
+    def with_matrices(self, changes: Mapping[str, fmpq_mat], *, rational: Mapping[str, fmpq_mat]) -> WrittenNumbers:
+        """Return the same with some matrices replaced."""
+        return replace(self, matrices={**self.matrices, **changes})
+
+    def as_own(self, matrix: fmpq_mat) -> fmpq_mat:
+        """Return a rational matrix as one of these numbers."""
+        return matrix
+
+    def width(self, matrix: fmpq_mat) -> int:
+        """Return the number of columns."""
+        return int(matrix.ncols())
 
     def zeros(self, rows: int, columns: int) -> fmpq_mat:
         """Return a zero matrix."""
@@ -148,17 +200,20 @@ class WrittenNumbers(PlantNumbers):
         rank, columns = pencil.normal_rank, pencil.shape[1]
         found = pencil.zeros(discrete=self.discrete).roots if rank == columns else ()
         values = tuple(root.value for root in found for _ in range(root.multiplicity))
-        return SystemFacts(rank, columns, tuple(root.value for root in found if root.side != "stable"), values, True)
+        outside = tuple(root.value for root in found if root.side != "stable")
+        return SystemFacts(rank, columns, outside, values, True, self.computed)
 
 
 @dataclass(frozen=True, eq=False)
 class SampledNumbers(PlantNumbers):
-    """Enclosures of the matrices of a continuous plant with ``E = I``, sampled with a zero-order hold."""
+    """Enclosures of the matrices of a sampled plant; those that sampling leaves (``E, C, Df, Dd``) are rational too."""
 
     matrices: Mapping[str, Rows]
+    rational: Mapping[str, fmpq_mat]
     bits: int
     discrete: bool = True
     exact: bool = False
+    computed: bool = False
 
     @cached_property
     def states(self) -> int:
@@ -168,6 +223,28 @@ class SampledNumbers(PlantNumbers):
     def matrix(self, name: str) -> Rows:
         """Return a matrix by its name."""
         return self.matrices[name]
+
+    @property
+    def regular_rank(self) -> int:
+        """Normal rank of ``A - s E``."""
+        return self.states
+
+    def with_matrices(self, changes: Mapping[str, Rows], *, rational: Mapping[str, fmpq_mat]) -> SampledNumbers:
+        """Return the same with some matrices replaced."""
+        return replace(self, matrices={**self.matrices, **changes}, rational={**self.rational, **rational})
+
+    def as_own(self, matrix: fmpq_mat) -> Rows:
+        """Return a rational matrix as one of these numbers."""
+        import flint
+
+        from obsynth.proofs.enclosed_pencils import enclosed
+
+        with flint.ctx.workprec(self.bits):
+            return enclosed(matrix)
+
+    def width(self, matrix: Rows) -> int:
+        """Return the number of columns."""
+        return len(matrix[0]) if matrix else 0
 
     def zeros(self, rows: int, columns: int) -> Rows:
         """Return a zero matrix."""
@@ -208,12 +285,12 @@ class SampledNumbers(PlantNumbers):
     def pencil(self, inputs: Rows, direct: Rows) -> EnclosedPencil:
         """Return ``[A - z, inputs; C, direct]``."""
         from obsynth.proofs.enclosed_pencils import EnclosedPencil
-        from obsynth.proofs.written_numbers import written_matrix
+        from obsynth.proofs.exact_pencils import blocks, zeros_matrix
 
         whole = self.blocks([[self.matrices["A"], inputs], [self.matrices["C"], direct]])
-        derivative = np.zeros((len(whole), len(whole[0])))
-        derivative[: self.states, : self.states] = np.eye(self.states)
-        return EnclosedPencil(written_matrix(derivative), whole, self.bits)
+        outputs, extra = len(whole) - self.states, len(whole[0]) - self.states
+        rest = zeros_matrix(self.states, extra), zeros_matrix(outputs, self.states), zeros_matrix(outputs, extra)
+        return EnclosedPencil(blocks([[self.rational["E"], rest[0]], [rest[1], rest[2]]]), whole, self.bits)
 
     def system(self, inputs: Rows, direct: Rows) -> SystemFacts:
         """Return facts on ``[A - z, inputs; C, direct]``; zeros only where the normal rank is full."""
@@ -222,14 +299,14 @@ class SampledNumbers(PlantNumbers):
         values = tuple(sorted(pencil.zeros, key=abs, reverse=True)) if rank == columns else ()
         stable = rank < columns or pencil.stable
         outside = tuple(value for value in values if abs(value) >= 1.0) or values[:1]
-        return SystemFacts(rank, columns, () if stable else outside, values, False)
+        return SystemFacts(rank, columns, () if stable else outside, values, False, self.computed)
 
 
 # Conditions ask for the same plant's several times; plants never change.
 @lru_cache(maxsize=4)
 def numbers_of(plant: DescriptorSystem) -> PlantNumbers | None:
     """Return the numbers on which existence is decided; ``None`` where the plant has too many states for that."""
-    from obsynth.proofs.written_numbers import rational_matrix, written_matrix
+    from obsynth.proofs.written_numbers import computed_entries, rational_matrix, written_matrix
 
     origin = origin_of(plant)
     if origin is not None:
@@ -237,11 +314,16 @@ def numbers_of(plant: DescriptorSystem) -> PlantNumbers | None:
         sizes = {"E": states, "A": states, "C": states, "Bf": plant.nf, "Df": plant.nf, "Bd": plant.nd, "Dd": plant.nd}
         exact = {name: rational_matrix(origin.exact[name], sizes[name]) for name in DECISIVE}
         if origin.sample_time is None:
-            return WrittenNumbers(exact, plant.is_discrete) if states <= EXACT_STATES else None
-        return sampled_numbers(exact, origin.sample_time) if states <= SAMPLED_STATES else None
+            written = WrittenNumbers(exact, plant.is_discrete, computed=origin.computed)
+            return written if states <= EXACT_STATES else None
+        sampled = sampled_numbers(exact, origin.sample_time) if states <= SAMPLED_STATES else None
+        return None if sampled is None else replace(sampled, computed=origin.computed)
     if plant.nx > EXACT_STATES:
         return None
-    return WrittenNumbers({name: written_matrix(getattr(plant, name)) for name in DECISIVE}, plant.is_discrete)
+    plant = plant.dense()
+    computed = any(computed_entries(getattr(plant, name)) for name in DECISIVE)
+    matrices = {name: written_matrix(getattr(plant, name)) for name in DECISIVE}
+    return WrittenNumbers(matrices, plant.is_discrete, computed=computed)
 
 
 def sampled_numbers(exact: Mapping[str, fmpq_mat], sample_time: Any) -> SampledNumbers:
@@ -264,4 +346,4 @@ def sampled_numbers(exact: Mapping[str, fmpq_mat], sample_time: Any) -> SampledN
         held = {"A": (0, states), "Bf": (states, states + faults), "Bd": (states + faults, states + width)}
         matrices = {name: [row[start:end] for row in rows] for name, (start, end) in held.items()}
         matrices |= {name: enclosed(exact[name]) for name in ("E", "C", "Df", "Dd")}
-    return SampledNumbers(matrices, bits)
+    return SampledNumbers(matrices, {name: exact[name] for name in ("E", "C", "Df", "Dd")}, bits)

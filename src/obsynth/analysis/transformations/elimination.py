@@ -153,6 +153,12 @@ def eliminated_exactly(plant: DescriptorSystem, basis: FloatArray | None = None)
     return Transformation(plant, with_origin(new, exact.origin), _description(plant, count), recovery)
 
 
+def dynamic_coordinates(plant: DescriptorSystem) -> FloatArray | None:
+    """Return the basis ``(nx, count)`` of dynamic states that elimination takes; ``None`` for given states."""
+    count = int(np.linalg.matrix_rank(equilibrate_pencil(plant.E, plant.A).E))
+    return None if int(np.sum(plant.E.any(axis=0))) == count else _coordinates(plant, count)[1]
+
+
 def _eliminated_in_floating_point(plant: DescriptorSystem) -> Transformation:
     try:
         count = _dynamic_count(plant)

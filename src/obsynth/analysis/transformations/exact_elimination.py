@@ -43,11 +43,14 @@ class ExactElimination:
         ``x`` from the new states (``A``) and from the signals (``B, Bf, Bd, Bw``).
     pivots : tuple of int
         States that stand for the dynamic ones.
+    computed : bool
+        Whether some of the data were computed in floating point.
     """
 
     matrices: Mapping[str, fmpq_mat]
     recovery: Mapping[str, fmpq_mat]
     pivots: tuple[int, ...]
+    computed: bool
 
     @property
     def origin(self) -> PlantOrigin:
@@ -56,7 +59,7 @@ class ExactElimination:
         from obsynth.proofs.written_numbers import fractions_of
 
         found: dict[str, fmpq_mat] = {"E": identity(len(self.pivots)), **self.matrices}
-        return PlantOrigin({name: fractions_of(found[name]) for name in DECISIVE})
+        return PlantOrigin({name: fractions_of(found[name]) for name in DECISIVE}, computed=self.computed)
 
 
 def exact_elimination(plant: DescriptorSystem) -> ExactElimination | None:
@@ -93,6 +96,7 @@ def exact_elimination(plant: DescriptorSystem) -> ExactElimination | None:
         | dict(zip(("C", *_DIRECT), _split(direct, widths), strict=True)),
         dict(zip(("A", *_SIGNALS), _split(states, widths), strict=True)),
         tuple(pivots),
+        computed,
     )
 
 
@@ -204,7 +208,7 @@ def _split(matrix: fmpq_mat, widths: list[int]) -> list[fmpq_mat]:
 
 def sampled_origin(smooth: DescriptorSystem, sample_time: float) -> PlantOrigin:
     """Return what a plant that is sampled from one with ``E = I`` remembers."""
-    from obsynth.proofs.written_numbers import fractions_of, written_fraction, written_matrix
+    from obsynth.proofs.written_numbers import computed_entries, fractions_of, written_fraction, written_matrix
 
     origin = origin_of(smooth)
     exact: Mapping[str, tuple[tuple[Fraction, ...], ...]] = (
@@ -212,4 +216,5 @@ def sampled_origin(smooth: DescriptorSystem, sample_time: float) -> PlantOrigin:
         if origin is not None
         else {name: fractions_of(written_matrix(getattr(smooth, name))) for name in DECISIVE}
     )
-    return PlantOrigin(exact, written_fraction(sample_time))
+    computed = origin.computed if origin else any(computed_entries(getattr(smooth, name)) for name in DECISIVE)
+    return PlantOrigin(exact, written_fraction(sample_time), computed)

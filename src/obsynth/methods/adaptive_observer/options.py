@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar
 
 from obsynth.methods.descriptor_kalman.options import DescriptorKalmanOptions
 from obsynth.numerics.value_types import Count, ForgettingFactor, Probability, WrittenAs
-from obsynth.observers.recursive.observer import Form, Guard
+from obsynth.observers.recursive.settings import Form, Guard
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar
 
 from obsynth.methods.method_spec import MethodOptions
 from obsynth.numerics.value_types import Count, ForgettingFactor, Positive, WrittenAs
-from obsynth.observers.dae.observer import Form, Guard, Integration, Weight
+from obsynth.observers.dae.settings import Form, Guard, Integration, Weight
 
 
 @dataclass(frozen=True)

@@ -8,13 +8,18 @@ inside the unit circle.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
 from obsynth.analysis.conditions import Condition, rank_condition
-from obsynth.analysis.zeros import Zero, fault_zeros, leading_names
+from obsynth.analysis.existence.numbers import numbers_of
+from obsynth.analysis.existence.verdicts import described_distance, settled_rank, unclear_detail, zero_verdict
+from obsynth.analysis.plant_units import PlantUnits
+from obsynth.analysis.zeros import Zero, fault_zeros, hidden_direction, leading_names, system_pencil, zero_at
 from obsynth.errors import PreconditionError
 from obsynth.methods.fault_estimation_filter.detectability_indexes import detectability_conditions
+from obsynth.methods.fault_estimation_filter.exact_indexes import numbers_with_fault_states
 from obsynth.methods.fault_estimation_filter.prepared_plant import PreparedPlant, prepare, with_sensor_faults_as_states
 from obsynth.numerics.pencils import PencilStructure, regularity
 from obsynth.numerics.ranks import decide_rank
@@ -22,6 +27,8 @@ from obsynth.plants.descriptor import DescriptorSystem
 
 #: At most this many signals are named in a failed condition.
 MOST_NAMES = 4
+_CLAIM = "every invariant zero from the faults to the outputs strictly inside the unit circle"
+_SOURCE = "never stated in Wang 2015: detectability of (A1, C1)"
 
 
 def fault_filter_conditions(
@@ -35,6 +42,7 @@ def examine_fault_filter(
     plant: DescriptorSystem, *, structure: PencilStructure | None = None
 ) -> tuple[tuple[Condition, ...], PreparedPlant | None]:
     """Return the existence conditions, and the prepared plant on which the last of them were decided."""
+    plant = plant.dense()
     prepared: PreparedPlant | None = None
 
     def visibility_conditions() -> list[Condition]:
@@ -58,7 +66,11 @@ def examine_fault_filter(
 
 
 def _form_conditions(plant: DescriptorSystem, structure: PencilStructure | None) -> list[Condition]:
-    if structure is None:
+    numbers = numbers_of(plant)
+    if numbers is not None:
+        normal_rank = numbers.regular_rank
+        regular = normal_rank == plant.nx
+    elif structure is None:
         regular, normal_rank = regularity(plant.E, plant.A)
     else:
         regular, normal_rank = structure.regular, structure.normal_rank
@@ -110,7 +122,13 @@ def _rank_conditions(plant: DescriptorSystem) -> list[Condition]:
         else f"{plant.nf} faults and {plant.ny} output(s). Measure more, or leave a fault out.",
         signals=() if plant.nf <= plant.ny else plant.fault_names,
     )
-    faults = decide_rank(np.vstack([plant.Bf, plant.Df]), expected=plant.nf)
+    numbers = numbers_with_fault_states(plant)
+    natural = PlantUnits.of(plant).rounded().scaled_plant(plant)
+    faults = settled_rank(
+        decide_rank(np.vstack([natural.Bf, natural.Df]), expected=plant.nf),
+        # Faults that act on the outputs are columns of Bf too, once they are states.
+        None if numbers is None else numbers.rank(numbers.blocks([[numbers.matrix("Bf")]])),
+    )
     ranks = [
         enough,
         rank_condition(
@@ -139,9 +157,13 @@ def _rank_conditions(plant: DescriptorSystem) -> list[Condition]:
                 signals=error.signals,
             ),
         ]
-    outputs = decide_rank(work.C, expected=work.ny)
-    stacked = np.vstack([work.E, work.C])
-    states = decide_rank(stacked, expected=work.nx)
+    natural = PlantUnits.of(work).rounded().scaled_plant(work)
+    stacked = np.vstack([natural.E, natural.C])
+    outputs, states = decide_rank(natural.C, expected=work.ny), decide_rank(stacked, expected=work.nx)
+    if numbers is not None:
+        c = numbers.matrix("C")
+        outputs = settled_rank(outputs, numbers.rank(c))
+        states = settled_rank(states, numbers.rank(numbers.blocks([[numbers.matrix("E")], [c]])))
     ranks += [
         rank_condition(
             "rank C",
@@ -167,20 +189,48 @@ def _rank_conditions(plant: DescriptorSystem) -> list[Condition]:
 
 
 def _zero_conditions(plant: DescriptorSystem) -> list[Condition]:
+    numbers = numbers_of(plant)
+    if numbers is None:
+        return _zero_conditions_in_floating_point(plant)
+    facts = numbers.system(numbers.matrix("Bf"), numbers.matrix("Df"))
+    if not facts.full:
+        return [_never_shown(hidden_direction(plant, missing=facts.columns - facts.normal_rank)[1])]
+    wide_e, wide_a = system_pencil(plant.E, plant.A, plant.Bf, plant.C, plant.Df)
+    units = PlantUnits.of(plant).rounded()
+    verdict = zero_verdict(facts, *units.scaled_pencil(wide_e, wide_a, units.faults), nx=plant.nx, discrete=True)
+    facts = verdict.facts
+    if facts.outside:
+        return [_zero_failure(plant, zero_at(plant.E, plant.A, facts.outside[0], plant.Bf, plant.C, plant.Df))]
+    largest = max((abs(value) for value in facts.zeros), default=0.0)
+    if verdict.answer == "unclear":
+        detail = unclear_detail(verdict, "A filter")
+        outside = fault_zeros(plant).outside
+        if outside:
+            lost = _zero_failure(plant, max(outside, key=lambda zero: abs(zero.value)))
+            return [replace(lost, detail=f"{detail} In floating point, {lost.detail}", unclear=True)]
+        return [Condition("fault zeros", _CLAIM, False, largest, 1.0, _SOURCE, detail, unclear=True)]
+    detail = f"{len(facts.zeros)} zero(s)" + (f", largest modulus {largest:.6g}" if facts.zeros else "")
+    detail += f"; {described_distance(verdict)}"
+    return [Condition("fault zeros", _CLAIM, True, largest, 1.0, _SOURCE, detail)]
+
+
+def _never_shown(names: tuple[str, ...]) -> Condition:
+    detail = f"faults {', '.join(map(repr, names))} can act together without showing in any output."
+    return Condition("fault zeros", _CLAIM, False, np.inf, 1.0, _SOURCE, detail, signals=names)
+
+
+def _zero_conditions_in_floating_point(plant: DescriptorSystem) -> list[Condition]:
     zeros = fault_zeros(plant)
     largest = max((abs(zero.value) for zero in zeros.zeros), default=0.0)
-    claim = "every invariant zero from the faults to the outputs strictly inside the unit circle"
-    source = "never stated in Wang 2015: detectability of (A1, C1)"
     if not zeros.normal_rank_full:
-        detail = f"faults {', '.join(map(repr, zeros.hidden_faults))} can act together without showing in any output."
-        return [Condition("fault zeros", claim, False, np.inf, 1.0, source, detail, signals=zeros.hidden_faults)]
+        return [_never_shown(zeros.hidden_faults)]
     if zeros.outside:
-        return [_zero_failure(plant, max(zeros.outside, key=lambda zero: abs(zero.value)), claim, source)]
+        return [_zero_failure(plant, max(zeros.outside, key=lambda zero: abs(zero.value)))]
     detail = f"{len(zeros.zeros)} zero(s)" + (f", largest modulus {largest:.6g}" if zeros.zeros else "")
-    return [Condition("fault zeros", claim, True, float(largest), 1.0, source, detail)]
+    return [Condition("fault zeros", _CLAIM, True, float(largest), 1.0, _SOURCE, detail)]
 
 
-def _zero_failure(plant: DescriptorSystem, zero: Zero, claim: str, source: str) -> Condition:
+def _zero_failure(plant: DescriptorSystem, zero: Zero) -> Condition:
     value = f"{zero.value.real:.6g}" if zero.value.imag == 0.0 else f"{zero.value:.6g}"
     if zero.is_unobservable_mode:
         signals = leading_names(np.abs(zero.state_direction), plant.state_names, most=MOST_NAMES)
@@ -195,7 +245,7 @@ def _zero_failure(plant: DescriptorSystem, zero: Zero, claim: str, source: str) 
             "in any output, so no filter can estimate it. Measure another signal."
         )
     return Condition(
-        "fault zeros", claim, False, abs(zero.value), 1.0, source, detail, mode=zero.value, signals=signals
+        "fault zeros", _CLAIM, False, abs(zero.value), 1.0, _SOURCE, detail, mode=zero.value, signals=signals
     )
 
 

@@ -12,13 +12,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from obsynth.analysis.conditions import Condition
+from obsynth.analysis.existence.verdicts import settled_rank
+from obsynth.methods.fault_estimation_filter.exact_indexes import ExactIndexes
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import DEAD_CHAIN_TOLERANCE, MARKOV_TOLERANCE, RankDecision, decide_rank
 
 #: A fault detectability matrix with a larger condition number is usable but noisy: a note says so.
 WARN_CONDITION = 1e4
-#: Above this its inverse means nothing in double precision.
-REFUSE_CONDITION = 1e8
+#: Above this rounding of data and gains is as large as what tells the faults apart.
+REFUSE_CONDITION = 1e12
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,13 +51,18 @@ class FaultDetectability:
         return powers
 
 
-def fault_detectability(ta: FloatArray, c: FloatArray, tf: FloatArray) -> FaultDetectability:
-    """Return the detectability indexes (19) and matrices (20).
+def fault_detectability(
+    ta: FloatArray, c: FloatArray, tf: FloatArray, *, exact: ExactIndexes | None = None
+) -> FaultDetectability:
+    """Return the detectability indexes (19) and matrices (20), with the exact ones where these are known.
 
     Shapes: ``ta (nx, nx)``, ``c (ny, nx)``, ``tf (nx, nf)``.
     """
     size = float(np.linalg.norm(c, 2))
-    results = [_first_visible(ta, c, tf[:, i], size) for i in range(tf.shape[1])]
+    if exact is None:
+        results = [_first_visible(ta, c, tf[:, i], size) for i in range(tf.shape[1])]
+    else:
+        results = [_at_index(ta, tf[:, i], index) for i, index in enumerate(exact.indexes)]
     psi = np.column_stack([vector for _, vector in results]) if results else np.zeros((ta.shape[0], 0))
     upsilon = c @ psi
     lengths = np.linalg.norm(upsilon, axis=0)
@@ -63,8 +70,18 @@ def fault_detectability(ta: FloatArray, c: FloatArray, tf: FloatArray) -> FaultD
     values = np.linalg.svd(unit, compute_uv=False) if unit.size else np.ones(1)
     invertible = unit.shape[0] >= unit.shape[1] and values[-1] > 0.0
     condition = float(values[0] / values[-1]) if invertible else np.inf
-    rank = decide_rank(unit, expected=tf.shape[1])
+    rank = decide_rank(unit, expected=tf.shape[1], tolerance=1.0 / REFUSE_CONDITION)
+    rank = settled_rank(rank, None if exact is None else exact.rank)
     return FaultDetectability(tuple(index for index, _ in results), psi, upsilon, rank, condition)
+
+
+def _at_index(ta: FloatArray, direction: FloatArray, index: int | None) -> tuple[int | None, FloatArray]:
+    """Return the vector ``(TA)^(index - 1) direction``."""
+    if index is None:
+        return None, np.zeros_like(direction)
+    for _ in range(index - 1):
+        direction = ta @ direction
+    return index, direction
 
 
 def _first_visible(ta: FloatArray, c: FloatArray, direction: FloatArray, size: float) -> tuple[int | None, FloatArray]:
@@ -109,7 +126,8 @@ def detectability_conditions(
     if hidden:
         return (finite,)
     rank, user_units = detectability.rank, detectability.Upsilon / output_scales[:, None]
-    usable = rank.full and detectability.condition_number <= REFUSE_CONDITION
+    # Where the rank was decided exactly, nearness to losing it has been judged with it.
+    usable = rank.full and (rank.means == "exact" or detectability.condition_number <= REFUSE_CONDITION)
     mixed = () if usable else _dependent_faults(detectability.Upsilon, fault_names)
     independent = Condition(
         "rank Upsilon",
@@ -122,6 +140,7 @@ def detectability_conditions(
         f"||Upsilon|| = {float(np.linalg.norm(user_units, 2)):.3g}"
         + (f"; {_names(mixed)} cannot be told apart at first sight. Leave one out, or measure more." if mixed else "."),
         signals=mixed,
+        unclear=not usable and rank.means != "exact" and (rank.full or rank.means == "unclear"),
     )
     return finite, independent
 

@@ -15,11 +15,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from obsynth.analysis.plant_units import FAR_UNITS, PlantUnits
 from obsynth.analysis.transformations import augment_faults
 from obsynth.methods.fault_estimation_filter.detectability_indexes import (
     FaultDetectability,
     fault_detectability,
 )
+from obsynth.methods.fault_estimation_filter.exact_indexes import exact_indexes
 from obsynth.methods.fault_estimation_filter.restricted_equivalent import (
     restricted_equivalent,
     restricted_equivalent_from,
@@ -66,7 +68,12 @@ def prepare(plant: DescriptorSystem, s: FloatArray | None = None) -> PreparedPla
     Shapes: ``s (na, na + ny)``.
     """
     work = with_sensor_faults_as_states(plant)
-    scaling = balance_system(work.E, work.A, inputs=[work.Bf], outputs=[work.C])
+    units = PlantUnits.of(work).rounded()
+    scaling = (
+        Scaling(units.equations, units.states, units.outputs)
+        if units.spread > FAR_UNITS
+        else balance_system(work.E, work.A, inputs=[work.Bf], outputs=[work.C])
+    )
     a, c = scaling.scale_dynamics(work.A), scaling.scale_output(work.C)
     if s is None:
         t, n = restricted_equivalent(scaling.scale_dynamics(work.E), c)
@@ -81,6 +88,7 @@ def prepare(plant: DescriptorSystem, s: FloatArray | None = None) -> PreparedPla
         direct = scaling.scale_feedthrough(d)
         return t @ scaling.scale_input(b) - ta @ (n @ direct), shown @ direct
 
+    found = fault_detectability(ta, c, tf, exact=exact_indexes(plant))
     bd, dd = error_input(work.Bd, work.Dd)
     bw, dw = error_input(work.Bw, work.Dw)
-    return PreparedPlant(work, scaling, t, n, ta, c, tf, bd, dd, bw, dw, fault_detectability(ta, c, tf))
+    return PreparedPlant(work, scaling, t, n, ta, c, tf, bd, dd, bw, dw, found)

@@ -59,6 +59,9 @@ def synthesise(plant: DescriptorSystem, asked: FilterOptions, *, progress: Calla
     free = asked.free_residual_weight if asked.free_residual_weight is not None else plant.nw > 0 or limit is not None
     problem, parts = gain_problem(prepared, free_weight=free)
     size = max(problem.disturbance_size, NOMINAL_GAIN)
+    if s is not None and limit is None:
+        # With the paper's S the weight is its W = Upsilon^+ too, which is that of the outputs as given.
+        problem, parts = centred(problem, prepared, parts)
     if limit is None:
         found = found_gains(problem, asked, asked.engine, noisy=plant.nw > 0, progress=progress)
     else:

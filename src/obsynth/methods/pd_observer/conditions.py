@@ -14,14 +14,18 @@ from dataclasses import replace
 import numpy as np
 
 from obsynth.analysis.conditions import Condition, rank_condition
+from obsynth.analysis.existence.numbers import PlantNumbers, WrittenNumbers, numbers_of
+from obsynth.analysis.existence.verdicts import described_distance, settled_rank, unclear_detail, zero_verdict
 from obsynth.analysis.far_zeros import equilibrated_at
+from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.structure import analyse_structure
 from obsynth.analysis.transformations import Transformation, eliminate_algebraic_states
-from obsynth.analysis.zeros import leading_names
+from obsynth.analysis.zeros import leading_names, system_pencil
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.ranks import decide_rank, equilibrate
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.proofs.written_numbers import computed_entries
 
 #: At most this many signals are named in a failed condition.
 MOST_NAMES = 4
@@ -45,6 +49,7 @@ def explicit_form(plant: DescriptorSystem) -> Transformation | None:
 
 def _all_conditions(plant: DescriptorSystem) -> Iterator[Condition]:
     """Yield the conditions; each may rely on those before it."""
+    plant = plant.dense()
     yield _condition(
         "continuous time", "a continuous-time plant (dt = 0)", not plant.is_discrete, plant.dt, 0.0, _SOURCE,
         f"a plant sampled every {plant.dt:g} s. Give the continuous one (no sample_time in its transform): the "
@@ -54,21 +59,18 @@ def _all_conditions(plant: DescriptorSystem) -> Iterator[Condition]:
         "faults", "at least one fault", plant.nf > 0, float(plant.nf), 1.0, _SOURCE,
         "none. Name the fault to estimate in Bf or Df.",
     )  # fmt: skip
-    pencil = pencil_structure(plant.E, plant.A)
+    normal_rank, index, dynamic = _form(plant)
     yield _condition(
-        "regularity", "a regular pencil (det(A - sE) not identically zero)", pencil.regular,
-        float(pencil.normal_rank), float(plant.nx), "definition of a descriptor plant",
-        f"normal rank {pencil.normal_rank} of {plant.nx}: the equations do not determine the states. Add what is "
-        "missing.",
+        "regularity", "a regular pencil (det(A - sE) not identically zero)", normal_rank == plant.nx,
+        float(normal_rank), float(plant.nx), "definition of a descriptor plant",
+        f"normal rank {normal_rank} of {plant.nx}: the equations do not determine the states. Add what is missing.",
     )  # fmt: skip
-    index = pencil.index or 0
     yield _condition(
         "index", "index 0 or 1: the algebraic states can be eliminated", index <= 1, float(index), 1.0,
         "ours: elimination of algebraic states",
         f"index {index}: the algebraic equations cannot be solved for the algebraic states without differentiating. "
         "Differentiate the constraints first.",
     )  # fmt: skip
-    dynamic = len(pencil.finite_eigenvalues)
     yield _condition(
         "dynamic states", "at least one dynamic state", dynamic > 0, float(dynamic), 1.0,
         "ours: elimination of algebraic states",
@@ -78,24 +80,45 @@ def _all_conditions(plant: DescriptorSystem) -> Iterator[Condition]:
     yield from _explicit_conditions(plant if form is None else form.plant)
 
 
+def _form(plant: DescriptorSystem) -> tuple[int, int, int]:
+    """Return normal rank, index (0 for a plant that is not regular) and the number of dynamic states."""
+    numbers = numbers_of(plant)
+    if not isinstance(numbers, WrittenNumbers) or computed_entries(plant.E):
+        pencil = pencil_structure(plant.E, plant.A)
+        return pencil.normal_rank, pencil.index or 0, len(pencil.finite_eigenvalues)
+    index = numbers.index
+    dynamic = numbers.rank(numbers.matrix("E"))
+    return plant.nx if index is not None else numbers.regular_rank, index or 0, dynamic
+
+
 def _explicit_conditions(plant: DescriptorSystem) -> Iterator[Condition]:
+    numbers = numbers_of(plant)
     yield _condition(
         "nf <= ny", "no more faults than outputs (nf <= ny)", plant.nf <= plant.ny, float(plant.nf), float(plant.ny),
         "Filasova et al., eq. (3)",
         f"{plant.nf} faults and {plant.ny} output(s). Measure more, or leave a fault out.",
         signals=plant.fault_names,
     )  # fmt: skip
-    columns = np.vstack([plant.Bf, plant.Df])
+    natural = PlantUnits.of(plant).rounded().scaled_plant(plant)
+    columns = np.vstack([natural.Bf, natural.Df])
     yield rank_condition(
-        "rank F", decide_rank(columns, expected=plant.nf),
+        "rank F", settled_rank(
+            decide_rank(columns, expected=plant.nf),
+            None if numbers is None else numbers.rank(numbers.blocks([[numbers.matrix("Bf")], [numbers.matrix("Df")]])),
+        ),
         "some faults act nowhere, or in the same direction as others, and cannot be told apart.",
         source="Filasova et al., eq. (3)", signals=_null_names(columns, plant.fault_names),
     )  # fmt: skip
-    yield _detectability(plant)
-    rosenbrock = np.block([[plant.A, plant.Bf], [plant.C, plant.Df]])
+    yield _detectability_in_floating_point(plant) if numbers is None else _detectability(plant, numbers)
+    rosenbrock = np.block([[natural.A, natural.Bf], [natural.C, natural.Df]])
     hidden = leading_names(_null_vector(rosenbrock)[plant.nx :], plant.fault_names, most=MOST_NAMES)
     at_zero = rank_condition(
-        "rank [A F; C Df]", decide_rank(rosenbrock, expected=plant.nx + plant.nf),
+        "rank [A F; C Df]", settled_rank(
+            decide_rank(rosenbrock, expected=plant.nx + plant.nf),
+            None if numbers is None else numbers.rank(numbers.blocks([
+                [numbers.matrix("A"), numbers.matrix("Bf")], [numbers.matrix("C"), numbers.matrix("Df")],
+            ])),
+        ),
         f"there is a zero at s = 0, where a constant fault {', '.join(map(repr, hidden))} does not show in the outputs "
         "once the states have settled. Measure another signal.",
         source="Filasova et al., eq. (3)", signals=hidden,
@@ -112,18 +135,46 @@ def _condition(
     )
 
 
-def _detectability(plant: DescriptorSystem) -> Condition:
-    """Return the condition that every mode that does not decay shows in the outputs."""
+_CLAIM = "every mode that does not decay shows in the outputs ((A, C) detectable)"
+_NEEDED_FOR = "necessary and sufficient with (3); Filasova et al. suppose observability"
+
+
+def _detectability(plant: DescriptorSystem, numbers: PlantNumbers) -> Condition:
+    """Return the condition that every mode that does not decay shows in the outputs, decided exactly."""
+    none = np.zeros((plant.nx, 0))
+    facts = numbers.system(numbers.zeros(plant.nx, 0), numbers.zeros(plant.ny, 0))
+    wide_e, wide_a = system_pencil(plant.E, plant.A, none, plant.C, np.zeros((plant.ny, 0)))
+    scaled = PlantUnits.of(plant).rounded().scaled_pencil(wide_e, wide_a)
+    verdict = zero_verdict(facts, *scaled, nx=plant.nx, discrete=False)
+    facts = verdict.facts
+    if verdict.answer == "no":
+        return _hidden_mode(plant, list(facts.outside))
+    if verdict.answer == "unclear":
+        detail = unclear_detail(verdict, "An observer")
+        hidden = list(analyse_structure(plant).undetectable_modes)
+        if hidden:
+            lost = _hidden_mode(plant, hidden)
+            return replace(lost, detail=f"{detail} In floating point, {lost.detail}", unclear=True)
+        return Condition("detectability", _CLAIM, False, 0.0, 0.0, _NEEDED_FOR, detail, unclear=True)
+    detail = f"{len(facts.zeros)} unobservable mode(s)" + (
+        f", slowest real part {max(value.real for value in facts.zeros):.6g}" if facts.zeros else ""
+    )
+    detail += f"; {described_distance(verdict)}"
+    return Condition("detectability", _CLAIM, True, 0.0, 0.0, _NEEDED_FOR, detail)
+
+
+def _detectability_in_floating_point(plant: DescriptorSystem) -> Condition:
     structure = analyse_structure(plant)
-    claim = "every mode that does not decay shows in the outputs ((A, C) detectable)"
-    source = "necessary and sufficient with (3); Filasova et al. suppose observability"
-    hidden = structure.undetectable_modes
     if structure.detectable:
         slowest = max((mode.real for mode in structure.unobservable_modes), default=-np.inf)
         detail = f"{len(structure.unobservable_modes)} unobservable mode(s)" + (
             f", slowest real part {slowest:.6g}" if structure.unobservable_modes else ""
         )
-        return Condition("detectability", claim, True, 0.0, 0.0, source, detail)
+        return Condition("detectability", _CLAIM, True, 0.0, 0.0, _NEEDED_FOR, detail)
+    return _hidden_mode(plant, list(structure.undetectable_modes))
+
+
+def _hidden_mode(plant: DescriptorSystem, hidden: list[complex]) -> Condition:
     mode = max(hidden, key=lambda value: value.real)
     signals = leading_names(_hidden_direction(plant, mode), plant.state_names, most=MOST_NAMES)
     value = f"{mode.real:.6g}" if mode.imag == 0.0 else f"{mode:.6g}"
@@ -131,7 +182,9 @@ def _detectability(plant: DescriptorSystem) -> Condition:
         f"the mode s = {value} (states {', '.join(map(repr, signals))}) never shows in the outputs and does not "
         "decay: measure something it moves."
     )
-    return Condition("detectability", claim, False, float(len(hidden)), 0.0, source, detail, mode=mode, signals=signals)
+    return Condition(
+        "detectability", _CLAIM, False, float(len(hidden)), 0.0, _NEEDED_FOR, detail, mode=mode, signals=signals
+    )
 
 
 def _hidden_direction(plant: DescriptorSystem, mode: complex) -> FloatArray:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from obsynth.analysis.plant_units import FAR_UNITS, PlantUnits
 from obsynth.analysis.structure import analyse_structure
 from obsynth.errors import InfeasibleError, SolverError
 from obsynth.methods.pd_observer.augmentation import with_faults_as_states, with_sensor_noise
@@ -92,13 +93,22 @@ def _advice(asked: PdOptions) -> str:
 def _units(
     plant: DescriptorSystem, asked: PdOptions, *, balanced_first: bool
 ) -> Iterable[tuple[FloatArray, FloatArray]]:
-    """Return units of the augmented states and of the outputs: the user's, then those that balance the plant."""
-    found = _candidate_units(plant, asked)
-    if not balanced_first:
+    """Return units of the augmented states and of the outputs: the user's, then those that balance the plant.
+
+    Units far from those in which the plant is near one are tried last: what is small there is not seen.
+    """
+    found = [*_candidate_units(plant, asked)]
+    if asked.gain_bound is not None:
         return found
-    # A Riccati equation has no objective that would weigh gains in the user's units.
+    units = PlantUnits.of(plant).rounded()
+    natural = np.concatenate([units.states, units.faults]), 1.0 / units.outputs
     users, *others = found
-    return (*others[:1], users, *others[1:]) if len(others) == 2 else (users, *others)
+    if units.spread > FAR_UNITS:
+        return [natural, *others, users]
+    # A Riccati equation has no objective that would weigh gains in the user's units.
+    if balanced_first and len(others) == 2:
+        return [others[0], users, others[1], natural]
+    return [users, *others, natural]
 
 
 def _candidate_units(plant: DescriptorSystem, asked: PdOptions) -> Iterator[tuple[FloatArray, FloatArray]]:

@@ -15,14 +15,17 @@ regularity nor index 1 is needed.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from obsynth.analysis.conditions import Condition
+from obsynth.analysis.existence.distance import drowned_zeros
+from obsynth.analysis.existence.numbers import SystemFacts, numbers_of
+from obsynth.analysis.existence.verdicts import believed, described_distance, in_own_time, unclear_detail, zero_verdict
 from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.transformations import Transformation
-from obsynth.analysis.zeros import Zero, leading_names, zeros_of_system
+from obsynth.analysis.zeros import Zero, leading_names, zero_at, zeros_of_system
 from obsynth.methods.ui_pi_observer.augmented_plant import AugmentedPlant
 from obsynth.methods.ui_pi_observer.decoupling_condition import (
     SOURCE,
@@ -30,6 +33,7 @@ from obsynth.methods.ui_pi_observer.decoupling_condition import (
     decoupling_rank,
     disturbance_rank,
 )
+from obsynth.methods.ui_pi_observer.exact_fault_model import exact_drops
 from obsynth.methods.ui_pi_observer.fault_model_condition import lost_in_rounding, model_conditions, order_conditions
 from obsynth.methods.ui_pi_observer.pencils import (
     MOST_NAMES,
@@ -69,6 +73,7 @@ class Existence:
 
 def existence(plant: DescriptorSystem, model: Exosystem) -> Existence:
     """Return the existence conditions of the unknown-input PI observer, and the plant to design for."""
+    plant = plant.dense()
     nothing = np.zeros(0, dtype=np.complex128)
     enough = _enough_outputs(plant)
     if not enough.holds:
@@ -78,15 +83,15 @@ def existence(plant: DescriptorSystem, model: Exosystem) -> Existence:
     units = PlantUnits.of(working, model).rounded()
     scaled, courses = units.scaled_plant(working), units.scaled_model(model)
     # (D1) and the others fail independently: a user wants to know both.
-    found = [enough, solvable, _zero_condition(scaled, units)]
+    found = [enough, solvable, _zero_condition(working, scaled, units)]
     if found[-1].holds:
-        found += model_conditions(scaled, courses, units)
+        found += model_conditions(working, model, scaled, courses, units)
     if not all(condition.holds for condition in found):
         return Existence(tuple(found), working, transformation, nothing)
     found += order_conditions(scaled, courses, units)
     if not found[-1].holds:
         return Existence(tuple(found), working, transformation, nothing)
-    fixed, condition = _fixed_modes(scaled, courses, units)
+    fixed, condition = _fixed_modes(working, model, scaled, courses, units)
     return Existence((*found, condition), working, transformation, fixed)
 
 
@@ -106,20 +111,63 @@ def _enough_outputs(plant: DescriptorSystem) -> Condition:
     )
 
 
-def _zero_condition(plant: DescriptorSystem, units: PlantUnits) -> Condition:
-    claim = "rank [sE - A, -Bd; C, Dd] = nx + rank [Bd; Dd] on and outside the boundary of stability"
-    source = "Share Pasand, Lemma 4 (9.2)"
+_D2 = "rank [sE - A, -Bd; C, Dd] = nx + rank [Bd; Dd] on and outside the boundary of stability"
+_D2_SOURCE = "Share Pasand, Lemma 4 (9.2)"
+
+
+def _zero_condition(given: DescriptorSystem, plant: DescriptorSystem, units: PlantUnits) -> Condition:
+    """Decide (D2) on the numbers of the plant as given, or in floating point on the scaled one."""
+    numbers = numbers_of(given)
+    if numbers is None:
+        return _zero_condition_in_floating_point(plant, units)
+    kept = numbers.independent_columns(numbers.blocks([[numbers.matrix("Bd")], [numbers.matrix("Dd")]]), given.nd)
+    facts = numbers.system(numbers.picked(numbers.matrix("Bd"), kept), numbers.picked(numbers.matrix("Dd"), kept))
+    inputs, direct = plant.Bd[:, kept], plant.Dd[:, kept]
+    if not facts.full:
+        return _hidden_trajectories(facts.normal_rank, facts.columns)
+    wide_e, wide_a = system_pencil(plant.E, plant.A, inputs, plant.C, direct)
+    verdict = zero_verdict(_timed(facts, units.rate), wide_e, wide_a, nx=plant.nx, discrete=plant.dt > 0.0)
+    if verdict.facts.outside:
+        zero = zero_at(plant.E, plant.A, verdict.facts.outside[0], inputs, plant.C, direct)
+        return _zero_failure(plant, units, zero, inputs, direct)
+    if verdict.answer == "unclear":
+        detail = unclear_detail(in_own_time(verdict, units.rate), "An observer")
+        _, _, outside = zeros_of_system(plant.E, plant.A, inputs, plant.C, direct, dt=plant.dt)
+        if outside:
+            worst = max(outside, key=lambda zero: instability(zero.value, plant.dt))
+            lost = _zero_failure(plant, units, worst, inputs, direct)
+            return replace(lost, detail=f"{detail} In floating point, {lost.detail}", unclear=True)
+        return Condition(
+            "(D2) zeros", _D2, False, float(facts.normal_rank), float(facts.columns), _D2_SOURCE, detail, unclear=True
+        )
+    return Condition(
+        "(D2) zeros", _D2, True, float(facts.normal_rank), float(facts.columns), _D2_SOURCE,
+        f"{len(verdict.facts.zeros)} stable zero(s); {described_distance(in_own_time(verdict, units.rate))}",
+    )  # fmt: skip
+
+
+def _timed(facts: SystemFacts, rate: float) -> SystemFacts:
+    """Return facts in the time of the scaled plant."""
+    zeros, outside = (tuple(value * rate for value in values) for values in (facts.zeros, facts.outside))
+    return replace(facts, zeros=zeros, outside=outside)
+
+
+def _hidden_trajectories(rank: int, full: int) -> Condition:
+    detail = f"normal rank {rank} of {full}: the plant hides whole trajectories from its outputs."
+    return Condition("(D2) zeros", _D2, False, float(rank), float(full), _D2_SOURCE, detail)
+
+
+def _zero_condition_in_floating_point(plant: DescriptorSystem, units: PlantUnits) -> Condition:
     inputs, direct = independent_disturbances(plant)
     found, zeros, outside = zeros_of_system(plant.E, plant.A, inputs, plant.C, direct, dt=plant.dt)
     full = plant.nx + inputs.shape[1]
     if found.normal_rank < full:
-        detail = f"normal rank {found.normal_rank} of {full}: the plant hides whole trajectories from its outputs."
-        return Condition("(D2) zeros", claim, False, float(found.normal_rank), float(full), source, detail)
+        return _hidden_trajectories(found.normal_rank, full)
     if outside:
         worst = max(outside, key=lambda zero: instability(zero.value, plant.dt))
-        return _zero_failure(plant, units, worst, inputs, direct, claim, source)
+        return _zero_failure(plant, units, worst, inputs, direct)
     return Condition(
-        "(D2) zeros", claim, True, float(found.normal_rank), float(full), source, f"{len(zeros)} stable zero(s)"
+        "(D2) zeros", _D2, True, float(found.normal_rank), float(full), _D2_SOURCE, f"{len(zeros)} stable zero(s)"
     )
 
 
@@ -129,8 +177,6 @@ def _zero_failure(
     zero: Zero,
     inputs: FloatArray,
     direct: FloatArray,
-    claim: str,
-    source: str,
 ) -> Condition:
     value = units.eigenvalue(zero.value)
     states = leading_names(np.abs(zero.state_direction), plant.state_names, most=MOST_NAMES)
@@ -143,26 +189,45 @@ def _zero_failure(
         "come to rest: no observer can know them. Measure something they move."
     )
     return Condition(
-        "(D2) zeros", claim, False, value.real if plant.dt == 0.0 else abs(value), 0.0, source, detail, mode=value,
+        "(D2) zeros", _D2, False, value.real if plant.dt == 0.0 else abs(value), 0.0, _D2_SOURCE, detail, mode=value,
         signals=(*states, *disturbances),
     )  # fmt: skip
 
 
-def _fixed_modes(plant: DescriptorSystem, model: Exosystem, units: PlantUnits) -> tuple[ComplexArray, Condition]:
+def _fixed_modes(
+    given: DescriptorSystem, courses: Exosystem, plant: DescriptorSystem, model: Exosystem, units: PlantUnits
+) -> tuple[ComplexArray, Condition]:
+    """Return the drops of the augmented pencil, exact where the numbers of the plant as given are known."""
     augmented = AugmentedPlant.of(plant, model)
-    inputs, direct = independent_disturbances(plant)
+    exact = exact_drops(given, courses)
+    if exact is not None:
+        inputs, direct = plant.Bd[:, exact.kept], plant.Dd[:, exact.kept]
+    else:
+        inputs, direct = independent_disturbances(plant)
     below = np.vstack([inputs, np.zeros((model.order, inputs.shape[1]))])
-    drops = finite_zeros(*system_pencil(augmented.E, augmented.A, below, augmented.C, direct)).values
-    zeros = units.eigenvalues(drops)
+    pencil = system_pencil(augmented.E, augmented.A, below, augmented.C, direct)
+    facts = None if exact is None else believed(_timed(exact.facts, units.rate), *pencil, nx=augmented.order)
+    if facts is not None and facts.full and not facts.outside:
+        # A mode that only rounding of the data moves is fixed as well.
+        nearly = drowned_zeros(*pencil, finite_zeros(*pencil).values, facts.zeros, nx=augmented.order)
+        zeros = np.array([*map(units.eigenvalue, (*facts.zeros, *nearly))], dtype=np.complex128)
+        verdict = zero_verdict(facts, *pencil, nx=augmented.order, discrete=plant.dt > 0.0)
+        if verdict.answer == "unclear" and verdict.distance is not None:
+            return zeros, lost_in_rounding(
+                model, plant.fault_names, units.eigenvalue(verdict.distance.point), augmented.order
+            )
+    else:
+        drops = finite_zeros(*pencil).values
+        zeros = units.eigenvalues(drops)
+        # Rounding scatters a multiple mode around its mean.  (D2) and (D3) exclude an unstable one: it is none at all.
+        bound = 1.0 if plant.dt > 0.0 else 0.0
+        means = [np.mean(drops[np.abs(drops - value) <= SCATTER * max(1.0, abs(value))]) for value in drops]
+        unstable = [mean for mean in means if instability(complex(mean), plant.dt) >= bound]
+        if unstable:
+            return zeros, lost_in_rounding(
+                model, plant.fault_names, units.eigenvalue(complex(unstable[0])), augmented.order
+            )
     text = ", ".join(numbers(zeros))
-    # Rounding scatters a multiple mode around its mean.  (D2) and (D3) exclude an unstable one: it is no mode at all.
-    bound = 1.0 if plant.dt > 0.0 else 0.0
-    means = [np.mean(drops[np.abs(drops - value) <= SCATTER * max(1.0, abs(value))]) for value in drops]
-    unstable = [mean for mean in means if instability(complex(mean), plant.dt) >= bound]
-    if unstable:
-        return zeros, lost_in_rounding(
-            model, plant.fault_names, units.eigenvalue(complex(unstable[0])), augmented.order
-        )
     return zeros, Condition(
         "fixed modes",
         "every pole that no gain moves is stable",

@@ -10,8 +10,11 @@ from dataclasses import replace
 import numpy as np
 
 from obsynth.analysis.conditions import Condition
+from obsynth.analysis.existence.numbers import numbers_of
+from obsynth.analysis.existence.verdicts import settled_rank
 from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.transformations import StateRecovery, Transformation, eliminate_algebraic_states
+from obsynth.analysis.transformations.elimination import dynamic_coordinates, eliminated_exactly
 from obsynth.analysis.zeros import leading_names
 from obsynth.errors import PreconditionError
 from obsynth.methods.ui_pi_observer.pencils import MOST_NAMES
@@ -19,6 +22,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import RANK_TOLERANCE, RankDecision, decide_rank
 from obsynth.numerics.scaling import equilibrate_pencil
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.origin import origin_of
 
 #: A direct effect on an output, relative to the effect on the states (both in scaled units), that elimination may
 #: leave by rounding.
@@ -34,8 +38,24 @@ SOURCE = "Share Pasand, Lemma 4 (9.1), in a form without E#"
 
 def decoupling_rank(plant: DescriptorSystem) -> RankDecision:
     """Decide (D1): ``rank [E 0 Bd; C Dd 0; 0 0 Dd]``, with what it must be."""
-    scaled = _scaled(plant)
-    return decide_rank(_decoupling_matrix(scaled), expected=plant.nx + _rank(scaled.Dd) + disturbance_rank(plant))
+    scaled, numbers = _scaled(plant), numbers_of(plant)
+    if numbers is None:
+        return decide_rank(_decoupling_matrix(scaled), expected=plant.nx + _rank(scaled.Dd) + disturbance_rank(plant))
+    bd, dd = numbers.matrix("Bd"), numbers.matrix("Dd")
+    nothing, tall, square = (
+        numbers.zeros(plant.nx, plant.nd),
+        numbers.zeros(plant.ny, plant.nx),
+        numbers.zeros(plant.ny, plant.nd),
+    )
+    matrix = numbers.blocks(
+        [
+            [numbers.matrix("E"), nothing, bd],
+            [numbers.matrix("C"), dd, square],
+            [tall, square, dd],
+        ]
+    )
+    decision = decide_rank(_decoupling_matrix(scaled), expected=plant.nx + numbers.rank(dd) + disturbance_rank(plant))
+    return settled_rank(decision, numbers.rank(matrix))
 
 
 def _scaled(plant: DescriptorSystem) -> DescriptorSystem:
@@ -53,6 +73,9 @@ def _decoupling_matrix(plant: DescriptorSystem) -> FloatArray:
 
 def disturbance_rank(plant: DescriptorSystem) -> int:
     """Return ``rank [Bd; Dd]``: repeated disturbances count once."""
+    numbers = numbers_of(plant)
+    if numbers is not None:
+        return numbers.rank(numbers.blocks([[numbers.matrix("Bd")], [numbers.matrix("Dd")]]))
     scaled = _scaled(plant)
     return _rank(np.vstack([scaled.Bd, scaled.Dd]))
 
@@ -87,6 +110,10 @@ def _eliminated(plant: DescriptorSystem) -> Transformation:
     Where the dynamic states are orthogonal combinations, these must not depend on the units of what they combine.
     """
     units = PlantUnits.of(plant)
+    basis = dynamic_coordinates(units.scaled_plant(plant))
+    found = eliminated_exactly(plant, None if basis is None else units.states[:, None] * basis)
+    if found is not None:
+        return found
     exact = units.rounded()
     found = eliminate_algebraic_states(exact.scaled_plant(plant))
     if set(found.plant.state_names) <= set(plant.state_names):
@@ -115,6 +142,8 @@ def _in_given_units(found: Transformation, plant: DescriptorSystem, units: Plant
 def _without_rounding(transformation: Transformation) -> Transformation:
     """Set to zero what elimination left of a direct effect that is none: a rank decision would take it for one."""
     plant = transformation.plant
+    if origin_of(plant) is not None:
+        return transformation  # rounded once: what is zero is zero
     # What may be rounding must have no say in the units in which it is judged.
     units = PlantUnits.of(plant.replace(Dd=np.zeros_like(plant.Dd), Df=np.zeros_like(plant.Df)))
     scaled = units.scaled_plant(plant)
@@ -145,6 +174,7 @@ def _decoupling_condition(plant: DescriptorSystem, decision: RankDecision, detai
         SOURCE,
         detail,
         signals=signals,
+        unclear=decision.means == "unclear",
     )
 
 

@@ -12,9 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.analysis.conditions import Condition
+from obsynth.analysis.existence.verdicts import settled_rank
 from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.zeros import is_outside, leading_names
 from obsynth.methods.ui_pi_observer.augmented_plant import AugmentedPlant
+from obsynth.methods.ui_pi_observer.exact_fault_model import exact_loss
 from obsynth.methods.ui_pi_observer.pencils import (
     MOST_NAMES,
     equilibrated,
@@ -31,18 +33,23 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.exosystems import Exosystem
 
 
-def model_conditions(plant: DescriptorSystem, model: Exosystem, units: PlantUnits) -> list[Condition]:
+def model_conditions(
+    given: DescriptorSystem, courses: Exosystem, plant: DescriptorSystem, model: Exosystem, units: PlantUnits
+) -> list[Condition]:
     """Test (D3) at each unstable eigenvalue of the fault model, upper half plane only."""
     unstable = [complex(value) for value in model.eigenvalues if value.imag >= 0.0 and is_outside(value, plant.dt)]
     found = []
     for value in sorted(unstable, key=lambda value: (value.real, value.imag)):
-        found.append(_model_condition(plant, model, value, units))
+        lost = exact_loss(given, courses, units.eigenvalue(value))
+        found.append(_model_condition(plant, model, value, units, lost))
         if not found[-1].holds:
             break
     return found
 
 
-def _model_condition(plant: DescriptorSystem, model: Exosystem, value: complex, units: PlantUnits) -> Condition:
+def _model_condition(
+    plant: DescriptorSystem, model: Exosystem, value: complex, units: PlantUnits, lost: int | None
+) -> Condition:
     inputs, direct = independent_disturbances(plant)
     courses = model.Cw @ kernel(model.Phi - value * np.eye(model.order))
     width = courses.shape[1]
@@ -51,7 +58,10 @@ def _model_condition(plant: DescriptorSystem, model: Exosystem, value: complex, 
         [plant.C.astype(complex), plant.Df @ courses, direct],
     ])  # fmt: skip
     scaled, columns = equilibrated(matrix)
-    decision = decide_rank(scaled, expected=matrix.shape[1], equilibrated=False)
+    decision = settled_rank(
+        decide_rank(scaled, expected=matrix.shape[1], equilibrated=False),
+        None if lost is None else matrix.shape[1] - lost,
+    )
     own = units.eigenvalue(value)
     where = f"{'s' if plant.dt == 0.0 else 'z'} = {number(own)}"
     signals: tuple[str, ...] = ()
@@ -82,6 +92,7 @@ def _model_condition(plant: DescriptorSystem, model: Exosystem, value: complex, 
         detail,
         mode=None if decision.full else own,
         signals=signals,
+        unclear=decision.means == "unclear",
     )
 
 
@@ -125,6 +136,7 @@ def order_conditions(plant: DescriptorSystem, model: Exosystem, units: PlantUnit
             f"{decision.describe()} at {number(point)}" + ("" if decision.full else lost),
             mode=None if decision.full else point,
             signals=() if decision.full else plant.fault_names,
+            unclear=not decision.full,
         )
     ]
 
@@ -142,6 +154,7 @@ def lost_in_rounding(model: Exosystem, fault_names: tuple[str, ...], mode: compl
         "conditions above exclude: in double precision the model is too long a chain. Lower its order.",
         mode=mode,
         signals=fault_names,
+        unclear=True,
     )
 
 

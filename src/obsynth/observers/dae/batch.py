@@ -127,7 +127,7 @@ def _in_casadi(
 def _one(observer: DAEObserver, y: FloatArray, u: FloatArray, trial: int) -> dict[str, FloatArray]:
     rows: list[DAERow] = []
     try:
-        advanced(observer, y[trial], _of_trial(u, trial), rows.append)
+        advanced(observer.steps, y[trial], _of_trial(u, trial), rows.append)
     except SolverError as error:
         raise SolverError(f"Trial {trial}: {error}", record={**error.record, "trial": trial}) from error
     return {name: np.concatenate([row.several.part(name) for row in rows]) for name in BATCH_PARTS}

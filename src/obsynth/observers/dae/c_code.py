@@ -14,9 +14,8 @@ import numpy as np
 from obsynth.numerics import newton
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.memory_layout import initial_memory
-from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.dae.step_graph import ObserverGraph
-from obsynth.observers.dae.steps import PROJECTION_NOTICE, PROJECTION_SHARE
+from obsynth.observers.dae.steps import PROJECTION_NOTICE, PROJECTION_SHARE, Steps
 from obsynth.plants.dae import step as implicit_step
 from obsynth.plants.dae.functions import DAEFunctions
 from obsynth.plants.dae.step_graph import step_graph
@@ -26,27 +25,27 @@ BATCH_PARTS = ("posterior", "theta", "spread", "innovation", "nis", "residual")
 _NUMBERS_PER_LINE = 4
 
 
-def observer_code(observer: DAEObserver) -> str:
+def observer_code(steps: Steps) -> str:
     """Return everything static: constants, CasADi's functions, ``struct observer``, ``reset`` and ``advance``."""
-    graph = observer.graph
-    short = step_graph(DAEFunctions(observer.model), PROJECTION_SHARE * observer.dt, np.inf)
+    graph = steps.graph
+    short = step_graph(DAEFunctions(steps.settings.model), PROJECTION_SHARE * steps.settings.dt, np.inf)
     functions = {"project": short.newton, "newton": graph.step.newton, "first": graph.first, "sample": graph.sample}
     return "\n".join([
-        "#include <math.h>", "", *_constants(observer, graph, functions.values()), "", _generated(functions), "",
+        "#include <math.h>", "", *_constants(steps, graph, functions.values()), "", _generated(functions), "",
         _template("advance"),
     ])  # fmt: skip
 
 
-def record_code(observer: DAEObserver) -> str:
+def record_code(steps: Steps) -> str:
     """Return the whole source of a library with functions ``record`` and ``batch``."""
-    graph, copies, total = observer.graph, [], 0
+    graph, copies, total = steps.graph, [], 0
     for name in BATCH_PARTS:
         layout, source = (graph.memory, "after") if name in graph.memory.shapes else (graph.row, "said")
         part = layout.slices[name]
         size = part.stop - part.start
         copies.append(f"    copy(out + {total}, {source} + {part.start}, {size});")
         total += size
-    return observer_code(observer) + "\n" + _template("record").replace("/* PARTS */", "\n".join(copies)).replace(
+    return observer_code(steps) + "\n" + _template("record").replace("/* PARTS */", "\n".join(copies)).replace(
         "PARTS_SIZE", str(total)
     )  # fmt: skip
 
@@ -56,9 +55,9 @@ def _template(name: str) -> str:
     return files("obsynth.observers.dae").joinpath("c", f"{name}.c").read_text(encoding="utf-8")
 
 
-def _constants(observer: DAEObserver, graph: ObserverGraph, functions: Iterable[Any]) -> list[str]:
+def _constants(steps: Steps, graph: ObserverGraph, functions: Iterable[Any]) -> list[str]:
     """Return sizes, settings and tables."""
-    model, move = observer.model, observer.largest_move
+    model, move = steps.settings.model, steps.settings.largest_move
     listed = list(functions)
     work = {name: max(max(getattr(function, f"sz_{name}")() for function in listed), 1) for name in
             ("arg", "res", "iw", "w")}  # fmt: skip
@@ -81,7 +80,7 @@ def _constants(observer: DAEObserver, graph: ObserverGraph, functions: Iterable[
           for name, value in numbers.items()),
         "/* Arrays of no length are none in C. */", "#define LENGTH(n) ((n) > 0 ? (n) : 1)", "",
         *c_table("SIZES", np.asarray(model.state_scales)),
-        *c_table("START", initial_memory(observer, observer.initial_state)),
+        *c_table("START", initial_memory(steps.settings, steps.settings.initial_state)),
     ]  # fmt: skip
 
 

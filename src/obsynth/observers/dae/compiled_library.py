@@ -9,16 +9,13 @@ import shutil
 import subprocess
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.c_code import BATCH_PARTS, record_code
-
-if TYPE_CHECKING:
-    from obsynth.observers.dae.observer import DAEObserver
+from obsynth.observers.dae.steps import Steps
 
 #: Tried in turn when the environment does not name one in ``CC``.
 COMPILERS = ("cc", "gcc", "clang")
@@ -39,11 +36,11 @@ def compiler() -> list[str] | None:
 class DAELibrary:
     """An observer in C.
 
-    Fields: observer: At rest.
+    Fields: steps: Of the observer.
     """
 
-    def __init__(self, observer: DAEObserver) -> None:
-        self.observer = observer
+    def __init__(self, steps: Steps) -> None:
+        self.steps = steps
         command = compiler()
         if command is None:
             raise SpecError(
@@ -52,7 +49,7 @@ class DAELibrary:
             )  # fmt: skip
         with tempfile.TemporaryDirectory(prefix="obsynth-") as folder:
             source, library = Path(folder) / "observer.c", Path(folder) / "observer.so"
-            source.write_text(record_code(observer), encoding="utf-8")
+            source.write_text(record_code(steps), encoding="utf-8")
             done = subprocess.run(
                 [*command, *FLAGS, str(source), "-o", str(library), "-lm"], capture_output=True, text=True, check=False
             )
@@ -77,20 +74,20 @@ class DAELibrary:
 
         Shapes: ``y (samples, ny)``, ``u (samples, nu)``.
         """
-        graph = self.observer.graph
+        graph = self.steps.graph
         after, said = np.zeros((len(y), graph.memory.size)), np.zeros((len(y), graph.row.size))
         taken = self._library.record(state, len(y), *map(_pointer, (_plain(u), _plain(y), after, said)))
         return after[:taken], said[:taken]
 
     def batch(self, y: FloatArray, u: FloatArray) -> tuple[int, dict[str, FloatArray]]:
         """Run over records; return how many could be finished, and what is said by name."""
-        graph, (runs, samples, _) = self.observer.graph, y.shape
+        graph, (runs, samples, _) = self.steps.graph, y.shape
         layouts = [graph.memory if name in graph.memory.shapes else graph.row for name in BATCH_PARTS]
         sizes = [layout.shapes[name][0] * layout.shapes[name][1] for layout, name in
                  zip(layouts, BATCH_PARTS, strict=True)]  # fmt: skip
         out = np.zeros((runs, samples, sum(sizes)))
         inputs, outputs = _plain(u), _plain(y)
-        apart = 0 if u.ndim == 2 else samples * self.observer.model.nu
+        apart = 0 if u.ndim == 2 else samples * self.steps.settings.model.nu
         taken = self._library.batch(runs, samples, apart, *map(_pointer, (inputs, outputs, out)))
         flat = np.split(out, np.cumsum(sizes)[:-1], axis=2)
         return taken, {

@@ -13,7 +13,7 @@ from obsynth.errors import SolverError
 from obsynth.numerics.arrays import FloatArray, read_only
 
 if TYPE_CHECKING:
-    from obsynth.observers.dae.observer import DAEObserver
+    from obsynth.observers.dae.settings import DAESettings
     from obsynth.observers.dae.step_graph import ObserverGraph
 
 
@@ -160,7 +160,7 @@ class GatheredRows:
     Fields: observer: Whose rows they are.
     """
 
-    def __init__(self, observer: DAEObserver) -> None:
+    def __init__(self, observer: DAESettings) -> None:
         self.observer = observer
         self.parts: list[dict[str, FloatArray]] = []
         self.projection = np.zeros(observer.model.nx)
@@ -194,7 +194,7 @@ class GatheredRows:
         )  # fmt: skip
 
 
-def _singular(observer: DAEObserver, rows: DAERow, i: int) -> SolverError:
+def _singular(observer: DAESettings, rows: DAERow, i: int) -> SolverError:
     equations, states = involved(observer.model, rows.part("scaled")[i])
     k, condition = rows.k + i, float(rows.conditions[i])
     return SolverError(
@@ -216,7 +216,7 @@ def _columns(rows: DAERow) -> dict[str, FloatArray]:
     }  # fmt: skip
 
 
-def _excitation(observer: DAEObserver, informations: FloatArray) -> FloatArray:
+def _excitation(observer: DAESettings, informations: FloatArray) -> FloatArray:
     levels, window = np.zeros(len(informations)), observer.window
     if not observer.model.nq or len(informations) < window:
         return levels

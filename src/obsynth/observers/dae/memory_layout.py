@@ -13,7 +13,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.dae.functions import BUTCHER
 
 if TYPE_CHECKING:
-    from obsynth.observers.dae.observer import DAEObserver
+    from obsynth.observers.dae.settings import DAESettings
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ MATRICES = frozenset({
 })  # fmt: skip
 
 
-def memory_layout(observer: DAEObserver) -> Layout:
+def memory_layout(observer: DAESettings) -> Layout:
     """Return the state.
 
     ``posterior`` is the state after the measurement, ``x`` the one before it with the parameters as they are estimated
@@ -100,7 +100,7 @@ def memory_layout(observer: DAEObserver) -> Layout:
     })  # fmt: skip
 
 
-def row_layout(observer: DAEObserver) -> Layout:
+def row_layout(observer: DAESettings) -> Layout:
     """Return what is said of one sample besides what is remembered.
 
     ``expected`` is the covariance of the innovation, that of the identity for what is not seen; ``kept`` is F (I - K H)
@@ -115,7 +115,7 @@ def row_layout(observer: DAEObserver) -> Layout:
     })  # fmt: skip
 
 
-def initial_memory(observer: DAEObserver, x: FloatArray) -> FloatArray:
+def initial_memory(observer: DAESettings, x: FloatArray) -> FloatArray:
     """Return what is remembered before the first sample.
 
     Shapes: ``x (nx,)``.

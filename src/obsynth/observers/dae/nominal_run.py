@@ -55,7 +55,7 @@ def dae_facts(observer: DAEObserver) -> DAEFacts:
     u = np.array(model.nominal_input)
     truth = _nominal_outputs(observer, u)
     gathered = GatheredRows(observer)
-    end = advanced(observer, truth, np.tile(u, (len(truth), 1)), gathered.add)
+    end = advanced(observer.steps, truth, np.tile(u, (len(truth), 1)), gathered.add)
     found = gathered.estimates()
     covariance = found.parameter_covariances[-1]
     deviations = np.sqrt(np.diag(covariance))

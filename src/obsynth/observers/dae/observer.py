@@ -2,42 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Callable
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
-from obsynth.numerics.covariances import covariance_factor, is_definite
-from obsynth.numerics.value_types import Count, ForgettingFactor, Positive, checked_value
+from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.dae.compiled_library import DAELibrary
+from obsynth.observers.dae.estimates import DAEEstimates, DAERow, GatheredRows
+from obsynth.observers.dae.records import run_record
+from obsynth.observers.dae.settings import DAESettings
+from obsynth.observers.dae.step_graph import ObserverGraph
+from obsynth.observers.dae.steps import DAEState, Steps
 from obsynth.observers.recursive.records import measured_record
 from obsynth.observers.running import RunningObserver
-from obsynth.plants.dae.checks import checked_inputs, finite_vector, require_known, step_length
-from obsynth.plants.dae.model import DAEModel
-
-if TYPE_CHECKING:
-    from obsynth.observers.dae.compiled_library import DAELibrary
-    from obsynth.observers.dae.estimates import DAEEstimates, DAERow
-    from obsynth.observers.dae.step_graph import ObserverGraph
-    from obsynth.observers.dae.steps import DAEState, Steps
-
-Form: TypeAlias = Literal["forgetting", "random-walk", "augmented-kalman"]
-Guard: TypeAlias = Literal["regularise", "none"]
-Weight: TypeAlias = Literal["innovation", "paper"]
-Integration: TypeAlias = Literal["backward-euler", "radau"]
-_KINDS = {
-    "form": Form, "guard": Guard, "weight": Weight, "integration": Integration, "forgetting": ForgettingFactor,
-    "window": Count, "largest_move": Positive | None,
-}  # fmt: skip
-_DEFINITE = ("R", "initial_parameter_covariance")
+from obsynth.plants.dae.checks import checked_inputs, require_known
 
 
-@dataclass(frozen=True, eq=False)
-class DAEObserver:
+class DAEObserver(DAESettings):
     """An observer: what `start` and `run` need, and nothing that depends on data.
 
     Parameters
@@ -80,115 +64,9 @@ class DAEObserver:
         Something is out of range or has the wrong shape.
     """
 
-    model: DAEModel
-    dt: float
-    Q: FloatArray
-    R: FloatArray
-    initial_state: FloatArray
-    initial_covariance: FloatArray
-    initial_parameters: FloatArray
-    initial_parameter_covariance: FloatArray
-    random_walk: FloatArray
-    lower: FloatArray
-    upper: FloatArray
-    form: str = "forgetting"
-    forgetting: float = 0.98
-    guard: str = "regularise"
-    weight: str = "innovation"
-    integration: str = "backward-euler"
-    largest_move: float | None = None
-    window: int = 50
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "dt", step_length(self.dt))
-        for name, kind in _KINDS.items():
-            checked_value(getattr(self, name), name, kind)
-        self._check_arrays()
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return what makes it again in another process: its functions and its library are made there anew."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
-
-    def _check_arrays(self) -> None:
-        nx, ny, nq = self.model.nx, self.model.ny, self.model.nq
-        sizes = {"Q": nx, "R": ny, "initial_covariance": nx, "initial_parameter_covariance": nq, "random_walk": nq}
-        for name, size in sizes.items():
-            matrix = as_matrix(getattr(self, name), name) if size else np.zeros((0, 0))
-            if matrix.shape != (size, size):
-                raise SpecError(f"{name} is {matrix.shape}, but {(size, size)} is needed.", path=name)
-            factor = covariance_factor(matrix, name)
-            if name in _DEFINITE:
-                self._require_definite(name, matrix, factor)
-            object.__setattr__(self, name, read_only(matrix))
-        model = self.model
-        for name, signals in (("initial_state", model.state_names), ("initial_parameters", model.parameter_names)):
-            object.__setattr__(self, name, read_only(finite_vector(getattr(self, name), signals, np.zeros(0), name)))
-        for name in ("lower", "upper"):
-            vector = np.asarray(getattr(self, name), dtype=np.float64)
-            if vector.shape != (nq,) or np.isnan(vector).any():
-                raise SpecError(f"bounds: {name} must be {nq} number(s).", path="bounds")
-            object.__setattr__(self, name, read_only(vector))
-        for name, low, start, high in zip(
-            model.parameter_names, self.lower, self.initial_parameters, self.upper, strict=True
-        ):
-            if not (low < high and low <= start <= high):
-                raise SpecError(
-                    f"bounds.{name}: the lower bound ({low:g}) must be below the upper one ({high:g}), and the start "
-                    f"({start:g}) between.", path=f"bounds.{name}",
-                )  # fmt: skip
-
-    def _require_definite(self, name: str, matrix: FloatArray, factor: FloatArray) -> None:
-        signals = self.model.output_names if name == "R" else self.model.parameter_names
-        variances = np.diag(matrix)
-        for signal, variance in zip(signals, variances, strict=True):
-            if not variance > 0.0:
-                raise SpecError(f"{name} must be positive definite, but the variance of {signal!r} is {variance:g}.",
-                                path=name)  # fmt: skip
-        if not is_definite(matrix, factor):
-            raise SpecError(f"{name} must be positive definite, but it is singular.", path=name)
-
-    @property
-    def state_names(self) -> tuple[str, ...]:
-        """The states that are estimated, in order."""
-        return self.model.state_names
-
-    @property
-    def fault_names(self) -> tuple[str, ...]:
-        """The parameters that are estimated, in order."""
-        return self.model.parameter_names
-
-    @property
-    def order(self) -> int:
-        """Number of states and parameters in its state."""
-        return self.model.nx + self.model.nq
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return every field as data.
-
-        Raises
-        ------
-        SpecError
-            The model is given as Python functions.
-        """
-        found = {field.name: getattr(self, field.name) for field in fields(self)}
-        return {**found, "model": self.model.as_dict()}
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> DAEObserver:
-        """Return the observer that `as_dict` described.
-
-        Parameters
-        ----------
-        data : mapping
-            Every field by name.
-        """
-        return cls(**{**data, "model": DAEModel(**data["model"])})
-
     @cached_property
     def steps(self) -> Steps:
         """What follows from the observer alone, made when it is first needed."""
-        from obsynth.observers.dae.steps import Steps
-
         return Steps(self)
 
     def init(self) -> DAEState:
@@ -226,8 +104,6 @@ class DAEObserver:
         SolverError
             The step has no solution; k, iteration and worst equation are named.
         """
-        from obsynth.observers.dae.estimates import GatheredRows
-
         outputs = measured_record(np.atleast_2d(np.asarray(y)), self.model.ny)[0]
         try:
             inputs = np.atleast_1d(np.asarray(u, dtype=np.float64))
@@ -245,12 +121,10 @@ class DAEObserver:
         """Return a running observer, at k = 0."""
         return RunningObserver(self)
 
-    @cached_property
+    @property
     def graph(self) -> ObserverGraph:
         """The steps of each sample as CasADi functions, built when they are first needed."""
-        from obsynth.observers.dae.step_graph import observer_graph
-
-        return observer_graph(self)
+        return self.steps.graph
 
     @cached_property
     def library(self) -> DAELibrary:
@@ -261,9 +135,7 @@ class DAEObserver:
         SpecError
             There is no compiler, or it fails.
         """
-        from obsynth.observers.dae.compiled_library import DAELibrary
-
-        return DAELibrary(self)
+        return DAELibrary(self.steps)
 
     def run(
         self, y: ArrayLike, u: ArrayLike | None = None, *, compiled: bool | None = None,
@@ -297,10 +169,9 @@ class DAEObserver:
         SolverError
             A step has no solution; k, iteration and worst equation are named.
         """
-        from obsynth.observers.dae.records import run_record
-
         if compiled not in (None, True, False):
             raise SpecError(f"compiled is {compiled!r}: give True, False or None.", path="compiled")
         outputs = measured_record(y, self.model.ny)
         inputs = checked_inputs(self.model, u, len(outputs))
-        return run_record(self, outputs, inputs, compiled=compiled, progress=progress)
+        library = self.library if compiled else None
+        return run_record(self.steps, outputs, inputs, compiled=compiled, library=library, progress=progress)

@@ -8,11 +8,10 @@ import numpy as np
 
 from obsynth.errors import SolverError
 from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.dae.compiled_library import DAELibrary
 from obsynth.observers.dae.estimates import DAEEstimates, DAERow, GatheredRows
-from obsynth.observers.dae.observer import DAEObserver
-from obsynth.observers.dae.steps import DAEState
+from obsynth.observers.dae.steps import DAEState, Steps
 from obsynth.observers.progress import shown_progress
-from obsynth.observers.running import RunningObserver
 from obsynth.plants.dae.functions import Compiled
 from obsynth.plants.dae.stretches import take_samples
 
@@ -21,56 +20,57 @@ SAMPLES_PER_CALL = 10_000
 
 
 def run_record(
-    observer: DAEObserver, y: FloatArray, u: FloatArray, *, compiled: bool | None,
+    steps: Steps, y: FloatArray, u: FloatArray, *, compiled: bool | None, library: DAELibrary | None,
     progress: bool | Callable[[int], None] | None,
 ) -> DAEEstimates:  # fmt: skip
     """Run over a whole record.
 
     Shapes: ``y (samples, ny)``, ``u (samples, nu)``.
     """
-    found = GatheredRows(observer)
-    found.add(_nothing(observer))
+    found = GatheredRows(steps.settings)
+    found.add(_nothing(steps))
     with shown_progress(progress, len(y), "samples") as note:
-        if compiled:
-            _in_c(observer, y, u, found.add_regular, note)
+        if library is not None:
+            _in_c(steps, library, y, u, found.add_regular, note)
         elif compiled is None:
-            advanced(observer, y, u, found.add_regular, note)
+            advanced(steps, y, u, found.add_regular, note)
         else:
-            running = RunningObserver(observer)
+            state = steps.first
             for k in range(len(y)):
-                found.add_regular(running.raw_step(y[k], u[k]))
+                state, row = steps.advance(state, y[k], u[k])
+                found.add_regular(row)
                 note(k + 1)
     return found.estimates()
 
 
-def _nothing(observer: DAEObserver) -> DAERow:
+def _nothing(steps: Steps) -> DAERow:
     """Return rows of no samples, so that an empty record has estimates of the right shape."""
-    graph, model = observer.graph, observer.model
+    graph, model = steps.graph, steps.settings.model
     memory, said = np.zeros((0, graph.memory.size)), np.zeros((0, graph.row.size))
     return DAERow(graph, 0, memory, said, np.zeros((0, model.ny), dtype=bool), np.zeros(model.nx))
 
 
 def _in_c(
-    observer: DAEObserver, y: FloatArray, u: FloatArray, keep: Callable[[DAERow], object],
+    steps: Steps, library: DAELibrary, y: FloatArray, u: FloatArray, keep: Callable[[DAERow], object],
     note: Callable[[int], object],
 ) -> None:  # fmt: skip
-    library, moved = observer.library, np.zeros(0)
+    moved = np.zeros(0)
     state = library.started()
     for begin in range(0, len(y), SAMPLES_PER_CALL):
         heard = y[begin : begin + SAMPLES_PER_CALL]
         after, said = library.record(state, heard, u[begin : begin + SAMPLES_PER_CALL])
         if len(after) < len(heard):
             # Go there again where the message is written.
-            advanced(observer, y, u, bool, note)
+            advanced(steps, y, u, bool, note)
             raise SolverError(f"The C stops at k = {begin + len(after)}, but CasADi goes on: leave compiled=True out.")
         if begin == 0:
-            moved = observer.steps.projected(observer.init(), u[0])[1]
-        keep(DAERow(observer.graph, begin, after, said, ~np.isnan(heard[: len(after)]), moved))
+            moved = steps.projected(steps.first, u[0])[1]
+        keep(DAERow(steps.graph, begin, after, said, ~np.isnan(heard[: len(after)]), moved))
         note(begin + len(heard))
 
 
 def advanced(
-    observer: DAEObserver, y: FloatArray, u: FloatArray, keep: Callable[[DAERow], object],
+    steps: Steps, y: FloatArray, u: FloatArray, keep: Callable[[DAERow], object],
     note: Callable[[int], object] = bool,
 ) -> DAEState:  # fmt: skip
     """Lead an observer from its start through a record; return its state at the end.
@@ -78,19 +78,22 @@ def advanced(
     Shapes: ``y (samples, ny)``, ``u (samples, nu)``.
     """
     calls: dict[int, Compiled] = {}
-    running = RunningObserver(observer)
+    state = steps.first
 
     def alone(k: int) -> None:
-        keep(running.raw_step(y[k], u[k]))
+        nonlocal state
+        state, row = steps.advance(state, y[k], u[k])
+        keep(row)
 
     def together(k: int, length: int) -> int:
+        nonlocal state
         if length not in calls:
-            calls[length] = Compiled(observer.graph.over(length))
-        running.state, rows = observer.steps.stretch(running.state, y[k : k + length], u[k : k + length], calls[length])
+            calls[length] = Compiled(steps.graph.over(length))
+        state, rows = steps.stretch(state, y[k : k + length], u[k : k + length], calls[length])
         keep(rows)
         return len(rows.memory)
 
     if len(y):
         alone(0)
     take_samples(1, len(y), together, alone, note)
-    return running.state
+    return state

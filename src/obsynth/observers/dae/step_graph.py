@@ -17,7 +17,7 @@ from obsynth.plants.dae.functions import DAEFunctions
 from obsynth.plants.dae.step_graph import StepGraph, step_graph
 
 if TYPE_CHECKING:
-    from obsynth.observers.dae.observer import DAEObserver
+    from obsynth.observers.dae.settings import DAESettings
 
 Arrays = dict[str, Any]
 
@@ -48,7 +48,7 @@ class ObserverGraph:
         return self._stretches[samples]
 
 
-def observer_graph(observer: DAEObserver) -> ObserverGraph:
+def observer_graph(observer: DAESettings) -> ObserverGraph:
     """Return the functions of an observer."""
     import casadi as ca
 
@@ -84,7 +84,7 @@ def _outcome(found: Arrays, memory: Layout, row: Layout) -> list[Any]:
     return [memory.column(found), row.column(found)]
 
 
-def _predicted(observer: DAEObserver, before: Arrays, x: Any, local: tuple[Any, ...]) -> Arrays:
+def _predicted(observer: DAESettings, before: Arrays, x: Any, local: tuple[Any, ...]) -> Arrays:
     """Steps 1 to 5: the prediction and its covariance, with K, H and L of k - 1."""
     import casadi as ca
 
@@ -107,7 +107,7 @@ def _predicted(observer: DAEObserver, before: Arrays, x: Any, local: tuple[Any, 
 class _Update:
     """The measurement of one sample; a channel that is not seen has an innovation of zero and no gain."""
 
-    def __init__(self, observer: DAEObserver, functions: DAEFunctions, y: Any, seen: Any) -> None:
+    def __init__(self, observer: DAESettings, functions: DAEFunctions, y: Any, seen: Any) -> None:
         import casadi as ca
 
         self.observer, self.functions, self.y, self.seen = observer, functions, y, seen

@@ -12,7 +12,8 @@ from obsynth.errors import SolverError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.estimates import DAERow
 from obsynth.observers.dae.memory_layout import initial_memory
-from obsynth.observers.dae.observer import DAEObserver
+from obsynth.observers.dae.settings import DAESettings
+from obsynth.observers.dae.step_graph import observer_graph
 from obsynth.plants.dae.functions import Compiled, DAEFunctions
 from obsynth.plants.dae.step import ImplicitStep
 
@@ -38,10 +39,10 @@ class DAEState(NamedTuple):
 class Steps:
     """The steps of an observer: what follows from it alone, once for all runs."""
 
-    def __init__(self, observer: DAEObserver) -> None:
-        self.observer, self.graph = observer, observer.graph
-        self.implicit = ImplicitStep(self.graph.functions, observer.dt, largest_move=observer.largest_move)
-        self.first = DAEState(initial_memory(observer, observer.initial_state), 0, np.zeros(observer.model.nu), ())
+    def __init__(self, settings: DAESettings) -> None:
+        self.settings, self.graph = settings, observer_graph(settings)
+        self.implicit = ImplicitStep(self.graph.functions, settings.dt, largest_move=settings.largest_move)
+        self.first = DAEState(initial_memory(settings, settings.initial_state), 0, np.zeros(settings.model.nu), ())
 
     def part(self, state: DAEState, name: str) -> FloatArray:
         """Return a part of what is remembered, by its name in `memory_layout`."""
@@ -53,7 +54,7 @@ class Steps:
         Shapes: ``y (ny,)`` with NaN for what is missing, ``u (nu,)``.
         """
         seen = ~np.isnan(y)
-        heard, moved = np.where(seen, y, 0.0), np.zeros(self.observer.model.nx)
+        heard, moved = np.where(seen, y, 0.0), np.zeros(self.settings.model.nx)
         if state.k == 0:
             memory, moved = self.projected(state, u)
             after, said = self._first(memory, heard, seen)
@@ -67,7 +68,7 @@ class Steps:
                 "there: the step has no unique solution.", record={"k": state.k},
             )  # fmt: skip
         row = DAERow(self.graph, state.k, after[:, 0], said[:, 0], seen, moved)
-        informations = (*state.informations, row.part("information"))[-self.observer.window :]
+        informations = (*state.informations, row.part("information"))[-self.settings.window :]
         return DAEState(after[:, 0], state.k + 1, u, informations), row
 
     def stretch(
@@ -84,8 +85,8 @@ class Steps:
         taken = len(y) if good.all() else int(np.argmin(good))
         rows = DAERow(self.graph, state.k, after[:taken], said[:taken], seen[:taken], np.zeros(0))
         if taken:
-            latest = tuple(rows.part("information")[-self.observer.window :])
-            informations = (*state.informations, *latest)[-self.observer.window :]
+            latest = tuple(rows.part("information")[-self.settings.window :])
+            informations = (*state.informations, *latest)[-self.settings.window :]
             state = DAEState(after[taken - 1].copy(), state.k + taken, u[taken - 1], informations)
         return state, rows
 
@@ -94,12 +95,12 @@ class Steps:
 
         Shapes: ``u (nu,)`` at k = 0.
         """
-        model, start = self.observer.model, self.part(state, "x")
-        short = ImplicitStep(DAEFunctions(model), PROJECTION_SHARE * self.observer.dt)
+        model, start = self.settings.model, self.part(state, "x")
+        short = ImplicitStep(DAEFunctions(model), PROJECTION_SHARE * self.settings.dt)
         found = short.solve_carefully(start, u, self.part(state, "theta")).x
         if np.abs((found - start) / model.state_scales).max() <= PROJECTION_NOTICE:
             return state.memory, np.zeros_like(start)
-        return initial_memory(self.observer, found), found - start
+        return initial_memory(self.settings, found), found - start
 
     def _carefully(self, state: DAEState, y: FloatArray, seen: FloatArray, u: FloatArray) -> tuple[FloatArray, ...]:
         """Take a step that needs damping or a homotopy: solved outside the graph, and all else in it."""

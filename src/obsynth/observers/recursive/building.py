@@ -10,7 +10,8 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_number, real_number, real_vector
 from obsynth.numerics.arrays import FloatArray, as_matrix
-from obsynth.observers.recursive.observer import Adaptation, RecursiveObserver
+from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.recursive.settings import Adaptation
 from obsynth.plants.sequences import MatrixSequence
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 

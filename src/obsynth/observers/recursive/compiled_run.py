@@ -19,8 +19,8 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.least_squares_step import SUSPECT_PARITY
 from obsynth.observers.recursive.estimates import RecursiveEstimates, deviations_of, received_in
-from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.observers.recursive.recursion import RawEstimate, RecursiveState
+from obsynth.observers.recursive.recursion import RawEstimate, Recursion, RecursiveState
+from obsynth.observers.recursive.settings import RecursiveSettings
 from obsynth.observers.recursive.step_stacks import stacked_matrices, stacked_steps
 
 #: Samples from which the kernel is used unasked: they take seconds without it, which is what loading numba, or the
@@ -34,12 +34,12 @@ CHUNK = 4096
 SHORT_STRETCH = 8
 
 
-def kernel_covers(observer: RecursiveObserver) -> bool:
+def kernel_covers(observer: RecursiveSettings) -> bool:
     """Return whether the kernel knows the recursion: that of a filter, with parameters as a random walk or none."""
     return observer.adaptation is None or observer.adaptation.form == "random-walk"
 
 
-def kernel_is_chosen(observer: RecursiveObserver, samples: int, compiled: bool | None) -> bool:
+def kernel_is_chosen(observer: RecursiveSettings, samples: int, compiled: bool | None) -> bool:
     """Return whether a record goes through the kernel."""
     if compiled is False:
         return False
@@ -59,18 +59,18 @@ def kernel_is_chosen(observer: RecursiveObserver, samples: int, compiled: bool |
     return True
 
 
-def run_record(observer: RecursiveObserver, y: FloatArray, u: FloatArray, compiled: bool | None) -> RecursiveEstimates:
+def run_record(recursion: Recursion, y: FloatArray, u: FloatArray, compiled: bool | None) -> RecursiveEstimates:
     """Run over a whole record.
 
     Shapes: ``y (samples, ny)``, ``u (samples, nu)``.
     """
-    if kernel_is_chosen(observer, len(y), compiled):
-        return run_compiled(observer, y, u)
-    state, rows = observer.init(), []
+    if kernel_is_chosen(recursion.settings, len(y), compiled):
+        return run_compiled(recursion, y, u)
+    state, rows = recursion.first, []
     for k in range(len(y)):
-        state, row = observer.advance(state, y[k], u[k])
+        state, row = recursion.advance(state, y[k], u[k])
         rows.append(row)
-    return RecursiveEstimates.of(observer, rows)
+    return RecursiveEstimates.of(recursion.settings, rows)
 
 
 @dataclass
@@ -98,7 +98,7 @@ class _Record:
         self.parameters[k], self.covariances[k] = row.parameters.theta, row.parameters.spread @ row.parameters.spread.T
         self.innovations[k, : len(row.innovation)], self.degrees[k] = row.innovation, len(row.innovation)
 
-    def estimates(self, observer: RecursiveObserver, y: FloatArray) -> RecursiveEstimates:
+    def estimates(self, observer: RecursiveSettings, y: FloatArray) -> RecursiveEstimates:
         """Return the whole."""
         most = int(self.degrees.max(initial=0.0))
         innovations = self.innovations[:, :most]
@@ -113,12 +113,13 @@ class _Record:
         )  # fmt: skip
 
 
-def run_compiled(observer: RecursiveObserver, y: FloatArray, u: FloatArray) -> RecursiveEstimates:
+def run_compiled(recursion: Recursion, y: FloatArray, u: FloatArray) -> RecursiveEstimates:
     """Run over a whole record with the kernel; single steps where samples are missing or a rank has to be decided.
 
     Shapes: ``y (samples, ny)``, ``u (samples, nu)``.
     """
-    state, plant = observer.init(), observer.plant
+    state, observer = recursion.first, recursion.settings
+    plant = observer.plant
     nq = 0 if observer.adaptation is None else plant.nq
     record = _Record.empty(len(y), plant.nx, nq, plant.ne + plant.ny + nq)
     stretches = _complete_stretches(y)
@@ -127,11 +128,11 @@ def run_compiled(observer: RecursiveObserver, y: FloatArray, u: FloatArray) -> R
     while k < len(y):
         count = min(int(stretches[k]), CHUNK)
         if pause or count < SHORT_STRETCH or state.diffuse.shape[1]:
-            state, row = observer.advance(state, y[k], u[k])
+            state, row = recursion.advance(state, y[k], u[k])
             record.note(k, row)
             k, pause = k + 1, max(pause - 1, 0)
             continue
-        state = _kernel_steps(observer, state, record, y[k : k + count], u[k - 1 : k + count])
+        state = _kernel_steps(recursion, state, record, y[k : k + count], u[k - 1 : k + count])
         taken, k = state.k - k, state.k
         if taken < count:
             # A step for the other path; where such steps are the rule, the kernel is tried less and less often.
@@ -147,13 +148,13 @@ def _complete_stretches(y: FloatArray) -> FloatArray:
 
 
 def _kernel_steps(
-    observer: RecursiveObserver, state: RecursiveState, record: _Record, y: FloatArray, u: FloatArray
+    recursion: Recursion, state: RecursiveState, record: _Record, y: FloatArray, u: FloatArray
 ) -> RecursiveState:
     """Take as many steps as the kernel can; ``u`` begins one sample before ``y``."""
     from obsynth.numerics.compiled_steps import square_root_steps
 
     first = state.k
-    stack = stacked_steps(stacked_matrices(observer.recursion.model, first - 1, len(y)), u[:-1], y, u[1:])
+    stack = stacked_steps(stacked_matrices(recursion.model, first - 1, len(y)), u[:-1], y, u[1:])
     if stack is None:
         return state
     count, rows = stack.data.shape

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from obsynth.numerics.arrays import FloatArray, read_only
 
 if TYPE_CHECKING:
-    from obsynth.observers.recursive.observer import RecursiveObserver
     from obsynth.observers.recursive.recursion import RawEstimate
+    from obsynth.observers.recursive.settings import RecursiveSettings
 
 #: Share of a diffuse direction below which a state is held to be determined: rounding of an orthonormal basis.
 UNDETERMINED_SHARE = 1e-8
@@ -71,7 +71,7 @@ class RecursiveEstimates:
 
     @classmethod
     def of(
-        cls, observer: RecursiveObserver, rows: Sequence[RawEstimate], *, window: Sequence[FloatArray] | None = None
+        cls, observer: RecursiveSettings, rows: Sequence[RawEstimate], *, window: Sequence[FloatArray] | None = None
     ) -> RecursiveEstimates:
         """Return the estimates in what a running observer gave.
 

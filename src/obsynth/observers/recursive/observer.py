@@ -2,93 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.errors import SpecError
-from obsynth.numerics.arguments import real_array, real_vector, truth
-from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
-from obsynth.numerics.covariances import covariance_factor
-from obsynth.numerics.value_types import Count, ForgettingFactor, Probability, checked_value
+from obsynth.numerics.arguments import real_array, real_vector
+from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.recursive.compiled_run import run_record
+from obsynth.observers.recursive.estimates import RecursiveEstimates
 from obsynth.observers.recursive.records import measured_record, require_horizon, whole_record
+from obsynth.observers.recursive.recursion import RawEstimate, Recursion, RecursiveState
+from obsynth.observers.recursive.settings import RecursiveSettings
 from obsynth.observers.running import RunningObserver
-from obsynth.plants.sequences import MatrixSequence
-from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
-
-if TYPE_CHECKING:
-    from obsynth.observers.recursive.estimates import RecursiveEstimates
-    from obsynth.observers.recursive.recursion import RawEstimate, Recursion, RecursiveState
-
-Form: TypeAlias = Literal["innovation", "literal", "random-walk"]
-Guard: TypeAlias = Literal["regularise", "directional", "none"]
 
 
-_KINDS = {"form": Form, "guard": Guard, "forgetting": ForgettingFactor, "window": Count, "reset": Probability}
-
-
-@dataclass(frozen=True, eq=False)
-class Adaptation:
-    """How parameters are estimated.
-
-    Parameters
-    ----------
-    form : {"innovation", "literal", "random-walk"}
-        Least squares on the whitened parity innovation; (18) as printed; or the parameters as states.
-    forgetting : float
-        lambda in (0, 1], dimensionless; not used by the random walk.
-    guard : {"regularise", "directional", "none"}
-        What keeps S bounded where excitation is missing.
-    initial_parameters : FloatArray
-        ``(nq,)``.
-    initial_covariance : FloatArray
-        ``S_0 (nq, nq)``, positive definite: also the covariance of the initial parameters.
-    walk : FloatArray
-        ``(nq, nq)``: covariance of one step of the random walk.
-    window : int
-        Samples over which excitation is watched.
-    reset : float
-        Detect and reset: probability, per sample, that innovations which no change has made larger pass the threshold
-        above which S and the covariance start again from S_0.  Zero never resets.
-
-    Raises
-    ------
-    SpecError
-        Something is out of range or has the wrong shape.
-    """
-
-    form: str
-    forgetting: float
-    guard: str
-    initial_parameters: FloatArray
-    initial_covariance: FloatArray
-    walk: FloatArray
-    window: int
-    reset: float = 0.0
-
-    def __post_init__(self) -> None:
-        for name, kind in _KINDS.items():
-            object.__setattr__(self, name, checked_value(getattr(self, name), name, kind))
-        if self.reset and self.form == "random-walk":
-            raise SpecError("reset belongs to the forms that forget: the random walk follows by itself.", path="reset")
-        q = len(self.initial_parameters)
-        object.__setattr__(self, "initial_parameters", read_only(self.initial_parameters))
-        for field, option in (("initial_covariance", "initial_parameter_covariance"), ("walk", "random_walk")):
-            matrix = as_matrix(getattr(self, field), option)
-            if matrix.shape != (q, q):
-                raise SpecError(f"{option} is {matrix.shape}, but {(q, q)} is needed.", path=option)
-            object.__setattr__(self, field, matrix)
-            factor = covariance_factor(matrix, option)
-            if field == "initial_covariance" and (np.diag(matrix) <= 0.0).any() | (np.linalg.matrix_rank(factor) < q):
-                raise SpecError(f"{option} (S_0) must be positive definite.", path=option)
-
-
-@dataclass(frozen=True, eq=False)
-class RecursiveObserver:
+class RecursiveObserver(RecursiveSettings):
     """A recursive observer: what `start` and `run` need, and nothing that depends on data.
 
     Parameters
@@ -112,96 +41,9 @@ class RecursiveObserver:
         A shape does not fit the plant.
     """
 
-    plant: TimeVaryingDescriptorSystem
-    Q: MatrixSequence
-    R: MatrixSequence
-    initial_state: FloatArray
-    initial_covariance: FloatArray
-    adaptation: Adaptation | None
-    early_constraints: bool = False
-
-    def __post_init__(self) -> None:
-        plant = self.plant
-        for name, size in (("Q", plant.ne), ("R", plant.ny)):
-            shape = getattr(self, name).shape
-            if shape != (size, size):
-                raise SpecError(f"{name} is {shape[0]} by {shape[1]}, but {size} by {size} is needed.", path=name)
-        state = real_vector(self.initial_state, plant.nx, "initial_state")
-        object.__setattr__(self, "early_constraints", truth(self.early_constraints, "early_constraints"))
-        covariance = as_matrix(self.initial_covariance, "initial_covariance")
-        if covariance.shape != (plant.nx, plant.nx):
-            raise SpecError(f"initial_covariance must be {plant.nx} by {plant.nx}.", path="initial_covariance")
-        covariance_factor(covariance, "initial_covariance")
-        object.__setattr__(self, "initial_state", read_only(state))
-        object.__setattr__(self, "initial_covariance", covariance)
-        if self.adaptation is not None and len(self.adaptation.initial_parameters) != plant.nq:
-            raise SpecError(f"initial_parameters must be {plant.nq} numbers.", path="initial_parameters")
-
-    @property
-    def dt(self) -> float:
-        """Seconds between samples."""
-        return self.plant.dt
-
-    @property
-    def state_names(self) -> tuple[str, ...]:
-        """The states that are estimated, in order."""
-        return self.plant.state_names
-
-    @property
-    def fault_names(self) -> tuple[str, ...]:
-        """The parameters that are estimated, in order."""
-        return () if self.adaptation is None else self.plant.parameter_names
-
-    @property
-    def order(self) -> int:
-        """Number of states and parameters in its state."""
-        return self.plant.nx + len(self.fault_names)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return every field as data.
-
-        Raises
-        ------
-        SpecError
-            A matrix is a callable.
-        """
-        adaptation = None
-        if self.adaptation is not None:
-            adaptation = {field.name: getattr(self.adaptation, field.name) for field in fields(self.adaptation)}
-        return {
-            "plant": self.plant.as_dict(), "Q": self.Q.as_data(), "R": self.R.as_data(),
-            "noise_constants": {**(self.Q.constants or {}), **(self.R.constants or {})},
-            "initial_state": self.initial_state, "initial_covariance": self.initial_covariance,
-            "adaptation": adaptation, "early_constraints": self.early_constraints,
-        }  # fmt: skip
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> RecursiveObserver:
-        """Return the observer that `as_dict` described.
-
-        Parameters
-        ----------
-        data : mapping
-            Every field by name.
-        """
-        constants = data["noise_constants"]
-        return cls(
-            TimeVaryingDescriptorSystem(**data["plant"]),
-            MatrixSequence.of(data["Q"], "Q", constants=constants),
-            MatrixSequence.of(data["R"], "R", constants=constants),
-            data["initial_state"], data["initial_covariance"],
-            None if data["adaptation"] is None else Adaptation(**data["adaptation"]), data["early_constraints"],
-        )  # fmt: skip
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return what makes it again in another process: its recursion is made there anew."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
-
     @cached_property
     def recursion(self) -> Recursion:
         """What follows from the observer alone, made when it is first needed."""
-        from obsynth.observers.recursive.recursion import Recursion
-
         return Recursion(self)
 
     def init(self) -> RecursiveState:
@@ -239,8 +81,6 @@ class RecursiveObserver:
         PreconditionError
             Rank H_k is lost at this k although no sample is missing.
         """
-        from obsynth.observers.recursive.estimates import RecursiveEstimates
-
         outputs = measured_record(np.atleast_2d(real_array(y, "y")), self.plant.ny)[0]
         inputs = real_vector(u, self.plant.nu, "u")
         require_horizon(self.plant.horizon, state.k + 1, early=self.early_constraints)
@@ -278,8 +118,6 @@ class RecursiveObserver:
         PreconditionError
             Rank H_k is lost at some k (named) although no sample is missing.
         """
-        from obsynth.observers.recursive.compiled_run import run_record
-
         outputs, inputs = whole_record(y, u, self.plant.ny, self.plant.nu)
         require_horizon(self.plant.horizon, len(outputs), early=self.early_constraints)
-        return run_record(self, outputs, inputs, compiled)
+        return run_record(self.recursion, outputs, inputs, compiled)

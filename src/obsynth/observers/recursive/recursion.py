@@ -18,10 +18,10 @@ from obsynth.numerics.least_squares_step import (
 )
 from obsynth.numerics.recursive_least_squares import ParameterState, start_of, update
 from obsynth.observers.recursive.literal_form import posterior_residual
-from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.recursive.parameter_reset import ParameterReset
 from obsynth.observers.recursive.prepared_step import PreparedStep
 from obsynth.observers.recursive.random_walk_parameters import RandomWalkParameterSteps, WalkingEarlySteps
+from obsynth.observers.recursive.settings import RecursiveSettings
 from obsynth.observers.recursive.step_model import (
     EarlyConstraintSteps,
     PlantSteps,
@@ -52,14 +52,14 @@ class RawEstimate(NamedTuple):
     y: FloatArray
 
 
-def step_model_of(observer: RecursiveObserver) -> StepModel:
+def step_model_of(settings: RecursiveSettings) -> StepModel:
     """Return the steps that an observer runs on, with its plant rewritten as its options ask."""
-    parts, adaptation = (observer.plant, observer.Q, observer.R), observer.adaptation
+    parts, adaptation = (settings.plant, settings.Q, settings.R), settings.adaptation
     walk = None
     if adaptation is not None and adaptation.form == "random-walk":
         walk = covariance_factor(adaptation.walk, "walk")
-    if observer.early_constraints:
-        rows = early_rows(observer.plant, early=True)
+    if settings.early_constraints:
+        rows = early_rows(settings.plant, early=True)
         return EarlyConstraintSteps(*parts, rows) if walk is None else WalkingEarlySteps(*parts, rows, walk)
     return PlantSteps(*parts) if walk is None else RandomWalkParameterSteps(PlantSteps(*parts), walk)
 
@@ -89,9 +89,9 @@ class RecursiveState(NamedTuple):
 class Recursion:
     """The recursion of an observer: what follows from it alone, once for all runs."""
 
-    def __init__(self, observer: RecursiveObserver) -> None:
-        self.observer, self.model = observer, step_model_of(observer)
-        adaptation, nx = observer.adaptation, observer.plant.nx
+    def __init__(self, settings: RecursiveSettings) -> None:
+        self.settings, self.model = settings, step_model_of(settings)
+        adaptation, nx = settings.adaptation, settings.plant.nx
         self.random_walk = adaptation is not None and adaptation.form == "random-walk"
         self.literal = adaptation is not None and adaptation.form == "literal"
         self.directional = adaptation is not None and adaptation.guard == "directional"
@@ -100,11 +100,11 @@ class Recursion:
         self.reset: ParameterReset | None = None
         # The factorisation of a step that stays the same; it follows from the step alone.
         self._prepared: PreparedStep | None = None
-        factor = covariance_factor(observer.initial_covariance, "initial_covariance")
-        nq = 0 if adaptation is None else observer.plant.nq
+        factor = covariance_factor(settings.initial_covariance, "initial_covariance")
+        nq = 0 if adaptation is None else settings.plant.nq
         self.first = RecursiveState(
-            0, observer.initial_state.copy(), factor, np.zeros((nx, nq)), np.zeros((nx, 0)),
-            start_of(np.zeros(0), np.zeros((0, 0))), np.zeros(observer.plant.nu), (), np.zeros((0, 2)), 0,
+            0, settings.initial_state.copy(), factor, np.zeros((nx, nq)), np.zeros((nx, 0)),
+            start_of(np.zeros(0), np.zeros((0, 0))), np.zeros(settings.plant.nu), (), np.zeros((0, 2)), 0,
         )  # fmt: skip
         if adaptation is None:
             return
@@ -158,14 +158,14 @@ class Recursion:
             found, lesson = self._careful(state, step, right)
         v, G = found.innovation[:, 0], -found.innovation[:, 1:]
         parameters, surprises, resets = state.parameters, state.surprises, state.resets
-        if nq and self.observer.adaptation is not None:
+        if nq and self.settings.adaptation is not None:
             if self.reset is not None:
                 surprises = self.reset.surprises(surprises, parameters, v, G)
                 if self.reset.is_due(surprises):
                     parameters, surprises, resets = self.reset.forgetful(parameters), surprises[:0], resets + 1
             seen, regressor, noise = lesson or (v, G, None)
             parameters, _ = update(
-                parameters, seen, regressor, forgetting=self.observer.adaptation.forgetting, regular=self.regular,
+                parameters, seen, regressor, forgetting=self.settings.adaptation.forgetting, regular=self.regular,
                 directional=self.directional, noise=noise,
             )  # fmt: skip
         after = state._replace(
@@ -192,7 +192,7 @@ class Recursion:
         S = np.zeros((len(H), max(width + step.noise.shape[1], len(H))))
         S[:ne, :width] = step.A @ state.factor
         S[:, width : width + step.noise.shape[1]] = step.noise
-        require_in_range(S, state.factor, state.k, self.observer.state_names)
+        require_in_range(S, state.factor, state.k, self.settings.state_names)
         unknown = np.zeros((len(H), state.diffuse.shape[1]))
         unknown[:ne] = step.A @ state.diffuse
         kept = ~np.isnan(right[:, 0])
@@ -217,7 +217,7 @@ class Recursion:
     ) -> RawEstimate:
         x, factor, diffuse = state.x, state.factor, state.diffuse
         if self.random_walk:
-            nx = self.observer.plant.nx
+            nx = self.settings.plant.nx
             nq = len(x) - nx
             known = ParameterState(x[nx:], np.zeros((nq, nq)), factor[nx:])
             return RawEstimate(state.k, x[:nx], factor[:nx], diffuse[:nx], known, innovation, np.zeros((0, nq)), nis, y)

@@ -115,7 +115,7 @@ def _identities(
     scaling = balance_by_least_squares(plant.E, plant.A, outputs=[plant.C])
     units = scaling.states
     # What cancels down to rounding is judged by the terms that it was formed of.
-    size_t, size_t0 = np.abs(t), np.abs(t0)
+    size_t, size_t0 = (_in_equations(matrix, scaling.equations) for matrix in (t, t0))
     yield "state in the error", "Az T E + By C = T A", Identity(
         (az @ (t @ plant.E), by @ plant.C, -t @ plant.A),
         ((az, t, plant.E), (by, plant.C), (size_t, plant.A), (az, t, plant.A)), units,
@@ -145,6 +145,12 @@ def _identities(
         "Dy Dd = T0 Bd",
         Identity((dy @ plant.Dd, -t0 @ plant.Bd), ((dy, plant.Dd), (size_t0, plant.Bd), (cz, t, plant.Bd))),
     )
+
+
+def _in_equations(matrix: FloatArray, equations: FloatArray) -> FloatArray:
+    """Return the largest entry of each row, in the units of each equation: what a row is made of."""
+    sizes = np.max(np.abs(matrix) / equations, axis=1, initial=0.0)
+    return np.asarray(np.outer(sizes, equations))
 
 
 def _tracking(

@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from obsynth.analysis.plant_units import PlantUnits
 from obsynth.methods.pd_observer.augmentation import with_faults_as_states, with_sensor_noise
 from obsynth.methods.pd_observer.checks.certificate import fitting_claims, proof_rows, stacked_gains
 from obsynth.methods.pd_observer.checks.error_system import PdErrorSystem
@@ -197,10 +198,12 @@ def _pencil_row(design: ObserverDesign, augmented: DescriptorSystem) -> Check:
     gain_j, gain_l = stacked_gains(design)
     n = augmented.nx
     one, zero = np.eye(n), np.zeros((n, n))
-    found = pencil_structure(
-        np.block([[one, zero], [zero, zero]]),
-        np.block([[zero, one], [augmented.A - gain_j @ augmented.C, -one - gain_l @ augmented.C]]),
+    # In units in which the error is near one: similarity by powers of two is exact.
+    states = PlantUnits.of(augmented).rounded().states
+    moved, shown = (
+        part * states / states[:, None] for part in (augmented.A - gain_j @ augmented.C, gain_l @ augmented.C)
     )
+    found = pencil_structure(np.block([[one, zero], [zero, zero]]), np.block([[zero, one], [moved, -one - shown]]))
     impulse_free = found.regular and found.infinite_block_sizes == (1,) * n
     abscissa = float(np.max(found.finite_eigenvalues.real)) if impulse_free else float("nan")
     return _negative(

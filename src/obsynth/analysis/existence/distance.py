@@ -1,0 +1,112 @@
+"""How far a pencil is from losing rank in the closed unstable region: its least singular value there, in scaled units.
+
+Estimated, not proved: the least that is found on the boundary, near all zeros and, for tall pencils, at the unstable
+points where a random compression of the rows loses rank, which are close to where the pencil nearly does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.analysis.far_zeros import equilibrated_at
+from obsynth.numerics.arrays import ComplexArray, FloatArray
+
+#: Below this distance, relative to the data, rounding of the data is as large as what a unit fault moves: gains of its
+#: inverse would be needed, which double precision drowns.
+DROWNED = 2e-14
+#: Zeros closer than this, relative to their size, may be one that rounding has moved.
+SAME_ZERO = 1e-3
+#: Points on the stability boundary; in continuous time between these magnitudes of the own rates.
+BOUNDARY_POINTS = 33
+#: Further out a pencil is close to what it is at infinity, where other conditions decide.
+SLOWEST, FASTEST = 1e-3, 1e3
+#: Compressions of a tall pencil, at most so many points of each.
+COMPRESSIONS = 2
+MOST_POINTS = 40
+
+
+@dataclass(frozen=True)
+class Distance:
+    """The least singular value found, relative to the largest, and where."""
+
+    value: float
+    point: complex
+
+
+def distance_to_loss(
+    E: FloatArray, A: FloatArray, *, nx: int, discrete: bool, zeros: tuple[complex, ...] = ()
+) -> Distance:
+    """Return how far ``A - s E (m, n)``, nx states, is from losing column rank on or outside the stability boundary."""
+    candidates = [*_boundary(E, A, discrete), *(_to_boundary(zero, discrete) for zero in zeros)]
+    if A.shape[0] > A.shape[1]:
+        candidates += _compressed_points(E, A, discrete)
+    best = Distance(np.inf, 0j)
+    for point in candidates:
+        value = relative_singular_value(E, A, point, nx=nx)
+        if value < best.value:
+            best = Distance(value, point)
+    return best
+
+
+def drowned_zeros(
+    E: FloatArray, A: FloatArray, found: Iterable[complex], exact: Sequence[complex], *, nx: int
+) -> list[complex]:
+    """Return those zeros found in floating point that the exact ones lack only by rounding of the data."""
+    return [
+        value
+        for value in map(complex, found)
+        if not any(abs(value - other) <= SAME_ZERO * max(1.0, abs(other)) for other in exact)
+        and relative_singular_value(E, A, value, nx=nx) <= DROWNED
+    ]
+
+
+def relative_singular_value(E: FloatArray, A: FloatArray, point: complex, *, nx: int) -> float:
+    """Return the least singular value of the pencil at a point relative to the largest, in units that suit it."""
+    pencil = equilibrated_at(E, A, point, nx=nx)
+    matrix: NDArray[Any] = pencil.A - (point if point.imag else point.real) * pencil.E
+    values = np.linalg.svd(matrix, compute_uv=False)
+    if matrix.shape[0] < matrix.shape[1] or not values.size or values[0] == 0.0:
+        return 0.0 if matrix.shape[1] else np.inf
+    return float(values[-1] / values[0])
+
+
+def _boundary(E: FloatArray, A: FloatArray, discrete: bool) -> list[complex]:
+    if discrete:
+        return [complex(np.exp(1j * angle)) for angle in np.linspace(0.0, np.pi, BOUNDARY_POINTS)]
+    rate = _typical_rate(E, A)
+    return [0j, *(complex(0.0, rate * size) for size in np.geomspace(SLOWEST, FASTEST, BOUNDARY_POINTS))]
+
+
+def _typical_rate(E: FloatArray, A: FloatArray) -> float:
+    """Return the size of s at which both matrices weigh the same."""
+    left, right = float(np.linalg.norm(E)), float(np.linalg.norm(A))
+    return right / left if left > 0.0 and right > 0.0 else 1.0
+
+
+def _to_boundary(value: complex, discrete: bool) -> complex:
+    if discrete:
+        return value / abs(value) if value else 1.0 + 0j
+    return complex(max(value.real, 0.0), abs(value.imag))
+
+
+def _compressed_points(E: FloatArray, A: FloatArray, discrete: bool) -> list[complex]:
+    from scipy.linalg import eigvals
+
+    rng, found = np.random.default_rng(1), list[complex]()
+    for _ in range(COMPRESSIONS):
+        left = rng.standard_normal((A.shape[1], A.shape[0]))
+        # LAPACK gives up on a few pencils: their points are left out.
+        try:
+            values: ComplexArray = eigvals(left @ A, left @ E)
+        except np.linalg.LinAlgError:
+            continue
+        finite = values[np.abs(values) <= FASTEST * (1.0 if discrete else _typical_rate(E, A))]
+        outside = finite[np.abs(finite) >= 1.0] if discrete else finite[finite.real >= 0.0]
+        upper = outside[outside.imag >= 0.0]
+        found += [complex(value) for value in upper[np.argsort(np.abs(upper))][:MOST_POINTS]]
+    return found

@@ -1,0 +1,104 @@
+"""Three answers from exact decisions and floating point: no, yes with its distance, and unclear.
+
+*No* is exact on the numbers as written.  *Yes* is exact too, and comes with how far the data are from another answer.
+Where that is no more than what rounding of the data or of any gains can bridge, the answer is *unclear*.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from obsynth.analysis.existence.distance import DROWNED, Distance, distance_to_loss
+from obsynth.analysis.existence.numbers import SystemFacts
+from obsynth.analysis.far_zeros import system_zeros
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.ranks import RankDecision
+
+
+def settled_rank(decision: RankDecision, exact_rank: int | None) -> RankDecision:
+    """Return a rank decision with the exact rank in place of that by a tolerance, or unclear."""
+    if exact_rank is None:
+        return decision
+    if exact_rank < decision.expected:
+        return replace(decision, rank=exact_rank, means="exact")
+    values = decision.singular_values
+    needed = decision.expected - 1
+    enough = decision.expected == 0 or (len(values) > needed and values[needed] > DROWNED * values[0])
+    if enough:
+        return replace(decision, rank=decision.expected, means="exact")
+    return replace(decision, rank=min(decision.rank, decision.expected - 1), means="unclear")
+
+
+#: Rounding scatters a multiple zero by up to this, relative to its size or one.
+SCATTER = 1e-2
+
+
+@dataclass(frozen=True)
+class ZeroVerdict:
+    """What is known of the zeros of a pencil outside the region of stability.
+
+    ``answer`` is no, yes or unclear; ``distance`` is there unless the answer is no.
+    """
+
+    answer: str
+    facts: SystemFacts
+    distance: Distance | None = None
+
+    @property
+    def means(self) -> str:
+        """How it was decided, in words."""
+        return (
+            "exactly, on the numbers as written" if self.facts.exact else "to hundreds of digits of the sampled plant"
+        )
+
+
+def zero_verdict(facts: SystemFacts, E: FloatArray, A: FloatArray, *, nx: int, discrete: bool) -> ZeroVerdict:
+    """Return the answer for the pencil ``A - s E (m, n)`` of which the facts are known."""
+    facts = believed(facts, E, A, nx=nx)
+    if not facts.full or facts.outside:
+        return ZeroVerdict("no", facts)
+    distance = distance_to_loss(E, A, nx=nx, discrete=discrete, zeros=facts.zeros)
+    return ZeroVerdict("yes" if distance.value > DROWNED else "unclear", facts, distance)
+
+
+def believed(facts: SystemFacts, E: FloatArray, A: FloatArray, *, nx: int) -> SystemFacts:
+    """Return the facts without zeros that rounding of computed data has brought in from infinity."""
+    if not facts.computed or not facts.zeros:
+        return facts
+    found = system_zeros(E, A, nx=nx).values
+
+    def near(value: complex) -> bool:
+        return bool(np.any(np.abs(found - value) <= SCATTER * max(1.0, abs(value))))
+
+    zeros, outside = (tuple(filter(near, values)) for values in (facts.zeros, facts.outside))
+    return replace(facts, zeros=zeros, outside=outside)
+
+
+def in_own_time(verdict: ZeroVerdict, rate: float) -> ZeroVerdict:
+    """Return a verdict on a plant in scaled time with its point in the time of the plant."""
+    found = verdict.distance
+    return verdict if found is None else replace(verdict, distance=Distance(found.value, found.point / rate))
+
+
+def described_distance(verdict: ZeroVerdict) -> str:
+    """Return the least singular value and where it is, for a condition that holds or is unclear."""
+    found = verdict.distance
+    if found is None:
+        return ""
+    where = f"{found.point.real:.4g}" if found.point.imag == 0.0 else f"{found.point:.4g}"
+    return f"least singular value {found.value:.2g} of the scaled pencil outside (near {where}), {verdict.means}"
+
+
+def unclear_detail(verdict: ZeroVerdict, what: str) -> str:
+    """Return what cannot be told apart, the tolerance, the witness, and what would decide it."""
+    found = verdict.distance
+    size = 0.0 if found is None else found.value
+    where = "" if found is None else f" near {found.point:.6g}"
+    return (
+        f"{what} exists for the numbers as written ({verdict.means}), but a plant whose scaled entries differ by "
+        f"{size:.1g} of the largest has a zero{where} and none: rounding of the data or of any gains is about "
+        f"{DROWNED:.0e}. Data with more digits in other states or units, or an output in which this shows more, would "
+        "decide it."
+    )

@@ -1,0 +1,142 @@
+"""Logs as text: columns separated by commas, semicolons, tabs or bars, numbers with a point or a comma."""
+
+from __future__ import annotations
+
+import csv
+import itertools
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TextIO
+
+import numpy as np
+
+from obsynth.data.signals import Signals
+from obsynth.data.stamps import MISSING, Stamps
+from obsynth.errors import SpecError
+from obsynth.files.tables import as_meant
+from obsynth.numerics.arrays import FloatArray
+
+#: What may separate columns, the first one that fits.
+SEPARATORS = (",", ";", "\t", "|")
+#: How programs of Microsoft say what separates the columns, in a line before the header.
+_SEPARATOR_LINE = re.compile(r"\s*sep=(.)\s*", re.IGNORECASE)
+#: Lines that may end with CR alone.
+_OLD_LINES = re.compile(r"[^\r]*\r\n?|[^\r]+")
+
+
+@dataclass(frozen=True)
+class Dialect:
+    """How a log is written: what separates its columns, and whether numbers may have a decimal comma."""
+
+    separator: str
+
+    @property
+    def comma(self) -> bool:
+        """Whether a comma in a number stands for its point."""
+        return self.separator != ","
+
+    def number(self, text: str | None, row: int, column: str) -> float:
+        """Return the number in a cell, NaN where it is missing; a cell that is none is named with its row."""
+        cell = "" if text is None else text.strip()
+        if cell.lower() in MISSING:
+            return float("nan")
+        try:
+            return float(cell.replace(",", ".") if self.comma and "." not in cell else cell)
+        except ValueError:
+            advice = ""
+            if "," in cell:
+                advice = (" Separate the columns by semicolons where numbers have a decimal comma."
+                          if not self.comma else " Leave out what groups thousands.")  # fmt: skip
+            raise SpecError(f"Row {row}, column {column!r}: {text!r} is no number.{advice}",
+                            path=f"row {row}") from None  # fmt: skip
+
+
+def text_chunks(path: Path, signals: Signals, stamps: Stamps, rows: int) -> Iterator[FloatArray]:
+    """Yield ``(rows, 1 + nu + ny)`` of a file."""
+    with path.open(encoding="utf-8-sig", newline="") as stream:
+        if not stream.readline():
+            raise SpecError(f"{path} cannot be read: it is empty.", path=str(path))
+        stream.seek(0)
+        try:
+            yield from _together(stream_rows(stream, signals, stamps), rows)
+        except SpecError as error:
+            if (error.path or "").startswith("cells"):
+                raise SpecError(f"{path} cannot be read: {error}", path=str(path)) from error
+            raise
+
+
+def stream_rows(stream: TextIO, signals: Signals, stamps: Stamps) -> Iterator[FloatArray]:
+    """Yield one row at a time, ``(1, 1 + nu + ny)``, as soon as its line is there."""
+    lines = _text_lines(stream)
+    first = next(lines, "")
+    told = _SEPARATOR_LINE.fullmatch(first)
+    head = next(lines, "") if told else first
+    dialect = Dialect(told.group(1)) if told else _dialect_of(head, signals)
+    # A name in quotes may go on in the next line.
+    table = _cells(itertools.chain([head], lines), dialect)
+    header = tuple(as_meant(name.strip()) for name in next(table, []))
+    places = signals.positions(header)
+    row = 0
+    for cells in table:
+        if not any(cell.strip() for cell in cells):
+            continue
+        row += 1
+        if len(cells) > len(header):
+            raise SpecError(f"Row {row} has {len(cells)} cells, but the header has {len(header)}.",
+                            path=f"cells of row {row}")  # fmt: skip
+        cells += [""] * (len(header) - len(cells))
+        time = stamps.read(cells[places[0]], row, header[places[0]], comma=dialect.comma)
+        yield np.array([[time, *(dialect.number(cells[place], row, header[place]) for place in places[1:])]])
+    if row == 0:
+        raise SpecError("The data have no rows.", path="data")
+
+
+def _together(rows: Iterator[FloatArray], count: int) -> Iterator[FloatArray]:
+    while block := list(itertools.islice(rows, count)):
+        yield np.concatenate(block)
+
+
+def _dialect_of(head: str, signals: Signals) -> Dialect:
+    """Return how a log is written: by the separator that finds the columns that are read, or that finds most."""
+    found = {separator: _names(head, separator) for separator in SEPARATORS}
+    whole = next((s for s, names in found.items() if set(signals.columns) <= set(names)), None)
+    return Dialect(whole or max(SEPARATORS, key=lambda s: len(found[s])))
+
+
+def _names(head: str, separator: str) -> Sequence[str]:
+    try:
+        return [as_meant(name.strip()) for name in next(csv.reader([head], delimiter=separator), [])]
+    except csv.Error:
+        return []
+
+
+def _cells(lines: Iterator[str], dialect: Dialect) -> Iterator[list[str]]:
+    """Yield the cells of each line; what is no text, or no table, is a `SpecError`."""
+    table = csv.reader(lines, delimiter=dialect.separator)
+    for row in itertools.count():
+        try:
+            cells = next(table, None)
+        except csv.Error as error:
+            raise SpecError(f"Row {row} of the data cannot be read: {error}.", path=f"row {row}") from error
+        if cells is None:
+            return
+        yield cells
+
+
+def _text_lines(stream: TextIO) -> Iterator[str]:
+    """Yield lines as they come; lines that end with CR alone, as of old, come together where a stream keeps these."""
+    is_first = True
+    for count in itertools.count():
+        try:
+            block = stream.readline()
+        except UnicodeDecodeError as error:
+            name = getattr(stream, "name", "The data")
+            raise SpecError(f"{name} is no UTF-8 text after line {count}.", path="data") from error
+        if not block:
+            return
+        for line in _OLD_LINES.findall(block):
+            # A byte order mark is no part of the first name.
+            yield line.removeprefix("\ufeff") if is_first else line
+            is_first = False

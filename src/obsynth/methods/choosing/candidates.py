@@ -1,0 +1,108 @@
+"""Every method that exists for a plant, designed, sampled to one clock; the others with the reason why not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from obsynth.errors import ObsynthError
+from obsynth.methods.choosing.figures import DECOUPLED, FaultFigures, fault_figures
+from obsynth.methods.method_spec import MethodSpec
+from obsynth.methods.registry import REGISTRY, method_spec
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.linear.sampling import sample_observer
+from obsynth.observers.recursive.steady_state import steady_observer
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.results.design import ObserverDesign
+
+#: Methods whose designs are continuous whatever the plant is used for: they are sampled afterwards.
+CONTINUOUS_ONLY = ("pd-observer",)
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A method for a plant: its design and figures, or why there is none.
+
+    Fields: method; design; observer: on the clock; figures: of each fault; milliseconds: to design; refused.
+    """
+
+    method: str
+    design: ObserverDesign | None
+    observer: LinearObserver | None
+    figures: tuple[FaultFigures, ...]
+    milliseconds: float
+    refused: str
+
+    def rank(self, leaky: bool) -> tuple[float, ...]:
+        """Return what sorts candidates by closed-form figures, the best first; ``leaky``: there are unknown inputs.
+
+        A mean over time T divides noise by the root of T: the deviation times the root of the delay is what averaging
+        cannot change.
+        """
+        if not self.figures:
+            return (2.0, 0.0, np.inf)
+        missed = float(not all(found.reaches for found in self.figures))
+        leak = float(leaky and any(found.leak > DECOUPLED for found in self.figures))
+        dt = self.observer.dt if self.observer is not None else 0.0
+        prices = [found.deviation * np.sqrt(max(found.most, dt)) for found in self.figures]
+        return (missed, leak, float(np.prod(prices) ** (1.0 / len(prices))) if np.all(np.isfinite(prices)) else np.inf)
+
+
+def candidate(
+    method: str,
+    plant: DescriptorSystem,
+    sampled: DescriptorSystem,
+    steps: int,
+    maker: Callable[[DescriptorSystem, str, Mapping[str, Any]], ObserverDesign],
+    options: Mapping[str, Any],
+    *,
+    continuous: bool = False,
+) -> Candidate:
+    """Return one method for a plant; on the sampled plant where it can be, or else (or if asked) sampled afterwards."""
+    spec = method_spec(method)
+    if "time-invariant" not in spec.plants:
+        return _refused(method, "for nonlinear plants")
+    begun = perf_counter()
+    try:
+        made = maker(plant if continuous or method in CONTINUOUS_ONLY else sampled, method, options)
+        observer = _sampled(made, sampled.dt)
+    except ObsynthError as error:
+        return _refused(method, one_line(str(error)), 1e3 * (perf_counter() - begun))
+    spent = 1e3 * (perf_counter() - begun)
+    if not observer.fault_names or any(name not in sampled.fault_names for name in observer.fault_names):
+        return _refused(method, "estimates the state, but no fault", spent)
+    return Candidate(method, made, observer, fault_figures(sampled, observer, steps), spent, "")
+
+
+def _sampled(design: ObserverDesign, dt: float) -> LinearObserver:
+    if isinstance(design.observer, LinearObserver):
+        return design.observer if design.observer.dt > 0.0 else sample_observer(design.observer, dt)
+    return steady_observer(design.recursive[1]).observer
+
+
+def _refused(method: str, reason: str, spent: float = 0.0) -> Candidate:
+    return Candidate(method, None, None, (), spent, reason)
+
+
+def one_line(text: str, most: int = 160) -> str:
+    """Return the start of a message in one line, with what would help, which stands at its end."""
+    flat = " ".join(text.split())
+    for mark in ("Add one of:", "Leave out one of:"):
+        head, found, tail = flat.rpartition(mark)
+        if found:
+            return f"{_cut(head, most)} {mark}{tail}"
+    return _cut(flat, most)
+
+
+def _cut(text: str, most: int) -> str:
+    short = text.removeprefix("No observer of this kind exists: ").strip()
+    return short if len(short) <= most else short[: most - 3].rstrip() + "..."
+
+
+def linear_methods() -> Sequence[MethodSpec]:
+    """Return the methods that take linear plants with constant matrices."""
+    return [found for found in map(method_spec, REGISTRY) if "time-invariant" in found.plants]

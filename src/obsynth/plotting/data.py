@@ -1,0 +1,209 @@
+"""A design on one's own data: measured outputs, estimates with intervals, residuals, statistics and alarms."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from obsynth.data.log_estimator import DECIDING
+from obsynth.data.run import DataRun
+from obsynth.errors import SpecError
+from obsynth.numerics.arguments import require_kind
+from obsynth.plotting.panels import (
+    BAND_STYLE,
+    BAND_WIDTH,
+    ESTIMATE_STYLE,
+    MARK_STYLE,
+    PANEL_HEIGHT,
+    RESIDUAL_STYLE,
+    THRESHOLD_STYLES,
+    TRUE_STYLE,
+    WIDTH,
+    legend_above,
+    new_panels,
+    tidy,
+    with_unit,
+)
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.axes import Axes
+
+    from obsynth.results.design import ObserverDesign
+
+#: Kinds of panels, in their order.
+PARTS = ("outputs", "faults", "residuals", "statistic")
+#: Signals of a kind that are drawn.
+MOST = 6
+#: Rows in which nothing is decided lie in grey, those with an alarm in red.
+_UNDECIDED: dict[str, Any] = {"color": "0.9", "linewidth": 0.0, "zorder": 0}
+_ALARM: dict[str, Any] = {"color": "tab:red", "alpha": 0.15, "linewidth": 0.0, "zorder": 0}
+_LINES = ("-", "--", "-.", ":")
+
+
+def plot_data(
+    run: DataRun,
+    *,
+    design: ObserverDesign | None = None,
+    show: Sequence[str] = PARTS,
+    axes: Iterable[Axes] | None = None,
+) -> list[Axes]:
+    """Plot what a design says of measured data.
+
+    Parameters
+    ----------
+    run : DataRun
+        From `obsynth.run_on_data` without ``out``, so that it holds its table.
+    design : ObserverDesign, optional
+        Which was run: gives units, and the standard deviations of the fault estimates of linear designs.
+    show : sequence of {"outputs", "faults", "residuals", "statistic"}, optional
+        What is drawn, of what there is: measured outputs with their estimates, fault estimates with 95 % intervals of
+        the stated noise, residuals with the thresholds of the run, and the statistic of its monitor.
+    axes : iterable of Axes, optional
+        As many as there are panels; new ones, one above the other, by default.
+
+    Returns
+    -------
+    list of Axes
+        One for each of the first six outputs and faults, one for all residuals, one for the statistic.  Rows in which
+        nothing is decided (warm-up, gaps) lie in grey, rows with an alarm in red.
+
+    Raises
+    ------
+    SpecError
+        The run holds no table, ``show`` names something else, or there are too few or too many axes.
+    """
+    require_kind(run, DataRun, "run", "what obsynth.run_on_data returns")
+    if run.table is None or run.measured is None:
+        raise SpecError("The run holds no table, since it was written to a file: run it without out.", path="run")
+    unknown = [part for part in show if part not in PARTS]
+    if isinstance(show, str) or unknown:
+        raise SpecError(f"show is {show!r}: use some of {', '.join(PARTS)}.", path="show")
+    plans = _plans(run.table, run.measured, show)
+    panels = new_panels(axes, len(plans), size=(WIDTH, PANEL_HEIGHT * max(len(plans), 1) + 0.6))
+    units = {} if design is None else dict(design.plant.units)
+    for panel, (part, name) in zip(panels, plans, strict=True):
+        _shade(panel, run.table, alarms=part != "outputs")
+        _DRAWN[part](panel, run, name, units, design)
+        legend_above(panel)
+        tidy(panel)
+    if panels:
+        panels[-1].set_xlabel("time" if run.stamps.is_dated else "time (s)")
+    return panels
+
+
+def panel_count(run: DataRun, show: Sequence[str] = PARTS) -> int:
+    """Return how many axes `plot_data` needs."""
+    return 0 if run.table is None or run.measured is None else len(_plans(run.table, run.measured, show))
+
+
+def _plans(table: pd.DataFrame, measured: pd.DataFrame, show: Sequence[str]) -> list[tuple[str, str]]:
+    """Return part and signal of each panel."""
+    columns = [str(name) for name in table.columns]
+    estimated = {name[5:-1] for name in columns if name.startswith("xhat[")}
+    outputs = [str(name) for name in measured.columns if name != "time"]
+    # Known inputs come first and are no outputs; of these the estimated ones say more.
+    outputs.sort(key=lambda name: name not in estimated)
+    plans = [("outputs", name) for name in outputs[:MOST]]
+    plans += [("faults", name) for name in [name for name in columns if name.startswith("fhat[")][:MOST]]
+    plans += [("residuals", "")] if any(name.startswith("r[") for name in columns) else []
+    plans += [("statistic", "")] if "statistic" in columns else []
+    return [plan for plan in plans if plan[0] in show]
+
+
+def _draw_output(panel: Axes, run: DataRun, name: str, units: dict[str, str], _: Any) -> None:
+    measured: Any = run.measured
+    table: Any = run.table
+    panel.plot(measured["time"], measured[name], label="measured", **{**TRUE_STYLE, "linewidth": 2.5})
+    column = f"xhat[{name}]"
+    if column in table:
+        panel.plot(_times(table, column), table[column], label="estimate", **ESTIMATE_STYLE)
+    panel.set_ylabel(with_unit(name, units))
+
+
+def _draw_fault(panel: Axes, run: DataRun, column: str, units: dict[str, str], design: Any) -> None:
+    table: Any = run.table
+    name, times = column[5:-1], _times(table, column)
+    values, deviation = table[column].to_numpy(float), _deviation(table, column, design)
+    if deviation is not None:
+        low, high = values - BAND_WIDTH * deviation, values + BAND_WIDTH * deviation
+        panel.fill_between(times, low, high, label="95 % interval of the stated noise", **BAND_STYLE)
+    panel.plot(times, values, label="estimate", **{**ESTIMATE_STYLE, "linestyle": "-"})
+    level = run.thresholds.get(column)
+    if level is not None:
+        centre = 0.0 if design is None else design.plant.operating_point.get(name, 0.0)
+        for i, side in enumerate((centre + level, centre - level)):
+            panel.axhline(side, label="threshold" if i == 0 else None, **THRESHOLD_STYLES[0])
+    panel.set_ylabel(with_unit(name, units))
+
+
+def _draw_residuals(panel: Axes, run: DataRun, _: str, units: dict[str, str], __: Any) -> None:
+    table: Any = run.table
+    names = [name for name in table.columns if name.startswith("r[")]
+    for i, name in enumerate(names[:MOST]):
+        style = {**RESIDUAL_STYLE, "linestyle": _LINES[i % len(_LINES)], "color": str(min(0.2 * i, 0.6))}
+        panel.plot(table["time"], table[name], label=name, **style)
+    for i, name in enumerate(name for name in names[:MOST] if name in run.thresholds):
+        style = THRESHOLD_STYLES[i % len(THRESHOLD_STYLES)]
+        for side, label in ((run.thresholds[name], f"threshold of {name}"), (-run.thresholds[name], None)):
+            panel.axhline(side, label=label, **style)
+    panel.set_ylabel("residuals")
+
+
+def _draw_statistic(panel: Axes, run: DataRun, _: str, __: dict[str, str], ___: Any) -> None:
+    table: Any = run.table
+    panel.plot(table["time"], table["statistic"], label="statistic", **RESIDUAL_STYLE)
+    panel.plot(table["time"], table["threshold"], label="threshold", **THRESHOLD_STYLES[0])
+    first = _first_alarm(table)
+    if first is not None and np.isfinite(table["statistic"].iloc[first]):
+        time = table["time"].iloc[first]
+        shown = run.stamps.shown(next(iter(run.alarms.values()))) if run.alarms else ""
+        panel.plot([time], [table["statistic"].iloc[first]], marker="o", color="black",
+                   label=f"first alarm at {shown}", **MARK_STYLE)  # fmt: skip
+    values = table["statistic"].to_numpy(float)
+    if np.nanmax(values, initial=0.0) > 0.0:
+        panel.set_yscale("symlog", linthresh=max(float(np.nanmedian(table["threshold"].to_numpy(float))), 1e-300))
+    panel.set_ylabel("statistic")
+
+
+_DRAWN = {
+    "outputs": _draw_output, "faults": _draw_fault, "residuals": _draw_residuals, "statistic": _draw_statistic,
+}  # fmt: skip
+
+
+def _times(table: Any, column: str) -> Any:
+    """Return the time of which a column is the estimate."""
+    own = f"time of {column}"
+    return table[own] if own in table else table["time"]
+
+
+def _deviation(table: Any, column: str, design: Any) -> Any:
+    if f"sd {column}" in table:
+        return table[f"sd {column}"].to_numpy(float)
+    rows = () if design is None else design.report.checks
+    values = [check.value for check in rows if check.name == f"noise in {column}"]
+    # Of a continuous design it is that for one second between samples: of no use without the sampling.
+    known = values and design is not None and getattr(design.observer, "dt", 0.0) > 0.0
+    return float(values[0]) if known else None
+
+
+def _first_alarm(table: Any) -> int | None:
+    if "alarm" not in table:
+        return None
+    rows = np.flatnonzero(table["alarm"].to_numpy() != "")
+    return int(rows[0]) if rows.size else None
+
+
+def _shade(panel: Axes, table: Any, *, alarms: bool) -> None:
+    """Shade the rows in which nothing is decided, and those with an alarm."""
+    marks = [(~table["status"].isin(DECIDING).to_numpy(), _UNDECIDED, "warm-up or gap")]
+    if alarms and "alarm" in table:
+        marks.append((table["alarm"].to_numpy() != "", _ALARM, "alarm"))
+    times = table["time"]
+    for where, style, label in marks:
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], where, [False]]).astype(int)))
+        for i, (begin, end) in enumerate(edges.reshape(-1, 2)):
+            panel.axvspan(times.iloc[begin], times.iloc[min(end, len(times) - 1)], label=label if i == 0 else None,
+                          **style)  # fmt: skip

@@ -1,0 +1,30 @@
+"""A seeded share of every campaign: what the committed tables say of thousands of cases holds on these."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+sys.path.insert(0, str(ROOT))
+
+from benchmarks.campaigns import frame  # noqa: E402
+
+PARTS = 4
+
+
+@pytest.mark.parametrize("part", range(PARTS))
+@pytest.mark.parametrize("name", frame.campaign_names())
+def test_a_share_of_the_campaign(name, part):
+    campaign = frame.load_campaign(name)
+    outcomes = frame.run_campaign(campaign, list(frame.share_of(campaign))[part::PARTS])
+    wrong = {seed: outcome for seed, outcome in outcomes.items() if outcome.wrong}
+    assert not wrong, wrong
+
+
+@pytest.mark.parametrize("name", frame.campaign_names())
+def test_the_table_is_of_the_whole_campaign_and_nothing_is_wrong(name):
+    campaign = frame.load_campaign(name)
+    table = (Path(frame.__file__).parent / f"{name}.md").read_text(encoding="utf-8")
+    assert f"Wrong: 0 of {campaign.CASES}." in table
+    assert (campaign.__doc__ or "").strip() in table

@@ -1,0 +1,69 @@
+"""The method by default: existence first, then closed-form figures, and the design names what was taken."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import obsynth
+from obsynth.cli.main import main
+from obsynth.methods.choosing.figures import fault_figures, on_the_clock
+from obsynth.spec.loader import load_spec
+
+DESIGNS = Path(__file__).parents[2] / "designs"
+
+
+def test_the_design_names_the_method_and_why(tmp_path: Path) -> None:
+    plant = load_spec(DESIGNS / "motor" / "sampled.yaml").plant
+    found = obsynth.design(plant)
+    assert found.method == "functional-filter"
+    assert found.notes[0].startswith("Method chosen by auto: functional-filter (it reaches every step")
+    assert obsynth.load(found.save(tmp_path / "gains.json")).method == "functional-filter"
+
+
+def test_options_choose_among_the_methods_that_have_them() -> None:
+    plant = load_spec(DESIGNS / "smib" / "spec.yaml").plant
+    assert obsynth.design(plant, gamma=0.5).method == "fault-estimation-filter"
+    with pytest.raises(obsynth.SpecError, match="No single method has the options delay, gamma"):
+        obsynth.design(plant, gamma=0.5, delay=3)
+
+
+def test_without_faults_the_state_is_observed() -> None:
+    plant = obsynth.DescriptorSystem(None, [[0.5, 1], [0, 0.8]], None, [[1, 0]], dt=1.0)
+    assert obsynth.design(plant).method == "ui-pi-observer"
+
+
+def test_where_nothing_exists_the_reason_and_the_sensor_are_given() -> None:
+    plant = obsynth.DescriptorSystem(None, [[0.5, 0], [0, 0.8]], None, ["x1"], Bf=["x2"], Dw=[[0.1]], dt=1.0)
+    with pytest.raises(obsynth.PreconditionError, match=r"Add one of: x2\.$"):
+        obsynth.design(plant)
+
+
+def test_spec_without_a_method(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = (DESIGNS / "motor" / "one_encoder.yaml").read_text(encoding="utf-8").split("method:")[0]
+    text = text.replace("[theta m, i]", "[theta m, theta l, i]").replace(
+        "theta m: 1.0e-3, ", "theta m: 1.0e-3, theta l: 1.0e-3, "
+    )
+    spec = tmp_path / "spec.yaml"
+    spec.write_text(text, encoding="utf-8")
+    assert load_spec(spec).method == "auto"
+    assert main(["check", "--system", str(spec)]) == 0
+    assert capsys.readouterr().out.startswith("What can be diagnosed")
+    target = tmp_path / "gains.json"
+    assert main(["design", "--system", str(spec), "--output", str(target), "--quiet"]) == 0
+    assert obsynth.load(target).method != "auto"
+
+
+def test_figures_are_what_a_simulation_gives() -> None:
+    spec = load_spec(DESIGNS / "smib" / "functional.yaml")
+    design = obsynth.functional_filter(spec.plant, fault_rate=0.01)
+    (found,) = fault_figures(on_the_clock(spec.plant, None), design.observer, 400)
+    scenario = obsynth.Scenario(horizon=8.0 - 0.02, faults={"tm GENCLS 1": obsynth.Step(size=1.0)})
+    run = obsynth.simulate(design, scenario)
+    estimate = run.estimates.faults[:, 0]
+    assert found.at_horizon == pytest.approx(estimate[399], rel=1e-9)
+    assert found.most == pytest.approx(0.02 * np.argmax(estimate >= 0.9))
+    assert found.deviation == pytest.approx(design.certificate.matrices["deviations"][0, 0], rel=0.02)
+    assert found.leak < 1e-9
