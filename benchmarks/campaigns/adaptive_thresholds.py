@@ -1,12 +1,12 @@
 """Thresholds over the tolerances of wang2015 (2 % of each entry of A), smib and drive (5 % of each constant).
 
-A case of `constant` is 20 runs of one design without a fault: plants of the box, half of them drawn, half at vertices by
-the sign of each constant's effect; disturbances and noise half random, half at their bounds with the sign that drives
-one output at one sample.  The plants are exact (made anew with numpy from the constants, not from the family), and a run
-counts as wrong if any threshold is passed at any sample.  `varying` draws the constants anew at each sample; `faults`
-has a step of three median thresholds, whose guaranteed intervals must hold at each sample.  `windows` are windows
-without a fault, none of which may be proved faulty; `proofs` windows with a fault of 0.05 on wang2015, each of which must
-be proved, and its certificate hold.
+A case of `constant` is 20 runs of one design without a fault: plants of the box, half of them drawn, half at vertices
+by the sign of each constant's effect; disturbances and noise half random, half at their bounds with the sign that
+drives one output at one sample.  The plants are exact (made anew with numpy from the constants, not from the family),
+and a run counts as wrong if any threshold is passed at any sample.  `varying` draws the constants anew at each sample;
+`faults` has a step of three median thresholds, whose guaranteed intervals must hold at each sample.  `windows` are
+windows without a fault, none of which may be proved faulty; the last cases are windows with a fault of 0.05 on
+wang2015, each of which must be proved, and its certificate hold.
 """
 
 from __future__ import annotations
@@ -87,6 +87,7 @@ def simulated(name: str, q: np.ndarray, signals: dict[str, np.ndarray], x0: np.n
 
 
 def inputs_of(name: str, rng: np.random.Generator) -> np.ndarray:
+    """Return known inputs of a run."""
     k = np.arange(STEPS)[:, None]
     if name == "wang2015":
         return 2.0 * np.sin(np.hstack([k, k])) if rng.random() < 0.5 else rng.uniform(-2.0, 2.0, (STEPS, 2))
@@ -205,7 +206,7 @@ def _windows(name: str, seed: int) -> Outcome:
     dbar, noise, start = BOUNDS[name]
     states = dict(zip(design.plant.state_names, start, strict=True))
     for i in range(10):
-        rows, u, y, _ = one_run(name, seed * RUNS + i)
+        _, u, y, _ = one_run(name, seed * RUNS + i)
         end = 30 + 5 * i
         found = proved_alarm(
             design, u[:end], y[:end], window=12, disturbance_bounds={design.plant.disturbance_names[0]: dbar},

@@ -10,6 +10,7 @@ import numpy as np
 from obsynth.data.linear_log import DataObserver
 from obsynth.data.signals import Signals
 from obsynth.data.sources import Data, chunks
+from obsynth.data.stamps import Stamps
 from obsynth.errors import SpecError
 from obsynth.experiments.alarm_proofs.proof import WINDOW, AlarmProof, proved_alarm
 from obsynth.numerics.arguments import require_kind, require_mapping
@@ -75,7 +76,7 @@ def prove_alarm(
     reader = DataObserver(design)
     signals = Signals.of(reader, columns, scales)
     found: list[np.ndarray] = []
-    for chunk in chunks(data, signals, _CHUNK):
+    for chunk in chunks(data, signals, Stamps(), _CHUNK):
         for line in chunk:
             seconds, missing = reader.clock.advance(float(line[0]), len(found) + 1)
             del seconds
