@@ -20,7 +20,9 @@ if TYPE_CHECKING:
     from obsynth.calibration.validating import validate
     from obsynth.calibration.validation import Validation
     from obsynth.calibration.validity import Validity, validity
-    from obsynth.compare.sensor_sets import SensorSet, SensorSets, sensor_sets
+    from obsynth.comparison.comparing import compare
+    from obsynth.comparison.result import ComparedMethod, Comparison, FaultComparison
+    from obsynth.comparison.sensor_sets import SensorSet, SensorSets, sensor_sets
     from obsynth.data.alarm_proof import prove_alarm
     from obsynth.data.run import DataRun, run_on_data
     from obsynth.errors import (
@@ -50,6 +52,7 @@ if TYPE_CHECKING:
     from obsynth.importing.modelica import from_modelica
     from obsynth.importing.state_space import from_control, from_scipy
     from obsynth.methods.adaptive_observer.public import adaptive_observer
+    from obsynth.methods.choosing.figures import FaultFigures
     from obsynth.methods.dae_adaptive_observer.public import dae_adaptive_observer
     from obsynth.methods.descriptor_kalman.public import descriptor_kalman
     from obsynth.methods.designing import design
@@ -107,13 +110,18 @@ __version__ = "0.1.0"
 
 # Names are imported when they are first used, so that `import obsynth` stays fast; ``module:name`` is another name.
 _HOMES = {
+    "ComparedMethod": "obsynth.comparison.result",
+    "Comparison": "obsynth.comparison.result",
+    "FaultComparison": "obsynth.comparison.result",
+    "FaultFigures": "obsynth.methods.choosing.figures",
+    "compare": "obsynth.comparison.comparing",
     "Validation": "obsynth.calibration.validation",
     "Validity": "obsynth.calibration.validity",
     "validate": "obsynth.calibration.validating",
     "validity": "obsynth.calibration.validity",
-    "SensorSet": "obsynth.compare.sensor_sets",
-    "SensorSets": "obsynth.compare.sensor_sets",
-    "sensor_sets": "obsynth.compare.sensor_sets",
+    "SensorSet": "obsynth.comparison.sensor_sets",
+    "SensorSets": "obsynth.comparison.sensor_sets",
+    "sensor_sets": "obsynth.comparison.sensor_sets",
     "functional_filter": "obsynth.methods.functional_filter.public",
     "CalibratedBox": "obsynth.calibration.box",
     "Calibration": "obsynth.calibration.result",
@@ -242,6 +250,8 @@ __all__ = [
     "Calibration",
     "Certificate",
     "Check",
+    "ComparedMethod",
+    "Comparison",
     "Constant",
     "ConstantsBox",
     "DAEBatchEstimates",
@@ -259,7 +269,9 @@ __all__ = [
     "Drift",
     "Estimates",
     "Evaluation",
+    "FaultComparison",
     "FaultDiagnosis",
+    "FaultFigures",
     "FaultModel",
     "Gaussian",
     "Identifiability",
@@ -307,6 +319,7 @@ __all__ = [
     "analyse_structure",
     "apply_adaptation_gain",
     "calibrate",
+    "compare",
     "dae_adaptive_observer",
     "decide",
     "decouple",

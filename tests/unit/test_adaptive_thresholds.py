@@ -197,12 +197,12 @@ def test_plants_are_drawn_from_the_box() -> None:
     design = obsynth.fault_estimation_filter(wang())
     exact = design.replace(plant=design.plant.replace(uncertainty=None))
     scenario = load_spec(DESIGNS / "wang2015" / "spec.yaml").scenario
-    quiet = scenario.replace(faults={}, horizon=120)
-    fixed, adaptive = obsynth.monitor(exact, quiet), obsynth.monitor(design, quiet)
+    quiet, box = scenario.replace(faults={}, horizon=120), design.plant.uncertainty
+    fixed, adaptive = obsynth.monitor(design, quiet), obsynth.monitor(design, quiet, constants=box)
     assert obsynth.evaluate(design, quiet, runs=30, monitor=fixed, plants=30).false_alarm_rate.value > 0.4
     assert obsynth.evaluate(design, quiet, runs=30, monitor=adaptive, plants=30).false_alarm_rate.value == 0.0
     faulty = scenario.replace(horizon=120)
-    found = obsynth.evaluate(design, faulty, runs=20, monitor=obsynth.monitor(design, faulty), plants=20)
+    found = obsynth.evaluate(design, faulty, runs=20, monitor=obsynth.monitor(design, faulty, constants=box), plants=20)
     assert found.false_alarm_rate.value == 0.0
     assert found.missed_detection_rate.value == 0.0
     with pytest.raises(SpecError, match="has none"):

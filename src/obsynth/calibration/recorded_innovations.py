@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -11,7 +10,6 @@ import numpy as np
 from obsynth.calibration.logs import Log
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.dae.observer import DAEObserver
-from obsynth.observers.recursive.estimates import UNDETERMINED_SHARE
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.results.design import ObserverDesign
 
@@ -56,24 +54,13 @@ def _recursive(observer: RecursiveObserver, log: Log, point: Mapping[str, float]
     plant = observer.plant
     y = log.y - np.array([point.get(name, 0.0) for name in plant.output_names])
     u = log.u - np.array([point.get(name, 0.0) for name in plant.input_names])
-    running = observer.start()
+    state, nothing = observer.init(), np.full(plant.ny, np.nan)
     e, deviations = np.full(y.shape, np.nan), np.full(y.shape, np.nan)
     for k in range(len(y)):
-        before = running.raw_step if k == 0 else copy.deepcopy(running).raw_step
-        prior = before(np.full(plant.ny, np.nan) if k else y[k], u[k])
-        if k == 0:
-            continue
-        theta, spread = prior.parameters.theta, prior.parameters.spread
-        C, Psi = plant.C.at(k), plant.Psi.at(k - 1)
-        reach = C @ prior.factor
-        variances = np.einsum("ij,ij->i", reach, reach) + np.diag(observer.R.at(k))
-        predicted = C @ prior.x[: plant.nx]
-        if len(theta):
-            predicted = predicted + Psi @ theta
-            variances = variances + np.einsum("ij,ij->i", Psi @ spread, Psi @ spread)
-        known = ~(np.abs(C @ prior.diffuse) > UNDETERMINED_SHARE).any(axis=1)
-        e[k], deviations[k] = np.where(known, y[k] - predicted, np.nan), np.sqrt(variances)
-        running.raw_step(y[k], u[k])
+        if k:
+            mean, spread = observer.recursion.predicted(state, nothing, u[k])
+            e[k], deviations[k] = np.where(np.isfinite(spread), y[k] - mean, np.nan), spread
+        state, _ = observer.advance(state, y[k], u[k])
     found = observer.run(y, u)
     return RecordedInnovations(
         e, deviations, float(found.nis.sum()), int(found.nis_degrees.sum()),

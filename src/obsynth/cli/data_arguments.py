@@ -54,6 +54,11 @@ def add_data_verbs(verbs: Any) -> None:
     _add_data_options(run)
     _add_scenario(run)
     run.add_argument(
+        "--outliers", choices=("gate", "huber", "none"),
+        help="recursive and nonlinear designs: leave out samples that their prediction excludes (default), pull them "
+        "to its limit, or take them as they are",
+    )  # fmt: skip
+    run.add_argument(
         "--state", type=Path, metavar="FILE", help="go on from this saved state if it exists, and save the new one"
     )
     add_json(run)

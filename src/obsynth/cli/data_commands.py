@@ -19,6 +19,7 @@ from obsynth.files.outputs import require_distinct
 if TYPE_CHECKING:
     from obsynth.data.run import DataRun
     from obsynth.experiments.monitors.online import OnlineMonitor
+    from obsynth.plants.uncertainty import Uncertainty
     from obsynth.results.design import ObserverDesign
 
 STREAM = "-"
@@ -40,6 +41,7 @@ def run_run(options: argparse.Namespace) -> int:
             design, sys.stdin if options.data == STREAM else Path(options.data), out,
             columns=dict(options.map), time_column=options.time_column, scales=numbers_of(options.scale),
             thresholds=numbers_of(options.threshold), monitor=watched, gap=options.gap, warm_up=options.warm_up,
+            outliers=options.outliers,
             state=options.state, progress=progress,
         )  # fmt: skip
     for text in found.warnings:
@@ -146,6 +148,17 @@ def numbers_of(pairs: list[tuple[str, str]]) -> Mapping[str, float]:
     return found
 
 
+def own_tolerances(design: ObserverDesign, kind: str | None) -> Uncertainty | None:
+    """Return the tolerances of a sampled design's plant, which its pointwise threshold holds for."""
+    from obsynth.observers.linear.observer import LinearObserver
+    from obsynth.plants.descriptor import DescriptorSystem
+
+    plant = design.plant
+    if kind != "pointwise" or not isinstance(plant, DescriptorSystem) or not plant.is_discrete:
+        return None
+    return plant.uncertainty if isinstance(design.observer, LinearObserver) else None
+
+
 def ranges_of(pairs: list[tuple[str, str]]) -> dict[str, float | tuple[float, float]]:
     """Return bounds by name, from arguments of the form NAME=BOUND or NAME=LOW:HIGH."""
     found: dict[str, float | tuple[float, float]] = {}
@@ -187,6 +200,7 @@ def monitor_of(
         noise_bound=options.noise_bound, initial_error=options.initial_error, window=options.window,
         false_alarms=options.false_alarms, change=options.change, nominal=numbers_of(options.nominal),
         sample_time=options.sample_time, initial_set=ranges_of(options.initial) or None,
+        constants=own_tolerances(design, options.monitor),
     )  # fmt: skip
 
 
@@ -198,6 +212,9 @@ def summary_of_run(found: DataRun, watched: OnlineMonitor | None) -> str:
         kinds = Counter(found.recovered.values())
         told = ", ".join(f"{count} {kind.replace('needs', 'with')}" for kind, count in kinds.items())
         lines.append(f"{len(found.recovered)} states as written recovered: {told}.")
+    if found.outliers:
+        told = ", ".join(f"{count} of {name}" for name, count in found.outliers.items())
+        lines.append(f"{sum(found.outliers.values())} outliers: {told}.")
     for name, time in found.alarms.items():
         fault = f"; {found.isolated} stands out" if watched and name == watched.kind and found.isolated else ""
         lines.append(f"Alarm: {name} first above its threshold at {found.stamps.shown(time)}{fault}.")

@@ -45,7 +45,7 @@ def add_evaluate_verb(verbs: Any) -> None:
 def run_evaluate(options: argparse.Namespace) -> int:
     """Run ``evaluate``: spec in, table of rates and errors out."""
     from obsynth.cli.commands import designed_or_loaded
-    from obsynth.cli.data_commands import numbers_of, ranges_of
+    from obsynth.cli.data_commands import numbers_of, own_tolerances, ranges_of
     from obsynth.spec import load_spec
 
     with progress(quiet=options.quiet) as report_stage:
@@ -65,7 +65,7 @@ def run_evaluate(options: argparse.Namespace) -> int:
                 design, scenario, options.monitor, disturbance_bounds=numbers_of(options.disturbance),
                 noise_bound=options.noise_bound, initial_error=options.initial_error, window=options.window,
                 false_alarms=options.false_alarms, change=options.change,
-                initial_set=ranges_of(options.initial) or None,
+                initial_set=ranges_of(options.initial) or None, constants=own_tolerances(design, options.monitor),
             )  # fmt: skip
         elif options.monitor is not None:
             watched = ParameterMonitor(options.monitor, false_alarms=options.false_alarms, change=options.change)

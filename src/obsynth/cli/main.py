@@ -13,6 +13,7 @@ from pathlib import Path
 from obsynth import __version__
 from obsynth.cli.arguments import add_force, add_json, add_quiet, add_system, add_verbose
 from obsynth.cli.calibration import add_calibration_verbs
+from obsynth.cli.compare import add_compare_verb
 from obsynth.cli.data_arguments import add_data_verbs
 from obsynth.cli.evaluate import add_evaluate_verb
 from obsynth.cli.output import print_error, print_json
@@ -90,6 +91,7 @@ def _parser() -> argparse.ArgumentParser:
     add_force(simulate)
     add_quiet(simulate)
     simulate.set_defaults(verb="simulate")
+    add_compare_verb(verbs)
     add_evaluate_verb(verbs)
     add_sweep_verb(verbs)
     add_data_verbs(verbs)
@@ -123,13 +125,24 @@ def _digits(text: str) -> int:
 
 
 def _verb(name: str) -> Callable[[argparse.Namespace], int]:
-    from obsynth.cli import calibration, commands, data_commands, evaluate, plot, prove_alarm, simulate, sweep
+    from obsynth.cli import (
+        calibration,
+        commands,
+        compare,
+        data_commands,
+        evaluate,
+        plot,
+        prove_alarm,
+        simulate,
+        sweep,
+    )
 
     return {
         "design": commands.run_design,
         "check": commands.run_check,
         "verify": commands.run_verify,
         "simulate": simulate.run_simulate,
+        "compare": compare.run_compare,
         "evaluate": evaluate.run_evaluate,
         "sweep": sweep.run_sweep,
         "run": data_commands.run_run,

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
 
-from obsynth.data.step_log import SteppingEngine
+from obsynth.data.step_log import SteppingEngine, without_outliers
 from obsynth.errors import SolverError, SpecError
 from obsynth.experiments.monitors.online import Evidence
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.estimates import DAEEstimates
-from obsynth.observers.linear.warm_up import FORGOTTEN, checked_warm_up
+from obsynth.observers.linear.warm_up import checked_warm_up
 from obsynth.observers.running import RunningObserver
 from obsynth.results.design import ObserverDesign
 
@@ -21,18 +20,17 @@ class DAEDataObserver(SteppingEngine[DAEEstimates]):
     """A running observer of a DAE on measured data; signals are absolute values, as the model's.
 
     Fields: design: Of a nonlinear plant; warm_up: Seconds that are marked after a start, and after rows with unknown
-    inputs; by default until forgetting has shrunk the weight of the start to 2 %, and none for the forms that do not
-    forget.
+    inputs, none by default: the covariances of the start say how uncertain the estimates are; outliers: What is done
+    with them, a gate by default.
     """
 
-    def __init__(self, design: ObserverDesign, *, warm_up: float | None = None) -> None:
+    def __init__(self, design: ObserverDesign, *, warm_up: float | None = None, outliers: str | None = None) -> None:
         self.model, self.observer = design.nonlinear
-        forgets = self.observer.form == "forgetting" and self.observer.forgetting < 1.0 and self.model.nq
-        steps = math.ceil(math.log(FORGOTTEN) / math.log(self.observer.forgetting)) if forgets else 0
+        self.observer = without_outliers(self.observer, outliers)
         super().__init__(
             (self.model.input_names, self.model.output_names, self.observer.state_names, self.observer.fault_names,
              self.model.output_names),
-            dt=self.observer.dt, warm_up=checked_warm_up(warm_up, steps * self.observer.dt), may_restart=True,
+            dt=self.observer.dt, warm_up=checked_warm_up(warm_up, 0.0), may_restart=True,
         )  # fmt: skip
 
     def started(self) -> RunningObserver[Any, Any, Any]:

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
 
-from obsynth.data.step_log import SteppingEngine
+from obsynth.data.step_log import SteppingEngine, without_outliers
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.experiments.monitors.online import Evidence
 from obsynth.numerics.arrays import FloatArray
-from obsynth.observers.linear.warm_up import FORGOTTEN, checked_warm_up
+from obsynth.observers.linear.warm_up import checked_warm_up
 from obsynth.observers.recursive.estimates import deviations_of
 from obsynth.observers.recursive.records import require_horizon
 from obsynth.observers.recursive.recursion import RawEstimate
-from obsynth.observers.recursive.transients import MOST_STEPS, transient_steps
 from obsynth.observers.running import RunningObserver
 from obsynth.results.design import ObserverDesign
 
@@ -24,14 +22,15 @@ class RecursiveDataObserver(SteppingEngine[RawEstimate]):
     """A running recursive observer on measured data.
 
     Fields: design: A recursive design; warm_up: Seconds that are marked after a start, and after rows with unknown
-    inputs; by default until an error at the start has shrunk to 2 %.
+    inputs, none by default: the covariances of the start say how uncertain the estimates are; outliers: What is done
+    with them, a gate by default.
     """
 
     uses_first_outputs = False
 
-    def __init__(self, design: ObserverDesign, *, warm_up: float | None = None) -> None:
+    def __init__(self, design: ObserverDesign, *, warm_up: float | None = None, outliers: str | None = None) -> None:
         self.plant, self.observer = design.recursive
-        steps = 0.0 if warm_up is not None else transient_steps(self.observer, FORGOTTEN)
+        self.observer = without_outliers(self.observer, outliers)
         # H_k has as many directions beside the state as there are parity innovations.
         self.directions = self.plant.ne + self.plant.ny - self.plant.nx
         residuals = tuple(f"innovation {i + 1}" for i in range(self.directions))
@@ -39,16 +38,10 @@ class RecursiveDataObserver(SteppingEngine[RawEstimate]):
         super().__init__(
             (self.plant.input_names, self.plant.output_names, self.observer.state_names, self.observer.fault_names,
              residuals),
-            dt=self.plant.dt, warm_up=checked_warm_up(warm_up, steps * self.plant.dt),
+            dt=self.plant.dt, warm_up=checked_warm_up(warm_up, 0.0),
             may_restart=constant and self.plant.horizon is None,
         )  # fmt: skip
         self.point, self.scales = self.plant.operating_point, self.plant.scales
-        if math.isinf(steps):
-            self.notes = (
-                f"The start is not forgotten within the model's horizon (or {MOST_STEPS} steps), so all rows are "
-                "'warm-up': some state or parameter is hardly seen. State a warm-up to have decisions; deviations are "
-                "right as far as those at the start are.",
-            )
         self.theta = np.zeros(len(self.fault_names))
 
     def started(self) -> RunningObserver[Any, Any, Any]:

@@ -50,6 +50,8 @@ class DataRun:
     recovered : mapping of str to str
         States of the plant as written that were recovered from the estimates, and what each of these estimates is:
         ``exact``, ``needs the fault estimate`` (it is used) or ``biased by the disturbance``.
+    outliers : mapping of str to int
+        How many samples of each output were left out, or pulled to their limit; recursive and nonlinear designs.
     warnings : tuple of str
         What a user should know about the data.
     digest : str
@@ -69,6 +71,7 @@ class DataRun:
     alarms: Mapping[str, float]
     isolated: str
     recovered: Mapping[str, str]
+    outliers: Mapping[str, int]
     warnings: tuple[str, ...]
     digest: str
     table: pd.DataFrame | None = field(default=None, repr=False)
@@ -81,7 +84,8 @@ class DataRun:
         return {
             "rows": self.rows, "statuses": dict(self.statuses), "alarms": dict(self.alarms),
             "alarm_stamps": {name: self.stamps.shown(time) for name, time in self.alarms.items()},
-            "isolated": self.isolated, "recovered": dict(self.recovered), "warnings": list(self.warnings),
+            "isolated": self.isolated, "recovered": dict(self.recovered),
+            "outliers": dict(self.outliers), "warnings": list(self.warnings),
             "gains_sha256": self.digest,
         }  # fmt: skip
 
@@ -98,6 +102,7 @@ def run_on_data(
     monitor: OnlineMonitor | None = None,
     gap: float | None = None,
     warm_up: float | None = None,
+    outliers: str | None = None,
     state: str | Path | None = None,
     chunk_rows: int = CHUNK_ROWS,
     progress: Callable[[int], None] | None = None,
@@ -137,7 +142,11 @@ def run_on_data(
     gap : float, optional, seconds
         Continuous-time designs: longer intervals are gaps; by default those ten times the longest one before.
     warm_up : float, optional, seconds
-        Marked after the start and after each gap; by default until the slowest mode has shrunk to 2 %.
+        Marked after the start and after each gap; by default until the slowest mode has shrunk to 2 %, and none for
+        recursive and nonlinear designs, whose deviations are honest from the start.
+    outliers : {"gate", "huber", "none"}, optional
+        Recursive and nonlinear designs: what is done with a sample that its prediction excludes; by default what the
+        design says, and a gate of six deviations where it says nothing.
     state : path, optional
         A saved state to go on from, if the file exists; the state at the end is written to it.
     chunk_rows : int, optional
@@ -193,7 +202,7 @@ def run_on_data(
     if time_column is not None:
         require_kind(time_column, str, "time_column", "the name of a column")
         columns = {**(columns or {}), TIME: time_column}
-    engine = engine_of(design, gap=gap, warm_up=warm_up)
+    engine = engine_of(design, gap=gap, warm_up=warm_up, outliers=outliers)
     stamps = Stamps()
     # The monitor is not used up: a second run may begin with it.
     watched = None if monitor is None else copy.deepcopy(monitor)
@@ -214,6 +223,7 @@ def run_on_data(
     recovered = {} if job.recovered is None else dict(job.recovered.flags)
     return DataRun(
         job.rows, dict(job.statuses), dict(job.alarms), job.isolated, recovered,
+        dict(getattr(engine, "outliers", {})),
         (*engine.notes, *job.first.warnings()), digest, table, _measured(kept, job.signals, stamps), stamps,
         dict(thresholds or {}),
     )  # fmt: skip

@@ -12,12 +12,17 @@ from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.results.design import ObserverDesign
 
 
-def engine_of(design: ObserverDesign, *, gap: float | None = None, warm_up: float | None = None) -> Engine:
-    """Return a running design, at its start."""
+def engine_of(
+    design: ObserverDesign, *, gap: float | None = None, warm_up: float | None = None, outliers: str | None = None
+) -> Engine:
+    """Return a running design, at its start; ``outliers`` takes the place of what the design says of them."""
     if not isinstance(design.observer, (RecursiveObserver, DAEObserver)):
+        if outliers not in (None, "none"):
+            raise SpecError("outliers is for recursive and nonlinear designs, which know how far a sample may be from "
+                            "its prediction.", path="outliers")  # fmt: skip
         return DataObserver(design, gap=gap, warm_up=warm_up)
     if gap is not None:
         raise SpecError("gap is for continuous-time designs: a sampled one knows which rows are missing.", path="gap")
     if isinstance(design.observer, RecursiveObserver):
-        return RecursiveDataObserver(design, warm_up=warm_up)
-    return DAEDataObserver(design, warm_up=warm_up)
+        return RecursiveDataObserver(design, warm_up=warm_up, outliers=outliers)
+    return DAEDataObserver(design, warm_up=warm_up, outliers=outliers)

@@ -14,9 +14,18 @@ from obsynth.data.log_estimator import GAP, LONGEST_BRIDGE, OK, PARTIAL, RECOVER
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.monitors.online import Evidence
 from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.robustness import Robust, with_outliers
 from obsynth.observers.running import RunningObserver, state_as_data, state_from_data
 
 Found = TypeVar("Found")
+
+
+def without_outliers(observer: Robust, outliers: str | None) -> Robust:
+    """Return an observer for logs: with a gate, unless it or ``outliers`` says otherwise."""
+    wanted = outliers or ("gate" if observer.outliers == "none" else observer.outliers)
+    if wanted == observer.outliers:
+        return observer
+    return with_outliers(observer, wanted)
 
 
 class SteppingEngine(ABC, Generic[Found]):
@@ -42,6 +51,12 @@ class SteppingEngine(ABC, Generic[Found]):
         self.running: RunningObserver[Any, Any, Any] = self.started()
         self.u: FloatArray | None = None
         self.settled_at, self.phase = math.inf, WARM_UP
+
+    @property
+    def outliers(self) -> dict[str, int]:
+        """How many samples of each output were outliers, since the observer last started."""
+        counts = self.running.state.refused[1]
+        return {name: int(count) for name, count in zip(self.output_names, counts, strict=True) if count}
 
     @abstractmethod
     def started(self) -> RunningObserver[Any, Any, Any]:
@@ -93,9 +108,17 @@ class SteppingEngine(ABC, Generic[Found]):
             self.settled_at = time + self.warm_up
             self.phase = WARM_UP if self.phase == WARM_UP else RECOVERING
         # A filter that begins with y(1) does not miss y(0).
-        heard = np.ones_like(known[nu:]) if fresh and not self.uses_first_outputs else known[nu:]
+        heard = known[nu:] & ~self._refused()
+        if fresh and not self.uses_first_outputs:
+            heard = np.ones_like(heard)
         status = self._status(time, known[:nu], heard, spoiled=spoiled)
         return Row(status, self.values(found), missing, self.evidence(found))
+
+    def _refused(self) -> np.ndarray:
+        """Return which outputs of the last sample were left out as outliers, as truth values."""
+        state = self.running.state
+        gated = getattr(self.running.observer, "outliers", "none") == "gate"
+        return np.asarray(state.refused[0] > 0.0) & gated
 
     def _bridged(self, missing: int, held: FloatArray, row: int) -> bool:
         """Take samples without outputs; return whether the observer had to start again."""

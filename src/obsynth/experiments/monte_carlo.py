@@ -227,7 +227,8 @@ def _trial(task: _Task) -> dict[str, FloatArray]:
     count = len(task.seeds)
     false, found_at, wrong = np.full(count, np.nan), np.full(count, np.nan), np.full(count, np.nan)
     if task.watched is not None:
-        passed = task.watched.passed_in(runs, observer.residual_rows)
+        watched = observer.fault_rows if task.watched.watches_estimates else observer.residual_rows
+        passed = task.watched.passed_in(runs, watched)
         begin = len(passed) if task.onset is None else task.onset
         false[:] = passed[:begin].any(axis=0)
         for run in np.flatnonzero(passed[begin:].any(axis=0)):

@@ -48,16 +48,18 @@ class Contraction:
         ball = Ball.exact(columns) if radius is None else Ball(np.asarray(columns, dtype=np.float64), radius)
         return column_norms(Ball.exact(self.Q) @ ball)
 
-    def sizes_in_sum(self, sums: FloatArray) -> FloatArray:
-        """Return upper bounds on ``sum_j |Q d_j|`` for columns with ``sum_j |d_j| <= sums (n, m)``, as ``(m,)``."""
-        return np.asarray(rounded_up(np.sum(np.abs(self.Q) @ sums, axis=0), 4 * len(sums) + 8))
+    def seen(self, rows: FloatArray, radius: FloatArray | None = None, summed: bool = False) -> float:
+        """Return an upper bound on the norm of ``c Q^-1`` for rows ``c (p, n)``, known to within ``radius``.
 
-    def seen(self, rows: FloatArray) -> float:
-        """Return an upper bound on the norm of ``c Q^-1`` for rows ``c (p, n)``."""
+        With ``summed`` the radius is a sum over many such rows, and so is the bound.
+        """
         if not rows.size:
             return 0.0
-        product = Ball.exact(rows) @ Ball.exact(self.inverse)
+        ball = Ball.exact(rows) if radius is None else Ball(np.asarray(rows, dtype=np.float64), radius)
+        product = ball @ Ball.exact(self.inverse)
         size = rounded_up(np.abs(product.midpoint) + product.radius, 2)
+        if summed:
+            return float(rounded_up(np.asarray(np.sum(size) / (1.0 - self.defect)), size.size + 4))
         # |X|^2 <= |X|_1 |X|_inf, or Frobenius: both bound the spectral norm.
         frobenius = float(np.sqrt(rounded_up(np.asarray(np.sum(size**2)), size.size + 2)))
         mixed = float(np.sqrt(np.max(np.sum(size, axis=0)) * np.max(np.sum(size, axis=1))))

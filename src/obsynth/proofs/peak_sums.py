@@ -1,8 +1,8 @@
 r"""Sums over all time of what a system makes of its inputs, from above, every rounding accounted for.
 
-``v_{j+1} = fl(M v_j)`` misses ``M v_j`` by a defect that is known; with a proved contraction (`Contraction`) the
-defects add no more than ``|c Q^-1| sum |Q defect| / (1 - rate)`` to all later terms together, and what follows the last
-term that is computed no more than that of ``|Q v_N|``.
+``c_{j+1} = fl(c_j M)`` misses ``c_j M`` by a defect that is known; with a proved contraction (`Contraction`) the
+defects add no more than ``sum |defect Q^-1| |Q b| / (1 - rate)`` to all later terms together, and what follows the last
+term that is computed no more than that of ``|c_N Q^-1|``.
 
 Where an input acts for an interval of length h, ``\int_0^h |g(s)| ds`` of ``g(s) = c M^j e^{A s} b`` is the trapezoidal
 sum over p pieces of length ``p d = h``, plus ``d^3 / 12`` times the largest second derivative of each piece; that is at
@@ -22,9 +22,11 @@ from obsynth.proofs.contraction import Contraction
 from obsynth.proofs.exponentials import exponential
 
 #: Most steps that are summed up one by one, and the share of the sum that the rest may then have.
-MOST_STEPS, LEFT = 16_384, 1e-4
+MOST_STEPS, LEFT = 65_536, 1e-3
 #: A piece of an interval is at most this share of one over the norm of A; most pieces.
 PIECE, MOST_PIECES = 0.05, 1_024
+#: More than the square root of what underflows in a square.
+LOST_SQUARES = 2.0**-510
 #: Length of an interval in units of one over the norm of A, and the largest order, for gains in continuous time.
 LENGTH, MOST_STATES = 0.4, 12
 #: Share of such a gain that the rest may have.
@@ -50,54 +52,59 @@ def peak_sums(
     Euclidean norms, or with ``each`` the absolute value of each row.  At least ``least`` terms are summed up one by
     one, and more until the rest is bounded by the share ``left``.
     """
-    moving, held, n = matrix.midpoint, columns.midpoint.copy(), len(matrix.midpoint)
-    growth, shown = gamma(n + 2), np.abs(rows)
-    seen = (
-        np.array([contraction.seen(rows[i : i + 1]) for i in range(len(rows))])[:, None]
-        if each
-        else np.array(contraction.seen(rows))
-    )
-
-    def rest(of: FloatArray) -> FloatArray:
-        """Return what the terms after these columns add up to, at most."""
-        sizes = contraction.sizes(moving @ of, rounded_up(_missed(matrix, np.abs(of), growth), 3 * n + 8))
-        return np.asarray(seen * contraction.factor * sizes)
-
+    moving, n, growth = matrix.midpoint, len(matrix.midpoint), gamma(len(matrix.midpoint) + 2)
+    driven, sizes = columns.midpoint, contraction.sizes(columns.midpoint, columns.radius)
+    powers, idle = np.array(rows, dtype=np.float64), ~driven.any(axis=0)
     terms: list[FloatArray] = []
-    gathered_columns = np.zeros_like(held)
+    collected = np.zeros_like(powers)
     total: FloatArray | float = 0.0
     while True:
-        product = np.abs(rows @ held)
+        product = np.abs(powers @ driven)
         terms.append(product if each else _norms(product))
-        total, gathered_columns = total + terms[-1], gathered_columns + np.abs(held)
+        total, collected = total + terms[-1], collected + np.abs(powers)
         done = len(terms) >= max(MOST_STEPS, least)
-        if done or (len(terms) >= least and (len(terms) % 64 == 0 or not held.any())):
-            after = rest(held)
-            if done or np.all(after <= left * total):
+        if done or (len(terms) >= least and (len(terms) % 64 == 0 or not powers.any())):
+            after = contraction.factor * _seen(
+                contraction, powers @ moving, _missed(matrix, np.abs(powers), growth), each
+            )
+            after = np.asarray(after * sizes)
+            # A column that is nothing but its radius has no terms to compare with.
+            if done or np.all((after <= left * total) | idle):
                 break
-        held = moving @ held
+        powers = powers @ moving
     count = len(terms) + 8
-    # Every defect, and what the columns are off by: sums of norms are at most the norm of the sums in the 1-norm.
-    defects = rounded_up(_missed(matrix, gathered_columns, growth) + columns.radius, 3 * n + count)
-    products = rounded_up(growth * (shown @ gathered_columns) + count * n * UNDERFLOW, 3 * n + count)
-    added = seen * contraction.factor * contraction.sizes_in_sum(defects) + (
-        products if each else np.sum(products, axis=0)
-    )
+    # Every defect of the rows, and what the columns are off by, in the norm that contracts: sums of norms are at most
+    # the sums of all entries.
+    defects = rounded_up(_missed(matrix, collected, growth), 3 * n + count)
+    added = contraction.factor * _seen(contraction, np.zeros_like(rows), defects, each, summed=True) * sizes
+    products = rounded_up(growth * (collected @ np.abs(driven)) + count * n * UNDERFLOW, 3 * n + count)
+    known = collected @ columns.radius if columns.radius.any() else np.zeros_like(products)
+    products = rounded_up(products + known, n + count)
+    added = rounded_up(added + (products if each else np.sum(products, axis=0)), len(rows) + 6)
     partial = rounded_up(np.cumsum(np.array(terms), axis=0), count + 2 * len(rows) + 10) + added
     return PeakSums(rounded_up(partial, 4), rounded_up(partial[-1] + after, 6))
 
 
 def _missed(matrix: Ball, sizes: FloatArray, growth: float) -> FloatArray:
-    """Return what products of the midpoint with columns of these sizes miss of those of any member."""
-    n = len(sizes)
-    return np.asarray(growth * (np.abs(matrix.midpoint) @ sizes) + matrix.radius @ sizes + n * UNDERFLOW)
+    """Return what products of rows of these sizes with the midpoint miss of those with any member."""
+    n = len(matrix.midpoint)
+    return np.asarray(growth * (sizes @ np.abs(matrix.midpoint)) + sizes @ matrix.radius + n * UNDERFLOW)
+
+
+def _seen(
+    contraction: Contraction, rows: FloatArray, radius: FloatArray, each: bool, *, summed: bool = False
+) -> FloatArray:
+    """Return bounds on ``|c Q^-1|``: of each row as a column, or of all; with ``summed`` those of sums of rows."""
+    if each:
+        return np.array([contraction.seen(rows[i : i + 1], radius[i : i + 1], summed) for i in range(len(rows))])[
+            :, None
+        ]
+    return np.array(contraction.seen(rows, radius, summed))
 
 
 def _norms(sizes: FloatArray) -> FloatArray:
-    """Return Euclidean norms of columns of upper bounds, rounded up."""
-    largest = np.max(sizes, axis=0, initial=0.0)
-    safe = np.where((largest > 0.0) & np.isfinite(largest), largest, 1.0)
-    return np.asarray(rounded_up(safe * np.sqrt(np.sum((sizes / safe) ** 2, axis=0)), 2 * len(sizes) + 10))
+    """Return Euclidean norms of columns, up to roundings that the caller counts; what squares lose is added."""
+    return np.asarray(np.sqrt(np.sum(sizes * sizes, axis=0)) + len(sizes) * LOST_SQUARES)
 
 
 class Pieces(NamedTuple):
@@ -113,7 +120,7 @@ class Pieces(NamedTuple):
 
 def interval_pieces(a: FloatArray, b: FloatArray, into: Ball, length: float) -> Pieces:
     """Return the pieces of ``into e^{A s} b``, s from 0 to ``length``: ``a (n, n)``, ``b (n, m)``, ``into (k, n)``."""
-    norm = float(np.linalg.norm(a, 2)) if a.size else 0.0
+    norm = _natural_norm(a)
     count = int(np.clip(np.ceil(length * norm / PIECE), 1, MOST_PIECES))
     step, m = length / count, b.shape[1]
     transition, ball_a = exponential(a, step), Ball.exact(a)
@@ -139,6 +146,13 @@ def interval_pieces(a: FloatArray, b: FloatArray, into: Ball, length: float) -> 
     joined = Ball(np.hstack([part.midpoint for part in parts]), np.hstack([part.radius for part in parts]))
     scale = rounded_up(np.repeat(np.array(weights), m), 6)
     return Pieces(joined, scale, np.tile(np.arange(m), len(parts)))
+
+
+def _natural_norm(a: FloatArray) -> float:
+    """Return the norm of a matrix in units that balance it: how fast its motions are, whatever their units."""
+    from scipy.linalg import matrix_balance
+
+    return float(np.linalg.norm(matrix_balance(a, permute=False)[0], 2)) if a.size else 0.0
 
 
 def _growth(a: FloatArray, step: float) -> FloatArray:
@@ -167,7 +181,7 @@ def absolute_gains(a: FloatArray, rows: FloatArray, contraction: Contraction) ->
         moving, columns, gather = Ball.exact(a), Ball.exact(np.eye(n)), None
         held: Contraction | None = contraction
     else:
-        length = LENGTH / float(np.linalg.norm(a, 2))
+        length = LENGTH / _natural_norm(a)
         gather = interval_pieces(a, np.eye(n), Ball.exact(np.eye(n)), length)
         moving, columns = exponential(a, length), gather.columns
         # The contraction in continuous time is one of its samples as well.

@@ -17,6 +17,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.constants import ConstantsBox
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.uncertain_system import uncertain_system
+from obsynth.plants.uncertainty import Uncertainty
 from obsynth.proofs.affine import AffineMatrix
 from obsynth.results.design import ObserverDesign
 from obsynth.tolerances.error_structure import ErrorStructure, error_structure
@@ -169,6 +170,8 @@ def with_tolerances(
         return design, plant
     if isinstance(constants, DescriptorSystem):
         return _of_plant(design, constants)
+    if isinstance(constants, Uncertainty):
+        constants = constants.box
     changed = uncertain_system(plant, constants)
     return design.replace(plant=changed), changed
 

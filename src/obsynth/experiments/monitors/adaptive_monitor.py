@@ -11,6 +11,7 @@ from obsynth.analysis.transformations.uncertain_plant import AffinePlant, affine
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.experiments.monitors.adaptive_bound import Start, adaptive_bound
 from obsynth.experiments.monitors.adaptive_rule import AdaptivePlan
+from obsynth.experiments.monitors.residual_model import watches_estimates
 from obsynth.numerics.arguments import is_finite_number, require_mapping
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
@@ -57,7 +58,8 @@ def adaptive_plan(
         return AdaptivePlan(
             adaptive_bound(structure, observer, begin, varying=varying),
             None if faults is None else adaptive_bound(faults, observer, begin, varying=varying), same, reason,
-            begin.norm is None, affine.box.names, observer.fault_names, observer.residual_names,
+            begin.norm is None, watches_estimates(design), affine.box.names, observer.fault_names,
+            observer.residual_names,
         )  # fmt: skip
 
     return plan(start), plan(later)
@@ -153,5 +155,4 @@ def tolerances_of(
                 "plant first (transform: sample_time, or obsynth.discretise).", condition="discrete time",
             )  # fmt: skip
         return design, False
-    uncertain = plant.uncertainty is not None and bool(plant.uncertainty.box.names)
-    return found, kind == "pointwise" and (uncertain or initial_set is not None)
+    return found, bool(asked)

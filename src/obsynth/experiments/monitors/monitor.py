@@ -25,12 +25,20 @@ STATEMENTS: Mapping[str, str] = {
     "probability, for Gaussian noise, after the start is forgotten",
 }
 #: What a statement adds for a continuous design.
-BETWEEN_SAMPLES = "; as far as outputs are straight lines between samples, where disturbances bend them"
+BETWEEN_SAMPLES = "; disturbances may do anything within their bounds between samples, at the stated sample time"
+#: The assumption of a sampled design: what happens between its samples is not in its model.
+HELD = "; inputs and disturbances are held between samples, as the sampled model has them"
+#: The other assumptions of every bound that is never passed.
+ASSUMED = "; the plant starts at rest, and known inputs are held or go in straight lines between samples"
+#: Where the residual is made not to see the faults that are modelled.
+OF_ESTIMATES = "the norm of the fault estimates, as the residual does not see the faults that are modelled: "
 
 
-def statement_of(kind: str, *, continuous: bool) -> str:
-    """Return what a threshold promises."""
-    return STATEMENTS[kind] + (BETWEEN_SAMPLES if continuous else "")
+def statement_of(kind: str, *, continuous: bool, estimates: bool = False) -> str:
+    """Return what a threshold promises; ``estimates``: of the fault estimates instead of the residual."""
+    bounded = kind in ("pointwise", "window")
+    ending = (BETWEEN_SAMPLES + ASSUMED) if continuous and bounded else HELD if bounded else ""
+    return (OF_ESTIMATES if estimates else "") + STATEMENTS[kind] + ending
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +97,8 @@ class Monitor:
         Their names.
     isolation_delay : int
         Samples from the alarm to the comparison.
+    watches_estimates : bool
+        Whether the fault estimates stand in place of the residual, which does not see modelled faults.
     """
 
     kind: str
@@ -103,6 +113,7 @@ class Monitor:
     fault_scales: FloatArray
     fault_names: tuple[str, ...]
     isolation_delay: int
+    watches_estimates: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "threshold", read_only(self.threshold))
@@ -191,7 +202,7 @@ class Monitor:
         SpecError
             Another number of samples than the monitor was made for.
         """
-        residuals = estimates.residuals[:, None, :]
+        residuals = (estimates.faults if self.watches_estimates else estimates.residuals)[:, None, :]
         hits = np.flatnonzero(self.passed(residuals)[:, 0])
         k = int(hits[0]) if hits.size else None
         fault = "" if k is None or not self.fault_names else self.fault_names[self.isolated(estimates.faults, k)]

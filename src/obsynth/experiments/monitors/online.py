@@ -146,7 +146,7 @@ class OnlineMonitor:
         more = tuple(getattr(self._rule, "cells", ()))
         # A statistic that has overflowed has passed any threshold.
         if math.isnan(statistic) or not math.isfinite(threshold):
-            return UNDECIDED._replace(threshold=threshold if more else math.nan, more=more)
+            return UNDECIDED._replace(more=more)
         if statistic <= threshold:
             return Seen(statistic, threshold, False, "", more)
         if which is None and self._names and np.isfinite(faults).all():

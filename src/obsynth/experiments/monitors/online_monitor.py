@@ -14,7 +14,7 @@ from obsynth.experiments.monitors.adaptive_rule import AdaptiveRule
 from obsynth.experiments.monitors.monitor import KINDS, statement_of
 from obsynth.experiments.monitors.online import OnlineMonitor, Rule
 from obsynth.experiments.monitors.parameter_rules import PARAMETER_KINDS, ParameterRule
-from obsynth.experiments.monitors.residual_model import ResidualModel, residual_model
+from obsynth.experiments.monitors.residual_model import ResidualModel, residual_model, watches_estimates
 from obsynth.experiments.monitors.residual_monitor import bounds_of, require_options
 from obsynth.experiments.monitors.residual_rules import NormRule, WhitenedRule
 from obsynth.experiments.monitors.thresholds import scaled_inputs
@@ -32,6 +32,7 @@ from obsynth.simulation.scenario import Scenario
 _FORGOTTEN = ", once the error at the start, which is not stated, is forgotten (else give a longer warm-up)"
 _AFTER_A_GAP = " (after a gap, too, while the error there is no larger than stated for the start)"
 _NOT_CLOSER = "; rows must not be closer than the stated sample time, as noise drives the plant itself"
+_REGULAR = ", for rows that are the stated sample time apart (none further apart, where they are not regular)"
 _ANY_LENGTH = " (the run may have any length)"
 _PARAMETER_STATEMENTS = {
     "chi-square": "distance of the parameters from their nominal values in the metric of their covariance: passed in a "
@@ -89,13 +90,15 @@ def online_monitor(
         Nominal value of parameters by name; those at the observer's start by default.
     sample_time : float, optional, seconds
         Continuous designs: between the rows of the data; the scenario's by default.
-    constants : mapping, ConstantsBox or DescriptorSystem, optional
-        ``pointwise``, discrete linear designs: tolerances instead of the plant's own, as `obsynth.uncertain_system`
-        takes them.  Where there are tolerances, the threshold adapts to the signals and holds for every plant within
-        them; columns of `run_on_data` tell thresholds, guaranteed intervals of faults, and shares of the constants.
+    constants : mapping, ConstantsBox, Uncertainty or DescriptorSystem, optional
+        ``pointwise``, discrete linear designs: tolerances as `obsynth.uncertain_system` takes them; those of the
+        design's plant by ``plant.uncertainty``.  The threshold adapts to the signals and holds for every plant within
+        them; without, it assumes an exact model (but ``obsynth run`` takes the plant's own).  Columns of `run_on_data`
+        tell thresholds, guaranteed intervals of faults, and shares of the constants.
     initial_set : mapping, optional
         ``pointwise``, discrete linear designs: bounds of the plant's states at the first row (deviations), each a
-        number or ``[low, high]``; the threshold then holds from the first row on.
+        number or ``[low, high]``; the threshold then holds from the first row on, for the plant's own tolerances where
+        no others are given.
 
     Returns
     -------
@@ -126,7 +129,8 @@ def online_monitor(
     if nominal:
         raise SpecError("nominal is for recursive designs, which estimate parameters.", path="nominal")
     design, adaptive = tolerances_of(design, kind, constants, initial_set, initial_error)
-    model, dt = _endless_model(design, scenario, window, sample_time)
+    estimates = watches_estimates(design) and kind in ("pointwise", "window")
+    model, dt = _endless_model(design, scenario, window, sample_time, estimates=estimates)
     bounds = bounds_of(design, model, disturbance_bounds)
     if scenario is None:
         stated = [name in (disturbance_bounds or {}) for name in design.linear[0].disturbance_names]
@@ -149,7 +153,15 @@ def online_monitor(
                 "(thresholds).",
                 path="noise_bound",
             )  # fmt: skip
-        norm = NormRule(table, limit, window=window if kind == "window" else 1, dt=dt, irregular=irregular)
+        watched, driven = None, None
+        if estimates:
+            watched = design.linear[1].fault_rows
+        if kind != "paper" and model.continuous is not None and design.linear[0].nu:
+            driven = model.continuous.between.input_response(model.continuous.observer)
+        norm = NormRule(
+            table, limit, window=window if kind == "window" else 1, dt=dt, irregular=irregular, watched=watched,
+            driven=driven,
+        )  # fmt: skip
         if adaptive:
             return _adaptive(design, scenario, norm, model, bounds, noise_bound, initial_error, initial_set)
         rule = norm
@@ -161,9 +173,11 @@ def online_monitor(
         # The noise of the plant itself is what is gathered between samples: the closer they are, the less, but in all
         # the more of it that is of one sign.
         ending += _NOT_CLOSER if model.Bw[:, model.sensor_noise[0].shape[1] :].any() else ""
-    statement = statement_of(kind, continuous=model.flow is not None) + ending + EXACT
+    if kind in ("pointwise", "window") and model.continuous is not None:
+        ending += _REGULAR + model.continuous.between.lasting_words(limit)
+    statement = statement_of(kind, continuous=model.flow is not None, estimates=estimates) + ending + EXACT
     return OnlineMonitor(
-        kind, statement, rule, residuals=len(model.C), fault_names=design.linear[1].fault_names,
+        kind, statement, rule, residuals=len(design.linear[1].residual_names), fault_names=design.linear[1].fault_names,
         fault_scales=model.fault_scales(),
     )  # fmt: skip
 
@@ -190,7 +204,7 @@ def _adaptive(
 
 
 def _endless_model(
-    design: ObserverDesign, scenario: Scenario | None, window: int, sample_time: float | None
+    design: ObserverDesign, scenario: Scenario | None, window: int, sample_time: float | None, *, estimates: bool
 ) -> tuple[ResidualModel, float]:
     """Return a model with as many samples as an error at the start needs to be forgotten, and their distance."""
     plant, observer = design.linear
@@ -208,7 +222,7 @@ def _endless_model(
         horizon=(steps - 0.5) * dt, sample_time=None if plant.is_discrete else dt, inputs={}, faults={}, sensors={},
         initial_state={}, observer_state=None, stabilise=False,
     )  # fmt: skip
-    return residual_model(design, expected), dt
+    return residual_model(design, expected, endless=True, estimates=estimates), dt
 
 
 def _whitened(

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import cast
 
 import numpy as np
 
+from obsynth.analysis.transformations import discretise
 from obsynth.errors import SpecError
+from obsynth.experiments.monitors.between_samples import BetweenSamples
 from obsynth.experiments.monitors.sampled_residual import sampled_errors, tracked_errors
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.norms import output_covariance
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.failures import Random, Uniform
 from obsynth.simulation.profiles import Additive, sampled
@@ -49,6 +54,7 @@ class ResidualModel:
     flow: tuple[FloatArray, FloatArray] | None = None
     start_noise: FloatArray | None = None
     sensor_noise: tuple[FloatArray, FloatArray] | None = None
+    continuous: ContinuousDesign | None = None
 
     @property
     def initial_error(self) -> float:
@@ -86,8 +92,50 @@ class ResidualModel:
         return np.where(scales > 0.0, scales, largest if largest > 0.0 else 1.0)
 
 
-def residual_model(design: ObserverDesign, scenario: Scenario) -> ResidualModel:
-    """Return the model of a design's residual on a scenario."""
+@dataclass(frozen=True, eq=False)
+class ContinuousDesign:
+    """What a bound at the samples of a continuous design is made of.
+
+    Fields: plant: With the noise that counts; tracking: ``V (nz, nx)``; dt: Seconds between samples; endless: Whether
+    the record may have any length.
+    """
+
+    plant: DescriptorSystem
+    observer: LinearObserver
+    tracking: FloatArray
+    dt: float
+    endless: bool
+
+    rows: slice
+
+    @cached_property
+    def between(self) -> BetweenSamples:
+        """The design on samples; raises `SpecError` where what is watched has no bound."""
+        return BetweenSamples.of(
+            self.plant, self.observer, self.tracking, self.dt, rows=self.rows, endless=self.endless
+        )
+
+    def gathered_noise(self, smooth: DescriptorSystem) -> FloatArray:
+        """Return a factor ``(n, m)`` of what process noise adds to the states of the plant in a sample."""
+        process = smooth.Bw[:, smooth.Bw.any(axis=0)]
+        if not process.shape[1]:
+            return np.zeros((smooth.nx, 0))
+        whole = DescriptorSystem(None, smooth.A, C=np.eye(smooth.nx), Bw=process)
+        return np.asarray(discretise(whole, self.dt).plant.Bw)
+
+
+def watches_estimates(design: ObserverDesign) -> bool:
+    """Whether the fault estimates are watched, as the residual is made not to see the faults that are modelled."""
+    return "Phi" in design.certificate.matrices
+
+
+def residual_model(
+    design: ObserverDesign, scenario: Scenario, *, endless: bool = False, estimates: bool = False
+) -> ResidualModel:
+    """Return the model of a design's residual on a scenario; ``endless`` where the record may have any length.
+
+    With ``estimates`` it is that of the fault estimates, which are zero without a fault but for their errors.
+    """
     plant, observer = design.linear
     drive = resolve(plant, scenario)
     noisy = plant.replace(
@@ -102,19 +150,22 @@ def residual_model(design: ObserverDesign, scenario: Scenario) -> ResidualModel:
     if len(begin) != observer.order:
         raise SpecError(f"observer_state needs {observer.order} numbers, not {len(begin)}.", path="observer_state")
     initial = found.tracking @ (plant.E @ start) - begin
-    shown, _, direct_d, direct_w = errors.residual_output
+    shown, _, direct_d, direct_w = errors.fault_output if estimates else errors.residual_output
+    rows = observer.fault_rows if estimates else observer.residual_rows
     faults, _, faults_d, faults_w = errors.fault_output
     bounds, means, deviations, steady = _disturbances(scenario, plant.disturbance_names, drive.steps, drive.dt)
     a, driven, noise, flow, start_noise, heard = errors.Az, errors.disturbance, errors.noise, None, None, None
+    continuous = None
     if not plant.is_discrete:
         held, flow = sampled_errors(noisy, observer, found, drive.dt), (errors.Az, errors.disturbance)
         a, driven, noise, start_noise = held.A, held.Bd, held.Bw, held.start
         sensors = noisy.Dw.any(axis=0)
         heard = errors.noise[:, sensors], direct_w[:, sensors]
-        direct_w, faults_w = held.direct(observer.residual_rows), held.direct(observer.fault_rows)
+        continuous = ContinuousDesign(noisy, observer, found.tracking, drive.dt, endless, rows)
+        direct_w, faults_w = held.direct(rows), held.direct(observer.fault_rows)
     return ResidualModel(
         a, -shown, driven, direct_d, noise, direct_w, -faults, faults_d, faults_w,
-        drive.steps, initial, bounds, means, deviations, steady, flow, start_noise, heard,
+        drive.steps, initial, bounds, means, deviations, steady, flow, start_noise, heard, continuous,
     )  # fmt: skip
 
 

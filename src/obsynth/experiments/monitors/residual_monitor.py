@@ -12,7 +12,7 @@ from obsynth.errors import SpecError
 from obsynth.experiments.batch_simulation import Bench, make_bench
 from obsynth.experiments.monitors.adaptive_monitor import EXACT, tolerances_of
 from obsynth.experiments.monitors.monitor import KINDS, Monitor, statement_of
-from obsynth.experiments.monitors.residual_model import ResidualModel, residual_model
+from obsynth.experiments.monitors.residual_model import ResidualModel, residual_model, watches_estimates
 from obsynth.experiments.monitors.thresholds import (
     paper_threshold,
     pointwise_threshold,
@@ -78,8 +78,8 @@ def monitor(
     isolation_delay : int, optional
         Samples from an alarm to the comparison of the fault estimates, where these answer later than the residual.
     constants, initial_set : mapping, optional
-        ``pointwise``, discrete designs: tolerances and the plant's start, as for `obsynth.online_monitor`.  Where there
-        are tolerances, the monitor adapts to the signals (see `obsynth.evaluate`); the start is the scenario's own by
+        ``pointwise``, discrete designs: tolerances and the plant's start, as for `obsynth.online_monitor`.  With either
+        of them the monitor adapts to the signals (see `obsynth.evaluate`); the start is the scenario's own by
         default.
 
     Returns
@@ -95,11 +95,12 @@ def monitor(
 
     Notes
     -----
-    Of a continuous design, the pointwise bound is that of the observer in continuous time, for disturbances of any
-    shape within their bounds: a rigorous bound on its peak gain, with what the known inputs and the plant's start alone
-    do to the sampled observer (which takes them as straight lines between samples) computed and added.  What the
-    curvature of the response to disturbances does between samples is not in it: sample fast enough, as the statement
-    says.  The statistical kinds use disturbances that are held between samples, and exact covariances of the noise.
+    Of a continuous design, the pointwise bound at the samples is for disturbances that may do anything within their
+    bounds at all times, between samples too: it depends on the sample time, and all its terms are rounded outwards.
+    What known inputs and the plant's start alone do to the sampled observer (which takes outputs as straight lines) is
+    computed and added.  Plants of index 2 and more have no such bound.  Where the residual does not see the faults that
+    are modelled (``ui-pi-observer``), ``pointwise`` and ``window`` are of the fault estimates.  The statistical kinds
+    use disturbances that are held between samples, and exact covariances of the noise.
     """
     require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
     require_kind(scenario, Scenario, "scenario", "an obsynth.Scenario")
@@ -108,14 +109,10 @@ def monitor(
         raise SpecError(f"kind is {kind!r}: use one of {', '.join(KINDS)}.", path="kind")
     require_options(noise_bound, initial_error, gamma, window, false_alarms, change, isolation_delay)
     design, adaptive = tolerances_of(design, kind, constants, initial_set, initial_error)
-    model = residual_model(design, scenario)
-    start = (
-        0.0
-        if adaptive and initial_error is None
-        else model.initial_error
-        if initial_error is None
-        else float(initial_error)
-    )
+    estimates = watches_estimates(design) and kind in ("pointwise", "window")
+    model = residual_model(design, scenario, estimates=estimates)
+    start = 0.0 if adaptive else model.initial_error
+    start = start if initial_error is None else float(initial_error)
     bounds = bounds_of(design, model, disturbance_bounds)
     whitener, mean = np.zeros((0, 0)), np.zeros(len(model.C))
     if kind == "paper":
@@ -136,12 +133,14 @@ def monitor(
         mean = steady_mean(model)
         threshold = _statistical(kind, model, len(whitener), start, window, false_alarms, white=white)
     bench = make_bench(design, scenario)
+    rows = bench.observer.fault_rows if estimates else bench.observer.residual_rows
     if model.flow is not None:
-        threshold = threshold + _straight_lines(design, scenario, model, kind, window)
+        threshold = threshold + _straight_lines(design, scenario, model, kind, window, rows)
+    statement = statement_of(kind, continuous=model.flow is not None, estimates=estimates) + EXACT
     found = Monitor(
-        kind, statement_of(kind, continuous=model.flow is not None) + EXACT, threshold, _floor(bench, scenario),
-        bench.drive.dt, window,
-        mean, whitener, float(change), model.fault_scales(), design.linear[1].fault_names, isolation_delay,
+        kind, statement, threshold, _floor(bench, scenario, rows), bench.drive.dt,
+        window,
+        mean, whitener, float(change), model.fault_scales(), design.linear[1].fault_names, isolation_delay, estimates,
     )  # fmt: skip
     if not adaptive:
         return found
@@ -200,9 +199,9 @@ def _statistical(
     return threshold
 
 
-def _floor(bench: Bench, scenario: Scenario) -> float:
+def _floor(bench: Bench, scenario: Scenario, rows: slice) -> float:
     """Return what rounding may add to the norm of the residual, from the size of what it is made of."""
-    runs, rows = bench.run([scenario.seed]), bench.observer.residual_rows
+    runs = bench.run([scenario.seed])
     size = (
         np.abs(runs.outputs) @ np.abs(bench.observer.Dy[rows]).T
         + np.abs(runs.inputs) @ np.abs(bench.observer.Du[rows]).T
@@ -211,14 +210,14 @@ def _floor(bench: Bench, scenario: Scenario) -> float:
 
 
 def _straight_lines(
-    design: ObserverDesign, scenario: Scenario, model: ResidualModel, kind: str, window: int
+    design: ObserverDesign, scenario: Scenario, model: ResidualModel, kind: str, window: int, rows: slice
 ) -> FloatArray:
     """Return what straight lines between samples add to a norm of the residual: known inputs and start alone."""
     if kind not in ("pointwise", "window"):
         return np.zeros(model.steps)
     calm = scenario.replace(faults={}, sensors={}, disturbances={}, noise=0.0, sensor_noise={})
     bench = make_bench(design, calm)
-    residuals = bench.run([scenario.seed]).rows[:, 0, bench.observer.residual_rows]
+    residuals = bench.run([scenario.seed]).rows[:, 0, rows]
     sizes = np.array([
         np.linalg.norm(residual - model.C @ power @ model.start)
         for residual, power in zip(residuals, model.powers(), strict=True)

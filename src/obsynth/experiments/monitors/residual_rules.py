@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
+from obsynth.experiments.monitors.between_samples import InputResponse
 from obsynth.experiments.monitors.online import share_of_look
 from obsynth.experiments.monitors.unlimited_horizon import UnlimitedHorizonBound
 from obsynth.numerics.arrays import FloatArray
@@ -27,13 +28,21 @@ class NormRule:
 
     Fields: table: The bound at each sample; limit: The bound after the table; window: Samples of which squares are
     summed up; 1 for the norm itself; dt: Between samples; irregular: Continuous designs: table and limit that hold
-    where samples are not all ``dt`` apart.
+    where samples are not all ``dt`` apart, but none further; watched: Rows of the observer that take the place of the
+    residual; driven: Continuous designs: what known inputs add, as the observer does not follow them exactly.
     """
 
     def __init__(
-        self, table: FloatArray, limit: float, *, window: int, dt: float, irregular: UnlimitedHorizonBound | None = None
-    ) -> None:
+        self, table: FloatArray, limit: float, *, window: int, dt: float,
+        irregular: UnlimitedHorizonBound | None = None, watched: slice | None = None,
+        driven: InputResponse | None = None,
+    ) -> None:  # fmt: skip
         self._table, self._limit, self._dt = table, limit, dt
+        self._watched, self._driven = watched, driven
+        self._states = None if driven is None else driven.start()
+        self._inputs: FloatArray | None = None
+        self._moved, self._late = False, False
+        self._added: deque[float] = deque(maxlen=window)
         self._other, self._regular = irregular, True
         self._norms: deque[float] = deque(maxlen=window)
         self._begin: float | None = None
@@ -43,8 +52,11 @@ class NormRule:
         self, time: float, residuals: FloatArray, evidence: Any, *, deciding: bool
     ) -> tuple[float, float, int | None]:
         """Return statistic and threshold; see `obsynth.experiments.monitors.online.Rule`."""
-        del evidence
-        away = 0.0 if self._last is None else abs(time - self._last - self._dt) / self._dt
+        if self._watched is not None:
+            residuals = evidence.rows[self._watched]
+        late = 0.0 if self._last is None else (time - self._last - self._dt) / self._dt
+        away = abs(late)
+        self._late |= self._other is not None and late > FITTING_SHARE
         fits = away <= FITTING_SHARE
         self._regular &= away <= SAME_SHARE
         if self._norms.maxlen != 1 and not fits:
@@ -54,6 +66,11 @@ class NormRule:
         k = math.floor((time - self._begin) / self._dt * (1.0 + ROUNDING))
         table, limit = (self._table, self._limit) if self._regular or self._other is None else self._other
         threshold = float(table[k]) if k < len(table) else limit
+        self._added.append(self._from_inputs(evidence))
+        # Neither rows further apart than stated nor inputs that move at other stamps are in the bound.
+        if self._late or (self._moved and not self._regular):
+            threshold = math.inf
+        threshold += math.hypot(*self._added)
         if not deciding:
             return math.nan, threshold, None
         # Not squared: the square of a number of any size may be none.
@@ -61,17 +78,32 @@ class NormRule:
         # The bound counts samples before the window as well: a window that is not full is bounded all the more.
         return math.hypot(*self._norms), threshold, None
 
+    def _from_inputs(self, evidence: Any) -> float:
+        """Return what known inputs add to the norm, and take those of this row."""
+        if self._driven is None or self._states is None:
+            return 0.0
+        u = evidence.inputs
+        if not np.isfinite(u).all():
+            u = np.zeros(len(u)) if self._inputs is None else self._inputs
+        if self._inputs is not None:
+            self._states = self._driven.advanced(self._states, self._inputs, u)
+            self._moved |= bool(u.any() or self._inputs.any())
+        self._inputs = u
+        return self._driven.size(self._states)
+
     def restart(self) -> None:
         """Begin again: the error at a new start is taken to be no larger than that at the first."""
         self._norms.clear()
+        self._added.clear()
         self._begin = self._last = None
-        self._regular = True
+        self._regular, self._late = True, False
 
     def as_dict(self) -> dict[str, Any]:
         """Return the state that goes from row to row, as data."""
         return {
             "norms": list(self._norms), "begin": self._begin, "last": self._last, "limit": self._limit,
-            "regular": self._regular,
+            "regular": self._regular, "added": list(self._added), "states": self._states, "inputs": self._inputs,
+            "moved": self._moved, "late": self._late,
         }  # fmt: skip
 
     def resume(self, data: Mapping[str, Any]) -> None:
@@ -80,6 +112,10 @@ class NormRule:
         self._norms.clear()
         self._norms.extend(data["norms"])
         self._begin, self._last, self._regular = data["begin"], data["last"], data["regular"]
+        self._added.clear()
+        self._added.extend(data["added"])
+        self._states, self._inputs = data["states"], data["inputs"]
+        self._moved, self._late = data["moved"], data["late"]
 
 
 class WhitenedRule:

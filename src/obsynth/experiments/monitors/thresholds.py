@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from obsynth.errors import SpecError
+from obsynth.experiments.monitors.between_samples import BetweenSamples
 from obsynth.experiments.monitors.residual_model import ResidualModel
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.norms import hinf_norm
@@ -16,14 +17,15 @@ from obsynth.numerics.peak_gain import peak_gain
 class ScaledInputs(NamedTuple):
     """What drives a residual, each input scaled to at most one in absolute value.
 
-    Fields: B, D: Inputs that change from sample to sample, ``(n, m)`` and ``(nr, m)``; constant: What signals of any
-    shape in continuous time add to the norm of the residual, at most; start: ``(n, any)``: inputs of the first sample
-    alone, straight to the error.
+    Fields: B, D: Inputs that change from sample to sample, ``(n, m)`` and ``(nr, m)``; between: ``(steps,)``: what
+    signals that may do anything between samples add to the norm of the residual, at most; limit: The same at any later
+    sample; start: ``(n, any)``: inputs of the first sample alone, straight to the error.
     """
 
     B: FloatArray
     D: FloatArray
-    constant: float
+    between: FloatArray
+    limit: float
     start: FloatArray
 
 
@@ -34,7 +36,9 @@ def scaled_inputs(
 
     Shapes: ``bounds (nd,)``.
     """
-    reached = np.any(model.Bd != 0.0, axis=0) | np.any(model.Dd != 0.0, axis=0)
+    between = None if model.continuous is None else model.continuous.between
+    sampled = np.any(model.Bd != 0.0, axis=0) | np.any(model.Dd != 0.0, axis=0)
+    reached = sampled if between is None else between.reached
     if np.any(reached & ~np.isfinite(bounds)):
         raise SpecError(
             "A disturbance has no bound (a Gaussian one has none): give disturbance_bounds (--disturbance), or use "
@@ -47,22 +51,35 @@ def scaled_inputs(
         )  # fmt: skip
     sizes = np.where(reached, bounds, 0.0)
     factor = 0.0 if noise_bound is None else noise_bound
-    if model.flow is None:
+    nothing = np.zeros(model.steps)
+    if between is None or model.continuous is None or model.flow is None:
         return ScaledInputs(
-            np.hstack([model.Bd * sizes, factor * model.Bw]), np.hstack([model.Dd * sizes, factor * model.Dw]), 0.0,
-            np.zeros((len(model.A), 0)),
+            np.hstack([model.Bd * sizes, factor * model.Bw]), np.hstack([model.Dd * sizes, factor * model.Dw]), nothing,
+            0.0, np.zeros((len(model.A), 0)),
         )  # fmt: skip
-    a, driven = model.flow
-    peaks = peak_gain(a, driven * sizes, model.C) + np.linalg.norm(model.Dd * sizes, axis=0)
-    if any_stamps and model.sensor_noise is not None:
+    count = 0 if model.sensor_noise is None else model.sensor_noise[0].shape[1]
+    process = factor * model.continuous.gathered_noise(between.plant)
+    if any_stamps:
+        return _at_any_stamps(model, between, sizes, factor)
+    table, limits = between.of_disturbances(sizes, model.steps)
+    noise, noise_limits = between.of_process_noise(process, model.steps)
+    start = np.zeros((len(model.A), 0)) if model.start_noise is None else factor * model.start_noise
+    limit = float(np.sum(limits) + np.sum(noise_limits))
+    return ScaledInputs(factor * model.Bw[:, :count], factor * model.Dw[:, :count], table + noise, limit, start)
+
+
+def _at_any_stamps(model: ResidualModel, between: BetweenSamples, sizes: FloatArray, factor: float) -> ScaledInputs:
+    """Return what drives the residual of a continuous design whose samples may be at any stamps, none further apart."""
+    (a, driven), count = model.flow or (model.A, model.Bd), 0
+    total = float(np.sum(peak_gain(a, driven * sizes, model.C) + np.linalg.norm(model.Dd * sizes, axis=0)))
+    if model.continuous is not None:
+        total += between.at_any_stamps(sizes, model.continuous.observer)
+    if model.sensor_noise is not None:
         into, direct = model.sensor_noise
         count = into.shape[1]
-        peaks = np.concatenate([peaks, factor * (peak_gain(a, into, model.C) + np.linalg.norm(direct, axis=0))])
-        return ScaledInputs(
-            factor * model.Bw[:, count:], factor * model.Dw[:, count:], float(np.sum(peaks)), np.zeros((len(a), 0))
-        )
-    noisy = np.zeros((len(a), 0)) if model.start_noise is None else factor * model.start_noise
-    return ScaledInputs(factor * model.Bw, factor * model.Dw, float(np.sum(peaks)), noisy)
+        total += factor * float(np.sum(peak_gain(a, into, model.C) + np.linalg.norm(direct, axis=0)))
+    b, d = factor * model.Bw[:, count:], factor * model.Dw[:, count:]
+    return ScaledInputs(b, d, np.full(model.steps, total), total, np.zeros((len(a), 0)))
 
 
 def paper_threshold(model: ResidualModel, bounds: FloatArray, initial_error: float, gamma: float | None) -> FloatArray:
@@ -87,7 +104,7 @@ def pointwise_threshold(model: ResidualModel, inputs: ScaledInputs, initial_erro
     start += np.array([np.sum(np.linalg.norm(model.C @ power @ inputs.start, axis=0)) for power in powers])
     gathered = np.array([np.sum(np.linalg.norm(model.C @ power @ inputs.B, axis=0)) for power in powers])
     earlier = np.concatenate([[0.0], np.cumsum(gathered)[:-1]])
-    return np.asarray(start + earlier + np.sum(np.linalg.norm(inputs.D, axis=0)) + inputs.constant)
+    return np.asarray(start + earlier + np.sum(np.linalg.norm(inputs.D, axis=0)) + inputs.between)
 
 
 def window_threshold(model: ResidualModel, inputs: ScaledInputs, initial_error: float, window: int) -> FloatArray:

@@ -55,7 +55,12 @@ def unlimited_bound(
     # Of k = m N + j samples, m N shrink by left^m: inputs of that age, and the start, add no more than this.
     aged = float(np.sum(np.linalg.norm(last @ inputs.B, axis=0))) * sum(shown) / (1.0 - left)
     bare = pointwise_threshold(model, inputs, 0.0)
-    pointwise = float(bare[-1]) + shown[-1] * float(np.sum(np.linalg.norm(inputs.B, axis=0))) + aged
+    pointwise = (
+        float(bare[-1] - inputs.between[-1])
+        + inputs.limit
+        + shown[-1] * float(np.sum(np.linalg.norm(inputs.B, axis=0)))
+        + aged
+    )
     begins = initial_error + float(np.sum(np.linalg.norm(inputs.start, axis=0)))
     start = max(shown) * left * begins
     if kind == "pointwise":

@@ -25,6 +25,8 @@ def adaptive_observer(
     initial_state: ArrayLike | None = None,
     initial_covariance: ArrayLike | None = None,
     early_constraints: bool = False,
+    outliers: str = "none",
+    outlier_limit: float | None = None,
     window: int = 50,
     reset: float = 0.0,
     name: str = "design",
@@ -62,6 +64,11 @@ def adaptive_observer(
     reset : float, optional, dimensionless
         Detect and reset: when the innovations of 20 samples pass a threshold (with this probability per sample where
         nothing has changed, such as 1e-6), S and the covariance of theta start again from S_0.  0, the default, never.
+    outliers : {"none", "gate", "huber"}, optional
+        What is done with a sample that its prediction excludes: taken as it is; left out, at most three times in a row
+        of one sensor; or taken at the limit (Huber's weight).
+    outlier_limit : float, optional
+        In standard deviations of the prediction: 6 for ``gate`` and 3 for ``huber`` by default.
     name : str, optional
         Name of the design.
 
@@ -95,5 +102,6 @@ def adaptive_observer(
         plant, "adaptive-observer", name=name, Q=Q, R=R, forgetting=forgetting, form=form, guard=guard,
         random_walk=random_walk, initial_parameters=initial_parameters,
         initial_parameter_covariance=initial_parameter_covariance, initial_state=initial_state,
-        initial_covariance=initial_covariance, early_constraints=early_constraints, window=window, reset=reset,
+        initial_covariance=initial_covariance, early_constraints=early_constraints, outliers=outliers,
+        outlier_limit=outlier_limit, window=window, reset=reset,
     )  # fmt: skip

@@ -9,6 +9,7 @@ from typing import Annotated, Any, ClassVar
 from obsynth.methods.method_spec import MethodOptions
 from obsynth.numerics.value_types import Count, ForgettingFactor, Positive, WrittenAs
 from obsynth.observers.dae.settings import Form, Guard, Integration, Weight
+from obsynth.observers.outliers import Outliers
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,8 @@ class DaeAdaptiveObserverOptions(MethodOptions):
     bounds: Annotated[Any, WrittenAs("named pairs")] = None
     largest_move: Positive | None = None
     window: Count = 50
+    outliers: Outliers = "none"
+    outlier_limit: Positive | None = None
 
     def conflicts(self) -> Iterator[str]:
         """Yield a sentence for each rule across options that is broken."""

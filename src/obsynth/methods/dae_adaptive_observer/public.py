@@ -30,6 +30,8 @@ def dae_adaptive_observer(
     bounds: ArrayLike | Mapping[str, ArrayLike] | None = None,
     largest_move: float | None = None,
     window: int = 50,
+    outliers: str = "none",
+    outlier_limit: float | None = None,
     name: str = "design",
 ) -> ObserverDesign:
     r"""Design an observer of states and parameters of a plant ``F(x', x, u, theta) = 0``, ``y = h(x, theta)``.
@@ -75,6 +77,11 @@ def dae_adaptive_observer(
         the connected one is found.
     window : int, optional
         Samples over which excitation is watched.
+    outliers : {"none", "gate", "huber"}, optional
+        What is done with a sample that its prediction excludes: taken as it is; left out, at most three times in a row
+        of one sensor; or taken at the limit (Huber's weight).
+    outlier_limit : float, optional
+        In standard deviations of the prediction: 6 for ``gate`` and 3 for ``huber`` by default.
     name : str, optional
         Name of the design.
 
@@ -109,5 +116,5 @@ def dae_adaptive_observer(
         weight=weight, integration=integration, random_walk=random_walk, initial_state=initial_state,
         initial_covariance=initial_covariance, initial_parameters=initial_parameters,
         initial_parameter_covariance=initial_parameter_covariance, bounds=bounds, largest_move=largest_move,
-        window=window,
+        window=window, outliers=outliers, outlier_limit=outlier_limit,
     )  # fmt: skip

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar
 
 from obsynth.methods.method_spec import MethodOptions
-from obsynth.numerics.value_types import WrittenAs
+from obsynth.numerics.value_types import Positive, WrittenAs
+from obsynth.observers.outliers import Outliers
 
 
 @dataclass(frozen=True)
@@ -20,3 +21,5 @@ class DescriptorKalmanOptions(MethodOptions):
     initial_state: Annotated[Any, WrittenAs("vector")] = None
     initial_covariance: Annotated[Any, WrittenAs("covariance")] = None
     early_constraints: bool = False
+    outliers: Outliers = "none"
+    outlier_limit: Positive | None = None

@@ -19,6 +19,8 @@ def descriptor_kalman(
     initial_state: ArrayLike | None = None,
     initial_covariance: ArrayLike | None = None,
     early_constraints: bool = False,
+    outliers: str = "none",
+    outlier_limit: float | None = None,
     name: str = "design",
 ) -> ObserverDesign:
     r"""Design the Kalman filter of a descriptor plant, time-varying or not.
@@ -29,8 +31,9 @@ def descriptor_kalman(
     Parameters
     ----------
     plant : TimeVaryingDescriptorSystem or DescriptorSystem
-        ``E (ne, nx)``, ``C (ny, nx)``; a DescriptorSystem must be discrete in time, without feedthrough and without
-        disturbances.  Its parameters are taken as zero.
+        ``E (ne, nx)``, ``C (ny, nx)``; a DescriptorSystem must be discrete in time and without feedthrough of inputs.
+        Its parameters are taken as zero.  Nothing is assumed about its unknown inputs: those that show in the outputs
+        at once become states of the filter, and are estimated; the equations that the others enter are left out.
     Q : MatrixLike, optional
         Covariance ``(ne, ne)`` of mu(k): constant, stack, callable, or rows of expressions in ``k``; a number stands
         for that multiple of the identity.  By default ``Bw Bw'`` of a DescriptorSystem with noise, else the identity.
@@ -43,6 +46,11 @@ def descriptor_kalman(
     early_constraints : bool, optional
         Use the equations of step k + 1 in which x(k + 2) does not appear already for x(k + 1).  They need u(k + 1),
         which `step` has; Q must not couple them with the others.
+    outliers : {"none", "gate", "huber"}, optional
+        What is done with a sample that its prediction excludes: taken as it is; left out, at most three times in a row
+        of one sensor; or taken at the limit (Huber's weight).
+    outlier_limit : float, optional
+        In standard deviations of the prediction: 6 for ``gate`` and 3 for ``huber`` by default.
     name : str, optional
         Name of the design.
 
@@ -76,5 +84,6 @@ def descriptor_kalman(
     """
     return design(
         plant, "descriptor-kalman", name=name, Q=Q, R=R, initial_state=initial_state,
-        initial_covariance=initial_covariance, early_constraints=early_constraints,
+        initial_covariance=initial_covariance, early_constraints=early_constraints, outliers=outliers,
+        outlier_limit=outlier_limit,
     )  # fmt: skip

@@ -22,6 +22,7 @@ DEFAULT_PARAMETER_SHARE = 0.1
 OPTIONS = (
     "dt", "Q", "R", "form", "forgetting", "guard", "weight", "integration", "random_walk", "initial_state",
     "initial_covariance", "initial_parameters", "initial_parameter_covariance", "bounds", "largest_move", "window",
+    "outliers", "outlier_limit",
 )  # fmt: skip
 
 
@@ -49,6 +50,7 @@ def dae_observer_from_options(model: DAEModel, options: Mapping[str, Any]) -> DA
         lower=bounds[:, 0], upper=bounds[:, 1], form=options["form"], forgetting=options["forgetting"],
         guard=options["guard"], weight=options["weight"], integration=options["integration"],
         largest_move=options["largest_move"], window=options["window"],
+        outliers=options.get("outliers", "none"), outlier_limit=options.get("outlier_limit"),
     )  # fmt: skip
 
 

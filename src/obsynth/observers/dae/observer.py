@@ -57,6 +57,11 @@ class DAEObserver(DAESettings):
         In nominal sizes of the states; see `obsynth.plants.dae.step.ImplicitStep`.
     window : int
         Samples over which excitation is watched.
+    outliers : {"none", "gate", "huber"}
+        What is done with a sample that its prediction excludes: taken as it is; left out, at most three times in a row
+        of one sensor; or taken at the limit.
+    outlier_limit : float or None
+        In standard deviations of the prediction: 6 for ``gate`` and 3 for ``huber`` by default.
 
     Raises
     ------

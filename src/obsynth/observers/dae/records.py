@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from obsynth.errors import SolverError
+from obsynth.errors import SolverError, SpecError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.compiled_library import DAELibrary
 from obsynth.observers.dae.estimates import DAEEstimates, DAERow, GatheredRows
@@ -27,12 +27,14 @@ def run_record(
 
     Shapes: ``y (samples, ny)``, ``u (samples, nu)``.
     """
+    if library is not None and steps.settings.outliers != "none":
+        raise SpecError("The C knows no outliers: leave compiled=True out, or take outliers='none'.", path="compiled")
     found = GatheredRows(steps.settings)
     found.add(_nothing(steps))
     with shown_progress(progress, len(y), "samples") as note:
         if library is not None:
             _in_c(steps, library, y, u, found.add_regular, note)
-        elif compiled is None:
+        elif compiled is None and steps.settings.outliers == "none":
             advanced(steps, y, u, found.add_regular, note)
         else:
             state = steps.first

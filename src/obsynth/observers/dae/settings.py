@@ -12,6 +12,7 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.covariances import covariance_factor, is_definite
 from obsynth.numerics.value_types import Count, ForgettingFactor, Positive, checked_value
+from obsynth.observers.outliers import Outliers, checked_limit
 from obsynth.plants.dae.checks import finite_vector, step_length
 from obsynth.plants.dae.model import DAEModel
 
@@ -48,11 +49,14 @@ class DAESettings:
     integration: str = "backward-euler"
     largest_move: float | None = None
     window: int = 50
+    outliers: Outliers = "none"
+    outlier_limit: float | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "dt", step_length(self.dt))
         for name, kind in _KINDS.items():
             checked_value(getattr(self, name), name, kind)
+        checked_limit(self.outliers, self.outlier_limit)
         self._check_arrays()
 
     def __getstate__(self) -> dict[str, Any]:

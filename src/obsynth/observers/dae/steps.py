@@ -13,7 +13,8 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.estimates import DAERow
 from obsynth.observers.dae.memory_layout import initial_memory
 from obsynth.observers.dae.settings import DAESettings
-from obsynth.observers.dae.step_graph import observer_graph
+from obsynth.observers.dae.step_graph import ObserverGraph, observer_graph
+from obsynth.observers.outliers import checked_limit, no_refusals, robust_advance
 from obsynth.plants.dae.functions import Compiled, DAEFunctions
 from obsynth.plants.dae.step import ImplicitStep
 
@@ -27,22 +28,26 @@ class DAEState(NamedTuple):
     """The state of an observer of a DAE.
 
     Fields: memory: Laid out as `memory_layout` says; k: The next sample; u: ``(nu,)``: the inputs of
-    the sample before; informations: ``(nq, nq)`` each: on the parameters, of the latest samples.
+    the sample before; informations: ``(nq, nq)`` each: on the parameters, of the latest samples; refused: ``(2, ny)``:
+    outliers in a row, and at all.
     """
 
     memory: FloatArray
     k: int
     u: FloatArray
     informations: tuple[FloatArray, ...]
+    refused: FloatArray
 
 
 class Steps:
     """The steps of an observer: what follows from it alone, once for all runs."""
 
-    def __init__(self, settings: DAESettings) -> None:
-        self.settings, self.graph = settings, observer_graph(settings)
+    def __init__(self, settings: DAESettings, graph: ObserverGraph | None = None) -> None:
+        self.settings, self.graph = settings, observer_graph(settings) if graph is None else graph
+        self.limit = checked_limit(settings.outliers, settings.outlier_limit)
         self.implicit = ImplicitStep(self.graph.functions, settings.dt, largest_move=settings.largest_move)
-        self.first = DAEState(initial_memory(settings, settings.initial_state), 0, np.zeros(settings.model.nu), ())
+        self.first = DAEState(initial_memory(settings, settings.initial_state), 0, np.zeros(settings.model.nu), (),
+                              no_refusals(settings.model.ny))  # fmt: skip
 
     def part(self, state: DAEState, name: str) -> FloatArray:
         """Return a part of what is remembered, by its name in `memory_layout`."""
@@ -53,6 +58,23 @@ class Steps:
 
         Shapes: ``y (ny,)`` with NaN for what is missing, ``u (nu,)``.
         """
+        if self.settings.outliers == "none":
+            return self.plain(state, y, u)
+        return robust_advance(self.settings.outliers, self.limit, self.plain, self.predicted, state, y, u)
+
+    def predicted(self, state: DAEState, heard: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return mean and deviation of each output ``(ny,)`` from what is heard of the next sample."""
+        after, row = self.plain(state, heard, u)
+        y, H, L = self.graph.functions.outputs(row.x, row.theta)
+        spread = row.parameter_covariance
+        joint = self.settings.form == "augmented-kalman"
+        cross = self.part(after, "cross") if joint else self.part(after, "Upsilon") @ spread
+        both = H @ cross @ L.T
+        whole = H @ row.covariance @ H.T + both + both.T + L @ spread @ L.T + self.settings.R
+        return y, np.sqrt(np.diag(whole))
+
+    def plain(self, state: DAEState, y: FloatArray, u: FloatArray) -> tuple[DAEState, DAERow]:
+        """Take a sample as it is."""
         seen = ~np.isnan(y)
         heard, moved = np.where(seen, y, 0.0), np.zeros(self.settings.model.nx)
         if state.k == 0:
@@ -69,7 +91,7 @@ class Steps:
             )  # fmt: skip
         row = DAERow(self.graph, state.k, after[:, 0], said[:, 0], seen, moved)
         informations = (*state.informations, row.part("information"))[-self.settings.window :]
-        return DAEState(after[:, 0], state.k + 1, u, informations), row
+        return DAEState(after[:, 0], state.k + 1, u, informations, state.refused), row
 
     def stretch(
         self, state: DAEState, y: FloatArray, u: FloatArray, run: Callable[..., tuple[FloatArray, ...]]
@@ -87,7 +109,7 @@ class Steps:
         if taken:
             latest = tuple(rows.part("information")[-self.settings.window :])
             informations = (*state.informations, *latest)[-self.settings.window :]
-            state = DAEState(after[taken - 1].copy(), state.k + taken, u[taken - 1], informations)
+            state = DAEState(after[taken - 1].copy(), state.k + taken, u[taken - 1], informations, state.refused)
         return state, rows
 
     def projected(self, state: DAEState, u: FloatArray) -> tuple[FloatArray, FloatArray]:

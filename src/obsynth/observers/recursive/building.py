@@ -16,7 +16,7 @@ from obsynth.plants.sequences import MatrixSequence
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 
 #: Options of the filter, and of the parameters besides.
-FILTER_OPTIONS = ("Q", "R", "initial_state", "initial_covariance", "early_constraints")
+FILTER_OPTIONS = ("Q", "R", "initial_state", "initial_covariance", "early_constraints", "outliers", "outlier_limit")
 PARAMETER_OPTIONS = (
     "form", "forgetting", "guard", "initial_parameters", "initial_parameter_covariance", "random_walk", "window",
     "reset",
@@ -44,7 +44,7 @@ def observer_from_options(plant: TimeVaryingDescriptorSystem, options: Mapping[s
         plant, _sequence(options["Q"], plant.ne, "Q", plant), _sequence(options["R"], plant.ny, "R", plant),
         _vector(options["initial_state"], plant.nx, "initial_state"),
         _square(options["initial_covariance"], plant.nx, 1.0, "initial_covariance"), adaptation,
-        options["early_constraints"],
+        options["early_constraints"], options.get("outliers", "none"), options.get("outlier_limit"),
     )  # fmt: skip
 
 

@@ -43,6 +43,11 @@ def kernel_is_chosen(observer: RecursiveSettings, samples: int, compiled: bool |
     """Return whether a record goes through the kernel."""
     if compiled is False:
         return False
+    if observer.outliers != "none":
+        if compiled:
+            raise SpecError("compiled=True: the kernel knows no outliers: leave it out, or take outliers='none'.",
+                            path="compiled")  # fmt: skip
+        return False
     covered, installed = kernel_covers(observer), importlib.util.find_spec("numba") is not None
     if compiled is None:
         return covered and installed and samples >= LONG_RECORD and observer.order <= SMALL_ORDER

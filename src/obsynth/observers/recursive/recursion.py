@@ -17,6 +17,8 @@ from obsynth.numerics.least_squares_step import (
     rank_revealing_step,
 )
 from obsynth.numerics.recursive_least_squares import ParameterState, start_of, update
+from obsynth.observers.outliers import checked_limit, no_refusals, robust_advance
+from obsynth.observers.recursive.estimates import UNDETERMINED_SHARE
 from obsynth.observers.recursive.literal_form import posterior_residual
 from obsynth.observers.recursive.parameter_reset import ParameterReset
 from obsynth.observers.recursive.prepared_step import PreparedStep
@@ -71,7 +73,8 @@ class RecursiveState(NamedTuple):
     random walk; factor: ``(n, any)``: square root of its covariance; Upsilon: ``(nx, nq)``; diffuse: ``(n, r)``:
     directions about which nothing is known; parameters: Estimate and spreads; u: ``(nu,)``: the inputs of the sample
     before; regressors: Of the latest samples; surprises: ``(any, 2)``: normalised squares of the latest innovations,
-    and their degrees of freedom, for resets; resets: How many there were.
+    and their degrees of freedom, for resets; resets: How many there were; refused: ``(2, ny)``: outliers in a row, and
+    at all.
     """
 
     k: int
@@ -84,6 +87,7 @@ class RecursiveState(NamedTuple):
     regressors: tuple[FloatArray, ...]
     surprises: FloatArray
     resets: int
+    refused: FloatArray
 
 
 class Recursion:
@@ -91,6 +95,7 @@ class Recursion:
 
     def __init__(self, settings: RecursiveSettings) -> None:
         self.settings, self.model = settings, step_model_of(settings)
+        self.limit = checked_limit(settings.outliers, settings.outlier_limit)
         adaptation, nx = settings.adaptation, settings.plant.nx
         self.random_walk = adaptation is not None and adaptation.form == "random-walk"
         self.literal = adaptation is not None and adaptation.form == "literal"
@@ -105,6 +110,7 @@ class Recursion:
         self.first = RecursiveState(
             0, settings.initial_state.copy(), factor, np.zeros((nx, nq)), np.zeros((nx, 0)),
             start_of(np.zeros(0), np.zeros((0, 0))), np.zeros(settings.plant.nu), (), np.zeros((0, 2)), 0,
+            no_refusals(settings.plant.ny),
         )  # fmt: skip
         if adaptation is None:
             return
@@ -126,6 +132,31 @@ class Recursion:
 
         Shapes: ``y (ny,)`` with NaN for what is missing, ``u (nu,)``.
         """
+        if self.settings.outliers == "none":
+            return self.plain(state, y, u)
+        return robust_advance(self.settings.outliers, self.limit, self.plain, self.predicted, state, y, u)
+
+    def predicted(self, state: RecursiveState, heard: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return mean and deviation of each output ``(ny,)`` from what is heard of the next sample.
+
+        The deviation is infinite where nothing is known.
+        """
+        plant, k = self.settings.plant, state.k
+        if k == 0:
+            return np.zeros(plant.ny), np.full(plant.ny, np.inf)
+        _, row = self.plain(state, heard, u)
+        C, mean = plant.C.at(k), plant.C.at(k) @ row.x
+        reach = C @ row.factor
+        variances = np.einsum("ij,ij->i", reach, reach) + np.diag(self.settings.R.at(k))
+        if len(row.parameters.theta):
+            Psi = plant.Psi.at(k - 1)
+            moved = Psi @ row.parameters.spread
+            mean, variances = mean + Psi @ row.parameters.theta, variances + np.einsum("ij,ij->i", moved, moved)
+        unknown = (np.abs(C @ row.diffuse) > UNDETERMINED_SHARE).any(axis=1)
+        return mean, np.where(unknown, np.inf, np.sqrt(variances))
+
+    def plain(self, state: RecursiveState, y: FloatArray, u: FloatArray) -> tuple[RecursiveState, RawEstimate]:
+        """Take a sample as it is."""
         theta = state.parameters.theta
         if state.k > 0:
             after, v, G = self._stepped(state, self.model.at(state.k - 1), y, u)

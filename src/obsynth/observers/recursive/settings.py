@@ -13,6 +13,7 @@ from obsynth.numerics.arguments import real_vector, truth
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.covariances import covariance_factor
 from obsynth.numerics.value_types import Count, ForgettingFactor, Probability, checked_value
+from obsynth.observers.outliers import Outliers, checked_limit
 from obsynth.plants.sequences import MatrixSequence
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 
@@ -90,8 +91,11 @@ class RecursiveSettings:
     initial_covariance: FloatArray
     adaptation: Adaptation | None
     early_constraints: bool = False
+    outliers: Outliers = "none"
+    outlier_limit: float | None = None
 
     def __post_init__(self) -> None:
+        checked_limit(self.outliers, self.outlier_limit)
         plant = self.plant
         for name, size in (("Q", plant.ne), ("R", plant.ny)):
             shape = getattr(self, name).shape
@@ -143,7 +147,8 @@ class RecursiveSettings:
             "plant": self.plant.as_dict(), "Q": self.Q.as_data(), "R": self.R.as_data(),
             "noise_constants": {**(self.Q.constants or {}), **(self.R.constants or {})},
             "initial_state": self.initial_state, "initial_covariance": self.initial_covariance,
-            "adaptation": adaptation, "early_constraints": self.early_constraints,
+            "adaptation": adaptation, "early_constraints": self.early_constraints, "outliers": self.outliers,
+            "outlier_limit": self.outlier_limit,
         }  # fmt: skip
 
     @classmethod
@@ -162,6 +167,7 @@ class RecursiveSettings:
             MatrixSequence.of(data["R"], "R", constants=constants),
             data["initial_state"], data["initial_covariance"],
             None if data["adaptation"] is None else Adaptation(**data["adaptation"]), data["early_constraints"],
+            data.get("outliers", "none"), data.get("outlier_limit"),
         )  # fmt: skip
 
     def __getstate__(self) -> dict[str, Any]:

@@ -1,0 +1,255 @@
+"""Every method that exists for a plant, designed, on one clock and on the same draws."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from obsynth.comparison.result import ComparedMethod, Comparison, FaultComparison
+from obsynth.comparison.scenario_runs import DrawnRuns, alarms, drawn_runs, estimates, rms
+from obsynth.errors import SpecError
+from obsynth.methods.choosing.candidates import Candidate, candidate, linear_methods
+from obsynth.methods.choosing.figures import DECOUPLED, on_the_clock, step_responses
+from obsynth.methods.designing import design
+from obsynth.methods.functional_filter.rates import settling_time
+from obsynth.numerics.arguments import is_finite_number, require_kind
+from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.value_types import Count, NonNegative, Positive, Probability, checked_value
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.results.design import ObserverDesign
+from obsynth.simulation.profiles import Sine, Step
+from obsynth.simulation.scenario import Scenario
+
+#: Runs of the scenario, and samples and settling times where nothing is stated.
+RUNS, SAMPLES, SETTLING_TIMES, MOST_STEPS = 20, 40, 8, 6000
+SEED = 7
+
+
+def compare(
+    plant: DescriptorSystem,
+    *,
+    scenario: Scenario | None = None,
+    options: Mapping[str, Mapping[str, Any]] | None = None,
+    methods: Sequence[str] | None = None,
+    sample_time: float | None = None,
+    within: float | None = None,
+    tolerance: float = 0.0,
+    disturbance: float = 1.0,
+    runs: int = RUNS,
+    false_alarms: float = 0.05,
+    data: Any = None,
+    progress: Callable[[str], None] | None = None,
+) -> Comparison:
+    """Design every method that exists for a plant and put them side by side, on one clock and the same draws.
+
+    Ranked by the root mean square error over the scenario, disturbances, noise and tolerances drawn, among those that
+    show 90 % of a step within the time asked for.
+
+    Parameters
+    ----------
+    plant : DescriptorSystem
+        Either time, with faults.  A continuous one is sampled: methods are designed for the samples where they can be.
+    scenario : Scenario, optional
+        What happens; by default each fault in turn is a step, while every unknown input is a sinusoid.
+    options : mapping of str to mapping, optional
+        Options by method id.
+    methods : sequence of str, optional
+        Ids; by default all for linear plants.
+    sample_time : float, optional, seconds
+        The clock of a continuous plant; by default that of the scenario, or a fortieth of the plant's settling time.
+    within : float, optional, seconds
+        Time within which 90 % of a step must be shown; by default the plant's settling time.
+    tolerance : float, optional
+        Relative: each parameter of a drawn plant is off by up to this.
+    disturbance : float, optional
+        Amplitude of unknown inputs where no scenario is given.
+    runs : int, optional
+        Drawn runs, with and without faults each.
+    false_alarms : float, optional
+        Share of fault-free runs that pass the threshold of an alarm.
+    data : str, Path or DataFrame, optional
+        A log with the outputs and inputs by name, replayed through every method; columns named as faults are the truth.
+    progress : callable, optional
+        Called with a text at the start of each stage.
+
+    Returns
+    -------
+    Comparison
+        ``times (steps,)``, ``truth (steps, nf)``; refused methods with the reason in one line.
+
+    Raises
+    ------
+    SpecError
+        The plant has no faults, an argument is out of range, a method is unknown, or the log lacks a column.
+
+    References
+    ----------
+    Ours: see `Comparison` for what each number means.
+    """
+    require_kind(plant, DescriptorSystem, "plant", "an obsynth.DescriptorSystem")
+    if plant.nf == 0:
+        raise SpecError("The plant has no faults: there is nothing to compare estimates of.", path="plant")
+    checked_value(tolerance, "tolerance", NonNegative)
+    checked_value(disturbance, "disturbance", NonNegative)
+    checked_value(runs, "runs", Count)
+    checked_value(false_alarms, "false_alarms", Probability)
+    for name, value in (("sample_time", sample_time), ("within", within)):
+        if value is not None:
+            checked_value(value, name, Positive)
+    report_stage = progress or (lambda _: None)
+    plant = plant.dense() if plant.is_sparse else plant
+    dt = plant.dt or sample_time or _step_of(scenario) or settling_time(plant) / SAMPLES
+    sampled = on_the_clock(plant, dt)
+    happening = _scenario(plant, scenario, dt, disturbance)
+    steps = int(min(happening.horizon / dt, MOST_STEPS)) + 1
+    ids = _checked_methods(methods)
+    found = []
+    for method in ids:
+        report_stage(f"designing by {method}")
+        found.append(candidate(method, plant, sampled, steps, _maker, (options or {}).get(method, {})))
+    report_stage("running the scenario")
+    drawn = drawn_runs(plant, sampled, happening, runs=runs, tolerance=float(tolerance), seed=SEED)
+    log = None if data is None else _log(data, sampled)
+    limit = within if within is not None else settling_time(plant)
+    compared = [_compared(entry, sampled, drawn, log, steps, limit, false_alarms) for entry in found]
+    compared.sort(key=lambda entry: (bool(entry.refused), not entry.fast_enough, entry.rms))
+    setting = (
+        f"{runs} runs of {happening.horizon:g} s, sampled every {dt:g} s, disturbances and noise drawn"
+        + (f", parameters off by up to {tolerance:.0%}" if tolerance else "")
+        + f"; 90 % of a step wanted within {limit:.3g} s"
+    )
+    times: FloatArray = (
+        np.asarray(np.arange(len(drawn.faults)) * float(dt), dtype=np.float64) if log is None else log.times
+    )
+    truth = drawn.faults if log is None else log.truth
+    best = next((entry for entry in compared if not entry.refused), None)
+    return Comparison(
+        tuple(compared), "" if best is None else best.method, _reason(best, compared, sampled), dt, read_only(times),
+        read_only(truth), plant.fault_names, setting,
+    )  # fmt: skip
+
+
+def _maker(plant: DescriptorSystem, method: str, options: Mapping[str, Any]) -> ObserverDesign:
+    return design(plant, method, **options)
+
+
+def _step_of(scenario: Scenario | None) -> float | None:
+    return None if scenario is None else scenario.sample_time
+
+
+def _checked_methods(methods: Sequence[str] | None) -> list[str]:
+    known = [spec.id for spec in linear_methods()]
+    if methods is None:
+        return known
+    unknown = [name for name in methods if name not in known]
+    if unknown:
+        raise SpecError(f"{', '.join(map(repr, unknown))}: use some of {', '.join(known)}.", path="methods")
+    return list(methods)
+
+
+def _scenario(plant: DescriptorSystem, given: Scenario | None, dt: float, disturbance: float) -> Scenario:
+    """Return what happens: the scenario given, with at least the sensors' own noise, or each fault in turn."""
+    if given is not None:
+        clocked = given if plant.dt or given.sample_time == dt else given.replace(sample_time=dt)
+        return clocked.replace(observer_state=None, stabilise=False)
+    settle = max(settling_time(plant), 4.0 * dt)
+    length = SETTLING_TIMES * settle
+    faults = {
+        name: Step(size=1.0, start=(1.0 + 2.0 * i) * length / 2.0, end=(2.0 + 2.0 * i) * length / 2.0)
+        for i, name in enumerate(plant.fault_names)
+    }
+    frequency = 0.2 / settle
+    return Scenario(
+        horizon=min(plant.nf * length, MOST_STEPS * dt), sample_time=None if plant.dt else dt, faults=faults, noise=1.0,
+        disturbances={name: Sine(amplitude=disturbance, frequency=frequency) for name in plant.disturbance_names}
+        if disturbance else {},
+    )  # fmt: skip
+
+
+class _Log:
+    """A log on the clock: known inputs, outputs, faults where it has them."""
+
+    def __init__(self, times: FloatArray, u: FloatArray, y: FloatArray, truth: FloatArray, known: bool) -> None:
+        self.times, self.u, self.y, self.truth, self.known = times, u, y, truth, known
+
+
+def _log(data: Any, plant: DescriptorSystem) -> _Log:
+    import pandas as pd
+
+    if isinstance(data, (str, Path)):
+        from obsynth.files.inputs import input_file
+
+        frame = pd.read_csv(input_file(Path(data)))
+    else:
+        require_kind(data, pd.DataFrame, "data", "a file name or a pandas.DataFrame")
+        frame = data
+    missing = [name for name in (*plant.input_names, *plant.output_names) if name not in frame.columns]
+    if missing:
+        raise SpecError(f"The log has no column {', '.join(map(repr, missing))}.", path="data")
+
+    def columns(names: Sequence[str]) -> FloatArray:
+        offsets = np.array([plant.operating_point.get(name, 0.0) for name in names])
+        scales = np.array([plant.scales.get(name, 1.0) for name in names])
+        values = frame[list(names)].to_numpy(dtype=np.float64)
+        if not np.all(np.isfinite(values)):
+            raise SpecError("The log has gaps: give rows without missing values.", path="data")
+        return np.asarray(values * scales - offsets)
+
+    there = [name for name in plant.fault_names if name in frame.columns]
+    truth = np.zeros((len(frame), plant.nf))
+    for name in there:
+        truth[:, plant.fault_names.index(name)] = frame[name].to_numpy(dtype=np.float64)
+    times: FloatArray = np.asarray(np.arange(len(frame)) * float(plant.dt), dtype=np.float64)
+    return _Log(times, columns(plant.input_names), columns(plant.output_names), truth, bool(there))
+
+
+def _compared(
+    entry: Candidate, plant: DescriptorSystem, drawn: DrawnRuns, log: _Log | None, steps: int, limit: float,
+    false_alarms: float,
+) -> ComparedMethod:  # fmt: skip
+    nothing = np.zeros((0, 0))
+    if entry.observer is None:
+        return ComparedMethod(entry.method, entry.refused, None, 0, entry.milliseconds, (), False, nothing, nothing)
+    observer = entry.observer
+    _, responses = step_responses(plant, observer, steps)
+    found, quiet = (estimates(observer, drawn.u, outputs) for outputs in (drawn.faulty, drawn.healthy))
+    replayed = None if log is None else estimates(observer, log.u, log.y[None])[0]
+    rows = []
+    for row, figures in enumerate(entry.figures):
+        column = plant.fault_names.index(figures.fault)
+        fault = drawn.faults[:, column]
+        response = responses[:, row, column]
+        level, delay, smallest = alarms(found[:, :, row], quiet[:, :, row], fault, response, false_alarms, drawn.dt)
+        error = found[:, :, row] - fault
+        if replayed is not None and log is not None and log.known:
+            error = replayed[:, row] - log.truth[:, column]
+        bias = float(np.max(np.abs(np.mean(quiet[:, :, row], axis=1)), initial=0.0))
+        rows.append(FaultComparison(figures, rms(error), bias, level, delay, smallest))
+    shown = found[0] if replayed is None else replayed
+    fast = all(fault.figures.reaches and fault.figures.most <= limit for fault in rows)
+    own = np.column_stack([responses[:, i, plant.fault_names.index(f.fault)] for i, f in enumerate(entry.figures)])
+    return ComparedMethod(
+        entry.method, "", entry.design, observer.order, entry.milliseconds, tuple(rows), fast, read_only(own),
+        read_only(shown),
+    )  # fmt: skip
+
+
+def _reason(best: ComparedMethod | None, compared: Sequence[ComparedMethod], plant: DescriptorSystem) -> str:
+    if best is None:
+        return compared[0].refused if compared else "no method was asked for"
+    others = [entry for entry in compared if not entry.refused and entry is not best]
+    words = [f"rms error {best.rms:.3g}"]
+    if others and is_finite_number(others[0].rms):
+        words[0] += f" against {others[0].rms:.3g} of {others[0].method}"
+    leak = max(fault.figures.leak for fault in best.faults)
+    if plant.nd:
+        words.append("no unknown input leaks" if leak <= DECOUPLED else f"an unknown input leaks by {leak:.2g}")
+    if not best.fast_enough:
+        words.append("though none shows a step as fast as asked for")
+    slow = [entry.method for entry in others if not entry.fast_enough] if best.fast_enough else []
+    if slow:
+        words.append(f"too slow or never there: {', '.join(slow)}")
+    return "; ".join(words)

@@ -1,0 +1,297 @@
+r"""What disturbances of any course do to the residual of a continuous design at the samples of its data, from above.
+
+The observer takes known inputs and outputs as straight lines between samples; the plant does not follow straight lines.
+In the coordinates of the error, ``eps = z - T x`` with ``T = V E``, and with ``x+ = Phi x + q``, ``y = C x + Dd d``,
+
+.. math::
+    \varepsilon^+ = \Phi_z \varepsilon + K x + (\Gamma_1 C - T) q + (\Gamma_0 - \Gamma_1) D_d d + \Gamma_1 D_d d^+,
+
+    r = C_r \varepsilon + D_r D_d d
+
+    K = \Phi_z T + (\Gamma_0 - \Gamma_1) C + \Gamma_1 C \Phi - T \Phi, \qquad
+    q = \int_0^h e^{A s} B_d\, d(t + h - s)\, ds
+
+K is what straight lines miss of a free motion of the plant: of third order in h, and zero for constants and ramps.  So
+x enters with a small factor, and only as far as it dies out: what is left of the modes that do not die out is rounding,
+or there is no bound.  All sums are proved (`obsynth.proofs.peak_sums`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from obsynth.analysis.transformations import eliminate_algebraic_states
+from obsynth.errors import PreconditionError, SpecError
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.holds import first_order_hold
+from obsynth.numerics.peak_gain import peak_gain
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.proofs.balls import Ball, block, rounded_up
+from obsynth.proofs.contraction import Contraction, column_norms, prove_contraction
+from obsynth.proofs.exponentials import exponential
+from obsynth.proofs.peak_sums import PeakSums, gathered, interval_pieces, peak_sums
+
+#: Modes of the plant that decay by less than this exponent in a sample are not followed until they have died out.
+LEAST_DECAY = 1e-4
+#: Share of the terms of K that counts as rounding.
+ROUNDING = 1e-9
+#: Share of the bound that rounding on modes that do not die out may add.
+ADDED = 1e-3
+#: Share of what a disturbance does to the outputs below which it is held not to reach the residual.
+UNREACHED = 1e-11
+#: Share of its terms that rounding adds to a sum over a record of known length, where no tail has to be bounded.
+FINITE = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class BetweenSamples:
+    """A continuous design on samples: ``s+ = M s``, ``r = c s``, ``s = [x; eps]`` with the part of x that is forgotten.
+
+    Fields: plant: Without algebraic states; M: ``(n + nz, n + nz)``; c: ``(nr, n + nz)``; into: How q enters s,
+    ``(n + nz, n)``; first, second: How ``y (ny)`` of a sample enters s at that sample and at the next; direct: ``(nr,
+    ny)``; left: ``(nr,)``: what the modes that are not forgotten add per unit of each state, at most.
+    """
+
+    plant: DescriptorSystem
+    dt: float
+    M: Ball
+    c: FloatArray
+    contraction: Contraction | None
+    into: Ball
+    first: FloatArray
+    second: FloatArray
+    direct: FloatArray
+    rows: slice
+    left: float
+
+    @classmethod
+    def of(
+        cls,
+        plant: DescriptorSystem,
+        observer: LinearObserver,
+        tracking: FloatArray,
+        dt: float,
+        *,
+        rows: slice,
+        endless: bool = True,
+    ) -> BetweenSamples:
+        """Return the design at samples ``dt`` apart, for ``tracking V (nz, nx)``; raise `SpecError` without a bound.
+
+        Without ``endless`` a record of known length is bounded whether or not anything dies out.
+        """
+        try:
+            done = eliminate_algebraic_states(plant)
+        except PreconditionError as error:
+            raise SpecError(
+                f"The residual at the samples has no bound: {error} Where rates of disturbances reach the outputs no "
+                "bound on the disturbances is one on the residual; use a statistical monitor (chi-square or cusum).",
+                path="monitor",
+            ) from error
+        smooth = done.plant
+        t = np.asarray(tracking @ (plant.E @ done.recovery.from_state))
+        az, g0, g1 = first_order_hold(observer.Az, observer.By, dt)
+        phi, c_plant = exponential(smooth.A, dt), Ball.exact(smooth.C)
+        earlier = Ball.exact(g0) - Ball.exact(g1)
+        ramp = Ball.exact(g1) @ c_plant
+        k = Ball.exact(az) @ Ball.exact(t) + earlier @ c_plant + ramp @ phi - Ball.exact(t) @ phi
+        j = Ball.exact(observer.Cz[rows]) @ Ball.exact(t) + Ball.exact(observer.Dy[rows]) @ c_plant
+        terms = np.abs(az) @ np.abs(t) + (np.abs(g0) + 2.0 * np.abs(g1)) @ np.abs(smooth.C) + np.abs(t)
+        parts = rows, (az, g1, earlier), t, (phi, k, j)
+        try:
+            return _assembled(smooth, dt, observer, *parts, _kept(smooth, dt, k, terms), endless=True)
+        except SpecError:
+            if endless:
+                raise
+            return _assembled(smooth, dt, observer, *parts, np.eye(smooth.nx), endless=False)
+
+    @cached_property
+    def per_unit(self) -> FloatArray:
+        """What each disturbance does to a residual in the long run, per unit of its bound ``(nd,)``."""
+        return self.of_disturbances(np.ones(self.plant.nd), 1)[1]
+
+    @property
+    def reached(self) -> np.ndarray:
+        """Which disturbances reach the residual beyond rounding ``(nd,)``."""
+        a, b = self.plant.A, self.plant.Bd
+        held = np.abs(self.plant.C) @ (np.abs(b) * self.dt + np.abs(a @ b) * self.dt**2) + np.abs(self.plant.Dd)
+        scale = np.linalg.norm(
+            np.abs(self.direct) @ held + np.abs(self.c[:, len(a) :]) @ (np.abs(self.second) @ held), axis=0
+        )
+        return np.asarray(self.per_unit > UNREACHED * scale)
+
+    def of_disturbances(self, sizes: FloatArray, steps: int) -> tuple[FloatArray, FloatArray]:
+        """Return the bounds at samples ``0 .. steps - 1``, and for ever ``(nd,)``, for ``|d_i(t)| <= sizes_i``."""
+        plant, count = self.plant, self.plant.nd
+        if not count:
+            return np.zeros(steps), np.zeros(0)
+        pieces = interval_pieces(plant.A, plant.Bd, self.into, self.dt)
+        between = self._sums(pieces.columns, steps)
+        at = self._at_samples(plant.Dd, steps)
+        table = gathered(pieces, between.partial, count)[: max(steps - 1, 0)] + at[1][: max(steps - 1, 0)]
+        whole = rounded_up((gathered(pieces, between.whole, count) + at[2] + at[0]) * sizes, 6)
+        earlier = np.vstack([np.zeros((1, count)), table])[:steps]
+        return np.asarray(rounded_up(np.sum((earlier + at[0]) * sizes, axis=1), count + 6)), np.asarray(whole)
+
+    def of_process_noise(self, columns: FloatArray, steps: int) -> tuple[FloatArray, FloatArray]:
+        """Return the same for what is gathered in each sample, columns ``(n, m)`` of x of at most one each."""
+        if not columns.shape[1]:
+            return np.zeros(steps), np.zeros(0)
+        found = self._sums(self.into @ Ball.exact(columns), steps)
+        earlier = np.vstack([np.zeros((1, columns.shape[1])), found.partial])[:steps]
+        return np.asarray(np.sum(earlier, axis=1)), np.asarray(found.whole)
+
+    def _at_samples(self, dd: FloatArray, steps: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return what the values at the samples do: at once ``(nd,)``, by later samples, and by all."""
+        n = len(self.plant.A)
+        above = np.zeros((n, dd.shape[1]))
+        now, later = np.vstack([above, self.first @ dd]), Ball.exact(np.vstack([above, self.second @ dd]))
+        at_once = column_norms(Ball.exact(self.direct) @ Ball.exact(dd) + Ball.exact(self.c) @ Ball.exact(now))
+        found = self._sums(self.M @ Ball.exact(now) + later, steps)
+        return at_once, found.partial, found.whole
+
+    def _sums(self, columns: Ball, steps: int) -> PeakSums:
+        if self.contraction is not None:
+            return peak_sums(self.M, self.c, columns, self.contraction, least=steps)
+        rows, terms = self.c, []
+        size = np.abs(columns.midpoint) + columns.radius
+        for _ in range(max(steps, 1)):
+            terms.append(
+                np.linalg.norm(rows @ columns.midpoint, axis=0) + FINITE * np.linalg.norm(np.abs(rows) @ size, axis=0)
+            )
+            rows = rows @ self.M.midpoint
+        partial = np.cumsum(np.array(terms), axis=0)
+        return PeakSums(partial, np.full(partial.shape[1], np.inf))
+
+    def input_response(self, observer: LinearObserver) -> InputResponse:
+        """Return what known inputs do to what is watched: held between samples, or in straight lines."""
+        plant, n = self.plant, self.plant.nx
+        _, held, ramp = first_order_hold(plant.A, plant.B, self.dt)
+        _, u0, u1 = first_order_hold(observer.Az, observer.Bu, self.dt)
+        _, y0, y1 = first_order_hold(observer.Az, observer.By, self.dt)
+        into, own = self.into.midpoint, np.zeros((n, plant.nu))
+        before = np.vstack([own, u0 + y0 @ plant.D]) + into @ held
+        rise = np.vstack([own, u1 + y1 @ plant.D])
+        return InputResponse(self.M.midpoint, self.c, before, (rise, rise + into @ ramp))
+
+    def lasting_words(self, limit: float) -> str:
+        """Return what to say of modes that do not die out: up to which state rounding on them does not matter."""
+        if not self.left > 0.0 or not np.isfinite(limit):
+            return ""
+        return f"; while no state of the plant exceeds {ADDED * limit / self.left:.2g} in its unit"
+
+    def at_any_stamps(self, sizes: FloatArray, observer: LinearObserver) -> float:
+        """Return what straight lines between outputs add at any stamps at most ``dt`` apart; may be infinite."""
+        plant, h = self.plant, self.dt
+        if not plant.nd:
+            return 0.0
+        projector = _dying(plant.A, h)
+        if projector is None:
+            return np.inf
+        others = np.eye(plant.nx) - projector
+        second = plant.C @ plant.A @ plant.A
+        if np.any(np.abs(second @ others) > ROUNDING * (np.abs(second) @ np.abs(others))):
+            return np.inf
+        # The modes that last are straight: they are moved to where they die out, and nothing enters them.
+        stable = plant.A @ projector - others
+        bent = np.array([np.sum(peak_gain(stable, projector @ plant.Bd * sizes, row[None])) for row in second])
+        slope, turn = np.abs(plant.C @ plant.Bd) @ sizes, np.abs(plant.C @ plant.A @ plant.Bd) @ sizes
+        missed = 0.25 * h * (2.0 * slope + h * (bent + turn)) + 2.0 * np.abs(plant.Dd) @ sizes
+        return float(peak_gain(observer.Az, observer.By, observer.Cz[self.rows]) @ missed)
+
+
+@dataclass(frozen=True, eq=False)
+class InputResponse:
+    """``s+ = M s + before u + rise (u+ - u)``, ``r = c s``, for a rise of two kinds: a step, and a line."""
+
+    M: FloatArray
+    c: FloatArray
+    before: FloatArray
+    rises: tuple[FloatArray, FloatArray]
+
+    def start(self) -> FloatArray:
+        """Return the states of both kinds, at rest ``(2, n)``."""
+        return np.zeros((2, len(self.M)))
+
+    def advanced(self, states: FloatArray, u: FloatArray, after: FloatArray) -> FloatArray:
+        """Return the states one sample later, for inputs ``u (nu)`` and those of the next sample."""
+        pairs = zip(states, self.rises, strict=True)
+        return np.array([self.M @ s + self.before @ u + rise @ (after - u) for s, rise in pairs])
+
+    def size(self, states: FloatArray) -> float:
+        """Return the larger of what both kinds do to the norm of what is watched."""
+        return float(np.max(np.linalg.norm(states @ self.c.T, axis=1), initial=0.0))
+
+
+def _kept(plant: DescriptorSystem, dt: float, k: Ball, terms: FloatArray) -> FloatArray:
+    """Return the projector ``(n, n)`` onto the modes of a plant that die out; raise where others are not straight."""
+    n = plant.nx
+    if not np.any(np.abs(k.midpoint) + k.radius > ROUNDING * terms):
+        return np.zeros((n, n))
+    projector = _dying(plant.A, dt)
+    others = np.eye(n) if projector is None else np.eye(n) - projector
+    missed = np.abs(k.midpoint @ others)
+    if np.any(missed > ROUNDING * (terms @ np.abs(others))):
+        slow = np.linalg.eigvals(plant.A)
+        slow = slow[slow.real > -LEAST_DECAY / dt]
+        pole = complex(slow[int(np.argmax(np.abs(slow)))]) if slow.size else 0j
+        raise SpecError(
+            f"The residual at the samples has no bound: the plant's mode at {pole:.4g} 1/s does not die out, and its "
+            "outputs are not straight between samples, as the observer takes them. Sample the plant first "
+            "(transform.sample_time) and design for the samples, sample faster, or use a statistical monitor.",
+            path="sample_time",
+        )
+    return np.zeros((n, n)) if projector is None else projector
+
+
+def _dying(a: FloatArray, dt: float) -> FloatArray | None:
+    """Return the projector ``(n, n)`` onto the modes that die out, along the others; ``None`` where there are none."""
+    from scipy.linalg import schur, solve_sylvester
+
+    n = len(a)
+    form, basis, lasting = schur(a, sort=lambda re, im=0.0: re > -LEAST_DECAY / dt, output="real")
+    if lasting == n:
+        return None
+    if not lasting:
+        return np.eye(n)
+    coupling = solve_sylvester(form[:lasting, :lasting], -form[lasting:, lasting:], -form[:lasting, lasting:])
+    # x = Z [y1; y2]; the lasting part is y1 - X y2 along the first columns.
+    return np.asarray(np.eye(n) - basis[:, :lasting] @ np.hstack([np.eye(lasting), -coupling]) @ basis.T)
+
+
+def _assembled(
+    plant: DescriptorSystem, dt: float, observer: LinearObserver, rows: slice,
+    held: tuple[FloatArray, FloatArray, Ball], t: FloatArray, found: tuple[Ball, Ball, Ball], kept: FloatArray,
+    *, endless: bool,
+) -> BetweenSamples:  # fmt: skip
+    (az, g1, earlier), (phi, k, j), n = held, found, plant.nx
+    exact = Ball.exact
+    followed = kept.any()
+    projector, others = exact(kept), exact(np.eye(n)) - exact(kept)
+    moving = phi @ projector
+    m = block([[moving, exact(np.zeros((n, len(az))))], [k if followed else exact(np.zeros(k.shape)), exact(az)]])
+    shown = np.hstack([j.midpoint if followed else np.zeros(j.shape), observer.Cz[rows]])
+    contraction = prove_contraction(m, discrete=True) if endless else None
+    if contraction is None and endless:
+        raise SpecError(
+            "The residual at the samples has no bound that double precision could prove: the observer, or a mode of "
+            "the plant that is not straight between samples, dies out too slowly. Sample the plant first "
+            "(transform.sample_time), or use a statistical monitor.", path="sample_time",
+        )  # fmt: skip
+    into = block([[projector], [exact(g1) @ exact(plant.C) - exact(t)]])
+    # What the split misses, and the modes that it leaves: driven by the state, whatever it is.
+    defect = projector @ phi - moving @ projector if followed else exact(np.zeros((n, n)))
+    rest = block([[defect], [k @ others if followed else k]])
+    direct_left = j @ others if followed else j
+    if followed:
+        direct_left = Ball(direct_left.midpoint, direct_left.radius + j.radius)
+    sizes = np.abs(direct_left.midpoint) + direct_left.radius
+    driven = np.zeros_like(sizes) if contraction is None else contraction.gain(shown, rest.midpoint, rest.radius)
+    left = float(np.linalg.norm(np.sum(rounded_up(driven + sizes, 4), axis=1)))
+    second = earlier.midpoint
+    return BetweenSamples(
+        plant, dt, m, shown, contraction, into, g1, second, observer.Dy[rows], rows, left,
+    )  # fmt: skip

@@ -1,0 +1,109 @@
+"""Single wrong samples: measurements that a prediction excludes are left out, or pulled to where they may be.
+
+A sensor whose sample is further from its prediction than `limit` standard deviations is left out (``gate``), but at
+most `LONGEST` times in a row: what stays away has changed, and is no outlier.  With ``huber`` the sample is taken at
+the limit instead, which is Huber's weight: its influence grows no further (Huber 1964; Masreliez 1975).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Literal, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.errors import SolverError, SpecError
+from obsynth.numerics.arrays import FloatArray
+
+BoolArray = NDArray[np.bool_]
+Outliers = Literal["none", "gate", "huber"]
+KINDS = ("none", "gate", "huber")
+#: Standard deviations: of a gate, so that no sample of a true model is left out in a million; and of Huber's weight.
+LIMITS = {"gate": 6.0, "huber": 3.0}
+#: What is larger has no square: it is no measurement, whatever the model says.
+OVERFLOW = 1e150
+#: Samples of one sensor in a row that are left out; the next is believed.
+LONGEST = 3
+
+State = TypeVar("State", bound=Any)
+Row = TypeVar("Row", bound=Any)
+
+
+def checked_limit(kind: str, limit: float | None) -> float:
+    """Return the limit in standard deviations, infinite for ``none``."""
+    if kind not in KINDS:
+        raise SpecError(f"outliers is {kind!r}: use one of {', '.join(KINDS)}.", path="outliers")
+    if limit is None:
+        return LIMITS.get(kind, float("inf"))
+    number = isinstance(limit, (int, float, np.number)) and not isinstance(limit, bool)
+    if not number or not (np.isfinite(limit) and limit > 0.0):
+        raise SpecError(f"outlier_limit is {limit!r}: give a positive number of standard deviations.",
+                        path="outlier_limit")  # fmt: skip
+    return float(limit)
+
+
+def no_refusals(outputs: int) -> FloatArray:
+    """Return the memory of outliers at a start, ``(2, ny)``: how many in a row of each sensor, and how many at all."""
+    return np.zeros((2, outputs))
+
+
+def robust_advance(
+    kind: str, limit: float, plain: Callable[[State, FloatArray, FloatArray], tuple[State, Row]],
+    predicted: Callable[[State, FloatArray, FloatArray], tuple[FloatArray, FloatArray]], state: State, y: FloatArray,
+    u: FloatArray,
+) -> tuple[State, Row]:  # fmt: skip
+    """Take a step; where its innovation is too long, ask each sensor and take the step again without the outliers.
+
+    ``predicted(state, heard, u)`` returns mean and deviation of each output ``(ny,)`` from the samples that are heard.
+    """
+    failed = False
+    try:
+        with np.errstate(all="ignore"):
+            after, row = plain(state, y, u)
+        if float(row.nis) <= limit**2:
+            return after._replace(refused=np.stack([np.zeros(len(y)), state.refused[1]])), row
+    except (SolverError, np.linalg.LinAlgError, ValueError):
+        failed = True
+    mean, deviation, far = _judged(limit, predicted, state, y, u)
+    if kind == "gate":
+        far &= (state.refused[0] < LONGEST) | (np.abs(y) > OVERFLOW)
+        heard = np.where(far, np.nan, y)
+    else:
+        pulled = mean + limit * deviation * np.sign(y - mean)
+        heard = np.where(far, np.where(np.isfinite(pulled), pulled, np.nan), y)
+    try:
+        if failed or far.any():
+            after, row = plain(state, heard, u)
+    except (SolverError, np.linalg.LinAlgError, ValueError):
+        # A sample that nothing predicts, and with which there is no step.
+        far = ~np.isnan(y)
+        after, row = plain(state, np.full(len(y), np.nan), u)
+    counts = np.where(np.isnan(y), state.refused[0], np.where(far, state.refused[0] + 1.0, 0.0))
+    return after._replace(refused=np.stack([counts, state.refused[1] + far])), row
+
+
+def _judged(
+    limit: float, predicted: Callable[[State, FloatArray, FloatArray], tuple[FloatArray, FloatArray]], state: State,
+    y: FloatArray, u: FloatArray,
+) -> tuple[FloatArray, FloatArray, BoolArray]:  # fmt: skip
+    """Return mean and deviation of each output, and which are too far from them.
+
+    Where the model alone predicts nothing of an output, the others of the same sample do.
+    """
+    with np.errstate(all="ignore"):
+        mean, deviation = predicted(state, np.full(len(y), np.nan), u)
+        far = (np.abs(y - mean) > limit * deviation) | (np.abs(y) > OVERFLOW)
+        ratios = np.zeros(len(y))
+        for i in np.flatnonzero(np.isinf(deviation) & ~np.isnan(y) & ~far):
+            others = np.where(far | (np.arange(len(y)) == i), np.nan, y)
+            try:
+                means, deviations = predicted(state, others, u)
+            except (SolverError, np.linalg.LinAlgError, ValueError):
+                continue
+            mean[i], deviation[i] = means[i], deviations[i]
+            ratios[i] = np.abs(y[i] - means[i]) / deviations[i]
+        # Of those that accuse each other, the worst alone.
+        worst = int(np.argmax(ratios))
+        far[worst] |= bool(ratios[worst] > limit)
+    return mean, deviation, far

@@ -1,0 +1,138 @@
+"""Bounds for disturbances that switch between samples, and the proved sums that they are made of."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.linalg import expm
+
+import obsynth
+from obsynth import SpecError
+from obsynth.proofs.balls import Ball
+from obsynth.proofs.contraction import prove_contraction
+from obsynth.proofs.exponentials import energy, exponential, held_input
+from obsynth.proofs.peak_sums import absolute_gains, gathered, interval_pieces, peak_sums
+
+
+def test_the_number_of_the_issue():
+    """x' = -x + d, y = x + d, L = .3, h = 1: 2.000 for every d(t), 1.356 for one that is held."""
+    a, one, gain = np.array([[-1.0]]), np.eye(1), np.array([[0.3]])
+    moving = exponential(a, 1.0) - Ball.exact(gain)
+    contraction = prove_contraction(moving, discrete=True)
+    pieces = interval_pieces(a, one, Ball.exact(-one), 1.0)
+    between = gathered(pieces, peak_sums(moving, one, pieces.columns, contraction).whole, 1)[0]
+    sampled = peak_sums(moving, one, Ball.exact(gain), contraction).whole[0]
+    exact = ((1.0 - np.exp(-1.0)) + 0.3) / (1.3 - np.exp(-1.0)) + 1.0
+    assert exact == pytest.approx(2.0, abs=1e-12)
+    assert exact <= between + sampled + 1.0 <= exact * 1.001
+    held = peak_sums(moving, one, Ball.exact(gain) - held_input(a, one, 1.0), contraction).whole[0]
+    assert held + 1.0 == pytest.approx(1.356, abs=1e-3)
+
+
+def test_sums_are_bounds_and_tight():
+    rng = np.random.default_rng(2)
+    for radius in (0.2, 0.9, 0.99):
+        a = rng.standard_normal((5, 5))
+        a *= radius / np.max(np.abs(np.linalg.eigvals(a)))
+        b, c = rng.standard_normal((5, 2)), rng.standard_normal((3, 5))
+        contraction = prove_contraction(a, discrete=True)
+        found = peak_sums(Ball.exact(a), c, Ball.exact(b), contraction, least=7)
+        powers, total = np.eye(5), np.zeros((4000, 2))
+        for k in range(4000):
+            total[k], powers = np.linalg.norm(c @ powers @ b, axis=0), powers @ a
+        exact = np.cumsum(total, axis=0)
+        assert np.all(found.partial[:7] >= exact[:7])
+        assert np.allclose(found.partial[:7], exact[:7], rtol=1e-9)
+        assert np.all(found.whole >= exact[-1])
+        assert np.all(found.whole <= 1.002 * exact[-1])
+        loose = contraction.gain(c, b)
+        assert np.all(loose >= sum(np.abs(c @ np.linalg.matrix_power(a, k) @ b) for k in range(50)))
+        gains, terms = absolute_gains(a, c, contraction), np.zeros((3, 5))
+        for k in range(2000):
+            terms += np.abs(c @ np.linalg.matrix_power(a, k))
+        assert np.all(gains >= terms * (1.0 - 1e-12))
+        assert np.all(gains <= 1.06 * terms)
+
+
+def test_gains_in_continuous_time_are_integrals():
+    a, c = np.array([[-1.0, 5.0], [-5.0, -1.0]]), np.array([[1.0, 0.5]])
+    found = absolute_gains(a, c, prove_contraction(a, discrete=False))
+    for i in range(2):
+        exact = sum(quad(lambda t, i=i: abs((c @ expm(a * t))[0, i]), k, k + 1, limit=200)[0] for k in range(30))
+        assert exact <= found[0, i] <= 1.1 * exact
+
+
+def test_what_does_not_contract_is_not_proved():
+    assert prove_contraction(np.array([[1.0]]), discrete=True) is None
+    assert prove_contraction(np.array([[0.0]]), discrete=False) is None
+    assert prove_contraction(np.array([[0.5, 1.0], [0.0, 1.0 + 1e-15]]), discrete=True) is None
+    assert prove_contraction(np.array([[-1.0]]), discrete=False, rate=1.0 + 1e-9) is None
+    assert prove_contraction(np.array([[-1.0]]), discrete=False, rate=1.0 - 1e-9) is not None
+
+
+def test_the_energy_of_an_interval_is_enclosed():
+    a, b = np.array([[-1.0, 2.0], [0.0, -0.3]]), np.array([[1.0], [0.5]])
+    found = energy(a, b, 0.7)
+    for i in range(2):
+        for j in range(2):
+            exact = quad(lambda s, i=i, j=j: (expm(a * s) @ b @ b.T @ expm(a.T * s))[i, j], 0.0, 0.7)[0]
+            assert abs(found.midpoint[i, j] - exact) <= 1e-12
+            assert found.radius[i, j] <= 1e-14
+
+
+def worst_residual(design: obsynth.ObserverDesign, dt: float, horizon: float, pieces: int = 8) -> float:
+    """The largest residual that a switching load of one reaches in a simulation of plant and sampled observer."""
+    plant, held = design.linear[0], obsynth.sample_observer(design.observer, dt)
+    steps, step = round(horizon / dt), dt / pieces
+    whole = expm(np.block([[plant.A, plant.Bd], [np.zeros((plant.nd, plant.nx + plant.nd))]]) * step)
+    free, forced = whole[: plant.nx, : plant.nx], whole[: plant.nx, plant.nx :]
+    seen = []
+    for piece in range(-1, pieces):  # -1: the value at the sample alone
+        x, z, rows = np.zeros(plant.nx), np.zeros(held.order), []
+        for k in range(steps):
+            y = plant.C @ x + (plant.Dd[:, 0] if k == 0 and piece == -1 else 0.0)
+            rows.append((held.Cz @ z + held.Dy @ y)[held.residual_rows])
+            z = held.Az @ z + held.By @ y
+            for i in range(pieces):
+                x = free @ x + forced[:, 0] * (k == 0 and i == piece)
+        seen.append(rows)
+    response = np.array(seen).reshape(-1, held.Cz[held.residual_rows].shape[0])
+    directions = np.random.default_rng(0).standard_normal((20, response.shape[1]))
+    best = 0.0
+    for direction in directions:
+        for _ in range(20):
+            direction = np.sign(response @ direction) @ response
+        best = max(best, float(np.linalg.norm(direction)))
+    return best
+
+
+@pytest.mark.parametrize("dt", [0.05, 0.4])
+@pytest.mark.parametrize("direct", [0.0, 0.3])
+def test_no_switching_load_passes_the_threshold_and_some_come_near(dt: float, direct: float):
+    """An oscillating plant whose outputs are far from straight between samples, with and without feedthrough."""
+    plant = obsynth.DescriptorSystem(
+        None, [[-0.4, 6.0, 0], [-6.0, -0.4, 0], [0, 0, 0.0]], C=[[1.0, 0, 0], [0, 1.0, 0], [0, 0.2, 1.0]],
+        Bf=[[0.0], [1.0], [0.0]], Bd=[[0.5], [0.2], [0.3]], Dd=[[0.0], [direct], [0.0]], disturbance_names=["load"],
+    )  # fmt: skip
+    design = obsynth.pd_observer(plant, decay=1.0)
+    scenario = obsynth.Scenario(horizon=20, sample_time=dt, disturbances={"load": obsynth.Uniform(low=-1, high=1)})
+    threshold = obsynth.monitor(design, scenario).threshold
+    found = worst_residual(design, dt, 20.0)
+    assert found <= threshold[-1] <= 1.5 * found
+    online = obsynth.online_monitor(design, disturbance_bounds={"load": 1.0}, sample_time=dt)
+    assert online._rule._limit >= threshold[-1] * (1.0 - 1e-9)
+    assert "between samples" in online.statement
+    assert "exact model" in online.statement
+
+
+def test_an_unstable_plant_whose_outputs_bend_has_no_bound_for_ever():
+    plant = obsynth.DescriptorSystem(
+        None, [[0.5, 1.0], [0.0, -1.0]], C=np.eye(2), Bf=[[0.0], [1.0]], Bd=[[1.0], [0.0]], disturbance_names=["load"]
+    )
+    design = obsynth.pd_observer(plant, decay=1.0)
+    with pytest.raises(SpecError, match=r"no bound: the plant's mode at 0\.5"):
+        obsynth.online_monitor(design, disturbance_bounds={"load": 1.0}, sample_time=0.1)
+    # A record of known length has one.
+    scenario = obsynth.Scenario(horizon=5, sample_time=0.1, disturbances={"load": obsynth.Uniform(low=-1, high=1)})
+    assert worst_residual(design, 0.1, 5.0) <= obsynth.monitor(design, scenario).threshold[-1]

@@ -1,0 +1,96 @@
+"""Methods side by side: the same clock and draws, one recommendation, refusals in one line, a log replayed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import obsynth
+from obsynth.cli.main import main
+from obsynth.spec.loader import load_spec
+
+DESIGNS = Path(__file__).parents[2] / "designs"
+
+
+@pytest.fixture(scope="module")
+def bicycle() -> obsynth.Comparison:
+    spec = load_spec(DESIGNS / "bicycle" / "spec.yaml")
+    scenario = spec.scenario.replace(horizon=10.0)
+    return obsynth.compare(spec.plant, scenario=scenario, options={spec.method: spec.options}, runs=5)
+
+
+def test_one_recommendation_with_its_reason(bicycle: obsynth.Comparison) -> None:
+    assert bicycle.recommended == "functional-filter"
+    assert "rms error" in bicycle.reason
+    assert "no unknown input leaks" in bicycle.reason
+    assert bicycle.methods[0].method == bicycle.recommended
+    ranked = [entry.rms for entry in bicycle.methods if not entry.refused and entry.fast_enough]
+    assert ranked == sorted(ranked)
+
+
+def test_refused_methods_say_why_in_one_line(bicycle: obsynth.Comparison) -> None:
+    text = bicycle["descriptor-kalman"].refused
+    assert "\n" not in text
+    assert text.endswith("Leave out one of: unknown input wind.")
+
+
+def test_numbers_of_the_table_are_those_of_a_simulation(bicycle: obsynth.Comparison) -> None:
+    entry = bicycle["functional-filter"]
+    figures = entry.faults[0].figures
+    response = entry.responses[:, 0]
+    assert figures.most == pytest.approx(bicycle.sample_time * np.argmax(response >= 0.9))
+    assert entry.faults[0].rms == pytest.approx(
+        np.sqrt(np.mean((entry.estimates[:, 0] - bicycle.truth[:, 0]) ** 2)), rel=0.3
+    )
+    assert entry.design is not None
+    assert entry.design.report.passed
+
+
+def test_texts_and_picture(bicycle: obsynth.Comparison) -> None:
+    assert "Take functional-filter" in str(bicycle)
+    assert "<table>" in bicycle._repr_html_()
+    assert len(bicycle.plot().axes) == 2
+    assert 'content="obsynth compare"' in bicycle.page()
+    json.dumps(bicycle.to_dict())
+
+
+def test_tolerances_make_a_bias() -> None:
+    spec = load_spec(DESIGNS / "motor" / "sampled.yaml")
+    scenario = spec.scenario.replace(horizon=3.0, faults={"torque": obsynth.Step(size=0.1, start=1.0)})
+    source = spec.transformation.source
+    common = {"scenario": scenario, "sample_time": 0.005, "runs": 4, "methods": ["functional-filter"]}
+    exact = obsynth.compare(source, **common)
+    off = obsynth.compare(source, tolerance=0.05, **common)
+    assert off.methods[0].faults[0].bias > 3.0 * exact.methods[0].faults[0].bias
+
+
+def test_a_log_is_replayed_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = pd.read_csv(DESIGNS / "motor" / "log.csv").iloc[:800]
+    log["torque"] = pd.read_csv(DESIGNS / "motor" / "true_log.csv")["f"].iloc[:800]
+    log.to_csv(tmp_path / "log.csv", index=False)
+    spec, page = DESIGNS / "motor" / "sampled.yaml", tmp_path / "page.html"
+    arguments = ["compare", "--system", str(spec), "--data", str(tmp_path / "log.csv"), "--runs", "2", "--quiet"]
+    assert main([*arguments, "--out", str(page), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["recommended"]
+    errors = {entry["method"]: entry["rms"] for entry in found["methods"]}
+    assert errors["functional-filter"] < errors["fault-estimation-filter"]
+    assert page.read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
+    assert main([*arguments]) == 0
+    assert "Take " in capsys.readouterr().out
+
+
+def test_bad_arguments(tmp_path: Path) -> None:
+    plant = load_spec(DESIGNS / "bicycle" / "spec.yaml").plant
+    with pytest.raises(obsynth.SpecError, match="use some of"):
+        obsynth.compare(plant, methods=["magic"])
+    with pytest.raises(obsynth.SpecError, match="tolerance"):
+        obsynth.compare(plant, tolerance=-1.0)
+    with pytest.raises(obsynth.SpecError, match="no column 'steer'"):
+        obsynth.compare(plant, data=pd.DataFrame({"vy": [0.0]}), runs=1, methods=["functional-filter"])
+    with pytest.raises(obsynth.SpecError, match="no faults"):
+        obsynth.compare(plant.replace(Bf=None, Df=None, fault_names=None, units={}))

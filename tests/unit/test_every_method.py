@@ -1,0 +1,209 @@
+"""One table of methods and properties: a method gets these tests by being in the registry."""
+
+from __future__ import annotations
+
+import io
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import obsynth
+from obsynth.methods.registry import REGISTRY, method_spec
+from obsynth.observers.dae.observer import DAEObserver
+from obsynth.observers.linear.observer import Estimates, LinearObserver
+from obsynth.observers.recursive.observer import RecursiveObserver
+
+SAMPLES = 24
+EACH = pytest.mark.parametrize("method", REGISTRY)
+
+A = np.array([[0.9, 0.1, 0.0], [-0.2, 0.7, 0.1], [0.0, 0.3, 0.6]])
+DISCRETE = obsynth.DescriptorSystem(
+    None, A, [[0.0], [1.0], [0.0]], [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], Bf=[[0.0], [1.0], [0.0]], dt=0.1
+)
+CONTINUOUS = obsynth.DescriptorSystem(
+    None, A - 2.0 * np.eye(3), DISCRETE.B, DISCRETE.C, Bf=DISCRETE.Bf, dt=0.0
+)  # fmt: skip
+TANK = obsynth.DAEModel(
+    {"tank": "area * der(level) = inflow - leak * sqrt(level)"},
+    {"gauge": "level"},
+    states={"level": 1.0}, inputs={"inflow": 0.5}, parameters={"leak": 0.5}, constants={"area": 2.0},
+    units={"level": "m", "inflow": "m3/s", "leak": "m2.5/s", "gauge": "m"},
+)  # fmt: skip
+#: Plants in the order in which a method takes the first that it has an observer for.
+PLANTS: tuple[Any, ...] = (DISCRETE, CONTINUOUS, TANK)
+#: What a method cannot do without.
+OPTIONS: dict[str, dict[str, Any]] = {
+    "descriptor-kalman": {"Q": 0.01, "R": 0.01},
+    "adaptive-observer": {"Q": 0.01, "R": 0.01},
+    "dae-adaptive-observer": {"dt": 0.1, "Q": 1e-4, "R": 1e-4},
+}
+#: A number of the shipped observer that nothing but the design says.
+CORRUPTED = {LinearObserver: "Az", RecursiveObserver: "initial_covariance", DAEObserver: "initial_covariance"}
+
+
+@cache
+def plant_of(method: str) -> Any:
+    """Return the first plant for which the method's own conditions hold."""
+    for plant in PLANTS:
+        try:
+            obsynth.design(plant, method, **OPTIONS.get(method, {}))
+        except obsynth.PreconditionError:
+            continue
+        return plant
+    raise AssertionError(f"{method} has no observer for any plant of the table: add one to PLANTS")
+
+
+@cache
+def design_of(method: str) -> obsynth.ObserverDesign:
+    return obsynth.design(plant_of(method), method, **OPTIONS.get(method, {}))
+
+
+def record_of(design: obsynth.ObserverDesign) -> tuple[np.ndarray, np.ndarray]:
+    """Return outputs and inputs that a plant may give: around its nominal values where it has some."""
+    rng = np.random.default_rng(7)
+    if isinstance(design.observer, DAEObserver):
+        return 1.0 + 0.01 * rng.standard_normal((SAMPLES, 1)), np.full((SAMPLES, 1), 0.5)
+    return rng.standard_normal((SAMPLES, design.plant.ny)), rng.standard_normal((SAMPLES, design.plant.nu))
+
+
+def log_of(design: obsynth.ObserverDesign) -> pd.DataFrame:
+    y, u = record_of(design)
+    dt = design.observer.dt or 0.1
+    names = ["time", *design.plant.input_names, *design.plant.output_names]
+    return pd.DataFrame(np.hstack([dt * np.arange(SAMPLES)[:, None], u, y]), columns=names)
+
+
+def stepping(design: obsynth.ObserverDesign) -> Any:
+    """Return the observer, sampled where its time is continuous."""
+    observer = design.observer
+    return obsynth.sample_observer(observer, 0.1) if observer.dt == 0.0 else observer
+
+
+def numbers(found: Any) -> dict[str, np.ndarray]:
+    return {name: value for name, value in vars(found).items() if isinstance(value, np.ndarray)}
+
+
+@EACH
+def test_a_design_is_verified_and_survives_its_file(method: str, tmp_path: Path) -> None:
+    design = design_of(method)
+    assert design.report.passed
+    again = obsynth.load(design.save(tmp_path / "gains.json"))
+    assert obsynth.verify(again).passed
+    here, there = (obsynth.run_on_data(one, log_of(one)).table for one in (design, again))
+    pd.testing.assert_frame_equal(here, there, check_exact=True)
+
+
+@EACH
+def test_a_run_is_its_steps(method: str) -> None:
+    design = design_of(method)
+    observer, (y, u) = stepping(design), record_of(design)
+    whole, state, kept = observer.run(y, u), observer.init(), observer.init()
+    for k in range(SAMPLES):
+        state, row = observer.step(state, y[k], u[k])
+        same = whole.states[k], getattr(whole, "parameters", whole.states)[k]
+        ours = row.states[0], getattr(row, "parameters", row.states)[0]
+        for expected, found in zip(same, ours, strict=True):
+            np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
+    # The first state was not touched: a state is a value.
+    np.testing.assert_equal(kept, observer.init())
+    assert isinstance(whole, Estimates | obsynth.RecursiveEstimates | obsynth.DAEEstimates)
+
+
+@EACH
+def test_a_run_that_was_interrupted_goes_on_as_if_it_was_not(method: str, tmp_path: Path) -> None:
+    design = design_of(method)
+    log, out = log_of(design), io.StringIO()
+    obsynth.run_on_data(design, io.StringIO(log.to_csv(index=False)), out)
+    parts = []
+    for rows in (slice(0, 11), slice(11, None)):
+        part = io.StringIO()
+        text = io.StringIO(log.iloc[rows].to_csv(index=False))
+        obsynth.run_on_data(design, text, part, state=tmp_path / "state.json")
+        parts.append(part.getvalue().splitlines())
+    assert [*parts[0], *parts[1][1:]] == out.getvalue().splitlines()
+
+
+@EACH
+def test_what_is_given_is_not_changed(method: str) -> None:
+    plant, options = plant_of(method), OPTIONS.get(method, {})
+    before = {key: repr(value) for key, value in plant.as_dict().items()}
+    obsynth.design(plant, method, **options)
+    assert {key: repr(value) for key, value in plant.as_dict().items()} == before
+
+
+@EACH
+def test_units_do_not_change_the_verdict(method: str) -> None:
+    """The same plant with outputs, equations and states in other units; noise and starts follow their units."""
+    plant = plant_of(method)
+    if not isinstance(plant, obsynth.DescriptorSystem):
+        return
+    rng = np.random.default_rng(3)
+    rows, states = (np.diag(10.0 ** rng.uniform(-4, 4, plant.nx)) for _ in range(2))
+    outputs = np.diag(10.0 ** rng.uniform(-4, 4, plant.ny))
+    changed = plant.replace(
+        E=rows @ plant.E @ states, A=rows @ plant.A @ states, B=rows @ plant.B, Bf=rows @ plant.Bf,
+        C=outputs @ plant.C @ states,
+    )  # fmt: skip
+    options = dict(OPTIONS.get(method, {}))
+    if "Q" in options:
+        options |= {"Q": 0.01 * rows @ rows.T, "R": 0.01 * outputs @ outputs.T}
+        options["initial_covariance"] = np.linalg.inv(states) @ np.linalg.inv(states).T
+    assert obsynth.design(changed, method, **options).report.passed
+
+
+@EACH
+def test_a_corrupted_design_fails(method: str) -> None:
+    design = design_of(method)
+    observer = design.observer
+    field = next(name for kind, name in CORRUPTED.items() if isinstance(observer, kind))
+    changed = replace(observer, **{field: 1.5 * getattr(observer, field)})
+    assert not obsynth.verify(design.replace(observer=changed)).passed
+
+
+@EACH
+def test_a_claim_that_the_method_does_not_know_fails(method: str) -> None:
+    design = design_of(method)
+    claims = {**design.certificate.claims, "perfection": 1.0}
+    assert "perfection" not in method_spec(method).claims
+    assert not obsynth.verify(design.replace(certificate=replace(design.certificate, claims=claims))).passed
+
+
+@EACH
+def test_the_observer_is_exported(method: str, tmp_path: Path) -> None:
+    design = design_of(method)
+    sampling = {"sample_time": 0.1} if design.observer.dt == 0.0 else {}
+    for path in obsynth.export(design, tmp_path / "observer.c", **sampling):
+        assert path.read_text(encoding="utf-8").strip()
+
+
+WITHOUT_SOLVERS = """
+import sys
+for name in ("cvxpy", "clarabel", "scs", "slycot"):
+    sys.modules[name] = None
+import obsynth
+for gains, log in zip(sys.argv[1::2], sys.argv[2::2]):
+    design = obsynth.load(gains)
+    print(obsynth.verify(design).passed, obsynth.run_on_data(design, log).rows)
+"""
+
+
+def test_verify_and_run_need_no_solver(tmp_path: Path) -> None:
+    """In a process in which no solver can be imported."""
+    arguments: list[str] = []
+    for method in REGISTRY:
+        design, log = design_of(method), tmp_path / f"{method}.csv"
+        log_of(design).to_csv(log, index=False)
+        arguments += [str(design.save(tmp_path / f"{method}.json")), str(log)]
+    done = subprocess.run(
+        [sys.executable, "-c", WITHOUT_SOLVERS, *arguments], capture_output=True, text=True, check=False,
+        env={**os.environ, "PYTHONPATH": str(Path(obsynth.__file__).parents[1])},
+    )  # fmt: skip
+    assert done.stdout.splitlines() == [f"True {SAMPLES}"] * len(REGISTRY), done.stderr

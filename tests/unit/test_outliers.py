@@ -1,0 +1,126 @@
+"""Wrong samples on a log: gates and Huber's weight in recursive and nonlinear observers, and in ``run``."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+from test_validate import designed
+
+import obsynth
+from obsynth import SolverError, SpecError, run_on_data, simulate_dae
+
+
+def tank_log(samples=120, seed=2):
+    design = designed()
+    u = np.tile(design.plant.nominal_input, (samples, 1))
+    true = simulate_dae(design.plant, u, dt=1.0, Q=np.diag([2e-5, 1.2e-5, 9e-7]), R=np.diag([1.7e-5, 4.8e-6, 2.7e-5]),
+                        integration="backward-euler", seed=seed)  # fmt: skip
+    return design, u, true
+
+
+def filter_design(**options):
+    plant = obsynth.TimeVaryingDescriptorSystem(
+        E=[[1, 0], [0, 0]], A=[[0.9, 0.1], [0.5, 1.0]], B=[[1.0], [0.0]], C=np.eye(2), Phi=[[0.1], [0.0]], dt=1.0,
+    )  # fmt: skip
+    return obsynth.adaptive_observer(
+        plant, Q=np.diag([1e-4, 1e-4]), R=np.diag([1e-3, 1e-3]), forgetting=0.98, initial_state=[0.0, 0.0],
+        initial_covariance=np.eye(2), initial_parameters=[0.0], initial_parameter_covariance=[[1.0]], **options,
+    )  # fmt: skip
+
+
+def filter_record(samples=150, seed=5):
+    rng = np.random.default_rng(seed)
+    u, x, rows = np.sin(np.arange(samples) / 9.0)[:, None], np.zeros(2), []
+    for k in range(samples):
+        if k:
+            first = 0.9 * x[0] + 0.1 * x[1] + u[k - 1, 0] + 0.05 + 0.01 * rng.standard_normal()
+            x = np.array([first, -0.5 * first])
+        rows.append([x[0], -0.5 * x[0]] + np.sqrt(1e-3) * rng.standard_normal(2))
+    return np.array(rows), u
+
+
+@pytest.mark.parametrize("kind", ["gate", "huber"])
+def test_one_sample_off_by_a_million_costs_a_nonlinear_observer_less_than_two_deviations(kind):
+    design, u, true = tank_log()
+    observer = replace(design.observer, outliers=kind)
+    clean = design.observer.run(true.outputs, u)
+    spoiled = np.array(true.outputs)
+    spoiled[60, 1] += 1e6
+    found = observer.run(spoiled, u)
+    late = slice(65, None)
+    assert (np.abs(found.states - clean.states)[late] < 2.0 * clean.state_deviations[late]).all()
+    assert (np.abs(found.parameters - clean.parameters)[late] < 2.0 * clean.parameter_deviations[late]).all()
+    # Without, the same sample leads where the model has no next step.
+    with pytest.raises(SolverError):
+        design.observer.run(spoiled, u)
+
+
+@pytest.mark.parametrize("kind", ["gate", "huber"])
+def test_one_sample_off_by_a_million_costs_a_recursive_observer_less_than_two_deviations(kind):
+    y, u = filter_record()
+    clean, robust = filter_design(), filter_design(outliers=kind)
+    spoiled = y.copy()
+    spoiled[80, 0] = 1e6
+    found, wanted = robust.observer.run(spoiled, u), clean.observer.run(y, u)
+    late = slice(85, None)
+    assert (np.abs(found.states - wanted.states)[late] < 2.0 * wanted.state_deviations[late]).all()
+    assert (np.abs(found.parameters - wanted.parameters)[late] < 2.0 * wanted.parameter_deviations[late]).all()
+
+
+@pytest.mark.parametrize("kind", ["gate", "huber"])
+def test_a_record_without_outliers_is_as_before(kind):
+    y, u = filter_record()
+    found, wanted = (
+        filter_design(outliers=kind, outlier_limit=8.0).observer.run(y, u),
+        filter_design().observer.run(y, u),
+    )
+    assert np.array_equal(found.states, wanted.states)
+    design, u, true = tank_log()
+    observer = replace(design.observer, outliers=kind, outlier_limit=8.0)
+    assert np.abs(observer.run(true.outputs, u).states - design.observer.run(true.outputs, u).states).max() < 1e-12
+
+
+def test_a_sensor_that_stays_away_is_believed_after_three_samples():
+    y, u = filter_record()
+    design = filter_design(outliers="gate")
+    y[80:] += [3.0, 0.0]
+    state = design.observer.init()
+    refused = []
+    for k in range(len(y)):
+        state, _ = design.observer.advance(state, y[k], u[k])
+        refused.append(state.refused.copy())
+    assert refused[79].sum() == 0.0
+    assert [counts[0, 0] for counts in refused[80:84]] == [1.0, 2.0, 3.0, 0.0]
+
+
+def test_run_leaves_outliers_out_by_default_and_counts_them(tmp_path):
+    design, u, true = tank_log()
+    table = pd.DataFrame({"time": np.arange(120.0), **dict(zip(("u1", "u3"), u.T, strict=True)),
+                          **dict(zip(("v1", "v2", "v3"), np.array(true.outputs).T, strict=True))})  # fmt: skip
+    clean = run_on_data(design, table)
+    assert clean.outliers == {}
+    # No warm-up is needed: the deviations of the start are stated.
+    assert clean.statuses == {"ok": 120}
+    spoiled = table.copy()
+    spoiled.loc[[40, 90], "v3"] = [1e6, -1e6]
+    found = run_on_data(design, spoiled)
+    assert found.outliers == {"v3": 2}
+    gap = np.abs(found.table["fhat[leak]"] - clean.table["fhat[leak]"])[95:]
+    assert (gap < 2.0 * clean.table["sd fhat[leak]"][95:]).all()
+    plain = run_on_data(design, spoiled, outliers="none")
+    assert plain.outliers == {}
+    with pytest.raises(SpecError, match="outliers"):
+        run_on_data(design, table, outliers="some")
+
+
+def test_options_are_checked_and_kept(tmp_path):
+    design = filter_design(outliers="huber", outlier_limit=2.5)
+    file = design.save(tmp_path / "gains.json")
+    again = obsynth.load(file)
+    assert (again.observer.outliers, again.observer.outlier_limit) == ("huber", 2.5)
+    for options in ({"outliers": "some"}, {"outliers": "gate", "outlier_limit": -1.0}):
+        with pytest.raises(SpecError, match="outlier"):
+            filter_design(**options)
