@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any
@@ -302,10 +304,27 @@ class SampledNumbers(PlantNumbers):
         return SystemFacts(rank, columns, () if stable else outside, values, False, self.computed)
 
 
+_EXACTLY: ContextVar[bool] = ContextVar("existence is decided exactly", default=True)
+
+
+@contextmanager
+def decided(*, exactly: bool) -> Iterator[None]:
+    """Decide existence exactly, or in floating point: for what is only tried, such as sensors that might be added."""
+    token = _EXACTLY.set(exactly)
+    try:
+        yield
+    finally:
+        _EXACTLY.reset(token)
+
+
+def numbers_of(plant: DescriptorSystem) -> PlantNumbers | None:
+    """Return the numbers on which existence is decided; ``None`` where it is decided in floating point."""
+    return _numbers_of(plant) if _EXACTLY.get() else None
+
+
 # Conditions ask for the same plant's several times; plants never change.
 @lru_cache(maxsize=4)
-def numbers_of(plant: DescriptorSystem) -> PlantNumbers | None:
-    """Return the numbers on which existence is decided; ``None`` where the plant has too many states for that."""
+def _numbers_of(plant: DescriptorSystem) -> PlantNumbers | None:
     from obsynth.proofs.written_numbers import computed_entries, rational_matrix, written_matrix
 
     origin = origin_of(plant)

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.conditions import Condition, require_all
+from obsynth.analysis.existence.numbers import decided
 from obsynth.errors import InfeasibleError
 from obsynth.methods.conic.lmi import FILTER_SOLVERS
 from obsynth.methods.fault_estimation_filter.certificate import bounded_real_certificate
@@ -43,9 +44,10 @@ from obsynth.results.design import Certificate
 BACKGROUND_NOISE = 1e-3
 
 
-def conditions(plant: DescriptorSystem) -> tuple[Condition, ...]:
-    """Return the existence conditions; the list ends at the first failure."""
-    return fault_filter_conditions(plant)
+def conditions(plant: DescriptorSystem, *, exactly: bool = True) -> tuple[Condition, ...]:
+    """Return the existence conditions, decided exactly or in floating point; the list ends at the first failure."""
+    with decided(exactly=exactly):
+        return fault_filter_conditions(plant)
 
 
 def synthesise(plant: DescriptorSystem, asked: FilterOptions, *, progress: Callable[[str], None]) -> Synthesis:

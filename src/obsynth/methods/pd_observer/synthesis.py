@@ -27,6 +27,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.conditions import Condition, require_all
+from obsynth.analysis.existence.numbers import decided
 from obsynth.errors import SpecError
 from obsynth.methods.pd_observer.augmentation import with_faults_as_states
 from obsynth.methods.pd_observer.certificate import explicit_certificate
@@ -46,9 +47,10 @@ from obsynth.results.design import Certificate
 WARN_AMPLIFICATION = 50.0
 
 
-def conditions(plant: DescriptorSystem) -> tuple[Condition, ...]:
-    """Return the existence conditions; the list ends at the first failure."""
-    return pd_observer_conditions(plant)
+def conditions(plant: DescriptorSystem, *, exactly: bool = True) -> tuple[Condition, ...]:
+    """Return the existence conditions, decided exactly or in floating point; the list ends at the first failure."""
+    with decided(exactly=exactly):
+        return pd_observer_conditions(plant)
 
 
 def synthesise(plant: DescriptorSystem, asked: PdOptions, *, progress: Callable[[str], None]) -> Synthesis:

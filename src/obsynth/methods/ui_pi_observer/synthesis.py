@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.conditions import Condition, require_all
+from obsynth.analysis.existence.numbers import decided
 from obsynth.analysis.zeros import is_outside
 from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.methods.lyapunov import lyapunov_factor
@@ -49,9 +50,10 @@ from obsynth.results.design import Certificate
 RADIUS_SHARE = 0.5
 
 
-def conditions(plant: DescriptorSystem, *, fault_model: Any = "step") -> tuple[Condition, ...]:
-    """Return the existence conditions; they are independent of each other, so several may fail."""
-    return existence(plant, exosystem(fault_model, plant.fault_names, plant.dt)).conditions
+def conditions(plant: DescriptorSystem, *, fault_model: Any = "step", exactly: bool = True) -> tuple[Condition, ...]:
+    """Return the existence conditions, decided exactly or in floating point; several may fail."""
+    with decided(exactly=exactly):
+        return existence(plant, exosystem(fault_model, plant.fault_names, plant.dt)).conditions
 
 
 def synthesise(plant: DescriptorSystem, asked: UiPiOptions, *, progress: Callable[[str], None]) -> Synthesis:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import random
 from dataclasses import dataclass, field
 from fractions import Fraction
-from itertools import combinations
+from itertools import combinations, count
 
 import numpy as np
 from flint import fmpq, fmpq_mat, fmpq_poly
@@ -31,8 +31,12 @@ class Drawn:
     units: dict[str, np.ndarray] = field(repr=False)
 
 
-def draw(method: str, seed: int) -> Drawn | None:
-    """Return the plant of a seed; ``None`` where the draw is not of the kind that the method takes."""
+def drawn_plant(method: str, seed: int) -> Drawn:
+    """Return the plant of a seed: the first draw that is of the kind that the method takes."""
+    return next(found for attempt in count() if (found := _draw(method, f"{seed} {attempt}")) is not None)
+
+
+def _draw(method: str, seed: str) -> Drawn | None:
     rng = random.Random(f"{method} {seed}")
     matrices = _base(rng, method)
     dt = 0.0 if method == "pd-observer" else 1.0 if method == "fault-estimation-filter" else rng.choice([0.0, 1.0])
@@ -70,15 +74,17 @@ def _base(rng: random.Random, method: str) -> dict[str, np.ndarray]:
 
 def _plant_obstacle(rng: random.Random, m: dict[str, np.ndarray], dt: float) -> None:
     """Hide a mode, or mask a fault, or leave the plant as it is; modes are slowed for sampled plants."""
-    nx, kind = len(m["A"]), rng.choice(["none", "none", "mode", "masked", "algebraic"])
+    nx, kind = len(m["A"]), rng.choice(["none", "none", "mode", "weak", "masked", "algebraic"])
     if dt:
         m["A"] = np.array([[Fraction(int(value), 4) for value in row] for row in m["A"]], dtype=object)
-    if kind == "mode":
-        # The first state is in no output and no other equation sees it but by its own pace.
+    if kind in ("mode", "weak"):
+        # The first state is in no output, or hardly, and no other equation sees it but by its own pace.
         pace = rng.choice([Fraction(-1), Fraction(-1, 2), Fraction(1, 2), Fraction(1), Fraction(0), Fraction(5, 4)])
         m["C"][:, 0] = 0
         m["A"][1:, 0] = 0
         m["A"][0, 0] = pace
+        if kind == "weak":
+            m["C"][rng.randrange(len(m["C"])), 0] = Fraction(1, 2 ** rng.choice([8, 14, 20]))
     elif kind == "masked":
         # x = v f, constant, solves the plant with y = 0 (continuous: A v + Bf = 0; sampled: A v + Bf = E v).
         hidden = [v for v in _small_vectors(nx) if not any(m["C"] @ v) and any(v)]

@@ -1,0 +1,97 @@
+"""Existence decided on numbers as written, through elimination and sampling; the three answers."""
+
+import numpy as np
+import pytest
+
+from obsynth import (
+    DescriptorSystem,
+    PreconditionError,
+    analyse_structure,
+    discretise,
+    eliminate_algebraic_states,
+    fault_estimation_filter,
+    ui_pi_observer,
+)
+from obsynth.analysis.existence.numbers import numbers_of
+from obsynth.analysis.existence.verdicts import DROWNED, settled_rank
+from obsynth.methods.designing import check
+from obsynth.numerics.ranks import decide_rank
+from obsynth.plants.origin import origin_of
+
+E = np.array([[1, 0, 0], [1, 1, 1], [0, 0, 0]])
+A = np.array([[-1, 2, 2], [-1, 0, -1], [0, 0, 3]])
+C = np.array([[0, 1, 1]])
+MASKED, SHOWN = np.array([[0], [-1], [3]]), np.array([[0], [-1], [2]])
+
+
+def with_zero(zero):
+    """One fault, one output, one zero."""
+    return DescriptorSystem(np.eye(2), [[0, 1], [0, 0.1]], C=[[-zero, 1]], Bf=[[0], [1]], dt=0.1)
+
+
+def test_elimination_leaves_no_trace_of_a_fault_that_never_shows():
+    reduced = eliminate_algebraic_states(DescriptorSystem(E, A, C=C, Bf=MASKED)).plant
+    assert not reduced.Df.any()
+    assert not np.any(reduced.Bf)
+    assert origin_of(reduced) is not None
+
+
+def test_what_elimination_knows_is_kept_by_changes_that_do_not_matter():
+    reduced = eliminate_algebraic_states(DescriptorSystem(E, A, C=C, Bf=SHOWN)).plant
+    assert origin_of(reduced.replace(B=np.ones((2, 1)), D=[[0]])) is origin_of(reduced)
+    assert origin_of(reduced.replace(C=2 * reduced.C)) is None
+
+
+@pytest.mark.parametrize("sample_time", [0.1, 1.0])
+def test_sampled_plants_are_decided_as_sampled(sample_time):
+    masked = discretise(DescriptorSystem(E, A, C=C, Bf=MASKED), sample_time).plant
+    shown = discretise(DescriptorSystem(E, A, C=C, Bf=SHOWN), sample_time).plant
+    with pytest.raises(PreconditionError, match=r"^No observer of this kind exists"):
+        ui_pi_observer(masked)
+    assert ui_pi_observer(shown).report.passed
+
+
+def test_a_triple_integrator_has_no_zero_before_it_is_sampled_and_an_unstable_one_after():
+    plant = DescriptorSystem(None, np.eye(3, k=1), C=[[1, 0, 0]], Bf=[[0], [0], [1]])
+    numbers = numbers_of(discretise(plant, 0.1).plant)
+    facts = numbers.system(numbers.matrix("Bf"), numbers.matrix("Df"))
+    assert not facts.exact
+    assert facts.outside[0] == pytest.approx(-2 - np.sqrt(3))
+    own = numbers_of(plant)
+    assert own.system(own.matrix("Bf"), own.matrix("Df")).zeros == ()
+
+
+@pytest.mark.parametrize(("zero", "stable"), [(1 - 1e-9, True), (1.0, False), (1 + 1e-9, False), (-1.0, False)])
+def test_a_zero_is_on_its_side_of_the_boundary_however_close(zero, stable):
+    assert check(with_zero(zero))["fault-estimation-filter"].passed == stable
+
+
+def test_an_answer_that_rounding_could_change_is_unclear():
+    plant = DescriptorSystem(np.eye(2), [[0.5, 0], [0, 2]], C=[[1, 1], [1, 1 + 2e-15]], Bf=[[1], [0]], dt=0.1)
+    with pytest.raises(PreconditionError, match=r"^Unclear: .*rounding") as error:
+        fault_estimation_filter(plant)
+    assert error.value.exit_code == 3
+
+
+def test_a_rank_lost_only_exactly_says_so():
+    plant = DescriptorSystem(np.eye(2), [[0.5, 0], [0, 0.2]], C=np.eye(2), Bf=[[1, 2], [0.1, 0.2]], dt=0.1)
+    with pytest.raises(PreconditionError, match=r"rank 1 of 2 \(exactly, on the numbers as written; .*1e16"):
+        fault_estimation_filter(plant)
+
+
+@pytest.mark.parametrize(
+    ("smallest", "exact", "means", "rank"),
+    [(1e-3, 2, "exact", 2), (1e-12, 2, "exact", 2), (DROWNED / 4, 2, "unclear", 1), (1e-3, 1, "exact", 1)],
+)
+def test_three_answers_for_a_rank(smallest, exact, means, rank):
+    decision = settled_rank(decide_rank(np.diag([1.0, smallest]), equilibrated=False), exact)
+    assert (decision.means, decision.rank) == (means, rank)
+    assert ("exactly" in decision.describe()) == (exact == 1 or means == "exact" or means == "unclear")
+
+
+def test_computed_data_keep_the_judgement_of_floating_point():
+    """A mode that is hidden but for rounding is hidden, and a far zero that rounding made is none."""
+    rng = np.random.default_rng(3)
+    q = np.linalg.qr(rng.standard_normal((3, 3)))[0]
+    plant = DescriptorSystem(None, q @ np.diag([0.5, 0.2, 1.5]) @ q.T, C=np.eye(3)[:2] @ q.T, Bf=q[:, :1], dt=1.0)
+    assert analyse_structure(plant).undetectable_modes == pytest.approx((1.5,))
