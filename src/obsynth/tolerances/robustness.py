@@ -31,9 +31,9 @@ from obsynth.tolerances.tracking import Tracking, tracking_of
 #: A design without tolerances says this.
 EXACT_MODEL = "assumes an exact model"
 #: Vertices beyond this number are drawn at random.
-MOST_VERTICES = 64
+MOST_VERTICES = 32
 #: Samples over which the gain at a vertex is summed up, at most.
-MOST_GAIN_SAMPLES = 100_000
+MOST_GAIN_SAMPLES = 5_000
 #: What is left of a response when its sum ends.
 _GAIN_LEFT = 1e-6
 
