@@ -26,6 +26,7 @@ from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.results.design import Certificate, ObserverDesign
+from obsynth.results.plant_source import source_of
 from obsynth.results.report import VerificationReport
 from obsynth.verification.plant import condition_rows
 from obsynth.verification.stored_numbers import StoredErrors
@@ -211,11 +212,13 @@ def draft_of(
     plant: Plant, method: str, found: Synthesis, *, name: str, recovery: StateRecovery | None = None
 ) -> ObserverDesign:
     """Return the design that a synthesis stands for, without a report."""
+    source = source_of(plant)
     if found.plant is not None:
         plant = found.plant
     if found.transformation is not None:
         own = found.transformation.recovery
         plant, recovery = found.transformation.plant, own if recovery is None else recovery.then(own)
+        source = source_of(plant)
     return ObserverDesign(
         name=name,
         method=method,
@@ -227,6 +230,7 @@ def draft_of(
         solver=found.solver,
         notes=found.notes,
         recovery=recovery,
+        source=source,
     )
 
 

@@ -128,7 +128,9 @@ def _in_given_units(found: Transformation, plant: DescriptorSystem, units: Plant
         units, time=1.0 / units.time, equations=states, states=1.0 / states, outputs=1.0 / units.outputs,
         faults=1.0 / units.faults, disturbances=1.0 / units.disturbances,
     )  # fmt: skip
-    own, old = units.states[:, None], found.recovery
+    old = found.recovery
+    # A source state that cannot be recovered is not among these.
+    own = np.array([kept.get(name, 1.0) for name in old.names])[:, None]
     recovery = StateRecovery(
         old.names, own * old.from_state / states, own * old.from_input, own * old.from_fault / units.faults,
         own * old.from_disturbance / units.disturbances,
