@@ -52,7 +52,7 @@ def source_text(found: Realisation, prefix: str, header: str) -> str:
     blocks.append(("next", "next[i]", {"z": observer.Az, "u": observer.Bu, "y": observer.By}))
     tables = [
         line for target, _, parts in blocks for signal, matrix in parts.items() if matrix.size
-        for line in _table(f"{target}_{signal}", matrix)
+        for line in table_lines(f"{target}_{signal}", matrix)
     ]  # fmt: skip
     body = [line for target, _, parts in blocks for line in _product(target, parts)]
     copy = [f"    for (i = 0; i < {sizes['z']}; i++) {{", "        state->z[i] = next[i];", "    }"]
@@ -69,7 +69,7 @@ def source_text(found: Realisation, prefix: str, header: str) -> str:
 def _reset(found: Realisation, prefix: str) -> Iterator[str]:
     start = "0.0"
     if found.start.any():
-        yield from _table("start", found.start.reshape(1, -1))
+        yield from table_lines("start", found.start.reshape(1, -1))
         start = "start[0][i]"
     yield f"void {prefix}_reset({prefix}_state *state)"
     yield from ("{", "    int i;", f"    for (i = 0; i < {max(found.observer.order, 1)}; i++) {{")
@@ -102,7 +102,8 @@ def _product(target: str, parts: dict[str, FloatArray]) -> Iterator[str]:
     yield "    }"
 
 
-def _table(name: str, matrix: FloatArray) -> Iterator[str]:
+def table_lines(name: str, matrix: FloatArray) -> Iterator[str]:
+    """Yield the lines of a table of constants."""
     yield f"static const double {name}[{matrix.shape[0]}][{matrix.shape[1]}] = {{"
     for row in matrix.tolist():
         # repr gives the shortest text that is read back bit for bit.

@@ -98,6 +98,12 @@ class OnlineMonitor:
         self._decided = False
 
     @property
+    def bound(self) -> Any:
+        """Bound of an adaptive threshold, for exports; `None` for other monitors."""
+        plan = getattr(self._rule, "plan", None)
+        return None if plan is None else plan.bound
+
+    @property
     def columns(self) -> tuple[str, ...]:
         """Columns of a run besides statistic, threshold and alarm: those of an adaptive threshold."""
         plan = getattr(self._rule, "plan", None)
