@@ -136,7 +136,10 @@ def monitor(
     rows = bench.observer.fault_rows if estimates else bench.observer.residual_rows
     if model.flow is not None:
         threshold = threshold + _straight_lines(design, scenario, model, kind, window, rows)
-    statement = statement_of(kind, continuous=model.flow is not None, estimates=estimates) + EXACT
+    statement = (
+        statement_of(kind, continuous=model.flow is not None, sampled=model.sampled is not None, estimates=estimates)
+        + EXACT
+    )
     found = Monitor(
         kind, statement, threshold, _floor(bench, scenario, rows), bench.drive.dt,
         window,
