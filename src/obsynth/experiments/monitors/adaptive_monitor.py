@@ -15,6 +15,7 @@ from obsynth.experiments.monitors.residual_model import watches_estimates
 from obsynth.numerics.arguments import is_finite_number, require_mapping
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.uncertainty import SAMPLED
 from obsynth.results.design import ObserverDesign
 from obsynth.tolerances.responses import loop_radius
 from obsynth.tolerances.robustness import EXACT_MODEL, structure_of, with_tolerances
@@ -133,8 +134,10 @@ def adaptive_statement(plan: AdaptivePlan, design: ObserverDesign) -> str:
     ever = "" if radius < 1.0 else (
         f"; the loop through the tolerances has radius {radius:.3g}: the threshold holds at each sample, but may grow"
     )  # fmt: skip
+    steps = () if uncertain is None else uncertain.steps
+    held = "; inputs and disturbances are held between samples" if any(kind == SAMPLED for kind, _ in steps) else ""
     missing = "" if plan.intervals or not plan.fault_names else f"; no guaranteed interval of faults: {plan.reason}"
-    return f"{text}; {kept}{ever}{missing}"
+    return f"{text}; {kept}{held}{ever}{missing}"
 
 
 def tolerances_of(
