@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from obsynth.comparison.comparing import compare
     from obsynth.comparison.result import ComparedMethod, Comparison, FaultComparison
     from obsynth.comparison.sensor_sets import SensorSet, SensorSets, sensor_sets
+    from obsynth.data.alarm_proof import prove_alarm
     from obsynth.data.run import DataRun, run_on_data
     from obsynth.errors import (
         InfeasibleError,
@@ -49,6 +50,8 @@ if TYPE_CHECKING:
         SpecError,
         VerificationError,
     )
+    from obsynth.experiments.alarm_proofs.certificate import verify_alarm
+    from obsynth.experiments.alarm_proofs.proof import AlarmProof
     from obsynth.experiments.intervals import Interval
     from obsynth.experiments.monitors.monitor import Detection, Monitor
     from obsynth.experiments.monitors.online import OnlineMonitor
@@ -157,6 +160,9 @@ _HOMES = {
     "Robustness": "obsynth.tolerances.robustness",
     "Uncertainty": "obsynth.plants.uncertainty",
     "robustness": "obsynth.tolerances.robustness",
+    "AlarmProof": "obsynth.experiments.alarm_proofs.proof",
+    "prove_alarm": "obsynth.data.alarm_proof",
+    "verify_alarm": "obsynth.experiments.alarm_proofs.certificate",
     "uncertain_system": "obsynth.plants.uncertain_system",
     "simulate_dae": "obsynth.simulation.dae",
     "DAEBatchEstimates": "obsynth.observers.dae.batch",
@@ -259,6 +265,7 @@ _HOMES = {
 __all__ = [
     "Adaptation",
     "Alarm",
+    "AlarmProof",
     "BatchEstimates",
     "CalibratedBox",
     "Calibration",
@@ -370,6 +377,7 @@ __all__ = [
     "pd_delta_scan",
     "pd_observer",
     "pd_observer_from_gains",
+    "prove_alarm",
     "robustness",
     "run_batch",
     "run_on_data",
@@ -386,6 +394,7 @@ __all__ = [
     "validate",
     "validity",
     "verify",
+    "verify_alarm",
 ]
 
 

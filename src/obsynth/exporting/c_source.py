@@ -84,7 +84,7 @@ def source_text(found: Realisation, prefix: str, header: str) -> str:
 def _reset(found: Realisation, prefix: str) -> Iterator[str]:
     start = "0.0"
     if found.start.any():
-        yield from _table("start", found.start.reshape(1, -1))
+        yield from table_lines("start", found.start.reshape(1, -1))
         start = "start[0][i]"
     yield f"void {prefix}_reset({prefix}_state *state)"
     yield from ("{", "    int i;", f"    for (i = 0; i < {max(found.observer.order, 1)}; i++) {{")
@@ -174,10 +174,10 @@ def _tables(name: str, matrix: FloatArray) -> Iterator[str]:
     """Return the constants of a matrix, in the form in which it is multiplied."""
     form = _form(matrix)
     if form == PLAIN:
-        yield from _table(name, matrix)
+        yield from table_lines(name, matrix)
     elif form == COLUMNS:
         yield comment("by columns")
-        yield from _table(name, matrix.T)
+        yield from table_lines(name, matrix.T)
     else:
         yield comment("the entries that are not zero, row by row")
         rows, columns = np.nonzero(matrix)
@@ -196,7 +196,8 @@ def _list(kind: str, name: str, texts: list[str]) -> Iterator[str]:
     yield from ("};", "")
 
 
-def _table(name: str, matrix: FloatArray) -> Iterator[str]:
+def table_lines(name: str, matrix: FloatArray) -> Iterator[str]:
+    """Yield the lines of a table of constants."""
     yield f"static const double {name}[{matrix.shape[0]}][{matrix.shape[1]}] = {{"
     for row in matrix.tolist():
         # repr gives the shortest text that is read back bit for bit.

@@ -18,6 +18,7 @@ from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.report.layout import facts_table, headed_table, name_list, number, print_section
+from obsynth.report.tolerances import tolerances_report
 from obsynth.report.verification import verification_report
 from obsynth.results.delta_scan import DeltaScan
 from obsynth.results.design import ObserverDesign
@@ -91,6 +92,7 @@ def design_report(design: ObserverDesign, *, console: Console, file: Path | None
     if design.recovery is not None:
         print_section(console, "States of the plant as written", facts_table(recovered_states(design.recovery)))
     verification_report(design.report, console=console)
+    tolerances_report(design, console=console)
     for note in design.notes:
         console.print(Text(f"Note: {note}"))
     if file is not None:

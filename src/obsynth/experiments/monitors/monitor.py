@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -168,6 +169,18 @@ class Monitor:
             ``(steps, runs, nr)``.
         """
         return np.asarray(self.statistic(residuals) > self.threshold[:, None] + self.floor)
+
+    def passed_in(self, runs: Any, residuals: slice) -> np.ndarray:
+        """Return the same from everything that happened in many runs.
+
+        Parameters
+        ----------
+        runs : Runs
+            With `rows` of the observer ``(steps, runs, rows)``.
+        residuals : slice
+            Which of them are residuals.
+        """
+        return self.passed(runs.rows[:, :, residuals])
 
     def isolated(self, faults: FloatArray, k: int) -> int:
         """Return the number of the fault that stands out after an alarm at ``k``.
