@@ -157,7 +157,7 @@ def command(*words: str, shell: str = "", **how) -> subprocess.CompletedProcess:
     if shell:
         line = ["bash", "-c", f'"$@" {shell}', "bash", *line]
     environment = {**os.environ, "PYTHONPATH": str(ROOT / "src")}
-    return subprocess.run(line, capture_output=True, text=True, env=environment, timeout=60, check=False, **how)
+    return subprocess.run(line, capture_output=True, text=True, env=environment, timeout=600, check=False, **how)
 
 
 class TestStandardStreams:
@@ -196,7 +196,7 @@ def test_a_stream_saves_its_state_when_it_is_ended(name):
         process.stdin.flush()
         answers = [process.stdout.readline() for _ in range(6)]
         process.send_signal(getattr(signal, name))
-        assert process.wait(60) == 128 + getattr(signal, name)
+        assert process.wait(600) == 128 + getattr(signal, name)
         assert "Traceback" not in process.stderr.read()
     rest = command(*words, input=lines[0] + "".join(lines[6:]))
     assert rest.returncode == 0
