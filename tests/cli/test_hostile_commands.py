@@ -325,3 +325,13 @@ def test_a_long_sum_is_no_deep_one(capsys):
         assert main(["check", "--system", "deep.yaml"]) == code
         told = capsys.readouterr().err
         assert ("it is nested more than" in told) == bool(code)
+
+
+def test_ragged_rows_with_an_entry_that_is_none(capsys):
+    plant = "plant: {kind: time-varying, dt: 1.0, horizon: 20, A: [[1, null], [1]], C: [[1, 0]]}\n"
+    method = "method: {id: descriptor-kalman, options: {Q: 1.0e-4, R: 1.0e-3}}\n"
+    Path("ragged.yaml").write_text("schema_version: 1\nname: ragged\n" + plant + method, "utf-8")
+    assert main(["check", "--system", "ragged.yaml"]) == 2
+    told = capsys.readouterr().err
+    assert "row 1, column 2 must be a number or an expression in k, not nothing (null)" in told
+    assert "row 2 has 1 entries, but row 1 has 2" in told
