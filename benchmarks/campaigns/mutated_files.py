@@ -21,7 +21,7 @@ from benchmarks.campaigns._mutations import mutate_text, mutate_tree
 from benchmarks.campaigns.frame import Outcome
 
 CASES = 1000
-LIMIT = 180.0  # s
+LIMIT = 600.0  # s: a busy machine is no hang
 
 _DESIGNS = Path(__file__).parents[2] / "designs"
 _BASES = ("wang2015/spec", "wang2015/spec", "smib/pd_observer", "filasova/spec", "diode_circuit/spec", "pendulum/spec")

@@ -157,7 +157,7 @@ def command(*words: str, shell: str = "", **how) -> subprocess.CompletedProcess:
     if shell:
         line = ["bash", "-c", f'"$@" {shell}', "bash", *line]
     environment = {**os.environ, "PYTHONPATH": str(ROOT / "src")}
-    return subprocess.run(line, capture_output=True, text=True, env=environment, timeout=60, check=False, **how)
+    return subprocess.run(line, capture_output=True, text=True, env=environment, timeout=600, check=False, **how)
 
 
 class TestStandardStreams:
@@ -196,7 +196,7 @@ def test_a_stream_saves_its_state_when_it_is_ended(name):
         process.stdin.flush()
         answers = [process.stdout.readline() for _ in range(6)]
         process.send_signal(getattr(signal, name))
-        assert process.wait(60) == 128 + getattr(signal, name)
+        assert process.wait(600) == 128 + getattr(signal, name)
         assert "Traceback" not in process.stderr.read()
     rest = command(*words, input=lines[0] + "".join(lines[6:]))
     assert rest.returncode == 0
@@ -325,3 +325,13 @@ def test_a_long_sum_is_no_deep_one(capsys):
         assert main(["check", "--system", "deep.yaml"]) == code
         told = capsys.readouterr().err
         assert ("it is nested more than" in told) == bool(code)
+
+
+def test_ragged_rows_with_an_entry_that_is_none(capsys):
+    plant = "plant: {kind: time-varying, dt: 1.0, horizon: 20, A: [[1, null], [1]], C: [[1, 0]]}\n"
+    method = "method: {id: descriptor-kalman, options: {Q: 1.0e-4, R: 1.0e-3}}\n"
+    Path("ragged.yaml").write_text("schema_version: 1\nname: ragged\n" + plant + method, "utf-8")
+    assert main(["check", "--system", "ragged.yaml"]) == 2
+    told = capsys.readouterr().err
+    assert "row 1, column 2 must be a number or an expression in k, not nothing (null)" in told
+    assert "row 2 has 1 entries, but row 1 has 2" in told

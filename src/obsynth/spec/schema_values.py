@@ -6,7 +6,7 @@ This module imports pydantic, so it is imported only when a spec is read.
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 from pydantic import (
     BaseModel,
@@ -20,6 +20,7 @@ from pydantic import (
     WrapValidator,
 )
 from pydantic_core import InitErrorDetails, PydanticCustomError
+from pydantic_core.core_schema import ErrorType
 
 from obsynth.numerics.arguments import is_number
 
@@ -42,10 +43,15 @@ def _rectangular(rows: Any, check_entries: ValidatorFunctionWrapHandler) -> Any:
         check_entries(rows)
     except ValidationError as error:
         others = [
-            InitErrorDetails(type=item["type"], loc=item["loc"], input=item["input"], ctx=item.get("ctx", {}))
+            InitErrorDetails(type=_kind_of_error(item), loc=item["loc"], input=item["input"], ctx=item.get("ctx", {}))
             for item in error.errors()
         ]
     raise ValidationError.from_exception_data("matrix", [*others, InitErrorDetails(type=problem, input=None)])
+
+
+def _kind_of_error(item: Any) -> Any:
+    """Return what an error is raised again as: kinds of our own are unknown to pydantic by name."""
+    return item["type"] if item["type"] in get_args(ErrorType) else PydanticCustomError(item["type"], item["msg"])
 
 
 def _kind_of_matrix(value: Any) -> str:
