@@ -114,6 +114,9 @@ def _eliminated(plant: DescriptorSystem) -> Transformation:
     found = eliminated_exactly(plant, None if basis is None else units.states[:, None] * basis)
     if found is not None:
         return found
+    found = eliminate_algebraic_states(plant)
+    if origin_of(found.plant) is not None:
+        return found
     exact = units.rounded()
     found = eliminate_algebraic_states(exact.scaled_plant(plant))
     if set(found.plant.state_names) <= set(plant.state_names):
@@ -128,14 +131,15 @@ def _in_given_units(found: Transformation, plant: DescriptorSystem, units: Plant
         units, time=1.0 / units.time, equations=states, states=1.0 / states, outputs=1.0 / units.outputs,
         faults=1.0 / units.faults, disturbances=1.0 / units.disturbances,
     )  # fmt: skip
-    own, old = units.states[:, None], found.recovery
+    old = found.recovery
+    own = np.array([kept[name] for name in old.names])[:, None]
     recovery = StateRecovery(
         old.names, own * old.from_state / states, own * old.from_input, own * old.from_fault / units.faults,
         own * old.from_disturbance / units.disturbances,
         own * old.from_noise * (1.0 if units.discrete else np.sqrt(units.time)), old.noise_kept,
     )  # fmt: skip
-    return Transformation(
-        plant, back.scaled_plant(found.plant).replace(E=None, dt=plant.dt), found.description, recovery
+    return replace(
+        found, source=plant, plant=back.scaled_plant(found.plant).replace(E=None, dt=plant.dt), recovery=recovery
     )
 
 
