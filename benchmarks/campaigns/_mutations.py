@@ -185,7 +185,7 @@ _BREAKS: tuple[tuple[str, Callable[[str, random.Random], bytes]], ...] = (
     ("CR line ends", lambda text, rng: text.replace("\n", "\r").encode()),
     ("CRLF line ends", lambda text, rng: text.replace("\n", "\r\n").encode()),
     ("byte order mark", _in_front(b"\xef\xbb\xbf")), ("UTF-16", lambda text, rng: text.encode("utf-16")),
-    ("Latin-1", lambda text, rng: (text + "\n# \u00e9\n").encode("latin-1")), ("null", _spliced("\0")),
+    ("Latin-1", lambda text, rng: (text + "\n# \u00e9\n").encode("latin-1", "replace")), ("null", _spliced("\0")),
     ("tab", _spliced("\t")), ("anchor bomb", _in_front(_ALIASES.encode())),
     ("tag", _spliced("!!python/object:os.system ")),
     ("alias", _spliced("*x ")), ("merge", _spliced("\n<<: {a: 1}\n")), ("brackets", _spliced("[" * 5000)),

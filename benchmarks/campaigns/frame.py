@@ -125,6 +125,13 @@ def written_table(campaign: ModuleType, outcomes: Mapping[int, Outcome]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def forget_wrong(journal: Path) -> None:
+    """Take the wrong cases out of a journal, so that they are run again."""
+    kept = {seed: outcome for seed, outcome in _journalled(journal) if not outcome.wrong}
+    lines = [json.dumps({"seed": seed, **asdict(outcome)}) + "\n" for seed, outcome in kept.items()]
+    journal.write_text("".join(lines), encoding="utf-8")
+
+
 def _journalled(journal: Path | None) -> Iterator[tuple[int, Outcome]]:
     if journal is None or not journal.exists():
         return

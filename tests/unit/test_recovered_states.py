@@ -10,6 +10,7 @@ import pytest
 
 import obsynth
 from obsynth import DescriptorSystem, run_on_data
+from obsynth.simulation import simulate_plant
 from obsynth.spec import load_spec
 
 ROOT = Path(__file__).parents[2]
@@ -32,7 +33,7 @@ def designed(sample_time: float | None) -> obsynth.ObserverDesign:
     if sample_time is None:
         return obsynth.design(reduced.plant, "ui-pi-observer", fault_model="step", recovery=reduced.recovery)
     whole = reduced.then(obsynth.discretise(reduced.plant, sample_time))
-    return obsynth.design(whole.plant, recovery=whole.recovery)
+    return obsynth.design(whole.plant, "fault-estimation-filter", recovery=whole.recovery)
 
 
 def simulated(design: obsynth.ObserverDesign, step: float) -> tuple[pd.DataFrame, dict[str, np.ndarray]]:
@@ -73,6 +74,24 @@ def test_they_are_those_of_the_plant_as_written(step):
         away = found[f"xhat[{name}]"].to_numpy()[late:] - values[: len(values) - late]
         assert np.abs(away[-40:]).max() < 1e-6, name
     assert np.isnan(found["xhat[power]"][0]) == sampled
+
+
+def test_inputs_faults_and_states_are_of_the_same_moment():
+    """The input changes in every sample: one that is a sample early or late is wrong by its size."""
+    design, steps = designed(0.1), 300
+    u = np.random.default_rng(8).uniform(-0.5, 0.5, size=(steps, 1))
+    run = simulate_plant(design.linear[0], steps=steps, u=u, f=np.full((steps, 1), 0.2))
+    speed, table = run.states[:, 0], pd.DataFrame(run.outputs + np.array([50.0, 0.0]), columns=["speed", "flux"])
+    table.insert(0, "valve", u[:, 0] + 3.0)
+    table.insert(0, "time", 0.1 * np.arange(steps))
+    found = run_on_data(design, table).table
+    assert np.array_equal(found["time of recovered states"], found["time"] - 0.1)
+    voltage = 0.5 * speed + 0.1 * u[:, 0]
+    for name, values in (("voltage", voltage + 1.02), ("power", 0.3 * speed + voltage + 1.0)):
+        estimated = found[f"xhat[{name}]"].to_numpy()
+        assert np.abs(estimated[1:] - values[:-1])[-100:].max() < 1e-6, name
+        # Any other moment would be told apart.
+        assert np.abs(estimated - values)[-100:].max() > 1e-2, name
 
 
 def test_they_wait_for_the_fault_estimate_after_missing_rows():

@@ -47,7 +47,9 @@ def design():
     )
     reduced = obsynth.eliminate_algebraic_states(source)
     sampled = obsynth.discretise(reduced.plant, 0.1)
-    return obsynth.design(sampled.plant, name="sampled", recovery=reduced.recovery.then(sampled.recovery))
+    return obsynth.design(
+        sampled.plant, "fault-estimation-filter", name="sampled", recovery=reduced.recovery.then(sampled.recovery)
+    )
 
 
 @pytest.fixture
@@ -233,7 +235,7 @@ class TestTampering:
         [
             ("kind", "something else", "no gain set"),
             ("kind", None, "no gain set"),
-            ("schema_version", 2, "schema version 2"),
+            ("schema_version", 3, "schema version 3"),
             ("schema_version", "1", "schema version '1'"),
             ("schema_version", None, "schema version None"),
             ("design", None, "changed"),
@@ -378,7 +380,7 @@ class TestAtomicWriting:
         before = json.dumps(design_as_dict(design))
         design.save(tmp_path / "a.json")
         assert json.dumps(design_as_dict(design)) == before
-        assert gain_sets.SCHEMA_VERSION == 1
+        assert gain_sets.SCHEMA_VERSION == 2
 
 
 PROGRAM = """

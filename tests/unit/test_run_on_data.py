@@ -187,6 +187,39 @@ def test_a_gap_in_continuous_time_is_bridged(continuous):
     assert error < 0.1 * np.abs(estimates(straight, "xhat")[240] - true[240]).max()
 
 
+@pytest.fixture(scope="module")
+def driven() -> obsynth.ObserverDesign:
+    """An observer of x1' = -x1 + x2, x2' = -2 x2 + u, with a fault on x1 that stays zero."""
+    plant = obsynth.DescriptorSystem(
+        np.eye(2), [[-1.0, 1.0], [0.0, -2.0]], [[0.0], [1.0]], np.eye(2), Bf=[[1.0], [0.0]]
+    )
+    return obsynth.design(plant, "ui-pi-observer", fault_model="step")
+
+
+@pytest.mark.parametrize("lost", ["rows", "outputs", "outputs of one sensor"])
+def test_the_input_goes_on_as_a_straight_line_in_a_gap(driven, lost):
+    """u = 0.3 t, of which x2 = 0.15 t - 0.075 (1 - e^-2t) and x1 follow: exact in the gap and at once after it."""
+    times = 0.02 * np.arange(700)
+    start, end = 400, 500
+    x2 = 0.15 * times - 0.075 * (1.0 - np.exp(-2.0 * times))
+    x1 = 0.15 * times - 0.225 + 0.3 * np.exp(-times) - 0.075 * np.exp(-2.0 * times)
+    states = np.column_stack([x1, x2])
+    assert np.abs(np.gradient(x1, times) + x1 - x2)[1:-1].max() < 1e-4  # the formula is right
+    table = pd.DataFrame({"time": times, driven.linear[0].input_names[0]: 0.3 * times, "y1": x1, "y2": x2})
+    if lost == "rows":
+        table, states = table.drop(index=range(start, end)), np.delete(states, slice(start, end), axis=0)
+    else:
+        table.loc[start : end - 1, ["y1", "y2"] if lost == "outputs" else ["y2"]] = np.nan
+    found = run_on_data(driven, table.reset_index(drop=True)).table
+    # Between rows the outputs are curved, and the observer takes them as straight: that alone is below this.
+    allowed = 2.0 * np.abs(estimates(found, "xhat")[300:start] - states[300:start]).max() + 1e-9
+    assert allowed < 1e-4
+    assert np.abs(estimates(found, "xhat")[start:] - states[start:]).max() < allowed
+    assert list(found["status"][start : start + 1]) == (["recovering"] if lost == "rows" else ["gap"])
+    # An input that is held at its last value would miss x2 by 0.3 * 2 s / 2 in the end.
+    assert abs(0.3 * (times[end] - times[start]) / 2.0) > 1000.0 * allowed
+
+
 @pytest.mark.parametrize("bad", [np.nan, np.inf, 1e308])
 def test_a_bad_row_never_poisons_the_state(sampled, bad):
     table, states = log_of(sampled, 80)

@@ -6,7 +6,7 @@ import os
 import sys
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 
 from obsynth.errors import ObsynthError, SolverError, SpecError
 
@@ -17,25 +17,22 @@ BROKEN_PIPE = 141
 @contextmanager
 def usable_streams() -> Iterator[None]:
     """Let texts go to nowhere where a stream is closed, print characters that an encoding lacks, warn in one line."""
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), ExitStack() as stack:
         warnings.showwarning = _told_warning
-        _prepare_streams()
+        for name in ("stdout", "stderr"):
+            stream = getattr(sys, name)
+            if stream is None:
+                # The first file that is opened would get its number, and what is meant for the terminal.
+                setattr(sys, name, stack.enter_context(open(os.devnull, "w", encoding="utf-8")))
+                stack.callback(setattr, sys, name, None)
+            elif hasattr(stream, "reconfigure"):
+                stream.reconfigure(errors="backslashreplace")
         yield
 
 
 def _told_warning(message: Warning | str, *_: object, **__: object) -> None:
     # Where in a library it arose is no use to the user.
     print(f"Warning: {message}", file=sys.stderr)
-
-
-def _prepare_streams() -> None:
-    for name in ("stdout", "stderr"):
-        stream = getattr(sys, name)
-        if stream is None:
-            # The first file that is opened would get its number, and what is meant for the terminal.
-            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115
-        elif hasattr(stream, "reconfigure"):
-            stream.reconfigure(errors="backslashreplace")
 
 
 def unwritable_output(error: OSError) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,11 @@ from obsynth.errors import SpecError
 from obsynth.experiments.monitors.online import OnlineMonitor
 from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray
+
+
+def damaged_state(path: Path) -> SpecError:
+    """Return the error for a saved state whose parts do not fit."""
+    return SpecError(f"{path} is damaged: it is no state of this design and these options.", path=str(path))
 
 
 class Job:
@@ -65,6 +71,8 @@ class Job:
         ends = {f"{end} {name}": value for name, value in point.items() for end in ("lowest", "highest")}
         self._shifts = np.array([ends.get(name, 0.0) for name in (() if monitor is None else monitor.columns)])
         self.first, self.rows = OperatingPointCheck(signals), 0
+        #: The file of the state that the first rows go on from: only they show whether its parts fit together.
+        self.resumed_from: Path | None = None
         self.statuses, self.alarms, self.isolated = Counter[str](), dict[str, float](), ""
 
     def take(self, chunk: FloatArray) -> list[list[Any]]:
@@ -72,6 +80,16 @@ class Job:
 
         Shapes: ``chunk (rows, 1 + nu + ny)``.
         """
+        if self.resumed_from is None:
+            return self._taken(chunk)
+        try:
+            found = self._taken(chunk)
+        except (AttributeError, LookupError, TypeError, ValueError, ArithmeticError) as error:
+            raise damaged_state(self.resumed_from) from error
+        self.resumed_from = None
+        return found
+
+    def _taken(self, chunk: FloatArray) -> list[list[Any]]:
         times: list[float] = chunk[:, 0].tolist()
         nu = len(self.engine.input_names)
         found, estimates = [], []

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.data.job import Job
+from obsynth.data.job import Job, damaged_state
 from obsynth.errors import SpecError
 from obsynth.files.inputs import read_json
 from obsynth.files.outputs import FileKind, write_atomically
-from obsynth.numerics.arguments import is_number
+from obsynth.numerics.arguments import is_finite_number, is_number
 from obsynth.observers.running import BY_COLUMNS
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import digest_of, gain_set_digest, plain, restored
@@ -21,6 +21,9 @@ from obsynth.results.gain_sets import digest_of, gain_set_digest, plain, restore
 KIND = "obsynth run state"
 SCHEMA_VERSION = 4
 STATE = FileKind("a saved state of obsynth", rb'\A\s*\{\s*"kind":\s*"obsynth run state"')
+
+#: Parts that are seconds, or nothing before the first row.
+_TIMES = frozenset({"last", "longest"})
 
 
 def digest_of_gains(design: ObserverDesign) -> str:
@@ -59,7 +62,8 @@ def resume_state(path: Path, job: Job, digest: str) -> None:
     except (AttributeError, LookupError, TypeError, ValueError, ArithmeticError):
         fits = False
     if not fits:
-        raise SpecError(f"{path} is damaged: it is no state of this design and these options.", path=str(path))
+        raise damaged_state(path)
+    job.resumed_from = path
 
 
 def _fits(own: Any, saved: Any) -> bool:
@@ -68,9 +72,9 @@ def _fits(own: Any, saved: Any) -> bool:
         found = saved.get(BY_COLUMNS) if isinstance(saved, dict) else saved
         return isinstance(found, np.ndarray) and _alike(own.shape, found.shape)
     if isinstance(own, Mapping):
-        return (
-            isinstance(saved, dict) and saved.keys() == own.keys() and all(_fits(own[key], saved[key]) for key in own)
-        )
+        if not isinstance(saved, dict) or saved.keys() != own.keys():
+            return False
+        return all(_fits(own[key], saved[key]) and _is_time(key, saved[key]) for key in own)
     if isinstance(own, (bool, np.bool_)):
         return isinstance(saved, bool)
     if isinstance(own, str):
@@ -78,6 +82,10 @@ def _fits(own: Any, saved: Any) -> bool:
     if isinstance(own, (list, tuple)):
         return isinstance(saved, list)
     return saved is None or is_number(saved) or (own is None and isinstance(saved, (np.ndarray, dict, list)))
+
+
+def _is_time(key: str, saved: Any) -> bool:
+    return key not in _TIMES or saved is None or is_finite_number(saved)
 
 
 def _alike(own: tuple[int, ...], saved: tuple[int, ...]) -> bool:

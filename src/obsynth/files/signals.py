@@ -47,10 +47,11 @@ class HeldSignals:
     def __enter__(self) -> None:
         self._is_held = True
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: object, *_: object) -> None:
         self._is_held = False
         waiting, self._waiting = self._waiting, None
-        if waiting is not None:
+        # An error ends the run already.
+        if waiting is not None and kind is None:
             waiting()
 
 

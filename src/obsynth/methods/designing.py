@@ -16,16 +16,19 @@ from obsynth.analysis.transformations.elimination import MANY_VARIABLES
 from obsynth.errors import PreconditionError, SpecError, VerificationError
 from obsynth.methods.advice import with_advice
 from obsynth.methods.choosing.automatic import automatic_design
+from obsynth.methods.drowned_designs import require_above_rounding
 from obsynth.methods.method_spec import MethodSpec, PlantKind
 from obsynth.methods.registry import AUTO, REGISTRY, method_spec, methods_for
 from obsynth.methods.synthesis_result import Synthesis
 from obsynth.methods.verifying import verify
 from obsynth.numerics.failures import failed_computations
 from obsynth.numerics.threads import one_thread_if_small
+from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.results.design import Certificate, ObserverDesign
+from obsynth.results.plant_source import source_of
 from obsynth.results.report import VerificationReport
 from obsynth.verification.plant import condition_rows
 from obsynth.verification.stored_numbers import StoredErrors
@@ -211,11 +214,13 @@ def draft_of(
     plant: Plant, method: str, found: Synthesis, *, name: str, recovery: StateRecovery | None = None
 ) -> ObserverDesign:
     """Return the design that a synthesis stands for, without a report."""
+    source = source_of(plant)
     if found.plant is not None:
         plant = found.plant
     if found.transformation is not None:
         own = found.transformation.recovery
         plant, recovery = found.transformation.plant, own if recovery is None else recovery.then(own)
+        source = source_of(plant)
     return ObserverDesign(
         name=name,
         method=method,
@@ -227,6 +232,7 @@ def draft_of(
         solver=found.solver,
         notes=found.notes,
         recovery=recovery,
+        source=source,
     )
 
 
@@ -244,6 +250,8 @@ def verified(
             + "".join(f" {note}" for note in draft.notes),
             report=report,
         )
+    if isinstance(draft.observer, LinearObserver) and isinstance(draft.plant, DescriptorSystem):
+        require_above_rounding(draft.plant, draft.observer)
     return draft.replace(report=report)
 
 

@@ -12,6 +12,7 @@ from obsynth.numerics.failures import failed_computations
 from obsynth.numerics.threads import one_thread_if_small
 from obsynth.results.report import VerificationReport
 from obsynth.verification.closed_claims import closed_claims
+from obsynth.verification.derivation import derivation_rows
 from obsynth.verification.stored_numbers import stored_number_rows
 
 if TYPE_CHECKING:
@@ -53,7 +54,8 @@ def verify(design: ObserverDesign, *, printed_digits: int | None = None) -> Veri
         rows = tuple(checks(design, printed_digits))
         if spec.tracked and all(row.passed for row in rows):
             gamma = design.certificate.claims.get("gamma") if "gamma" in spec.claims else None
-            rows = (*rows, *stored_number_rows(design, spec.load("tracked")(design), gamma))
+            tracked = spec.load("tracked")(design)
+            rows = (*rows, *stored_number_rows(design, tracked, gamma), *derivation_rows(design, tracked))
         covered = {name: meaning.row for name, meaning in spec.claims.items()}
         meanings = {name: meaning.meaning for name, meaning in spec.claims.items()}
         return VerificationReport.of((*rows, *closed_claims(design, rows, covered, meanings, spec.witnesses)))

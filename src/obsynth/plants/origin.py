@@ -46,8 +46,23 @@ def with_origin(plant: DescriptorSystem, origin: PlantOrigin | None) -> Descript
     return plant
 
 
+def note_source(source: DescriptorSystem, new: DescriptorSystem, *, sample_time: float | None = None) -> None:
+    """Note on a plant that elimination or sampling has just made which plant, as written, it comes from."""
+    if new is source:
+        return
+    written, earlier = getattr(source, "_made_from", (source, None))
+    if earlier is None or sample_time is None:
+        object.__setattr__(new, "_made_from", (written, earlier if sample_time is None else sample_time))
+
+
 def carry_origin(old: DescriptorSystem, new: DescriptorSystem) -> DescriptorSystem:
     """Note on a changed plant what the old one was made from, if nothing has changed that matters."""
+    made = getattr(old, "_made_from", None)
+    unchanged = old.dt == new.dt and all(
+        np.array_equal(getattr(old, name), getattr(new, name)) for name in (*DECISIVE, "B", "D")
+    )
+    if made is not None and unchanged:
+        object.__setattr__(new, "_made_from", made)
     origin = origin_of(old)
     same = origin is not None and old.dt == new.dt
     if same and all(np.array_equal(getattr(old, name), getattr(new, name)) for name in DECISIVE):

@@ -18,6 +18,7 @@ from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.results.plant_source import PlantSource
 from obsynth.results.report import VerificationReport
 
 if TYPE_CHECKING:
@@ -73,6 +74,8 @@ class ObserverDesign:
         Map from the plant's states back to those of the plant before its transformation.
     report : VerificationReport
         The report of this very object.
+    source : PlantSource, optional
+        The plant as written, where algebraic states were eliminated or the plant was sampled: `verify` does it again.
     """
 
     name: str
@@ -86,6 +89,7 @@ class ObserverDesign:
     notes: tuple[str, ...] = ()
     recovery: StateRecovery | None = None
     report: VerificationReport = field(default_factory=VerificationReport)
+    source: PlantSource | None = None
 
     def __post_init__(self) -> None:
         frozen = {name: read_only(matrix) for name, matrix in self.gains.items()}

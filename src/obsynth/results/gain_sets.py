@@ -37,9 +37,12 @@ from obsynth.results.binary_members import (
 )
 from obsynth.results.design import Certificate, ObserverDesign
 from obsynth.results.gain_set_parts import checked_parts, made
+from obsynth.results.plant_source import PlantSource
 from obsynth.results.report import VerificationReport
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
+#: Schema 1 holds no plant as written and no bounds of stored numbers: what it lacks is assumed, or least found.
+READABLE = (1, 2)
 #: Larger gain sets are refused before they fill the memory.
 MAXIMUM_CHARACTERS = 2_000_000_000
 _KIND = "obsynth gain set"
@@ -123,6 +126,7 @@ def _body_of(design: ObserverDesign) -> dict[str, Any]:
         "notes": design.notes,
         "recovery": None if design.recovery is None else _fields_of(design.recovery),
         "report": design.report.as_dict(),
+        "source": None if design.source is None else design.source.as_dict(),
         **_tag(design),
     }
 
@@ -230,9 +234,12 @@ def _design_of(document: Any, arrays: bytes | None, source: str) -> ObserverDesi
     """Return the design in a document whose digest is right."""
     if not isinstance(document, dict) or document.get("kind") != _KIND:
         raise SpecError(f"{source} is no gain set of obsynth.", path=source)
-    if document.get("schema_version") != SCHEMA_VERSION:
+    if document.get("schema_version") not in READABLE:
         version = document.get("schema_version")
-        raise SpecError(f"{source} has schema version {version!r}; this obsynth reads {SCHEMA_VERSION}.", path=source)
+        raise SpecError(
+            f"{source} has schema version {version!r}; this obsynth reads {' and '.join(map(str, READABLE))}.",
+            path=source,
+        )
     body = document.get("design")
     try:
         digest = (
@@ -272,4 +279,5 @@ def _design_from(data: dict[str, Any]) -> ObserverDesign:
         if recovery is None
         else made("recovery", StateRecovery, **{**recovery, "names": tuple(recovery["names"])}),
         report=made("report", VerificationReport.from_dict, data["report"]),
+        source=None if data.get("source") is None else made("source", PlantSource.from_dict, data["source"]),
     )

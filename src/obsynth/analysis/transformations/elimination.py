@@ -23,7 +23,7 @@ from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
 from obsynth.numerics.scaling import equilibrate_pencil, power_of_two_below
 from obsynth.numerics.sparse import is_sparse
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.origin import with_origin
+from obsynth.plants.origin import note_source, with_origin
 from obsynth.plants.uncertainty import ELIMINATED
 from obsynth.proofs.written_numbers import computed_entries
 
@@ -68,6 +68,7 @@ def eliminate_algebraic_states(plant: DescriptorSystem) -> Transformation:
     found = eliminated_exactly(arrays) or _eliminated_in_floating_point(arrays)
     if not found.dropped:
         found = found.with_tolerances(ELIMINATED)
+    note_source(arrays, found.plant)
     return found if arrays is plant else replace(found, source=plant)
 
 

@@ -16,7 +16,7 @@ from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, SLOW_ZERO_RADIUS
 from obsynth.numerics.scaling import power_of_two_below
 from obsynth.numerics.sparse import dense
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.origin import with_origin
+from obsynth.plants.origin import note_source, with_origin
 from obsynth.plants.uncertainty import SAMPLED
 
 
@@ -86,6 +86,7 @@ def discretise(plant: DescriptorSystem, sample_time: float) -> Transformation:
     noise_kept = np.hstack([np.zeros((smooth.nw, factor.shape[1])), np.eye(smooth.nw)[:, direct]])
     recovery = unchanged_states(smooth, sampled, from_state=np.eye(smooth.nx), noise_kept=noise_kept)
     description = f"sampled every {sample_time:g} s (zero-order hold)"
+    note_source(smooth, sampled, sample_time=float(sample_time))
     step = Transformation(smooth, sampled, description, recovery)
     return first.then(step.with_tolerances(SAMPLED, sample_time))
 

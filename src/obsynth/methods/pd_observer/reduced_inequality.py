@@ -93,6 +93,8 @@ def closed_form(task: PdTask, *, free_delta: bool) -> tuple[PdSolution, float]:
     try:
         return _closed_form(task, free_delta=free_delta)
     except SolverError as error:
+        if "delta_limit" in error.record:
+            raise
         failure = error
     a, c = task.plants[0]
     states = inverse = np.eye(len(a))

@@ -132,7 +132,8 @@ def _in_given_units(found: Transformation, plant: DescriptorSystem, units: Plant
         faults=1.0 / units.faults, disturbances=1.0 / units.disturbances,
     )  # fmt: skip
     old = found.recovery
-    own = np.array([kept[name] for name in old.names])[:, None]
+    # A source state that cannot be recovered is not among these.
+    own = np.array([kept.get(name, 1.0) for name in old.names])[:, None]
     recovery = StateRecovery(
         old.names, own * old.from_state / states, own * old.from_input, own * old.from_fault / units.faults,
         own * old.from_disturbance / units.disturbances,

@@ -1,0 +1,81 @@
+"""The plant as written behind the plant that a design is for, and the steps between them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from obsynth.analysis.transformations import Transformation, discretise, eliminate_algebraic_states
+from obsynth.numerics.arrays import FloatArray
+from obsynth.plants.descriptor import DescriptorSystem
+
+#: Larger plants are not stored: their elimination is checked where it is done.
+MOST_STATES = 500
+
+
+@dataclass(frozen=True, eq=False)
+class PlantSource:
+    """A plant as it was written, and what was done to it.
+
+    Parameters
+    ----------
+    plant : DescriptorSystem
+        As written.
+    sample_time : float or None, seconds
+        With which it was sampled, after its algebraic states were eliminated; ``None`` where it was not.
+    """
+
+    plant: DescriptorSystem
+    sample_time: float | None = None
+
+    def derived(self) -> Transformation:
+        """Return the elimination, and the sampling where there was one, done again."""
+        if self.sample_time is None:
+            return eliminate_algebraic_states(self.plant)
+        return discretise(self.plant, self.sample_time)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the source as data: matrices by their entries that are not zero."""
+        values = {field.name: getattr(self.plant, field.name) for field in fields(self.plant)}
+        values.pop("uncertainty", None)
+        matrices = {name: _entries(value) for name, value in values.items() if isinstance(value, np.ndarray)}
+        others = {name: value for name, value in values.items() if name not in matrices}
+        return {"matrices": matrices, "signals": others, "sample_time": self.sample_time}
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> PlantSource:
+        """Return the source that `as_dict` described.
+
+        Parameters
+        ----------
+        data : mapping
+            Its entries.
+        """
+        matrices: dict[str, Any] = {name: _matrix(entries) for name, entries in data["matrices"].items()}
+        time = data["sample_time"]
+        return cls(DescriptorSystem(**matrices, **data["signals"]), None if time is None else float(time))
+
+
+def _entries(matrix: FloatArray) -> dict[str, Any]:
+    rows, columns = np.nonzero(matrix)
+    return {
+        "size": list(matrix.shape), "rows": rows.tolist(), "columns": columns.tolist(),
+        "values": matrix[rows, columns].tolist(),
+    }  # fmt: skip
+
+
+def _matrix(entries: Mapping[str, Any]) -> FloatArray:
+    found = np.zeros([int(size) for size in entries["size"]])
+    found[np.array(entries["rows"], dtype=int), np.array(entries["columns"], dtype=int)] = entries["values"]
+    return found
+
+
+def source_of(plant: Any) -> PlantSource | None:
+    """Return what a plant was made from by elimination and sampling, where that is known and can be stored."""
+    made = getattr(plant, "_made_from", None)
+    if made is None or type(made[0]) is not DescriptorSystem or made[0].nx > MOST_STATES:
+        return None
+    return PlantSource(made[0], made[1])

@@ -1,0 +1,114 @@
+"""Gain sets of schema 1 are read and say what they lack; those of schema 2 hold the plant as written, done again."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import obsynth
+from obsynth import verify
+from obsynth.analysis.transformations import StateRecovery
+from obsynth.results.plant_source import PlantSource, source_of
+from obsynth.spec import load_spec
+
+OLD = sorted((Path(__file__).parents[1] / "data" / "schema_1").glob("*.json"))
+DESIGNS = Path(__file__).parents[2] / "designs"
+
+
+@pytest.fixture(scope="module")
+def smib() -> obsynth.ObserverDesign:
+    spec = load_spec(DESIGNS / "smib" / "spec.yaml")
+    recovery = spec.transformation.recovery
+    return obsynth.design(spec.plant, spec.method, name="smib", recovery=recovery, **dict(spec.options))
+
+
+@pytest.mark.parametrize("path", OLD, ids=lambda path: path.stem)
+def test_a_gain_set_of_schema_1_loads_passes_and_says_what_it_lacks(path: Path, tmp_path: Path):
+    assert json.loads(path.read_text(encoding="utf-8"))["schema_version"] == 1
+    design = obsynth.load(path)
+    report = verify(design)
+    assert report.passed
+    assert design.source is None
+    names = {check.name: check for check in report.checks}
+    if design.method in ("pd-observer", "ui-pi-observer", "fault-estimation-filter"):
+        row = names["stored numbers: states"]
+        assert (row.kind, row.status) == ("information", "proved")
+        assert "no bound is claimed" in row.detail
+    if design.recovery is not None:
+        assert names["plant as written"].status == "assumed"
+    again = obsynth.load(design.save(tmp_path / "new.json"))
+    assert json.loads((tmp_path / "new.json").read_text(encoding="utf-8"))["schema_version"] == 2
+    assert again.certificate.claims == design.certificate.claims
+
+
+def test_the_plant_as_written_comes_back_bit_for_bit(smib, tmp_path):
+    assert smib.source.sample_time == 0.02
+    again = obsynth.load(smib.save(tmp_path / "smib.json"))
+    for name in ("E", "A", "B", "C", "Bf", "Bd", "Dw"):
+        assert np.array_equal(getattr(again.source.plant, name), getattr(smib.source.plant, name))
+    assert again.source.plant.state_names == smib.source.plant.state_names
+    report = verify(again)
+    assert report.passed
+    assert report["plant as written"].value == 0.0
+    assert "eliminated 30 algebraic states; sampled every 0.02 s" in report["plant as written"].detail
+
+
+def test_elimination_sampling_and_recovery_are_done_again(smib):
+    def failures(design: obsynth.ObserverDesign) -> set[str]:
+        return {check.name for check in verify(design).failures}
+
+    written = smib.source.plant
+    a = np.array(written.A)
+    place = np.argwhere((a != 0.0) & (a != 1.0) & (a != -1.0))[0]
+    a[tuple(place)] *= 1.0 + 1e-6
+    assert "plant as written" in failures(smib.replace(source=PlantSource(written.replace(A=a), 0.02)))
+    assert "plant as written" in failures(smib.replace(source=PlantSource(written, 0.021)))
+    assert "plant as written" in failures(smib.replace(source=PlantSource(written, None)))
+    recovery = smib.recovery
+    moved = np.array(recovery.from_state)
+    row = next(i for i, name in enumerate(recovery.names) if name not in smib.plant.state_names and moved[i].any())
+    moved[row] *= 1.0 + 1e-6
+    fields = {field.name: getattr(recovery, field.name) for field in dataclasses.fields(recovery)}
+    changed = StateRecovery(**{**fields, "from_state": moved})
+    assert failures(smib.replace(recovery=changed)) == {"recovery as written"}
+
+
+def test_a_changed_plant_forgets_what_it_was_made_from(smib):
+    plant = load_spec(DESIGNS / "smib" / "spec.yaml").plant
+    assert source_of(plant).sample_time == 0.02
+    assert source_of(plant.replace(units={})) is not None
+    assert source_of(plant.replace(A=1.001 * plant.A)) is None
+
+
+def test_the_gain_over_all_disturbances_is_at_least_that_of_fast_sines(smib):
+    """No feedthrough: the lifted norm.  A sine between samples is one disturbance of many."""
+    written = obsynth.DescriptorSystem(
+        None, [[-1.0, 2.0], [-2.0, -1.0]], C=np.eye(2), Bf=[[0.0], [1.0]], Bd=[[1.0], [0.3]], disturbance_names=["d"]
+    )
+    plant = obsynth.discretise(written, 0.5).plant
+    design = obsynth.fault_estimation_filter(plant)
+    value = design.report["gain over all d(t)"].value
+    assert design.report["sampling: delay"].value == 1.0
+    # Held disturbances are some of all: in the same norm their gain is no larger.
+    assert value >= design.report["H-infinity norm"].value * (1.0 - 1e-6)
+    # One pulse within a sample, of the worst kind, gives a gain of its own that is no larger.
+    observer, samples, pieces = design.observer, 60, 20
+    from scipy.linalg import expm
+
+    step = 0.5 / pieces
+    whole = expm(np.block([[written.A, written.Bd], [np.zeros((1, 3))]]) * step)
+    effects = []
+    for piece in range(pieces):
+        x, z, shown = np.zeros(2), np.zeros(observer.order), []
+        for k in range(samples):
+            shown.append((observer.Cz @ z + observer.Dy @ (written.C @ x))[observer.fault_rows])
+            z = observer.Az @ z + observer.By @ (written.C @ x)
+            for i in range(pieces):
+                x = whole[:2, :2] @ x + whole[:2, 2] * (k == 0 and i == piece)
+        effects.append(np.ravel(shown))
+    found = np.sqrt(0.5) * np.linalg.norm(np.array(effects), 2) / np.sqrt(step)
+    assert found <= value * (1.0 + 1e-6)
