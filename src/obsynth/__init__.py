@@ -1,4 +1,21 @@
-"""obsynth: designs, proves and runs observers and fault-estimation filters for descriptor systems."""
+"""obsynth: designs, proves and runs observers and fault-estimation filters for descriptor systems.
+
+Plants
+    DescriptorSystem, TimeVaryingDescriptorSystem, DAEModel; from other tools: from_andes, from_control, from_fmu,
+    from_matlab, from_modelica, from_pandas, from_scipy, from_sympy; from a spec: load_spec; changed by discretise,
+    eliminate_algebraic_states.
+What is possible
+    check, analyse_structure, diagnose, identifiability.
+Designs
+    design, and one function for each method: fault_estimation_filter, pd_observer, ui_pi_observer, descriptor_kalman,
+    adaptive_observer, dae_adaptive_observer; verify, load.
+On data
+    run_on_data, online_monitor, plotting.plot_data, html_report, export.
+In simulation
+    Scenario, simulate, monitor, evaluate, decide; plotting.
+What is wrong
+    SpecError, PreconditionError, InfeasibleError, SolverError, VerificationError, all of them ObsynthError.
+"""
 
 from __future__ import annotations
 
@@ -52,7 +69,7 @@ if TYPE_CHECKING:
     from obsynth.methods.choosing.figures import FaultFigures
     from obsynth.methods.dae_adaptive_observer.public import dae_adaptive_observer
     from obsynth.methods.descriptor_kalman.public import descriptor_kalman
-    from obsynth.methods.designing import design
+    from obsynth.methods.designing import check, design
     from obsynth.methods.fault_estimation_filter.public import (
         fault_estimation_filter,
         fault_estimation_filter_from_gains,
@@ -194,6 +211,7 @@ _HOMES = {
     "adaptive_observer": "obsynth.methods.adaptive_observer.public",
     "analyse_structure": "obsynth.analysis.structure",
     "apply_adaptation_gain": "obsynth.methods.pd_observer.public",
+    "check": "obsynth.methods.designing",
     "decide": "obsynth.observers.decisions",
     "descriptor_kalman": "obsynth.methods.descriptor_kalman.public",
     "design": "obsynth.methods.designing",
@@ -312,6 +330,7 @@ __all__ = [
     "analyse_structure",
     "apply_adaptation_gain",
     "calibrate",
+    "check",
     "compare",
     "dae_adaptive_observer",
     "decide",
@@ -365,12 +384,18 @@ __all__ = [
 ]
 
 
+#: Packages whose names are used through them, such as ``obsynth.plotting.plot_data``.
+_PACKAGES = ("plotting",)
+
+
 def __getattr__(name: str) -> Any:
     if name in _HOMES:
         module, _, other_name = _HOMES[name].partition(":")
         return getattr(import_module(module), other_name or name)
+    if name in _PACKAGES:
+        return import_module(f"obsynth.{name}")
     raise AttributeError(f"module 'obsynth' has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *__all__])
+    return sorted([*__all__, *_PACKAGES, "__version__"])

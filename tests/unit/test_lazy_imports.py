@@ -77,3 +77,23 @@ def test_the_help_was_really_run() -> None:
     assert (
         loaded_modules(DESIGN_HELP + RUN, ("obsynth.cli.main", "argparse")) == "LOADED ['obsynth.cli.main', 'argparse']"
     )
+
+
+def test_a_run_of_a_linear_gain_set_loads_nothing_heavy(tmp_path):
+    """No data frames, no pictures, no solver: what a controller's computer would wait for."""
+    import subprocess
+    import sys
+
+    import obsynth
+
+    plant = obsynth.DescriptorSystem(None, [[0.5]], C=[[1.0]], Bf=[[1.0]], dt=1.0)
+    obsynth.fault_estimation_filter(plant).save(tmp_path / "gains.json")
+    (tmp_path / "log.csv").write_text("time;y1\n0;0,5\n1;0,25\n")
+    heavy = ("pandas", "scipy", "matplotlib", "casadi", "cvxpy", "clarabel", "control", "numba", "rich", "pydantic")
+    code = (
+        "import sys\nfrom obsynth.cli.main import main\n"
+        "code = main(['run', '--gains', 'gains.json', '--data', 'log.csv', '--out', 'out.csv', '--quiet'])\n"
+        f"print(code, [name for name in {heavy!r} if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert done.stdout.split(maxsplit=1) == ["0", "[]\n"]

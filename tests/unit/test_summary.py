@@ -39,7 +39,7 @@ def test_a_design_prints_as_about_twelve_lines_of_eighty_columns(network):
     text = " ".join(" ".join(lines).split())
     assert "fault-estimation-filter" in text
     assert "gamma = 0.3" in text
-    assert re.search(r"tm GENCLS 1 +1 +0\.02 +0\.0402 pu +0\.23\d* of active power Bus 3", "\n".join(lines))
+    assert re.search(r"tm GENCLS 1 +1 +0\.02 +0\.04\d* pu +0\.\d+ of active power Bus 3", "\n".join(lines))
     assert "white noise on 3 of 3 sensors" in text
 
 
@@ -115,3 +115,24 @@ def test_check_says_one_line_per_method(capsys):
     assert "pd-observer" in printed
     assert main(["check", "--system", str(DESIGNS / "smib" / "spec.yaml")]) == 0
     assert "sample the observer afterwards" in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize(
+    ("matrix", "dt", "words"),
+    [
+        ([[-20.0, 1.0], [0.0, -0.5]], 0.1, "matrices of a plant in continuous time?"),
+        ([[0.9, 0.1], [0.0, 0.8]], 0.0, "matrices of a sampled plant?"),
+        ([[0.9, 0.1], [0.0, 0.8]], 0.1, ""),
+        ([[-20.0, 1.0], [0.0, -0.5]], 0.0, ""),
+        ([[1.5, 1.0], [0.0, -0.5]], 0.1, ""),
+    ],
+)
+def test_matrices_of_another_time_are_asked_about(matrix, dt, words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("spec.yaml").write_text(
+        f"schema_version: 1\nname: a\nplant: {{dt: {dt}, A: {matrix}, C: [[1, 0], [0, 1]], Bf: [[1], [0]]}}\n"
+        "method: {id: ui-pi-observer}\n"
+    )
+    main(["check", "--system", "spec.yaml"])
+    asked = capsys.readouterr().err
+    assert (words in asked) if words else not asked

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -32,6 +33,7 @@ def run_design(options: argparse.Namespace) -> int:
         spec = load_spec(options.system)
         wanted = default_gains(spec) if options.output is None else options.output
         target = spec_output(wanted, GAIN_SET, spec, options, option="--output")
+        _ask(spec)
         design = designed(spec, report_stage)
         file = write_atomically(target, gain_set_bytes(design, spec=spec.path))
     from obsynth.report.summary import summary
@@ -116,6 +118,7 @@ def run_check(options: argparse.Namespace) -> int:
     from obsynth.spec import load_spec
 
     spec = load_spec(options.system)
+    _ask(spec)
     from obsynth.analysis.diagnosis.diagnosing import diagnose
     from obsynth.analysis.structure import analyse_structure
     from obsynth.methods.designing import check
@@ -155,6 +158,15 @@ def run_check(options: argparse.Namespace) -> int:
             console.print()
         print_methods(methods, own=spec.method, console=console)
     return 0 if passed else PreconditionError.exit_code
+
+
+def _ask(spec: Spec) -> None:
+    """Ask on stderr what may not be meant, as it may be the reason for all that follows."""
+    from obsynth.analysis.plausibility import questions
+    from obsynth.plants.descriptor import DescriptorSystem
+
+    for text in questions(spec.plant) if isinstance(spec.plant, DescriptorSystem) else ():
+        print(f"Question: {text}", file=sys.stderr)
 
 
 def _structure_as_dict(structure: Structure) -> dict[str, Any]:

@@ -57,6 +57,10 @@ def add_data_verbs(verbs: Any) -> None:
         "to its limit, or take them as they are",
     )  # fmt: skip
     run.add_argument(
+        "--recovered", action="append", metavar="NAME",
+        help="a state of the plant as written to recover (or all, or none; default: all of up to 300)",
+    )  # fmt: skip
+    run.add_argument(
         "--state", type=Path, metavar="FILE", help="go on from this saved state if it exists, and save the new one"
     )
     add_json(run)

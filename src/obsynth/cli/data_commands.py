@@ -40,6 +40,7 @@ def run_run(options: argparse.Namespace) -> int:
             design, sys.stdin if options.data == STREAM else Path(options.data), out,
             columns=dict(options.map), time_column=options.time_column, scales=numbers_of(options.scale),
             thresholds=numbers_of(options.threshold), monitor=watched, gap=options.gap, warm_up=options.warm_up,
+            recovered=_recovered(options.recovered),
             outliers=options.outliers,
             state=options.state, progress=progress,
         )  # fmt: skip
@@ -59,6 +60,10 @@ def run_run(options: argparse.Namespace) -> int:
         # The estimates themselves may be on stdout.
         print(summary_of_run(found, watched), file=sys.stderr if out is sys.stdout else sys.stdout)
     return 0
+
+
+def _recovered(names: list[str] | None) -> str | list[str] | None:
+    return names[0] if names in (["all"], ["none"]) else names
 
 
 def run_export(options: argparse.Namespace) -> int:

@@ -10,8 +10,8 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.importing.extras import imported
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.extras import imported
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.names import checked_names
 

@@ -14,11 +14,11 @@ from xml.etree import ElementTree
 import numpy as np
 
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.importing.extras import imported
 from obsynth.importing.fmu_instance import Instance, instance_of
 from obsynth.importing.roles import plant_of
 from obsynth.numerics.arguments import is_finite_number, require_mapping
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.extras import imported
 from obsynth.plants.descriptor import DescriptorSystem
 
 #: Newton steps towards an equilibrium.

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.importing.extras import imported
 from obsynth.numerics.arguments import is_finite_number, require_mapping
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.extras import imported
 from obsynth.plants.descriptor import DescriptorSystem
 
 _MATRICES = ("E", "A", "B", "C", "D", "Bf", "Df", "Bd", "Dd", "Bw", "Dw")

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
-from obsynth.importing.extras import imported
 from obsynth.importing.roles import plant_of
+from obsynth.numerics.extras import imported
 from obsynth.plants.descriptor import DescriptorSystem
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from obsynth.analysis.conditions import Condition
 from obsynth.analysis.transformations import StateRecovery, eliminate_algebraic_states
 from obsynth.analysis.transformations.elimination import MANY_VARIABLES
+from obsynth.analysis.transformations.recovery import Transformation, plant_and_recovery
 from obsynth.errors import PreconditionError, SpecError, VerificationError
 from obsynth.methods.advice import with_advice
 from obsynth.methods.choosing.automatic import automatic_design
@@ -47,7 +48,7 @@ def _silent(_: str) -> None:
 
 
 def design(
-    plant: Plant,
+    plant: Plant | Transformation,
     method: str = AUTO,
     *,
     name: str = "design",
@@ -59,8 +60,9 @@ def design(
 
     Parameters
     ----------
-    plant : DescriptorSystem, TimeVaryingDescriptorSystem or DAEModel
-        The plant.  Of one with sparse matrices and 500 states or more the algebraic states are eliminated first.
+    plant : DescriptorSystem, TimeVaryingDescriptorSystem, DAEModel or Transformation
+        The plant, or what `discretise` and `eliminate_algebraic_states` return: its way back is kept then.
+        Of one with sparse matrices and 500 states or more the algebraic states are eliminated first.
     method : str, optional
         Method id; for its options see the function of the same name, such as `fault_estimation_filter`.  By default
         ``auto``: every method that exists and has the options given is designed, and the best by closed-form figures
@@ -94,17 +96,19 @@ def design(
         Gains were found, but the shipped realisation fails a check.
     """
     report_stage = progress or _silent
+    own: Plant
+    own, recovery = plant_and_recovery(plant, recovery)
 
     def made(plant: Plant, method: str, options: Mapping[str, Any], *, advise: bool = False) -> ObserverDesign:
         return _designed(plant, method, options, name=name, recovery=recovery, progress=report_stage, advise=advise)
 
     if method == AUTO:
         report_stage("designing by every method that exists")
-        kind_of(plant)
-        with failed_computations(), one_thread_if_small(plant.nx):
-            plant, recovery, _ = _with_arrays(plant, recovery, report_stage)
-            return automatic_design(plant, options, made, partial(made, advise=True))
-    return made(plant, method, options, advise=True)
+        kind_of(own)
+        with failed_computations(), one_thread_if_small(own.nx):
+            own, recovery, _ = _with_arrays(own, recovery, report_stage)
+            return automatic_design(own, options, made, partial(made, advise=True))
+    return made(own, method, options, advise=True)
 
 
 def _designed(
@@ -146,15 +150,36 @@ def _with_arrays(
     return found.plant, through, found.notes
 
 
-def check(plant: Plant, options: Mapping[str, Mapping[str, Any]] | None = None) -> dict[str, VerificationReport]:
+def check(
+    plant: Plant | Transformation, options: Mapping[str, Mapping[str, Any]] | None = None
+) -> dict[str, VerificationReport]:
     """Return, for every method, the report of its existence conditions; nothing is designed, and what fails is a row.
 
-    Malformed options are a `SpecError`, numbers beyond double precision a `SolverError`.
+    Parameters
+    ----------
+    plant : DescriptorSystem, TimeVaryingDescriptorSystem, DAEModel or Transformation
+        The plant.
+    options : mapping, optional
+        Options by method id, of which those that the conditions depend on are used, such as ``fault_model``.
+
+    Returns
+    -------
+    dict of str to VerificationReport
+        By method id; a design by the method can exist where ``passed`` is true.
+
+    Raises
+    ------
+    SpecError
+        The plant or an option is malformed.
+    SolverError
+        The numbers are beyond double precision.
     """
-    kind_of(plant)
+    own: Plant
+    own, _ = plant_and_recovery(plant)
+    kind_of(own)
     try:
-        with failed_computations(), one_thread_if_small(plant.nx):
-            return _checked(_with_arrays(plant, None, _silent)[0], options or {})
+        with failed_computations(), one_thread_if_small(own.nx):
+            return _checked(_with_arrays(own, None, _silent)[0], options or {})
     except PreconditionError as error:
         # The sparse plant as written has no reduced form for any method.
         row = Condition(

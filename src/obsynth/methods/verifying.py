@@ -10,6 +10,7 @@ from obsynth.errors import SpecError
 from obsynth.methods.registry import REGISTRY, method_spec
 from obsynth.numerics.failures import failed_computations
 from obsynth.numerics.threads import one_thread_if_small
+from obsynth.results.plant_source import remembering
 from obsynth.results.report import VerificationReport
 from obsynth.verification.closed_claims import closed_claims
 from obsynth.verification.derivation import derivation_rows
@@ -51,6 +52,7 @@ def verify(design: ObserverDesign, *, printed_digits: int | None = None) -> Veri
     checks = spec.load("checks")
     # A corrupted design may overflow; what is not a number fails its check, so no warning is needed.
     with np.errstate(all="ignore"), failed_computations(), one_thread_if_small(design.plant.nx):
+        remembering(design.plant, design.source)
         rows = tuple(checks(design, printed_digits))
         if spec.tracked and all(row.passed for row in rows):
             gamma = design.certificate.claims.get("gamma") if "gamma" in spec.claims else None

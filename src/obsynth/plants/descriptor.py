@@ -18,6 +18,7 @@ from obsynth.plants.uncertainty import UNCERTAIN_MATRICES, Uncertainty, uncertai
 from obsynth.plants.validation import expected_shapes
 
 MatrixOrNames = ArrayLike | Sequence[str] | None
+_NAMES = ("state_names", "input_names", "output_names", "fault_names", "disturbance_names", "noise_names")
 #: For `expected_shapes`, where only the names of the matrices matter.
 _NO_SIGNALS = dict.fromkeys("yufdw", 0)
 
@@ -207,7 +208,8 @@ class DescriptorSystem:
     def replace(self, **changes: Any) -> DescriptorSystem:
         """Return a plant with some fields changed, checked again as a whole.
 
-        Tolerances are those of the matrices as they were: they are dropped with a change of one of these.
+        Tolerances are those of the matrices as they were: they are dropped with a change of one of these.  Units and
+        other labels of signals that are gone, such as those of ``disturbance_names=None``, go with them.
 
         Parameters
         ----------
@@ -217,6 +219,10 @@ class DescriptorSystem:
         kept = self.as_dict()
         if self.uncertainty is not None and changes.keys() & {*UNCERTAIN_MATRICES, "dt"}:
             del kept["uncertainty"]
+        gone = {name for field in _NAMES if field in changes for name in getattr(self, field)}
+        gone -= {name for field in _NAMES for name in (changes[field] or () if field in changes else kept[field])}
+        for label in ("operating_point", "scales", "units"):
+            kept[label] = {name: value for name, value in kept[label].items() if name not in gone}
         return carry_origin(self, DescriptorSystem(**{**kept, **changes}))
 
     def __repr__(self) -> str:

@@ -37,6 +37,8 @@ if TYPE_CHECKING:
 PARTS = ("outputs", "faults", "residuals", "statistic")
 #: Signals of a kind that are drawn.
 MOST = 6
+#: A statistic this many times above its threshold gets a logarithmic axis.
+_FAR = 30.0
 #: Rows in which nothing is decided lie in grey, those with an alarm in red.
 _UNDECIDED: dict[str, Any] = {"color": "0.9", "linewidth": 0.0, "zorder": 0}
 _ALARM: dict[str, Any] = {"color": "tab:red", "alpha": 0.15, "linewidth": 0.0, "zorder": 0}
@@ -84,8 +86,9 @@ def plot_data(
     plans = _plans(run.table, run.measured, show)
     panels = new_panels(axes, len(plans), size=(WIDTH, PANEL_HEIGHT * max(len(plans), 1) + 0.6))
     units = {} if design is None else dict(design.plant.units)
+    told: set[str] = set()
     for panel, (part, name) in zip(panels, plans, strict=True):
-        _shade(panel, run.table, alarms=part != "outputs")
+        _shade(panel, run.table, told, alarms=part != "outputs")
         _DRAWN[part](panel, run, name, units, design)
         legend_above(panel)
         tidy(panel)
@@ -156,15 +159,16 @@ def _draw_statistic(panel: Axes, run: DataRun, _: str, __: dict[str, str], ___: 
     table: Any = run.table
     panel.plot(table["time"], table["statistic"], label="statistic", **RESIDUAL_STYLE)
     panel.plot(table["time"], table["threshold"], label="threshold", **THRESHOLD_STYLES[0])
-    first = _first_alarm(table)
-    if first is not None and np.isfinite(table["statistic"].iloc[first]):
-        time = table["time"].iloc[first]
-        shown = run.stamps.shown(next(iter(run.alarms.values()))) if run.alarms else ""
-        panel.plot([time], [table["statistic"].iloc[first]], marker="o", color="black",
-                   label=f"first alarm at {shown}", **MARK_STYLE)  # fmt: skip
-    values = table["statistic"].to_numpy(float)
-    if np.nanmax(values, initial=0.0) > 0.0:
-        panel.set_yscale("symlog", linthresh=max(float(np.nanmedian(table["threshold"].to_numpy(float))), 1e-300))
+    values, levels = table["statistic"].to_numpy(float), table["threshold"].to_numpy(float)
+    passed = np.flatnonzero(values > levels)
+    own = [run.alarms[name] for name in run.alarms if name not in run.thresholds]
+    if passed.size and own:
+        first = int(passed[0])
+        panel.plot([table["time"].iloc[first]], [values[first]], marker="o", color="black",
+                   label=f"first alarm at {run.stamps.shown(own[0])}", **MARK_STYLE)  # fmt: skip
+    level = float(np.nanmax(levels, initial=0.0))
+    if level > 0.0 and np.nanmax(values, initial=0.0) > _FAR * level:
+        panel.set_yscale("symlog", linthresh=level)
     panel.set_ylabel("statistic")
 
 
@@ -189,21 +193,15 @@ def _deviation(table: Any, column: str, design: Any) -> Any:
     return float(values[0]) if known else None
 
 
-def _first_alarm(table: Any) -> int | None:
-    if "alarm" not in table:
-        return None
-    rows = np.flatnonzero(table["alarm"].to_numpy() != "")
-    return int(rows[0]) if rows.size else None
-
-
-def _shade(panel: Axes, table: Any, *, alarms: bool) -> None:
-    """Shade the rows in which nothing is decided, and those with an alarm."""
+def _shade(panel: Axes, table: Any, told: set[str], *, alarms: bool) -> None:
+    """Shade the rows in which nothing is decided, and those with an alarm; each is explained in one panel."""
     marks = [(~table["status"].isin(DECIDING).to_numpy(), _UNDECIDED, "warm-up or gap")]
     if alarms and "alarm" in table:
         marks.append((table["alarm"].to_numpy() != "", _ALARM, "alarm"))
     times = table["time"]
     for where, style, label in marks:
         edges = np.flatnonzero(np.diff(np.concatenate([[False], where, [False]]).astype(int)))
-        for i, (begin, end) in enumerate(edges.reshape(-1, 2)):
-            panel.axvspan(times.iloc[begin], times.iloc[min(end, len(times) - 1)], label=label if i == 0 else None,
-                          **style)  # fmt: skip
+        for begin, end in edges.reshape(-1, 2):
+            new = None if label in told else label
+            told.add(label)
+            panel.axvspan(times.iloc[begin], times.iloc[min(end, len(times) - 1)], label=new, **style)

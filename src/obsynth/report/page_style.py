@@ -49,7 +49,8 @@ pre { background: var(--shade); border: 1px solid var(--hair); border-radius: 3p
   margin: 0.6rem 0; overflow-x: auto; font: 0.9rem/1.5 ui-monospace, "Liberation Mono", Menlo, Consolas, monospace; }
 .digest { font-family: ui-monospace, "Liberation Mono", Menlo, Consolas, monospace; overflow-wrap: anywhere; }
 @media (max-width: 56rem) {
-  .copied th, .copied td:first-child { white-space: normal; } .copied th, .copied td { padding-right: 0.7rem; }
+  .copied th, .copied td:first-child { white-space: normal; } .copied th, .copied td { padding-right: 0.5rem; }
+  .copied { font-size: 0.8rem; }
   body { padding: 1.1rem 1.1rem 3rem; } h1 { font-size: 1.4rem; } h2 { margin-top: 2.2rem; }
   .verdict { font-size: 1.1rem; padding: 0.7rem 0.9rem; }
   .checks thead { display: none; }

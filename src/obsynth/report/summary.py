@@ -13,6 +13,7 @@ from typing import Any
 from rich.console import Console
 from rich.text import Text
 
+from obsynth.analysis.plausibility import questions
 from obsynth.methods.registry import REGISTRY, method_spec
 from obsynth.observers.linear.warm_up import FORGOTTEN, transient
 from obsynth.plants.dae.model import DAEModel
@@ -24,7 +25,7 @@ from obsynth.report.verification import verdict_line
 from obsynth.results.design import ObserverDesign
 
 #: Faults, warnings and notes that are listed; the others are counted.
-_MOST_FAULTS, _MOST_NOTES = 5, 2
+_MOST_FAULTS, _MOST_NOTES = 5, 1
 #: An unknown input that reaches a fault estimate in the fault's own unit with this gain or more looks like the fault.
 NEAR_ONE = 0.5
 #: An estimate follows a step if in the end it misses it by no more than this share.
@@ -220,6 +221,8 @@ def _estimates(design: ObserverDesign, gains: FaultGains | None) -> tuple[tuple[
 
 def _warnings(design: ObserverDesign, gains: FaultGains | None) -> Iterator[str]:
     """Yield what a user should not overlook: leaks that look like faults, steps that are not followed."""
+    if isinstance(design.plant, DescriptorSystem):
+        yield from questions(design.plant)
     if gains is None:
         return
     plant, observer = design.linear

@@ -140,6 +140,13 @@ class Transformation:
         )  # fmt: skip
 
 
+def plant_and_recovery(given: Any, recovery: StateRecovery | None = None) -> tuple[Any, StateRecovery | None]:
+    """Return the plant of a transformation with its way back, or a plant as it is; a stated way back goes first."""
+    if not isinstance(given, Transformation):
+        return given, recovery
+    return given.plant, given.recovery if recovery is None else recovery
+
+
 def unchanged_states(
     source: DescriptorSystem, new: DescriptorSystem, *, from_state: FloatArray, noise_kept: FloatArray | None = None
 ) -> StateRecovery:

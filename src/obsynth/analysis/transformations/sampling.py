@@ -20,7 +20,7 @@ from obsynth.plants.origin import note_source, with_origin
 from obsynth.plants.uncertainty import SAMPLED
 
 
-def discretise(plant: DescriptorSystem, sample_time: float) -> Transformation:
+def discretise(plant: DescriptorSystem | Transformation, sample_time: float) -> Transformation:
     """Sample a continuous plant with a zero-order hold.
 
     Exact for inputs, faults and disturbances that are constant between samples.  Algebraic states are
@@ -51,6 +51,8 @@ def discretise(plant: DescriptorSystem, sample_time: float) -> Transformation:
     ----------
     .. [VanLoan1978] C. Van Loan, "Computing integrals involving the matrix exponential", IEEE TAC 23, 1978.
     """
+    if isinstance(plant, Transformation):
+        return plant.then(discretise(plant.plant, sample_time))
     if plant.dt > 0.0:
         raise SpecError(f"The plant is already sampled (dt = {plant.dt:g} s): give a continuous plant.", path="dt")
     if not (math.isfinite(sample_time) and sample_time > 0.0):

@@ -27,16 +27,21 @@ STATEMENTS: Mapping[str, str] = {
 BETWEEN_SAMPLES = "; disturbances may do anything within their bounds between samples, at the stated sample time"
 #: The assumption of a sampled design: what happens between its samples is not in its model.
 HELD = "; inputs and disturbances are held between samples, as the sampled model has them"
+SAMPLED = BETWEEN_SAMPLES + "; known inputs are held between samples"
 #: The other assumptions of every bound that is never passed.
 ASSUMED = "; the plant starts at rest, and known inputs are held or go in straight lines between samples"
 #: Where the residual is made not to see the faults that are modelled.
 OF_ESTIMATES = "the norm of the fault estimates, as the residual does not see the faults that are modelled: "
 
 
-def statement_of(kind: str, *, continuous: bool, estimates: bool = False) -> str:
-    """Return what a threshold promises; ``estimates``: of the fault estimates instead of the residual."""
+def statement_of(kind: str, *, continuous: bool, sampled: bool = False, estimates: bool = False) -> str:
+    """Return what a threshold promises; ``estimates``: of the fault estimates instead of the residual.
+
+    ``sampled``: the continuous plant behind a sampled one is known, and disturbances may move between samples.
+    """
     bounded = kind in ("pointwise", "window")
-    ending = (BETWEEN_SAMPLES + ASSUMED) if continuous and bounded else HELD if bounded else ""
+    held = SAMPLED if sampled else HELD
+    ending = (BETWEEN_SAMPLES + ASSUMED) if continuous and bounded else held if bounded else ""
     return (OF_ESTIMATES if estimates else "") + STATEMENTS[kind] + ending
 
 

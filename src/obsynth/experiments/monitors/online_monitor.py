@@ -173,7 +173,10 @@ def online_monitor(
         ending += _NOT_CLOSER if model.Bw[:, model.sensor_noise[0].shape[1] :].any() else ""
     if kind in ("pointwise", "window") and model.continuous is not None:
         ending += _REGULAR + model.continuous.between.lasting_words(limit)
-    statement = statement_of(kind, continuous=model.flow is not None, estimates=estimates) + ending + EXACT
+    promised = statement_of(
+        kind, continuous=model.flow is not None, sampled=model.sampled is not None, estimates=estimates
+    )
+    statement = promised + ending + EXACT
     return OnlineMonitor(
         kind, statement, rule, residuals=len(design.linear[1].residual_names), fault_names=design.linear[1].fault_names,
         fault_scales=model.fault_scales(),

@@ -126,7 +126,9 @@ def monitor(
     rows = bench.observer.fault_rows if estimates else bench.observer.residual_rows
     if model.flow is not None:
         threshold = threshold + _straight_lines(design, scenario, model, kind, window, rows)
-    statement = statement_of(kind, continuous=model.flow is not None, estimates=estimates)
+    statement = statement_of(
+        kind, continuous=model.flow is not None, sampled=model.sampled is not None, estimates=estimates
+    )
     return Monitor(
         kind, statement, threshold, _floor(bench, scenario, rows), bench.drive.dt,
         window,

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from numpy.typing import ArrayLike
 
+from obsynth.analysis.transformations.recovery import plant_and_recovery
 from obsynth.errors import SpecError
 from obsynth.methods.designing import design, draft_of
 from obsynth.methods.verifying import verify
@@ -163,10 +164,11 @@ def fault_estimation_filter_from_gains(
     """
     from obsynth.methods.fault_estimation_filter.given_gains import synthesis_from_gains
 
+    plant, recovery = plant_and_recovery(plant)
     if plant.nd and gamma is None:
         raise SpecError(
             "gamma is needed: the plant has disturbances, and a gain set claims a bound on them.", path="gamma"
         )
     found = synthesis_from_gains(plant, T=T, N=N, L=L, W=W, gamma=gamma, indexes=indexes)
-    draft = draft_of(plant, "fault-estimation-filter", found, name=name)
+    draft = draft_of(plant, "fault-estimation-filter", found, name=name, recovery=recovery)
     return draft.replace(report=verify(draft))

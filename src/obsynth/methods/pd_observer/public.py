@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from obsynth.analysis.transformations.recovery import plant_and_recovery
 from obsynth.errors import SpecError, VerificationError
 from obsynth.methods.designing import design as design_by_method
 from obsynth.methods.designing import draft_of
@@ -165,9 +166,10 @@ def pd_observer_from_gains(
     """
     from obsynth.methods.pd_observer.synthesis import synthesis_from_gains
 
+    plant, recovery = plant_and_recovery(plant)
     gains = {"J": J, "L": L, "M": M, "N": N}
     found = synthesis_from_gains(plant, gains=gains, adaptation_gain=adaptation_gain, decay=decay)
-    draft = draft_of(plant, "pd-observer", found, name=name)
+    draft = draft_of(plant, "pd-observer", found, name=name, recovery=recovery)
     return draft.replace(report=verify(draft))
 
 

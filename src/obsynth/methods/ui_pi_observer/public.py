@@ -7,6 +7,7 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
+from obsynth.analysis.transformations.recovery import plant_and_recovery
 from obsynth.methods.designing import design, draft_of
 from obsynth.methods.verifying import verify
 from obsynth.plants.descriptor import DescriptorSystem
@@ -156,6 +157,7 @@ def ui_pi_observer_from_gains(
     """
     from obsynth.methods.ui_pi_observer.synthesis import synthesis_from_gains
 
+    plant, recovery = plant_and_recovery(plant)
     found = synthesis_from_gains(plant, U=U, D=D, K=K, F=F, fault_model=fault_model)
-    draft = draft_of(plant, "ui-pi-observer", found, name=name)
+    draft = draft_of(plant, "ui-pi-observer", found, name=name, recovery=recovery)
     return draft.replace(report=verify(draft))

@@ -13,6 +13,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.extras import imported
 from obsynth.plants.dae.checks import (
     check_distinct,
     check_structure,
@@ -112,6 +113,7 @@ class DAEModel:
         equation_names: Sequence[str] | None = None,
         output_names: Sequence[str] | None = None,
     ) -> None:
+        imported("casadi", extra="nonlinear", what="A nonlinear plant")
         problems = Problems()
         fields: dict[str, Any] = {"storage": storage}
         given = {"states": states, "inputs": inputs, "parameters": parameters, "constants": constants}

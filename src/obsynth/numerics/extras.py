@@ -8,11 +8,13 @@ from typing import Any
 from obsynth.errors import SpecError
 
 
-def imported(module: str, *, extra: str | None) -> Any:
+def imported(module: str, *, extra: str | None, what: str = "This") -> Any:
     """Return a module; where it is not installed, raise `SpecError` with the one command that installs it."""
     try:
         return import_module(module)
     except ImportError as error:
         package = module.partition(".")[0]
         wanted = package if extra is None else f"'obsynth[{extra}]'"
-        raise SpecError(f"This needs {package}, which is not installed: pip install {wanted}", path=package) from error
+        raise SpecError(
+            f"{what} needs {package}, which is not installed: pip install {wanted}", path=package
+        ) from error

@@ -1,0 +1,105 @@
+"""Pages that are made at each build: the reference from the public names, designs and notebooks from their folders."""
+
+from __future__ import annotations
+
+import inspect
+import re
+import shutil
+from pathlib import Path
+
+import obsynth
+
+MADE = "made"
+#: Module prefix -> section of the reference, in order; the first that fits.
+SECTIONS = (
+    ("obsynth.errors", "Errors"),
+    ("obsynth.importing", "Plants from other tools"),
+    ("obsynth.spec", "Specs"),
+    ("obsynth.plants", "Plants"),
+    ("obsynth.analysis", "What is possible"),
+    ("obsynth.methods", "Designs"),
+    ("obsynth.results", "Results"),
+    ("obsynth.compare", "Comparing designs"),
+    ("obsynth.sweeps", "Comparing designs"),
+    ("obsynth.observers", "Observers"),
+    ("obsynth.data", "Measured data"),
+    ("obsynth.experiments", "Simulation and monitors"),
+    ("obsynth.simulation", "Simulation and monitors"),
+    ("obsynth.calibration", "Calibration"),
+    ("obsynth.tolerances", "Tolerances"),
+    ("obsynth.robustness", "Tolerances"),
+    ("obsynth.exporting", "Handing on"),
+    ("obsynth.report", "Handing on"),
+)
+ORDER = (
+    "Plants", "Plants from other tools", "Specs", "What is possible", "Designs", "Comparing designs", "Results",
+    "Observers", "Measured data", "Simulation and monitors", "Calibration", "Tolerances", "Handing on", "Other",
+    "Pictures", "Errors",
+)  # fmt: skip
+
+
+def write_sources(folder: Path) -> None:
+    """Write the pages into ``folder / made``."""
+    target = folder / MADE
+    shutil.rmtree(target, ignore_errors=True)
+    target.mkdir()
+    (target / "reference.rst").write_text(_reference(), encoding="utf-8")
+    _designs(folder.parent, target)
+    _notebooks(folder.parent, target)
+    shutil.copy(folder.parent / "CHANGELOG.md", target / "changelog.md")
+
+
+def _section(name: str) -> str:
+    module = getattr(getattr(obsynth, name), "__module__", "") or ""
+    return next((title for prefix, title in SECTIONS if module.startswith(prefix)), "Other")
+
+
+def _reference() -> str:
+    import obsynth.plotting
+
+    found: dict[str, list[str]] = {}
+    # A second name of the same thing has no page of its own.
+    for name in (name for name in obsynth.__all__ if getattr(getattr(obsynth, name), "__name__", name) == name):
+        found.setdefault(_section(name), []).append(f"obsynth.{name}")
+    found["Pictures"] = [f"obsynth.plotting.{name}" for name in obsynth.plotting.__all__]
+    lines = ["API reference", "=============", "", "Every public name, from its docstring.", ""]
+    for title in (title for title in ORDER if title in found):
+        names = sorted(found[title], key=lambda name: (not _is_function(name), name.lower()))
+        lines += [title, "-" * len(title), "", ".. autosummary::", "   :toctree: api", ""]
+        lines += [*(f"   {name}" for name in names), ""]
+    return "\n".join(lines)
+
+
+def _is_function(name: str) -> bool:
+    value: object = obsynth
+    for part in name.split(".")[1:]:
+        value = getattr(value, part)
+    return inspect.isfunction(value)
+
+
+def _designs(root: Path, target: Path) -> None:
+    """Copy the notes of each design, below a list of them."""
+    entries = []
+    for notes in sorted(root.glob("designs/*/NOTES.md")):
+        name = notes.parent.name
+        text = notes.read_text(encoding="utf-8")
+        (target / f"design_{name}.md").write_text(_without_files(text), encoding="utf-8")
+        entries.append(f"design_{name}")
+    head = ["# Papers and deviations", "", "What was printed, what is right, and how we differ: one page for each",
+            "published example and each real plant.", ""]  # fmt: skip
+    lines = [*head, "```{toctree}", ":maxdepth: 1", "", *entries, "```", ""]
+    (target / "designs.md").write_text("\n".join(lines), encoding="utf-8")
+
+
+def _notebooks(root: Path, target: Path) -> None:
+    entries = []
+    for notebook in sorted(root.glob("notebooks/*.ipynb")):
+        shutil.copy(notebook, target / notebook.name)
+        entries.append(notebook.stem)
+    lines = ["# Notebooks", "", "```{toctree}", ":maxdepth: 1", "", *entries, "```", ""]
+    (target / "notebooks.md").write_text("\n".join(lines), encoding="utf-8")
+
+
+def _without_files(text: str) -> str:
+    """Return a page whose links to files of the repository are plain names."""
+    return re.sub(r"\[([^\]]+)\]\((?!https?:)[^)]*\)", r"\1", text)

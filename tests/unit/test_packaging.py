@@ -1,0 +1,57 @@
+"""What is released: one version everywhere, extras that are what they say, a plant without its package."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+from ruamel.yaml import YAML
+
+import obsynth
+
+ROOT = Path(__file__).parents[2]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+
+
+def names(requirements: list[str]) -> set[str]:
+    return {requirement.split("[")[0].split(">")[0].strip() for requirement in requirements}
+
+
+def test_there_is_one_version():
+    citation = YAML(typ="safe").load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert obsynth.__version__ == PROJECT["version"] == citation["version"]
+    assert citation["license"] == PROJECT["license"]
+
+
+def test_no_package_under_the_gpl_is_needed():
+    extras = PROJECT["optional-dependencies"]
+    assert "andes" not in names(PROJECT["dependencies"])
+    assert [name for name, listed in extras.items() if "andes" in names(listed)] == ["andes"]
+
+
+def test_casadi_is_for_nonlinear_plants_only():
+    assert "casadi" not in names(PROJECT["dependencies"])
+    assert "casadi" in names(PROJECT["optional-dependencies"]["nonlinear"])
+    code = (
+        "import sys\nsys.modules['casadi'] = None\nimport obsynth\n"
+        "try:\n    obsynth.DAEModel({'a': 'der(x) = -x'}, {'y': 'x'}, states={'x': 1.0})\n"
+        "except obsynth.SpecError as error:\n    print(error)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "A nonlinear plant needs casadi, which is not installed: pip install 'obsynth[nonlinear]'\n"
+
+
+def test_the_readme_is_short():
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 100
+
+
+def test_dir_is_the_public_names_only():
+    shown = set(dir(obsynth))
+    assert shown == {*obsynth.__all__, "plotting", "__version__"}
+    assert obsynth.plotting.plot_data is not None
+    assert obsynth.check is not None
+    # Every name of the grouped list in the docstring exists.
+    named = [word.strip(" .,;:") for word in (obsynth.__doc__ or "").split()]
+    assert {"load_spec", "check", "from_control"} <= set(named) & shown
