@@ -17,12 +17,14 @@ from obsynth.analysis.transformations.recovery import Transformation, plant_and_
 from obsynth.errors import PreconditionError, SpecError, VerificationError
 from obsynth.methods.advice import with_advice
 from obsynth.methods.choosing.automatic import automatic_design
+from obsynth.methods.drowned_designs import require_above_rounding
 from obsynth.methods.method_spec import MethodSpec, PlantKind
 from obsynth.methods.registry import AUTO, REGISTRY, method_spec, methods_for
 from obsynth.methods.synthesis_result import Synthesis
 from obsynth.methods.verifying import verify
 from obsynth.numerics.failures import failed_computations
 from obsynth.numerics.threads import one_thread_if_small
+from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
@@ -274,6 +276,8 @@ def verified(
             + "".join(f" {note}" for note in draft.notes),
             report=report,
         )
+    if isinstance(draft.observer, LinearObserver) and isinstance(draft.plant, DescriptorSystem):
+        require_above_rounding(draft.plant, draft.observer)
     return draft.replace(report=report)
 
 
