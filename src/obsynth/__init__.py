@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from obsynth.comparison.comparing import compare
     from obsynth.comparison.result import ComparedMethod, Comparison, FaultComparison
     from obsynth.comparison.sensor_sets import SensorSet, SensorSets, sensor_sets
+    from obsynth.data.alarm_proof import prove_alarm
     from obsynth.data.run import DataRun, run_on_data
     from obsynth.errors import (
         InfeasibleError,
@@ -49,6 +50,8 @@ if TYPE_CHECKING:
         SpecError,
         VerificationError,
     )
+    from obsynth.experiments.alarm_proofs.certificate import verify_alarm
+    from obsynth.experiments.alarm_proofs.proof import AlarmProof
     from obsynth.experiments.intervals import Interval
     from obsynth.experiments.monitors.monitor import Detection, Monitor
     from obsynth.experiments.monitors.online import OnlineMonitor
@@ -74,6 +77,7 @@ if TYPE_CHECKING:
         fault_estimation_filter,
         fault_estimation_filter_from_gains,
     )
+    from obsynth.methods.functional_filter.detection import DetectionFilter, detection_filter
     from obsynth.methods.functional_filter.public import functional_filter
     from obsynth.methods.pd_observer.public import (
         apply_adaptation_gain,
@@ -124,6 +128,8 @@ __version__ = "0.1.0"
 
 # Names are imported when they are first used, so that `import obsynth` stays fast; ``module:name`` is another name.
 _HOMES = {
+    "DetectionFilter": "obsynth.methods.functional_filter.detection",
+    "detection_filter": "obsynth.methods.functional_filter.detection",
     "ComparedMethod": "obsynth.comparison.result",
     "Comparison": "obsynth.comparison.result",
     "FaultComparison": "obsynth.comparison.result",
@@ -154,6 +160,9 @@ _HOMES = {
     "Robustness": "obsynth.tolerances.robustness",
     "Uncertainty": "obsynth.plants.uncertainty",
     "robustness": "obsynth.tolerances.robustness",
+    "AlarmProof": "obsynth.experiments.alarm_proofs.proof",
+    "prove_alarm": "obsynth.data.alarm_proof",
+    "verify_alarm": "obsynth.experiments.alarm_proofs.certificate",
     "uncertain_system": "obsynth.plants.uncertain_system",
     "simulate_dae": "obsynth.simulation.dae",
     "DAEBatchEstimates": "obsynth.observers.dae.batch",
@@ -256,6 +265,7 @@ _HOMES = {
 __all__ = [
     "Adaptation",
     "Alarm",
+    "AlarmProof",
     "BatchEstimates",
     "CalibratedBox",
     "Calibration",
@@ -276,6 +286,7 @@ __all__ = [
     "DeltaScan",
     "DescriptorSystem",
     "Detection",
+    "DetectionFilter",
     "Diagnosis",
     "Drift",
     "Estimates",
@@ -337,6 +348,7 @@ __all__ = [
     "decouple",
     "descriptor_kalman",
     "design",
+    "detection_filter",
     "diagnose",
     "discretise",
     "eliminate_algebraic_states",
@@ -365,6 +377,7 @@ __all__ = [
     "pd_delta_scan",
     "pd_observer",
     "pd_observer_from_gains",
+    "prove_alarm",
     "robustness",
     "run_batch",
     "run_on_data",
@@ -381,6 +394,7 @@ __all__ = [
     "validate",
     "validity",
     "verify",
+    "verify_alarm",
 ]
 
 

@@ -187,3 +187,25 @@ def test_refusals_name_their_reason() -> None:
     assert "may grow" in loud.statement
     with pytest.raises(PreconditionError, match="not proved regular"):
         obsynth.online_monitor(design, noise_bound=1.0, disturbance_bounds={"load": 0.1}, constants={"J2": "150 %"})
+
+
+def test_plants_are_drawn_from_the_box() -> None:
+    from uncertain_plants import DESIGNS
+
+    from obsynth.spec import load_spec
+
+    design = obsynth.fault_estimation_filter(wang())
+    exact = design.replace(plant=design.plant.replace(uncertainty=None))
+    scenario = load_spec(DESIGNS / "wang2015" / "spec.yaml").scenario
+    quiet, box = scenario.replace(faults={}, horizon=120), design.plant.uncertainty
+    fixed, adaptive = obsynth.monitor(design, quiet), obsynth.monitor(design, quiet, constants=box)
+    assert obsynth.evaluate(design, quiet, runs=30, monitor=fixed, plants=30).false_alarm_rate.value > 0.4
+    assert obsynth.evaluate(design, quiet, runs=30, monitor=adaptive, plants=30).false_alarm_rate.value == 0.0
+    faulty = scenario.replace(horizon=120)
+    found = obsynth.evaluate(design, faulty, runs=20, monitor=obsynth.monitor(design, faulty, constants=box), plants=20)
+    assert found.false_alarm_rate.value == 0.0
+    assert found.missed_detection_rate.value == 0.0
+    with pytest.raises(SpecError, match="has none"):
+        obsynth.evaluate(exact, quiet, runs=2, plants=2)
+    with pytest.raises(SpecError, match="follows inputs and outputs"):
+        adaptive.watch(obsynth.simulate(design, quiet).estimates)

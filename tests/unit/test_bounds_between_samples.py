@@ -136,3 +136,32 @@ def test_an_unstable_plant_whose_outputs_bend_has_no_bound_for_ever():
     # A record of known length has one.
     scenario = obsynth.Scenario(horizon=5, sample_time=0.1, disturbances={"load": obsynth.Uniform(low=-1, high=1)})
     assert worst_residual(design, 0.1, 5.0) <= obsynth.monitor(design, scenario).threshold[-1]
+
+
+@pytest.mark.parametrize("direct", [0.0, 0.4])
+def test_a_sampled_design_knows_what_moves_between_its_samples(direct: float, tmp_path):
+    """The bound is that of the issue; a saved design, which holds the plant as written, has the same."""
+    written = obsynth.DescriptorSystem(
+        None, [[-0.2, 4.0], [-4.0, -0.2]], C=[[1.0, 0.2], [0.0, 1.0]], Bf=[[0.0], [1.0]], Bd=[[1.0], [0.3]],
+        Dd=[[direct], [0.0]], disturbance_names=["load"],
+    )  # fmt: skip
+    design = obsynth.fault_estimation_filter(obsynth.discretise(written, 0.6).plant)
+    scenario = obsynth.Scenario(horizon=60, disturbances={"load": obsynth.Uniform(low=-1, high=1)})
+    watched = obsynth.monitor(design, scenario)
+    observer, rows = design.observer, design.observer.residual_rows
+    t, phi = design.certificate.matrices["tracking"][:, :2], observer.Az
+    exact, powers = np.zeros(1), np.eye(observer.order)
+    for _ in range(80):
+        shown = observer.Cz[rows] @ powers
+        exact += quad(lambda s, c=shown: np.linalg.norm(c @ t @ expm(written.A * s) @ written.Bd), 0.0, 0.6)[0]
+        exact += np.linalg.norm(shown @ observer.By @ written.Dd)
+        powers = powers @ phi
+    exact += np.linalg.norm(observer.Dy[rows] @ written.Dd)
+    assert exact[0] <= watched.threshold[-1] <= exact[0] * 1.002
+    assert "between samples" in watched.statement
+    again = obsynth.load(design.save(tmp_path / "gains.json"))
+    online = obsynth.online_monitor(again, disturbance_bounds={"load": 1.0})
+    assert online._rule._limit == pytest.approx(watched.threshold[-1], rel=1e-3)
+    held = design.replace(source=None)
+    assert obsynth.monitor(held, scenario).threshold[-1] < watched.threshold[-1]
+    assert "held between samples" in obsynth.monitor(held, scenario).statement

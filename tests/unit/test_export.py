@@ -156,6 +156,34 @@ def through_c(observer: LinearObserver, source: Path, signals: np.ndarray) -> np
     return np.frombuffer(done.stdout).reshape(len(signals), -1)
 
 
+def test_large_matrices_by_columns_and_by_entries(tmp_path):
+    rng = np.random.default_rng(5)
+    order, nx = 70, 40
+    shown = np.zeros((nx + 1 + 9, order))
+    shown[np.arange(nx), np.arange(nx)] = 1.0
+    shown[nx:] = rng.normal(size=(10, order))
+    observer = LinearObserver(
+        0.9 * np.linalg.qr(rng.normal(size=(order, order)))[0], rng.normal(size=(order, 2)),
+        rng.normal(size=(order, 9)), shown, np.zeros((nx + 10, 2)), rng.normal(size=(nx + 10, 9)),
+        dt=1.0, input_names=("u1", "u2"), output_names=tuple(f"y{i}" for i in range(9)),
+        state_names=tuple(f"x{i}" for i in range(nx)), fault_names=("f",),
+        residual_names=tuple(f"y{i}" for i in range(9)), state_delays=(0,) * nx, fault_delays=(0,),
+    )  # fmt: skip
+    design = obsynth.fault_estimation_filter(
+        obsynth.DescriptorSystem(None, [[0.5]], C=[[1.0]], Bf=[[1.0]], dt=1.0)
+    ).replace(observer=observer)
+    source = obsynth.export(design, tmp_path / "large.c")[0]
+    text = source.read_text()
+    assert "by columns" in text
+    assert "states_z_column[40]" in text
+    assert "-O3" in text
+    signals = rng.normal(size=(500, 11))
+    expected = observer.run(signals[:, 2:], signals[:, :2])
+    found = through_c(observer, source, signals)
+    wanted = np.hstack([expected.states, expected.faults, expected.residuals])
+    np.testing.assert_allclose(found, wanted, rtol=1e-12, atol=1e-12)
+
+
 @pytest.mark.parametrize(("which", "sample_time"), [("sampled", None), ("network", None), ("continuous", 0.01)])
 def test_c_equals_python_over_ten_thousand_steps(request, tmp_path, which, sample_time):
     design = request.getfixturevalue(which)

@@ -144,7 +144,7 @@ def test_a_number_that_overflows_there_is_no_warning():
     A[4, 1] = 300.0  # leak = 300 flux, which nothing feels
     whole = obsynth.eliminate_algebraic_states(SOURCE.replace(A=A))
     whole = whole.then(obsynth.discretise(whole.plant, 0.1))
-    design = obsynth.design(whole.plant, recovery=whole.recovery)
+    design = obsynth.design(whole.plant, "fault-estimation-filter", recovery=whole.recovery)
     table = simulated(design, 0.1)[0]
     table.loc[30, "flux"] = 1e307
     found = run_on_data(design, table).table

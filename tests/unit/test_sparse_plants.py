@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import scipy.sparse as sp
 
@@ -201,6 +202,30 @@ class TestMethods:
         assert design.plant.state_names == network.dynamic
         assert set(design.recovery.names) == set(network.names) - set(network.idle)
         assert any(network.idle[0] in note for note in design.notes)
+
+    def test_saved_run_and_recovered(self, tmp_path):
+        network = random_network(520, 20, 7)
+        plant = network.plant(Bd=None, disturbance_names=None)
+        design = obsynth.load(obsynth.pd_observer(plant).save(tmp_path / "large.gains.json"))
+        assert design.recovery.by_operator is not None
+        assert design.report.passed
+        again = obsynth.eliminate_algebraic_states(plant).recovery
+        np.testing.assert_array_equal(design.recovery.from_state, again.from_state)
+        assert design.recovery.flags() == again.flags()
+        rng = np.random.default_rng(0)
+        data = pd.DataFrame(0.01 * rng.normal(size=(5, plant.ny)), columns=list(plant.output_names))
+        data.insert(0, "time", 0.01 * np.arange(5))
+        assert not obsynth.run_on_data(design, data).recovered
+        bus = "v Bus 3"
+        found = obsynth.run_on_data(design, data, recovered=[bus])
+        assert set(found.recovered) == {bus}
+        states = found.table[[f"xhat[{name}]" for name in design.plant.state_names]].to_numpy()
+        faults = found.table[[f"fhat[{name}]" for name in design.plant.fault_names]].to_numpy()
+        row = design.recovery.names.index(bus)
+        expected = states @ design.recovery.from_state[row] + faults @ design.recovery.from_fault[row]
+        np.testing.assert_allclose(found.table[f"xhat[{bus}]"].to_numpy(), expected, rtol=1e-9, atol=1e-12)
+        with pytest.raises(obsynth.SpecError, match="nothing"):
+            obsynth.run_on_data(design, data, recovered=["nothing"])
 
     def test_check_says_why_a_large_one_cannot_be_reduced(self):
         network = random_network(520, 20, 8)

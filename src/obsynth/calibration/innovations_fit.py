@@ -78,15 +78,23 @@ def chosen_timing(
     return problem, fits, Timing(delay, losses)
 
 
-def innovations_fit(problem: Problem, fits: list[Fit], level: float, note: Callable[[str], object]) -> InnovationsFit:
-    """Return the fit of the innovations, from fits of the simulation."""
-    objective = Objective(problem, fits[0])
+def guarded_maximum(
+    objective: Objective, fits: list[Fit], note: Callable[[str], object]
+) -> tuple[Maximum, Information]:
+    """Return the greatest likelihood, with variances that the log cannot tell from zero kept away from it."""
     maximum = greatest_likelihood(objective, fits, note)
     found = information(maximum.hessian, objective, maximum.z)
     if not found.undetermined:
         # Along a direction that the log leaves open the weight of a variance would only lead the constants away.
         maximum = without_collapse(objective, maximum, note)
         found = information(maximum.hessian, objective, maximum.z)
+    return maximum, found
+
+
+def innovations_fit(problem: Problem, fits: list[Fit], level: float, note: Callable[[str], object]) -> InnovationsFit:
+    """Return the fit of the innovations, from fits of the simulation."""
+    objective = Objective(problem, fits[0])
+    maximum, found = guarded_maximum(objective, fits, note)
     variances = int((objective.is_q | objective.is_r).sum())
     root = quantile(level, objective.nt, problem.log.samples, variances)
     note("boxes by profile likelihood")

@@ -110,6 +110,11 @@ def upper_limit(objective: Objective, maximum: Maximum, i: int) -> float:
     return side.value
 
 
+def deviance_root(objective: Objective, maximum: Maximum, i: int, value: float) -> float:
+    """Return the root of the profile's deviance at a value of a constant."""
+    return _Profile(objective, maximum, i).root(value / float(objective.problem.widths[i]))
+
+
 class _Profile:
     """The least value of the objective as a function of one variable, the others led along."""
 

@@ -182,11 +182,37 @@ def _structure_as_dict(structure: Structure) -> dict[str, Any]:
     return facts
 
 
+def _is_alarm(path: Path) -> bool:
+    """Whether a file begins like the certificate of an alarm."""
+    from obsynth.experiments.alarm_proofs.certificate import CERTIFICATE
+    from obsynth.files.inputs import input_file
+
+    with input_file(path).open("rb") as stream:
+        return CERTIFICATE.mark in stream.read(200)
+
+
+def _verify_alarm(options: argparse.Namespace) -> int:
+    """Recheck the certificate of an alarm without a solver."""
+    from obsynth.experiments.alarm_proofs.certificate import verify_alarm
+    from obsynth.report.verification import verification_report
+
+    report = verify_alarm(options.gains)
+    if options.json:
+        print_json({
+            "command": "verify", "file": str(options.gains), "passed": report.passed, "report": report.as_dict()
+        })  # fmt: skip
+    else:
+        verification_report(report, console=stdout_console())
+    return 0 if report.passed else VerificationError.exit_code
+
+
 def run_verify(options: argparse.Namespace) -> int:
     """Run ``verify``: recheck a saved gain set without a solver."""
     from obsynth.methods.verifying import verify
     from obsynth.results.gain_sets import load
 
+    if _is_alarm(options.gains):
+        return _verify_alarm(options)
     design = load(options.gains)
     report = verify(design, printed_digits=options.printed_digits)
     if options.json:

@@ -29,7 +29,9 @@ An estimate that lags has a column 'time of ...', the time of which it is the es
 
 --monitor KIND adds columns 'statistic', 'threshold' and 'alarm', with the fault that stands out. The thresholds hold
 however long the data are. KIND is one of
-  pointwise   linear designs: the residual's peak bound, for disturbances and noise within bounds
+  pointwise   linear designs: the residual's peak bound, for disturbances and noise within bounds; where the plant's
+              constants have tolerances, it adapts to the signals and holds for every plant within them, with columns
+              for each threshold, the guaranteed interval of each fault, and the share of each constant
   window      the same for its l2 norm over a window
   paper       linear, discrete: eq. (66) of Wang et al. 2015; no bound
   chi-square  linear: a window of the residual against its covariance; recursive: the parameters against theirs
@@ -55,6 +57,10 @@ def add_data_verbs(verbs: Any) -> None:
         "--outliers", choices=("gate", "huber", "none"),
         help="recursive and nonlinear designs: leave out samples that their prediction excludes (default), pull them "
         "to its limit, or take them as they are",
+    )  # fmt: skip
+    run.add_argument(
+        "--recovered", action="append", metavar="NAME",
+        help="a state of the plant as written to recover (or all, or none; default: all of up to 300)",
     )  # fmt: skip
     run.add_argument(
         "--state", type=Path, metavar="FILE", help="go on from this saved state if it exists, and save the new one"
@@ -159,6 +165,10 @@ def add_monitor_arguments(parser: argparse.ArgumentParser) -> None:
         help="largest absolute value of a disturbance; may be repeated",
     )  # fmt: skip
     group.add_argument("--noise-bound", type=float, metavar="N", help="standard deviations that no noise exceeds")
+    group.add_argument(
+        "--initial", type=pair, action="append", default=[], metavar="STATE=BOUND",
+        help="pointwise, discrete designs: bound of a state of the plant at the start (or LOW:HIGH); may be repeated",
+    )  # fmt: skip
     group.add_argument("--initial-error", type=float, metavar="E", help="bound on the norm of the error at the start")
     group.add_argument(
         "--false-alarms", type=float, default=0.01, metavar="P",

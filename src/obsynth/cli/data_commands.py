@@ -19,6 +19,7 @@ from obsynth.files.outputs import require_distinct
 if TYPE_CHECKING:
     from obsynth.data.run import DataRun
     from obsynth.experiments.monitors.online import OnlineMonitor
+    from obsynth.plants.uncertainty import Uncertainty
     from obsynth.results.design import ObserverDesign
 
 STREAM = "-"
@@ -40,6 +41,7 @@ def run_run(options: argparse.Namespace) -> int:
             design, sys.stdin if options.data == STREAM else Path(options.data), out,
             columns=dict(options.map), time_column=options.time_column, scales=numbers_of(options.scale),
             thresholds=numbers_of(options.threshold), monitor=watched, gap=options.gap, warm_up=options.warm_up,
+            recovered=_recovered(options.recovered),
             outliers=options.outliers,
             state=options.state, progress=progress,
         )  # fmt: skip
@@ -59,6 +61,10 @@ def run_run(options: argparse.Namespace) -> int:
         # The estimates themselves may be on stdout.
         print(summary_of_run(found, watched), file=sys.stderr if out is sys.stdout else sys.stdout)
     return 0
+
+
+def _recovered(names: list[str] | None) -> str | list[str] | None:
+    return names[0] if names in (["all"], ["none"]) else names
 
 
 def run_export(options: argparse.Namespace) -> int:
@@ -147,6 +153,27 @@ def numbers_of(pairs: list[tuple[str, str]]) -> Mapping[str, float]:
     return found
 
 
+def own_tolerances(design: ObserverDesign, kind: str | None) -> Uncertainty | None:
+    """Return the tolerances of a sampled design's plant, which its pointwise threshold holds for."""
+    from obsynth.observers.linear.observer import LinearObserver
+    from obsynth.plants.descriptor import DescriptorSystem
+
+    plant = design.plant
+    if kind != "pointwise" or not isinstance(plant, DescriptorSystem) or not plant.is_discrete:
+        return None
+    return plant.uncertainty if isinstance(design.observer, LinearObserver) else None
+
+
+def ranges_of(pairs: list[tuple[str, str]]) -> dict[str, float | tuple[float, float]]:
+    """Return bounds by name, from arguments of the form NAME=BOUND or NAME=LOW:HIGH."""
+    found: dict[str, float | tuple[float, float]] = {}
+    for name, text in pairs:
+        low, colon, high = text.partition(":")
+        ends = numbers_of([(name, low), (name, high)] if colon else [])
+        found[name] = (numbers_of([(name, low)])[name], ends[name]) if colon else numbers_of([(name, text)])[name]
+    return found
+
+
 def monitor_of(
     design: ObserverDesign, options: argparse.Namespace, *, has_scenario: bool = False
 ) -> OnlineMonitor | None:
@@ -157,7 +184,7 @@ def monitor_of(
             for name in (*(() if has_scenario else ("system",)), "noise_bound", "initial_error", "sample_time")
             if getattr(options, name)
         ]
-        asked += [name for name in ("disturbance", "nominal") if getattr(options, name)]
+        asked += [name for name in ("disturbance", "nominal", "initial") if getattr(options, name)]
         if asked:
             flag = f"--{asked[0].replace('_', '-')}"
             raise SpecError(f"{flag} is for a monitor: say which one by --monitor.", path=flag)
@@ -177,7 +204,8 @@ def monitor_of(
         design, options.monitor, scenario=scenario, disturbance_bounds=numbers_of(options.disturbance),
         noise_bound=options.noise_bound, initial_error=options.initial_error, window=options.window,
         false_alarms=options.false_alarms, change=options.change, nominal=numbers_of(options.nominal),
-        sample_time=options.sample_time,
+        sample_time=options.sample_time, initial_set=ranges_of(options.initial) or None,
+        constants=own_tolerances(design, options.monitor),
     )  # fmt: skip
 
 

@@ -32,6 +32,9 @@ def add_evaluate_verb(verbs: Any) -> None:
     evaluate.add_argument(
         "--confidence", type=float, default=0.95, metavar="P", help="of the intervals (default: 0.95)"
     )
+    evaluate.add_argument(
+        "--plants", type=int, metavar="N", help="draw N plants from the tolerances, half of them vertices"
+    )
     evaluate.add_argument("--jobs", type=int, default=1, metavar="N", help="processes (default: 1)")
     add_monitor_arguments(evaluate)
     add_json(evaluate)
@@ -42,7 +45,7 @@ def add_evaluate_verb(verbs: Any) -> None:
 def run_evaluate(options: argparse.Namespace) -> int:
     """Run ``evaluate``: spec in, table of rates and errors out."""
     from obsynth.cli.commands import designed_or_loaded
-    from obsynth.cli.data_commands import numbers_of
+    from obsynth.cli.data_commands import numbers_of, own_tolerances, ranges_of
     from obsynth.spec import load_spec
 
     with progress(quiet=options.quiet) as report_stage:
@@ -62,6 +65,7 @@ def run_evaluate(options: argparse.Namespace) -> int:
                 design, scenario, options.monitor, disturbance_bounds=numbers_of(options.disturbance),
                 noise_bound=options.noise_bound, initial_error=options.initial_error, window=options.window,
                 false_alarms=options.false_alarms, change=options.change,
+                initial_set=ranges_of(options.initial) or None, constants=own_tolerances(design, options.monitor),
             )  # fmt: skip
         elif options.monitor is not None:
             watched = ParameterMonitor(options.monitor, false_alarms=options.false_alarms, change=options.change)
@@ -69,6 +73,7 @@ def run_evaluate(options: argparse.Namespace) -> int:
             found = evaluate(
                 design, scenario, runs=options.runs, monitor=watched, executor=executor,
                 progress=lambda done, total: report_stage(f"{done} of {total} runs"), confidence=options.confidence,
+                plants=options.plants,
             )  # fmt: skip
     from obsynth.report.evaluation import described, evaluation_report, final_threshold
 

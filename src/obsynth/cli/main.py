@@ -18,6 +18,7 @@ from obsynth.cli.data_arguments import add_data_verbs
 from obsynth.cli.evaluate import add_evaluate_verb
 from obsynth.cli.output import print_error, print_json
 from obsynth.cli.process import told_error, unwritable_output, usable_streams
+from obsynth.cli.prove_alarm import add_prove_alarm_verb
 from obsynth.cli.sweep import add_sweep_verb
 from obsynth.errors import ObsynthError
 from obsynth.files.inputs import protected_inputs
@@ -70,7 +71,9 @@ def _parser() -> argparse.ArgumentParser:
     check.set_defaults(verb="check")
 
     verify = verbs.add_parser("verify", help=_VERIFY, description=_VERIFY)
-    verify.add_argument("gains", type=Path, metavar="FILE", help="a gain set (JSON) that design wrote")
+    verify.add_argument(
+        "gains", type=Path, metavar="FILE", help="a gain set that design wrote, or an alarm's certificate"
+    )
     verify.add_argument(
         "--printed-digits", type=_digits, metavar="N",
         help="judge the gains as numbers that were printed with N decimals",
@@ -93,6 +96,7 @@ def _parser() -> argparse.ArgumentParser:
     add_sweep_verb(verbs)
     add_data_verbs(verbs)
     add_calibration_verbs(verbs)
+    add_prove_alarm_verb(verbs)
     return parser
 
 
@@ -121,7 +125,17 @@ def _digits(text: str) -> int:
 
 
 def _verb(name: str) -> Callable[[argparse.Namespace], int]:
-    from obsynth.cli import calibration, commands, compare, data_commands, evaluate, plot, simulate, sweep
+    from obsynth.cli import (
+        calibration,
+        commands,
+        compare,
+        data_commands,
+        evaluate,
+        plot,
+        prove_alarm,
+        simulate,
+        sweep,
+    )
 
     return {
         "design": commands.run_design,
@@ -138,6 +152,7 @@ def _verb(name: str) -> Callable[[argparse.Namespace], int]:
         "linearise": calibration.run_linearise,
         "calibrate": calibration.run_calibrate,
         "validate": calibration.run_validate,
+        "prove-alarm": prove_alarm.run_prove_alarm,
     }[name]
 
 

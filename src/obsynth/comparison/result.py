@@ -188,15 +188,20 @@ class Comparison:
             left, right = axes[row]
             right.plot(self.times, self.truth[:, row], color="0.3", linewidth=1.5, label="fault")
             left.axhline(1.0, color="0.8", linewidth=0.8)
-            for entry in shown:
+            for rank, entry in enumerate(shown):
+                # The best lies on top.
+                height = 3.0 + len(shown) - rank
                 names = [fault.figures.fault for fault in entry.faults]
                 if name not in names:
                     continue
                 column = names.index(name)
                 response = np.clip(entry.responses[:, column], -1.0, 3.0)
-                left.plot(np.arange(len(response)) * self.sample_time, response, label=entry.method)
-                right.plot(self.times, entry.estimates[:, column], linewidth=0.8, label=entry.method)
+                left.plot(np.arange(len(response)) * self.sample_time, response, label=entry.method, zorder=height)
+                right.plot(self.times, entry.estimates[:, column], linewidth=0.8, zorder=height)
             left.set(xlabel="s after a unit step", ylabel=f"estimate of {name}")
+            times = [f.figures.most for entry in shown for f in entry.faults if np.isfinite(f.figures.most)]
+            length = max((len(entry.responses) for entry in shown), default=2) * self.sample_time
+            left.set_xlim(0.0, min(max([3.0 * max(times, default=length), 10.0 * self.sample_time]), length))
             right.set(xlabel="s", ylabel=name)
             spread = float(np.max(np.abs(self.truth[:, row]), initial=0.0)) or 1.0
             best = shown[0].estimates[:, 0] if shown else self.truth[:, row]

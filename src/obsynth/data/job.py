@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,10 +35,10 @@ class Job:
 
     def __init__(
         self, engine: Engine, signals: Signals, recovery: StateRecovery | None, thresholds: Mapping[str, float],
-        monitor: OnlineMonitor | None,
+        monitor: OnlineMonitor | None, recovered: str | Sequence[str] | None = None,
     ) -> None:  # fmt: skip
         self.engine, self.signals, self.monitor = engine, signals, monitor
-        self.recovered = RecoveredStates.of(recovery, engine)
+        self.recovered = RecoveredStates.of(recovery, engine, recovered)
         extra = () if self.recovered is None else self.recovered.columns
         names = (*engine.columns, *extra)
         for name, level in thresholds.items():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,10 @@ import numpy as np
 from obsynth.analysis.transformations import StateRecovery
 from obsynth.data.log_estimator import Engine, Row
 from obsynth.numerics.arrays import FloatArray
+from obsynth.plants.names import index_of
 
+#: Of plants with more states as written none is recovered unless asked for: each row would take too long.
+MOST_RECOVERED = 300
 #: Its column says of which time the recovered states are.
 LATE = "recovered states"
 
@@ -28,8 +31,9 @@ class RecoveredStates:
     not estimate count as zero.
     """
 
-    def __init__(self, recovery: StateRecovery, engine: Engine) -> None:
-        places = [recovery.names.index(name) for name in recovery.names if not _kept(recovery, engine, name)]
+    def __init__(self, recovery: StateRecovery, engine: Engine, names: Sequence[str]) -> None:
+        wanted = set(names)
+        places = [i for i, name in enumerate(recovery.names) if name in wanted and not _kept(recovery, engine, name)]
         self.names = tuple(recovery.names[i] for i in places)
         self.columns = tuple(
             f"xhat[{name}]" if name not in engine.state_names else f"xhat[{name} as written]" for name in self.names
@@ -50,11 +54,16 @@ class RecoveredStates:
         self._known = np.zeros(len(engine.input_names))
 
     @classmethod
-    def of(cls, recovery: StateRecovery | None, engine: Engine) -> RecoveredStates | None:
-        """Return the recovery of a design; `None` where there is nothing to recover."""
-        if recovery is None or recovery.from_state.shape[1] != len(engine.state_names):
+    def of(
+        cls, recovery: StateRecovery | None, engine: Engine, asked: str | Sequence[str] | None = None
+    ) -> RecoveredStates | None:
+        """Return the recovery of a design, of all states or of those asked for; `None` where there is nothing."""
+        if recovery is None:
             return None
-        found = cls(recovery, engine)
+        names = _asked_for(recovery, asked)
+        if not names or _states_of(recovery) != len(engine.state_names):
+            return None
+        found = cls(recovery, engine, names)
         return found if found.names else None
 
     def take(self, row: Row, inputs: FloatArray) -> FloatArray:
@@ -82,6 +91,23 @@ class RecoveredStates:
         self._rows.clear()
         self._rows.extend(data["rows"])
         self._known = data["known"]
+
+
+def _states_of(recovery: StateRecovery) -> int:
+    """Return the number of states from which the others follow, without forming a large map."""
+    operator = recovery.by_operator
+    return int(recovery.from_state.shape[1]) if operator is None else operator.state_count
+
+
+def _asked_for(recovery: StateRecovery, asked: str | Sequence[str] | None) -> tuple[str, ...]:
+    if asked is None:
+        return recovery.names if len(recovery.names) <= MOST_RECOVERED else ()
+    if isinstance(asked, str) and asked in ("all", "none"):
+        return recovery.names if asked == "all" else ()
+    names = (asked,) if isinstance(asked, str) else tuple(asked)
+    for name in names:
+        index_of(name, recovery.names, what="The plant as written")
+    return names
 
 
 def _kept(recovery: StateRecovery, engine: Engine, name: str) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -103,6 +103,7 @@ def run_on_data(
     gap: float | None = None,
     warm_up: float | None = None,
     outliers: str | None = None,
+    recovered: str | Sequence[str] | None = None,
     state: str | Path | None = None,
     chunk_rows: int = CHUNK_ROWS,
     progress: Callable[[int], None] | None = None,
@@ -147,6 +148,9 @@ def run_on_data(
     outliers : {"gate", "huber", "none"}, optional
         Recursive and nonlinear designs: what is done with a sample that its prediction excludes; by default what the
         design says, and a gate of six deviations where it says nothing.
+    recovered : {"all", "none"} or list of str, optional
+        Which states of the plant as written, before its algebraic states were eliminated, stand beside the estimates;
+        by default all of up to 300, and none of more.
     state : path, optional
         A saved state to go on from, if the file exists; the state at the end is written to it.
     chunk_rows : int, optional
@@ -206,7 +210,7 @@ def run_on_data(
     stamps = Stamps()
     # The monitor is not used up: a second run may begin with it.
     watched = None if monitor is None else copy.deepcopy(monitor)
-    job = Job(engine, Signals.of(engine, columns, scales), design.recovery, thresholds or {}, watched)
+    job = Job(engine, Signals.of(engine, columns, scales), design.recovery, thresholds or {}, watched, recovered)
     digest = digest_of_gains(design)
     if state is not None and Path(state).exists():
         resume_state(Path(state), job, digest)
@@ -220,9 +224,9 @@ def run_on_data(
     if state is not None:
         save_state(Path(state), job, digest)
     table = sink.frame() if isinstance(sink, FrameSink) else None
-    recovered = {} if job.recovered is None else dict(job.recovered.flags)
+    shown = {} if job.recovered is None else dict(job.recovered.flags)
     return DataRun(
-        job.rows, dict(job.statuses), dict(job.alarms), job.isolated, recovered,
+        job.rows, dict(job.statuses), dict(job.alarms), job.isolated, shown,
         dict(getattr(engine, "outliers", {})),
         (*engine.notes, *job.first.warnings()), digest, table, _measured(kept, job.signals, stamps), stamps,
         dict(thresholds or {}),

@@ -74,9 +74,10 @@ class Signals:
 
     def estimates_point(self, engine: Engine) -> FloatArray:
         """Return what is added to the columns of estimates: the operating point of states and faults."""
-        named = engine.state_names + engine.fault_names
-        values = [self.point.get(name, 0.0) for name in named]
-        return np.array(values + [0.0] * (len(engine.columns) - len(named)))
+        biases = getattr(getattr(engine, "plant", None), "sensor_faults", ())
+        values = [self.point.get(name, 0.0) for name in engine.state_names]
+        values += [0.0 if name in biases else self.point.get(name, 0.0) for name in engine.fault_names]
+        return np.array(values + [0.0] * (len(engine.columns) - len(values)))
 
 
 #: How columns of time stamps are often called.

@@ -23,6 +23,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario
+from obsynth.tolerances.exact_plant import drawn_points, plant_at
 
 #: Numbers that a batch of runs may hold at once, per signal: what keeps memory small and one task worth sending.
 BATCH_SAMPLES = 100_000
@@ -95,6 +96,7 @@ def evaluate(
     executor: Executor | None = None,
     progress: Progress | bool | None = None,
     confidence: float = 0.95,
+    plants: int | None = None,
 ) -> Evaluation:
     """Run a scenario many times, with the seeds ``scenario.seed``, ``scenario.seed + 1``, ...
 
@@ -115,6 +117,9 @@ def evaluate(
         Called with the number of runs done and their total after each batch; `True` shows a bar on standard error.
     confidence : float, optional
         Of every interval: Clopper-Pearson for shares, Student for means.
+    plants : int, optional
+        Plants drawn from the box of the plant's constants, half of them vertices, each with its share of the runs (at
+        least one); by default all runs are of the nominal plant.
 
     Returns
     -------
@@ -134,10 +139,15 @@ def evaluate(
         raise SpecError(f"runs is {runs!r}: give a whole number, 1 or more.", path="runs")
     if not (is_finite_number(confidence) and 0.0 < confidence < 1.0):
         raise SpecError(f"confidence is {confidence!r}: give a number between 0 and 1.", path="confidence")
+    if plants is not None and (isinstance(plants, bool) or not isinstance(plants, int) or plants < 1):
+        raise SpecError(f"plants is {plants!r}: give a whole number, 1 or more.", path="plants")
+    runs = runs if plants is None else max(runs, plants)
     seeds = range(scenario.seed, scenario.seed + runs)
     tasks: Sequence[_Task] | Sequence[RecursiveTask]
     if isinstance(design.observer, LinearObserver):
-        tasks, onset, dt = _linear_tasks(design, scenario, monitor, seeds)
+        tasks, onset, dt = _linear_tasks(design, scenario, monitor, seeds, plants)
+    elif plants is not None:
+        raise SpecError("plants are drawn for linear designs of a plant with tolerances.", path="plants")
     else:
         bench = make_recursive_bench(design, scenario)
         onset, dt = bench.onset, bench.drive.dt
@@ -148,7 +158,11 @@ def evaluate(
 
 
 def _linear_tasks(
-    design: ObserverDesign, scenario: Scenario, monitor: Monitor | ParameterMonitor | None, seeds: Sequence[int]
+    design: ObserverDesign,
+    scenario: Scenario,
+    monitor: Monitor | ParameterMonitor | None,
+    seeds: Sequence[int],
+    plants: int | None = None,
 ) -> tuple[list[_Task], int | None, float]:
     """Return batches of runs, the first sample at which something is wrong, and the seconds between samples."""
     if isinstance(monitor, ParameterMonitor):
@@ -158,10 +172,25 @@ def _linear_tasks(
     onset = bench.drive.first_fault(slice(nu, nu + nf))
     states, faults = (end or 0 for end in warm_up_ends(bench))
     size = max(1, BATCH_SAMPLES // bench.drive.steps)
+    benches = [bench] if plants is None else _drawn_benches(design, scenario, plants)
+    share = -(-len(seeds) // len(benches))
     tasks = [
-        _Task(bench, monitor, onset, (states, faults), tuple(seeds[i : i + size])) for i in range(0, len(seeds), size)
+        _Task(one, monitor, onset, (states, faults), tuple(seeds[i : min(i + size, (number + 1) * share)]))
+        for number, one in enumerate(benches)
+        for i in range(number * share, min((number + 1) * share, len(seeds)), size)
     ]
     return tasks, onset, bench.drive.dt
+
+
+def _drawn_benches(design: ObserverDesign, scenario: Scenario, plants: int) -> list[Bench]:
+    """Return a bench for each of some plants in the box, drawn with the scenario's seed."""
+    plant, _ = design.linear
+    if plant.uncertainty is None or not plant.uncertainty.box.names:
+        raise SpecError("plants are drawn from the tolerances of the plant's constants, and it has none.",
+                        path="plants")  # fmt: skip
+    box = plant.uncertainty.box
+    points = drawn_points(len(box.names), plants, scenario.seed)
+    return [make_bench(design.replace(plant=plant_at(plant, box.values(q))), scenario) for q in points]
 
 
 def _done(
@@ -198,9 +227,8 @@ def _trial(task: _Task) -> dict[str, FloatArray]:
     count = len(task.seeds)
     false, found_at, wrong = np.full(count, np.nan), np.full(count, np.nan), np.full(count, np.nan)
     if task.watched is not None:
-        passed = task.watched.passed(
-            runs.rows[:, :, observer.fault_rows if task.watched.watches_estimates else observer.residual_rows]
-        )
+        watched = observer.fault_rows if task.watched.watches_estimates else observer.residual_rows
+        passed = task.watched.passed_in(runs, watched)
         begin = len(passed) if task.onset is None else task.onset
         false[:] = passed[:begin].any(axis=0)
         for run in np.flatnonzero(passed[begin:].any(axis=0)):

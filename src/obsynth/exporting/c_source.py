@@ -4,11 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+import numpy as np
+
 from obsynth.exporting.c_words import comment, included, quoted
 from obsynth.exporting.realisation import Realisation
 from obsynth.numerics.arrays import FloatArray
 
 _NUMBERS_PER_LINE = 4
+#: Matrices with fewer entries are multiplied row by row: nothing is gained by more.
+LARGE_TABLE = 1024
+#: At most this share of entries that are not zero makes a matrix sparse.
+SPARSE_SHARE = 0.25
+#: Columns that are added in one pass over the rows.
+UNROLLED = 4
+PLAIN, ENTRIES, COLUMNS = "plain", "entries", "columns"
+ADVICE = (
+    "Compile with -O3, and with -march=native where it runs on the same machine: the products are written so that rows "
+    "are independent, and sums keep their order."
+)
 
 
 def header_text(found: Realisation, prefix: str) -> str:
@@ -52,13 +65,15 @@ def source_text(found: Realisation, prefix: str, header: str) -> str:
     blocks.append(("next", "next[i]", {"z": observer.Az, "u": observer.Bu, "y": observer.By}))
     tables = [
         line for target, _, parts in blocks for signal, matrix in parts.items() if matrix.size
-        for line in _table(f"{target}_{signal}", matrix)
+        for line in _tables(f"{target}_{signal}", matrix)
     ]  # fmt: skip
+    large = any(_form(matrix) != PLAIN for _, _, parts in blocks for matrix in parts.values())
+    advice = [comment(ADVICE), ""] if large else []
     body = [line for target, _, parts in blocks for line in _product(target, parts)]
     copy = [f"    for (i = 0; i < {sizes['z']}; i++) {{", "        state->z[i] = next[i];", "    }"]
     return "\n".join([
         comment(f"sha256 of the gain set: {found.digest}"), f'#include "{included(header)}"', "", "#include <math.h>",
-        "", *tables, *_reset(found, prefix),
+        "", *advice, *tables, *_reset(found, prefix),
         _step_signature(found, prefix), "{", "    int i;", *(["    int j;"] if any(sizes.values()) else []),
         *([f"    double next[{sizes['z']}];"] if sizes["z"] else []),
         *([] if sizes["z"] else ["    (void)state;"]),
@@ -69,7 +84,7 @@ def source_text(found: Realisation, prefix: str, header: str) -> str:
 def _reset(found: Realisation, prefix: str) -> Iterator[str]:
     start = "0.0"
     if found.start.any():
-        yield from _table("start", found.start.reshape(1, -1))
+        yield from table_lines("start", found.start.reshape(1, -1))
         start = "start[0][i]"
     yield f"void {prefix}_reset({prefix}_state *state)"
     yield from ("{", "    int i;", f"    for (i = 0; i < {max(found.observer.order, 1)}; i++) {{")
@@ -86,23 +101,103 @@ def _guards(sizes: dict[str, int]) -> Iterator[str]:
             yield "    }"
 
 
+def _form(matrix: FloatArray) -> str:
+    """Return how a matrix is multiplied: small ones plainly, by entries where most are zero, else by columns."""
+    if matrix.size < LARGE_TABLE:
+        return PLAIN
+    return ENTRIES if np.count_nonzero(matrix) <= SPARSE_SHARE * matrix.size else COLUMNS
+
+
 def _product(target: str, parts: dict[str, FloatArray]) -> Iterator[str]:
     rows = next(iter(parts.values())).shape[0]
     if not rows:
+        return
+    if any(_form(matrix) != PLAIN for matrix in parts.values()):
+        yield from _large_product(target, parts, rows)
         return
     yield f"    for (i = 0; i < {rows}; i++) {{"
     yield "        double sum = 0.0;"
     for signal, matrix in parts.items():
         if matrix.size:
-            vector = "state->z" if signal == "z" else signal
             yield f"        for (j = 0; j < {matrix.shape[1]}; j++) {{"
-            yield f"            sum += {target}_{signal}[i][j] * {vector}[j];"
+            yield f"            sum += {target}_{signal}[i][j] * {_vector(signal)}[j];"
             yield "        }"
     yield f"        {target}[i] = sum;"
     yield "    }"
 
 
-def _table(name: str, matrix: FloatArray) -> Iterator[str]:
+def _vector(signal: str) -> str:
+    return "state->z" if signal == "z" else signal
+
+
+def _large_product(target: str, parts: dict[str, FloatArray], rows: int) -> Iterator[str]:
+    """Add column by column, so that rows are independent and a compiler can use vectors; the sums keep their order."""
+    yield "    {"
+    yield f"        double sum[{rows}];"
+    yield f"        for (i = 0; i < {rows}; i++) {{"
+    yield "            sum[i] = 0.0;"
+    yield "        }"
+    for signal, matrix in parts.items():
+        if not matrix.size:
+            continue
+        name, vector, columns = f"{target}_{signal}", _vector(signal), matrix.shape[1]
+        form = _form(matrix)
+        if form == ENTRIES:
+            yield f"        for (i = 0; i < {rows}; i++) {{"
+            yield f"            for (j = {name}_start[i]; j < {name}_start[i + 1]; j++) {{"
+            yield f"                sum[i] += {name}_value[j] * {vector}[{name}_column[j]];"
+            yield "            }"
+            yield "        }"
+        elif form == PLAIN:
+            yield f"        for (i = 0; i < {rows}; i++) {{"
+            yield f"            for (j = 0; j < {columns}; j++) {{"
+            yield f"                sum[i] += {name}[i][j] * {vector}[j];"
+            yield "            }"
+            yield "        }"
+        else:
+            whole = columns - columns % UNROLLED
+            yield f"        for (j = 0; j < {whole}; j += {UNROLLED}) {{"
+            terms = " + ".join(f"{name}[j + {k}][i] * {vector}[j + {k}]" for k in range(UNROLLED))
+            yield from (f"            for (i = 0; i < {rows}; i++) {{", f"                sum[i] = sum[i] + {terms};")
+            yield from ("            }", "        }")
+            if whole < columns:
+                yield f"        for (j = {whole}; j < {columns}; j++) {{"
+                yield f"            for (i = 0; i < {rows}; i++) {{"
+                yield f"                sum[i] += {name}[j][i] * {vector}[j];"
+                yield from ("            }", "        }")
+    yield f"        for (i = 0; i < {rows}; i++) {{"
+    yield f"            {target}[i] = sum[i];"
+    yield from ("        }", "    }")
+
+
+def _tables(name: str, matrix: FloatArray) -> Iterator[str]:
+    """Return the constants of a matrix, in the form in which it is multiplied."""
+    form = _form(matrix)
+    if form == PLAIN:
+        yield from table_lines(name, matrix)
+    elif form == COLUMNS:
+        yield comment("by columns")
+        yield from table_lines(name, matrix.T)
+    else:
+        yield comment("the entries that are not zero, row by row")
+        rows, columns = np.nonzero(matrix)
+        starts = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=len(matrix)))])
+        yield from _list("int", f"{name}_start", [str(int(start)) for start in starts])
+        yield from _list("int", f"{name}_column", [str(int(column)) for column in columns] or ["0"])
+        yield from _list(
+            "double", f"{name}_value", [repr(value) for value in matrix[rows, columns].tolist()] or ["0.0"]
+        )
+
+
+def _list(kind: str, name: str, texts: list[str]) -> Iterator[str]:
+    lines = [", ".join(texts[i : i + _NUMBERS_PER_LINE]) for i in range(0, len(texts), _NUMBERS_PER_LINE)]
+    yield f"static const {kind} {name}[{len(texts)}] = {{"
+    yield "    " + ",\n    ".join(lines)
+    yield from ("};", "")
+
+
+def table_lines(name: str, matrix: FloatArray) -> Iterator[str]:
+    """Yield the lines of a table of constants."""
     yield f"static const double {name}[{matrix.shape[0]}][{matrix.shape[1]}] = {{"
     for row in matrix.tolist():
         # repr gives the shortest text that is read back bit for bit.

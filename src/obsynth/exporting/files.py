@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,6 +20,10 @@ from obsynth.observers.dae.observer import DAEObserver
 from obsynth.results.design import ObserverDesign
 
 SUFFIXES = (".mat", ".npz", ".c", ".fmu")
+if TYPE_CHECKING:
+    from obsynth.experiments.monitors.adaptive_bound import AdaptiveBound
+    from obsynth.experiments.monitors.online import OnlineMonitor
+
 #: What an existing file has to be for another export to take its place.
 _C_FILE = FileKind("C code that obsynth has exported", rb"sha256 of the gain set")
 EXPORTED = {
@@ -38,6 +43,7 @@ def export(
     fmi: str = "2.0",
     thresholds: Mapping[str, float] | None = None,
     warm_up: float | None = None,
+    monitor: OnlineMonitor | None = None,
 ) -> tuple[Path, ...]:
     """Write the observer of a design for MATLAB and Simulink, for numpy, as C99, or as a functional mock-up unit.
 
@@ -65,6 +71,9 @@ def export(
         point, of the deviation), above which its alarm is raised; for ``.fmu`` only, where they can be changed.
     warm_up : float, optional, seconds
         Without alarms after the start; by default until the slowest mode has shrunk to 2 %.  For ``.fmu`` only.
+    monitor : OnlineMonitor, optional
+        From `online_monitor` with ``constants``: its thresholds over the tolerances as ``<stem>_thresholds_step``, for
+        constants that stay the same; for ``.c`` only.
 
     Returns
     -------
@@ -102,8 +111,10 @@ def export(
     if isinstance(design, ObserverDesign) and isinstance(design.observer, DAEObserver):
         return write_dae_c(design, target, sample_time)
     found = Realisation.of(design, sample_time)
+    if monitor is not None and suffix != ".c":
+        raise SpecError("Thresholds over tolerances are written as C (.c).", path="monitor")
     if suffix == ".c":
-        return _write_c(found, target)
+        return _write_c(found, target, None if monitor is None else _bound_of(monitor, found))
     buffer = io.BytesIO()
     if suffix == ".npz":
         np.savez(buffer, **found.as_arrays())
@@ -126,10 +137,26 @@ def exported_files(target: Path) -> dict[Path, FileKind | None]:
     return {target: EXPORTED.get(suffix), **header}
 
 
-def _write_c(found: Realisation, target: Path) -> tuple[Path, ...]:
+def _bound_of(monitor: OnlineMonitor, found: Realisation) -> AdaptiveBound:
+    """Return the bound of an adaptive monitor of the design that is written."""
+    monitor.require_fit(len(found.observer.residual_names), found.observer.fault_names)
+    bound: AdaptiveBound | None = monitor.bound
+    if bound is None:
+        raise SpecError("The monitor has no thresholds over tolerances: make it with constants.", path="monitor")
+    return bound
+
+
+def _write_c(found: Realisation, target: Path, bound: AdaptiveBound | None = None) -> tuple[Path, ...]:
     if found.observer.dt == 0.0:
         raise SpecError("The observer is continuous in time: give the sample time, in seconds, for C.",
                         path="sample_time")  # fmt: skip
     prefix = c_identifier(target.stem)
     header = target.with_suffix(".h")
-    return write_together({target: source_text(found, prefix, header.name), header: header_text(found, prefix)})
+    source, declared = source_text(found, prefix, header.name), header_text(found, prefix)
+    if bound is not None:
+        from obsynth.exporting.c_thresholds import threshold_header, threshold_source
+
+        begin, end = declared.rsplit("#endif", 1)
+        declared = begin + threshold_header(bound, prefix) + "#endif" + end
+        source += threshold_source(bound, prefix)
+    return write_together({target: source, header: declared})

@@ -83,8 +83,10 @@ class Realisation:
         """The operating point of inputs and of outputs: inputs are deviations from it, outputs as well."""
         plant = self.design.plant
         point = {} if isinstance(plant, DAEModel) else plant.operating_point
-        estimated = self.observer.state_names + self.observer.fault_names
-        after = [point.get(name, 0.0) for name in estimated] + [0.0] * len(self.observer.residual_names)
+        biases = getattr(plant, "sensor_faults", ())
+        after = [point.get(name, 0.0) for name in self.observer.state_names]
+        after += [0.0 if name in biases else point.get(name, 0.0) for name in self.observer.fault_names]
+        after += [0.0] * len(self.observer.residual_names)
         return np.array([point.get(name, 0.0) for name in self.inputs]), np.array(after)
 
     def as_arrays(self) -> dict[str, Any]:

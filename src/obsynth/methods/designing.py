@@ -17,18 +17,21 @@ from obsynth.analysis.transformations.recovery import Transformation, plant_and_
 from obsynth.errors import PreconditionError, SpecError, VerificationError
 from obsynth.methods.advice import with_advice
 from obsynth.methods.choosing.automatic import automatic_design
+from obsynth.methods.drowned_designs import require_above_rounding
 from obsynth.methods.method_spec import MethodSpec, PlantKind
 from obsynth.methods.registry import AUTO, REGISTRY, method_spec, methods_for
 from obsynth.methods.synthesis_result import Synthesis
 from obsynth.methods.verifying import verify
 from obsynth.numerics.failures import failed_computations
 from obsynth.numerics.threads import one_thread_if_small
+from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.results.design import Certificate, ObserverDesign
 from obsynth.results.plant_source import source_of
 from obsynth.results.report import VerificationReport
+from obsynth.verification.means import before_the_mean
 from obsynth.verification.plant import condition_rows
 from obsynth.verification.stored_numbers import StoredErrors
 
@@ -273,6 +276,8 @@ def verified(
             + "".join(f" {note}" for note in draft.notes),
             report=report,
         )
+    if isinstance(draft.observer, LinearObserver) and isinstance(draft.plant, DescriptorSystem):
+        require_above_rounding(draft.plant, draft.observer)
     return draft.replace(report=report)
 
 
@@ -282,7 +287,8 @@ def with_stored_errors(draft: ObserverDesign) -> ObserverDesign:
     if not spec.tracked:
         return draft
     with np.errstate(all="ignore"):
-        found = StoredErrors.of(spec.load("tracked")(draft), draft.linear[1])
+        base = before_the_mean(draft)[0] if spec.averaged else draft
+        found = StoredErrors.of(spec.load("tracked")(base), base.linear[1])
     if found is None:
         return draft
     old = draft.certificate

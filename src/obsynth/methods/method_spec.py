@@ -64,7 +64,8 @@ class MethodSpec:
     summary: One line; source: The paper whose letters its gains have; public: The function of `obsynth`; options: A
     `MethodOptions`; conditions: Existence, from the plant; synthesise: ``(plant, options, progress=)`` -> `Synthesis`;
     checks: ``(design, printed_digits)`` -> rows; claims: Every claim that it may make; witnesses: Matrices that its
-    certificate may hold; tracked: ``(design)`` -> `TrackedPlant`, of a linear observer.
+    certificate may hold; tracked: ``(design)`` -> `TrackedPlant`, of a linear observer; averaged: Its option
+    ``mean`` puts registers behind the observer, which the checks are not about.
     """
 
     id: str
@@ -80,6 +81,7 @@ class MethodSpec:
     claims: Mapping[str, ClaimMeaning]
     witnesses: frozenset[str] = frozenset()
     tracked: str = ""
+    averaged: bool = False
 
     def load(
         self, part: Literal["public", "options", "conditions", "synthesise", "checks", "tracked"]

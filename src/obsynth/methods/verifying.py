@@ -10,9 +10,11 @@ from obsynth.errors import SpecError
 from obsynth.methods.registry import REGISTRY, method_spec
 from obsynth.numerics.failures import failed_computations
 from obsynth.numerics.threads import one_thread_if_small
+from obsynth.results.plant_source import remembering
 from obsynth.results.report import VerificationReport
 from obsynth.verification.closed_claims import closed_claims
 from obsynth.verification.derivation import derivation_rows
+from obsynth.verification.means import before_the_mean, mean_noise_rows
 from obsynth.verification.stored_numbers import stored_number_rows
 
 if TYPE_CHECKING:
@@ -51,11 +53,14 @@ def verify(design: ObserverDesign, *, printed_digits: int | None = None) -> Veri
     checks = spec.load("checks")
     # A corrupted design may overflow; what is not a number fails its check, so no warning is needed.
     with np.errstate(all="ignore"), failed_computations(), one_thread_if_small(design.plant.nx):
-        rows = tuple(checks(design, printed_digits))
+        remembering(design.plant, design.source)
+        shipped, (design, mean_rows) = design, before_the_mean(design) if spec.averaged else (design, ())
+        rows = (*mean_rows, *checks(design, printed_digits))
         if spec.tracked and all(row.passed for row in rows):
             gamma = design.certificate.claims.get("gamma") if "gamma" in spec.claims else None
             tracked = spec.load("tracked")(design)
             rows = (*rows, *stored_number_rows(design, tracked, gamma), *derivation_rows(design, tracked))
         covered = {name: meaning.row for name, meaning in spec.claims.items()}
         meanings = {name: meaning.meaning for name, meaning in spec.claims.items()}
+        rows = rows if shipped is design else (*rows, *mean_noise_rows(shipped))
         return VerificationReport.of((*rows, *closed_claims(design, rows, covered, meanings, spec.witnesses)))

@@ -24,7 +24,7 @@ LIMITS = {"gate": 6.0, "huber": 3.0}
 #: What is larger has no square: it is no measurement, whatever the model says.
 OVERFLOW = 1e150
 #: Samples of one sensor in a row that are left out; the next is believed.
-LONGEST = 3
+LONGEST = 2
 
 State = TypeVar("State", bound=Any)
 Row = TypeVar("Row", bound=Any)

@@ -192,6 +192,12 @@ class DescriptorSystem:
         return self.replace(**changes)
 
     @property
+    def sensor_faults(self) -> tuple[str, ...]:
+        """Faults that act on outputs only: their size has no operating point, whatever they are called."""
+        acts = abs(self.Bf).sum(axis=0)
+        return tuple(name for name, size in zip(self.fault_names, acts, strict=True) if size == 0.0)
+
+    @property
     def is_discrete(self) -> bool:
         """Whether the plant is sampled (``dt > 0``)."""
         return self.dt > 0.0

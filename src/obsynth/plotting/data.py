@@ -136,7 +136,8 @@ def _draw_fault(panel: Axes, run: DataRun, column: str, units: dict[str, str], d
     panel.plot(times, values, label="estimate", **{**ESTIMATE_STYLE, "linestyle": "-"})
     level = run.thresholds.get(column)
     if level is not None:
-        centre = 0.0 if design is None else design.plant.operating_point.get(name, 0.0)
+        biases = () if design is None else getattr(design.plant, "sensor_faults", ())
+        centre = 0.0 if design is None or name in biases else design.plant.operating_point.get(name, 0.0)
         for i, side in enumerate((centre + level, centre - level)):
             panel.axhline(side, label="threshold" if i == 0 else None, **THRESHOLD_STYLES[0])
     panel.set_ylabel(with_unit(name, units))

@@ -29,8 +29,9 @@ PIECE, MOST_PIECES = 0.05, 1_024
 LOST_SQUARES = 2.0**-510
 #: Length of an interval in units of one over the norm of A, and the largest order, for gains in continuous time.
 LENGTH, MOST_STATES = 0.4, 12
-#: Share of such a gain that the rest may have.
-LEFT_OF_GAINS = 0.05
+#: Share of such a gain that the rest may have, and most steps towards it: what it bounds is a rounding, and slow modes
+#: would take a hundred thousand.
+LEFT_OF_GAINS, MOST_STEPS_OF_GAINS = 0.05, 1_024
 
 
 class PeakSums(NamedTuple):
@@ -45,12 +46,12 @@ class PeakSums(NamedTuple):
 
 def peak_sums(
     matrix: Ball, rows: FloatArray, columns: Ball, contraction: Contraction, *, least: int = 0, left: float = LEFT,
-    each: bool = False,
+    each: bool = False, most: int = MOST_STEPS,
 ) -> PeakSums:  # fmt: skip
     """Return bounds on the sums over j of ``|c M^j b|`` of every column ``b``, for ``c (p, n)``.
 
     Euclidean norms, or with ``each`` the absolute value of each row.  At least ``least`` terms are summed up one by
-    one, and more until the rest is bounded by the share ``left``.
+    one, and more until the rest is bounded by the share ``left``, or ``most`` are.
     """
     moving, n, growth = matrix.midpoint, len(matrix.midpoint), gamma(len(matrix.midpoint) + 2)
     driven, sizes = columns.midpoint, contraction.sizes(columns.midpoint, columns.radius)
@@ -62,7 +63,7 @@ def peak_sums(
         product = np.abs(powers @ driven)
         terms.append(product if each else _norms(product))
         total, collected = total + terms[-1], collected + np.abs(powers)
-        done = len(terms) >= max(MOST_STEPS, least)
+        done = len(terms) >= max(most, least)
         if done or (len(terms) >= least and (len(terms) % 64 == 0 or not powers.any())):
             after = contraction.factor * _seen(
                 contraction, powers @ moving, _missed(matrix, np.abs(powers), growth), each
@@ -126,7 +127,8 @@ def interval_pieces(a: FloatArray, b: FloatArray, into: Ball, length: float) -> 
     transition, ball_a = exponential(a, step), Ball.exact(a)
     at = Ball.exact(b)
     first = ball_a @ (ball_a @ Ball.exact(b))
-    third = _growth(a, step) @ np.abs(_upper(ball_a @ first))
+    growth = _growth(a, step)
+    third = growth @ np.abs(_upper(ball_a @ first))
     parts: list[Ball] = []
     weights: list[float] = []
     largest = np.zeros_like(b)
@@ -138,7 +140,7 @@ def interval_pieces(a: FloatArray, b: FloatArray, into: Ball, length: float) -> 
             weights.append(step**3 / 12.0)
             largest = np.maximum(largest, third)
             at, first = transition @ at, transition @ first
-            third = _growth(a, step) @ _upper(ball_a @ first)
+            third = growth @ _upper(ball_a @ first)
     # What is left, of any sign, in every coordinate at once: as many columns as coordinates.
     rest = Ball(np.zeros((into.shape[0], m)), rounded_up(_upper(into) @ largest, 2 * len(a) + 6))
     parts.append(rest)
@@ -189,5 +191,5 @@ def absolute_gains(a: FloatArray, rows: FloatArray, contraction: Contraction) ->
         held = replace(contraction, rate=rate, discrete=True) if rate < 1.0 else None
     if held is None:
         return loose
-    whole = peak_sums(moving, rows, columns, held, left=LEFT_OF_GAINS, each=True).whole
+    whole = peak_sums(moving, rows, columns, held, left=LEFT_OF_GAINS, each=True, most=MOST_STEPS_OF_GAINS).whole
     return np.asarray(np.minimum(loose, whole if gather is None else gathered(gather, whole, n)))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from rich.console import Console
@@ -10,6 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from obsynth.analysis.transformations import StateRecovery
+from obsynth.methods.functional_filter.delay_curve import DelayCurve, delay_curve
 from obsynth.methods.registry import REGISTRY, method_spec
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
@@ -17,6 +18,7 @@ from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.report.layout import facts_table, headed_table, name_list, number, print_section
+from obsynth.report.tolerances import tolerances_report
 from obsynth.report.verification import verification_report
 from obsynth.results.delta_scan import DeltaScan
 from obsynth.results.design import ObserverDesign
@@ -79,6 +81,10 @@ def design_report(design: ObserverDesign, *, console: Console, file: Path | None
     print_section(console, "What is promised", facts_table(promises(design)))
     if design.observer.fault_names:
         print_section(console, *fault_estimates_table(design))
+    for curve in delay_curves(design):
+        print_section(console, f"Deviation of {curve.fault} against delay", delay_table(curve))
+        console.print(Text(curve.sentence))
+        console.print()
     if "delta_scan" in design.solver:
         print_section(
             console, "Other values of delta", delta_scan_table(DeltaScan.from_dict(design.solver["delta_scan"]))
@@ -86,11 +92,38 @@ def design_report(design: ObserverDesign, *, console: Console, file: Path | None
     if design.recovery is not None:
         print_section(console, "States of the plant as written", facts_table(recovered_states(design.recovery)))
     verification_report(design.report, console=console)
+    tolerances_report(design, console=console)
     for note in design.notes:
         console.print(Text(f"Note: {note}"))
     if file is not None:
         # A path must stay in one piece, so that it can be copied.
         console.print(Text(f"Gain set: {file}"), soft_wrap=True)
+
+
+#: Curves of at most so many faults, of plants with at most so many states.
+MOST_CURVES, MOST_STATES = 3, 80
+
+
+def delay_curves(design: ObserverDesign) -> list[DelayCurve]:
+    """Return what delay buys on the plant of a design, for each fault that it estimates, where noise is stated."""
+    plant, observer = design.plant, design.observer
+    if not isinstance(plant, DescriptorSystem) or not isinstance(observer, LinearObserver) or plant.nx > MOST_STATES:
+        return []
+    names = [name for name in observer.fault_names if name in plant.fault_names][:MOST_CURVES]
+    rates = design.options.get("fault_rate")
+    found = []
+    for name in names:
+        rate = rates.get(name) if isinstance(rates, Mapping) else rates
+        found.append(delay_curve(plant, plant.fault_names.index(name), rate))
+    return [curve for curve in found if curve is not None]
+
+
+def delay_table(curve: DelayCurve) -> Table:
+    """Return deviations by walk (rows) and lag in samples (columns)."""
+    table = headed_table("walk per sample", *(f"lag {lag}" for lag in curve.lags))
+    for rate, row in zip(curve.rates, curve.deviations, strict=True):
+        table.add_row(Text(f"{rate:.3g}"), *(Text(number(float(value), digits=3)) for value in row))
+    return table
 
 
 def delta_scan_table(scan: DeltaScan) -> Table:

@@ -9,7 +9,7 @@ from pathlib import Path
 from obsynth.data.run import DataRun
 from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.methods.registry import REGISTRY, method_spec
-from obsynth.report.designs import fault_estimates_table, plant_facts, promises, recovered_states
+from obsynth.report.designs import delay_curves, fault_estimates_table, plant_facts, promises, recovered_states
 from obsynth.report.own_data import data_section
 from obsynth.report.page_style import STYLE
 from obsynth.report.page_tables import check_rows, copied_table, fact_rows, matrix_rows, value_text
@@ -86,6 +86,7 @@ def _page_text(
         "In short": list(_in_short(design.replace(report=report))),
         "Pictures": list(_pictures(design, scenario, report)),
         "What is promised": [*fact_rows(promises(design)), *_fault_estimates(design), *_recovered(design)],
+        "What delay buys": list(_delay(design)),
         "Notes": list(_notes(design.notes)),
         "The plant": list(fact_rows(plant_facts(design.plant))),
         "Checks": list(check_rows(report.checks)) if report.checks else [],
@@ -129,6 +130,16 @@ def _recovered(design: ObserverDesign) -> Iterator[str]:
     if design.recovery is not None:
         yield "<h3>States of the plant as written</h3>"
         yield from fact_rows(recovered_states(design.recovery))
+
+
+def _delay(design: ObserverDesign) -> Iterator[str]:
+    for curve in delay_curves(design):
+        head = "".join(f"<th>{text}</th>" for text in ("walk per sample", *(f"lag {lag}" for lag in curve.lags)))
+        yield f"<h3>{escape(curve.fault)}</h3>"
+        yield f'<div class="scroll"><table class="facts"><thead><tr>{head}</tr></thead><tbody>'
+        for rate, row in zip(curve.rates, curve.deviations, strict=True):
+            yield f"<tr><td>{rate:.3g}</td>" + "".join(f"<td>{value:.3g}</td>" for value in row) + "</tr>"
+        yield f"</tbody></table></div><p>{escape(curve.sentence)}</p>"
 
 
 def _notes(notes: Sequence[str]) -> Iterator[str]:

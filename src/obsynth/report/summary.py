@@ -22,6 +22,7 @@ from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.plotting.frequency import FaultGains, fault_gains
 from obsynth.report.layout import number
 from obsynth.report.verification import verdict_line
+from obsynth.report.warnings import design_warnings
 from obsynth.results.design import ObserverDesign
 
 #: Faults, warnings and notes that are listed; the others are counted.
@@ -237,6 +238,7 @@ def _warnings(design: ObserverDesign, gains: FaultGains | None) -> Iterator[str]
         if abs(followed - 1.0) > FOLLOWS:
             share = number(100.0 * followed, digits=3)
             yield f"the estimate of {fault} does not follow a step: in the end it shows {share} % of it."
+    yield from design_warnings(design)
     for check in design.report.checks:
         if check.name.startswith("limit at "):
             yield f"{check.name}: {check.claim}."

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.transformations import StateRecovery
+from obsynth.analysis.transformations.recovery_operator import RecoveryOperator
 from obsynth.errors import SpecError
 from obsynth.files.inputs import input_file, json_data, read_json
 from obsynth.files.outputs import FileKind, write_atomically
@@ -257,7 +258,23 @@ def _design_of(document: Any, arrays: bytes | None, source: str) -> ObserverDesi
 
 
 def _fields_of(record: StateRecovery) -> dict[str, Any]:
+    if (operator := record.by_operator) is not None:
+        # Sparse equations take less room than the map that they stand for.
+        return {
+            "names": record.names, "noise_kept": record.noise_kept, "operating_point": record.operating_point,
+            "operator": operator.as_dict(),
+        }  # fmt: skip
     return {field.name: getattr(record, field.name) for field in fields(record)}
+
+
+def _recovery_from(**data: Any) -> StateRecovery:
+    names = tuple(data.pop("names"))
+    if "operator" not in data:
+        return StateRecovery(names=names, **data)
+    operator = RecoveryOperator.from_dict(data["operator"])
+    if operator.dynamic.shape[0] != len(names):
+        raise ValueError(f"the recovery has {len(names)} names for {operator.dynamic.shape[0]} states")
+    return StateRecovery.from_operator(names, operator, data["noise_kept"], data["operating_point"])
 
 
 def _design_from(data: dict[str, Any]) -> ObserverDesign:
@@ -275,9 +292,7 @@ def _design_from(data: dict[str, Any]) -> ObserverDesign:
         certificate=made("certificate", Certificate, **data["certificate"]),
         solver=data["solver"],
         notes=tuple(data["notes"]),
-        recovery=None
-        if recovery is None
-        else made("recovery", StateRecovery, **{**recovery, "names": tuple(recovery["names"])}),
+        recovery=None if recovery is None else made("recovery", _recovery_from, **recovery),
         report=made("report", VerificationReport.from_dict, data["report"]),
         source=None if data.get("source") is None else made("source", PlantSource.from_dict, data["source"]),
     )

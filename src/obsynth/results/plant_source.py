@@ -9,11 +9,15 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.transformations import Transformation, discretise, eliminate_algebraic_states
+from obsynth.errors import ObsynthError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.origin import DECISIVE, origin_of, with_origin
 
 #: Larger plants are not stored: their elimination is checked where it is done.
 MOST_STATES = 500
+#: Most states of a plant behind which there are exact numbers.
+MOST_EXACT = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,3 +83,18 @@ def source_of(plant: Any) -> PlantSource | None:
     if made is None or type(made[0]) is not DescriptorSystem or made[0].nx > MOST_STATES:
         return None
     return PlantSource(made[0], made[1])
+
+
+def remembering(plant: Any, source: PlantSource | None) -> None:
+    """Note on a plant that was read from a file the exact numbers behind it, where its source still gives it."""
+    if source is None or type(plant) is not DescriptorSystem or origin_of(plant) is not None:
+        return
+    if source.plant.nx > MOST_EXACT:
+        return
+    try:
+        found = source.derived().plant
+    except ObsynthError:
+        return
+    same = all(np.array_equal(getattr(found, name), getattr(plant, name)) for name in DECISIVE)
+    if same and found.dt == plant.dt:
+        with_origin(plant, origin_of(found))

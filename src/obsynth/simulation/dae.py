@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.errors import SpecError
+from obsynth.errors import SolverError, SpecError
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.covariances import covariance_factor
 from obsynth.plants.dae.checks import checked_inputs, finite_vector, step_length
@@ -16,6 +16,11 @@ from obsynth.plants.dae.functions import Compiled, DAEFunctions
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.dae.step import ImplicitStep
 from obsynth.plants.dae.stretches import take_samples
+
+#: A step of backward Euler this much shorter than dt puts a state onto its constraint and moves it no further.
+PROJECTION_SHARE = 1e-6
+#: Smaller moves, in sizes of the states, are the motion during that step and no projection.
+PROJECTION_NOTICE = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +67,8 @@ def simulate_dae(
     parameters : array_like, optional
         ``(nq,)``, or ``(samples, nq)`` for parameters that change; nominal values by default.
     initial_state : array_like, optional
-        ``(nx,)``; nominal values by default.  It is taken as it is: the first step leads onto the constraint.
+        ``(nx,)``; nominal values by default.  Where it contradicts the algebraic equations at the first input, it is
+        put onto them first, by a step so short that nothing else moves.
     Q : array_like, optional
         ``(nx, nx)``: covariance of noise on the right sides of the equations, taken to first order; none by default.
     R : array_like, optional
@@ -93,9 +99,23 @@ def simulate_dae(
     pushed = _noise(Q, model.nx, "Q", rng, len(inputs))
     heard = _noise(R, model.ny, "R", rng, len(inputs))
     run = _Run(ImplicitStep(DAEFunctions(model, integration), length), inputs, theta, pushed)
-    run.start(x)
+    run.start(_consistent(model, x, inputs, theta, length))
     take_samples(1, len(inputs), run.together, run.alone)
     return DAETrajectory(read_only(run.states), read_only(run.outputs + heard), read_only(run.residuals))
+
+
+def _consistent(model: DAEModel, x: FloatArray, inputs: FloatArray, theta: FloatArray, dt: float) -> FloatArray:
+    """Return a start on the algebraic equations, which is the given one where it is on them already."""
+    if not len(inputs):
+        return x
+    short = ImplicitStep(DAEFunctions(model), PROJECTION_SHARE * dt)
+    try:
+        found = short.solve_carefully(x, inputs[0], theta[0]).x
+    except SolverError:
+        # From there the first step, which is longer, may still find a way.
+        return x
+    moved = np.abs((found - x) / model.state_scales).max()
+    return found if moved > PROJECTION_NOTICE else x
 
 
 def _parameters(model: DAEModel, value: ArrayLike | None, samples: int) -> FloatArray:

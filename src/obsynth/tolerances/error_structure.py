@@ -53,6 +53,7 @@ class ErrorStructure:
     owner: tuple[int, ...]
     offsets: FloatArray
     reading: FloatArray
+    watching: FloatArray
 
     @property
     def sizes(self) -> tuple[int, int, int]:
@@ -84,24 +85,26 @@ class ErrorStructure:
 
 def error_structure(
     observer: LinearObserver, affine: AffinePlant, tracking: Tracking, bounds: FloatArray, noise_bound: float, *,
-    faults: bool = False,
+    faults: bool = False, states: bool = False,
 ) -> ErrorStructure:  # fmt: skip
     """Return the error system of an observer over a box.
 
     ``bounds (nd,)`` of the disturbances; ``noise_bound`` in standard deviations.  With ``faults``, faults are unknown
     signals that are estimated like states, and the outputs are the errors of their estimates; else there is no fault,
-    and the outputs are fault estimates and residuals.
+    and the outputs are fault estimates and residuals, or (``states``) the errors of the state estimates.
     """
     plant, count = affine.plant, affine.count
     t, t0 = tracking
     nz, n, nf = observer.order, plant.nx, plant.nf if faults else 0
     shown = observer.fault_rows
+    back = 2.0 * np.eye(n) - affine.coordinates
     watched = list(range(shown.start, shown.stop if faults else len(observer.Cz)))
+    watched = list(range(n)) if states else watched
     picked = np.zeros((n + nf + len(watched), len(observer.Cz)))
-    picked[:n, observer.state_rows] = 2.0 * np.eye(n) - affine.coordinates
+    picked[:n, observer.state_rows] = back
     if faults:
         picked[n : n + nf, shown] = np.eye(nf)
-    picked[n + nf :, watched] = np.eye(len(watched))
+    picked[n + nf :, watched] = back if states else np.eye(len(watched))
     c, dy, du, algebraic = picked @ observer.Cz, picked @ observer.Dy, picked @ observer.Du, picked @ t0
 
     def stacked(inner: AffineMatrix, output: AffineMatrix) -> AffineMatrix:
@@ -109,7 +112,8 @@ def error_structure(
         top, low = output.after(observer.By) - inner.after(t), output.after(dy) + inner.after(algebraic)
         return affine_block([[top], [low]])
 
-    target = np.vstack([np.zeros((nz, n)), np.eye(n), np.zeros((len(picked) - n, n))])
+    rest = np.eye(n) if states else np.zeros((len(picked) - n, n))
+    target = np.vstack([np.zeros((nz, n)), np.eye(n), rest])
     followed = affine.E.after(t)
     state = stacked(affine.A, affine.C) + affine_block([[followed.after(observer.Az)], [followed.after(c)]]) + (-target)
     known = stacked(affine.B, affine.D) + np.vstack([observer.Bu, du])
@@ -130,6 +134,7 @@ def error_structure(
         AffineMatrix(np.zeros_like(input_rest), input_parts, input_rest), disturbances,
         np.concatenate([bounds, np.full(plant.nw, noise_bound)]), np.vstack([rows, more]), len(rows) + single,
         np.hstack([effects, remainders]), tuple(owner), affine.offsets, picked[: n + nf],
+        picked[n + nf :],
     )  # fmt: skip
 
 

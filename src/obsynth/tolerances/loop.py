@@ -12,7 +12,7 @@ from obsynth.tolerances.error_structure import ErrorStructure, owners
 from obsynth.tolerances.responses import Responses, loop_radius, responses_of
 
 #: The largest tolerance is found to this share.
-FACTOR_SHARE = 1e-4
+FACTOR_SHARE = 1e-3
 #: Factors beyond this are as good as infinite.
 LARGEST_FACTOR = 1e6
 #: Added to the loop, as a share of its largest entry, so that its eigenvector is positive.

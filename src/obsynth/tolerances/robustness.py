@@ -17,6 +17,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.constants import ConstantsBox
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.uncertain_system import uncertain_system
+from obsynth.plants.uncertainty import Uncertainty
 from obsynth.proofs.affine import AffineMatrix
 from obsynth.results.design import ObserverDesign
 from obsynth.tolerances.error_structure import ErrorStructure, error_structure
@@ -30,9 +31,9 @@ from obsynth.tolerances.tracking import Tracking, tracking_of
 #: A design without tolerances says this.
 EXACT_MODEL = "assumes an exact model"
 #: Vertices beyond this number are drawn at random.
-MOST_VERTICES = 64
+MOST_VERTICES = 32
 #: Samples over which the gain at a vertex is summed up, at most.
-MOST_GAIN_SAMPLES = 100_000
+MOST_GAIN_SAMPLES = 5_000
 #: What is left of a response when its sum ends.
 _GAIN_LEFT = 1e-6
 
@@ -169,6 +170,8 @@ def with_tolerances(
         return design, plant
     if isinstance(constants, DescriptorSystem):
         return _of_plant(design, constants)
+    if isinstance(constants, Uncertainty):
+        constants = constants.box
     changed = uncertain_system(plant, constants)
     return design.replace(plant=changed), changed
 
@@ -263,7 +266,7 @@ def robustness(
 
 def structure_of(
     design: ObserverDesign, affine: AffinePlant, tracking: Tracking, *, bounds: FloatArray | None = None,
-    noise_bound: float = 0.0, faults: bool = False,
+    noise_bound: float = 0.0, faults: bool = False, states: bool = False,
 ) -> ErrorStructure:  # fmt: skip
     """Return the error system of a discrete design over its box."""
     plant, observer = design.linear
@@ -274,7 +277,7 @@ def structure_of(
             condition="discrete time",
         )  # fmt: skip
     sizes = np.zeros(plant.nd) if bounds is None else bounds
-    return error_structure(observer, affine, tracking, sizes, noise_bound, faults=faults)
+    return error_structure(observer, affine, tracking, sizes, noise_bound, faults=faults, states=states)
 
 
 def _named(names: tuple[str, ...], shares: FloatArray) -> dict[str, float]:

@@ -14,7 +14,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.proofs.affine import AffineMatrix, affine_inverse
 
 #: Boxes after which a statement is left open.
-MOST_BOXES = 600
+MOST_BOXES = 150
 #: The matrix over ``lower <= q <= upper``.
 Build: TypeAlias = Callable[[FloatArray, FloatArray], AffineMatrix]
 #: With more constants than this, not all vertices are looked at first.

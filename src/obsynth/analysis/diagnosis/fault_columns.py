@@ -127,6 +127,10 @@ class FaultColumn:
             markov.append(powers[-1] @ f)
             powers.append(powers[-1] @ a)
         observed = np.vstack(powers)
+        # Powers grow or fade: rows of one length keep a long chain of one output apart from rounding.
+        lengths = np.linalg.norm(observed, axis=1, keepdims=True)
+        lengths = np.where(lengths > 0.0, lengths, 1.0)
+        observed = observed / lengths
         left, values, _ = np.linalg.svd(observed)
         rank = rank_from(values, expected=observed.shape[1]).rank
         parity = left[:, rank:].T
@@ -137,6 +141,7 @@ class FaultColumn:
         for row in range(order + 1):
             for column in range(row + 1):
                 toeplitz[row * p : (row + 1) * p, column] = markov[row - column][:, 0]
+        toeplitz = toeplitz / lengths
         return bool(np.linalg.norm(parity @ toeplitz) > TRACE_TOLERANCE * max(1.0, float(np.linalg.norm(toeplitz))))
 
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 #: Plants of more states are decided in floating point.
 EXACT_STATES = 64
 SAMPLED_STATES = 24
+#: Of computed data an exact answer says little more than floating point does, and takes longer.
+COMPUTED_STATES = 24
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +61,7 @@ class PlantNumbers(ABC):
     exact: bool
     computed: bool
     discrete: bool
+    kept: dict[object, Any]
     rational: Mapping[str, fmpq_mat]
 
     @abstractmethod
@@ -86,8 +89,20 @@ class PlantNumbers(ABC):
         """Return some columns."""
 
     @abstractmethod
+    def decided_system(self, inputs: Any, direct: Any) -> SystemFacts:
+        """Decide facts on ``[A - s E, inputs; C, direct]``."""
+
     def system(self, inputs: Any, direct: Any) -> SystemFacts:
-        """Return facts on ``[A - s E, inputs; C, direct]``."""
+        """Return facts on ``[A - s E, inputs; C, direct]``; zeros only where the normal rank is full."""
+        key = ("system", str(inputs), str(direct))
+        facts: SystemFacts = self.remembered(key, lambda: self.decided_system(inputs, direct))
+        return facts
+
+    def remembered(self, key: object, decide: Callable[[], Any]) -> Any:
+        """Return what has been decided before under this key, or decide it."""
+        if key not in self.kept:
+            self.kept[key] = decide()
+        return self.kept[key]
 
     @property
     @abstractmethod
@@ -127,6 +142,7 @@ class WrittenNumbers(PlantNumbers):
     discrete: bool
     exact: bool = True
     computed: bool = False
+    kept: dict[object, Any] = field(default_factory=dict, repr=False)
 
     @property
     def rational(self) -> Mapping[str, fmpq_mat]:  # type: ignore[override]
@@ -142,7 +158,8 @@ class WrittenNumbers(PlantNumbers):
         """Normal rank of ``A - s E``."""
         from obsynth.proofs.exact_pencils import ExactPencil
 
-        return ExactPencil(self.matrices["E"], self.matrices["A"]).normal_rank
+        pencil = ExactPencil(self.matrices["E"], self.matrices["A"])
+        return int(self.remembered("normal rank", lambda: pencil.normal_rank))
 
     @property
     def index(self) -> int | None:
@@ -153,7 +170,7 @@ class WrittenNumbers(PlantNumbers):
 
     def with_matrices(self, changes: Mapping[str, fmpq_mat], *, rational: Mapping[str, fmpq_mat]) -> WrittenNumbers:
         """Return the same with some matrices replaced."""
-        return replace(self, matrices={**self.matrices, **changes})
+        return replace(self, matrices={**self.matrices, **changes}, kept={})
 
     def as_own(self, matrix: fmpq_mat) -> fmpq_mat:
         """Return a rational matrix as one of these numbers."""
@@ -196,8 +213,8 @@ class WrittenNumbers(PlantNumbers):
 
         return system_pencil(self.matrices["E"], self.matrices["A"], inputs, self.matrices["C"], direct)
 
-    def system(self, inputs: fmpq_mat, direct: fmpq_mat) -> SystemFacts:
-        """Return facts on ``[A - s E, inputs; C, direct]``; zeros only where the normal rank is full."""
+    def decided_system(self, inputs: fmpq_mat, direct: fmpq_mat) -> SystemFacts:
+        """Decide facts on ``[A - s E, inputs; C, direct]``."""
         pencil = self.pencil(inputs, direct)
         rank, columns = pencil.normal_rank, pencil.shape[1]
         found = pencil.zeros(discrete=self.discrete).roots if rank == columns else ()
@@ -216,6 +233,7 @@ class SampledNumbers(PlantNumbers):
     discrete: bool = True
     exact: bool = False
     computed: bool = False
+    kept: dict[object, Any] = field(default_factory=dict, repr=False)
 
     @cached_property
     def states(self) -> int:
@@ -233,7 +251,7 @@ class SampledNumbers(PlantNumbers):
 
     def with_matrices(self, changes: Mapping[str, Rows], *, rational: Mapping[str, fmpq_mat]) -> SampledNumbers:
         """Return the same with some matrices replaced."""
-        return replace(self, matrices={**self.matrices, **changes}, rational={**self.rational, **rational})
+        return replace(self, matrices={**self.matrices, **changes}, rational={**self.rational, **rational}, kept={})
 
     def as_own(self, matrix: fmpq_mat) -> Rows:
         """Return a rational matrix as one of these numbers."""
@@ -294,8 +312,8 @@ class SampledNumbers(PlantNumbers):
         rest = zeros_matrix(self.states, extra), zeros_matrix(outputs, self.states), zeros_matrix(outputs, extra)
         return EnclosedPencil(blocks([[self.rational["E"], rest[0]], [rest[1], rest[2]]]), whole, self.bits)
 
-    def system(self, inputs: Rows, direct: Rows) -> SystemFacts:
-        """Return facts on ``[A - z, inputs; C, direct]``; zeros only where the normal rank is full."""
+    def decided_system(self, inputs: Rows, direct: Rows) -> SystemFacts:
+        """Decide facts on ``[A - z, inputs; C, direct]``."""
         pencil = self.pencil(inputs, direct)
         rank, columns = pencil.normal_rank, pencil.shape[1]
         values = tuple(sorted(pencil.zeros, key=abs, reverse=True)) if rank == columns else ()
@@ -319,12 +337,35 @@ def decided(*, exactly: bool) -> Iterator[None]:
 
 def numbers_of(plant: DescriptorSystem) -> PlantNumbers | None:
     """Return the numbers on which existence is decided; ``None`` where it is decided in floating point."""
-    return _numbers_of(plant) if _EXACTLY.get() else None
+    return _numbers_of(_Content.of(plant)) if _EXACTLY.get() and plant.nx <= EXACT_STATES else None
 
 
-# Conditions ask for the same plant's several times; plants never change.
-@lru_cache(maxsize=4)
-def _numbers_of(plant: DescriptorSystem) -> PlantNumbers | None:
+@dataclass(frozen=True, eq=False)
+class _Content:
+    """A plant that equals another one with the same numbers: plants are made again, and decided once."""
+
+    plant: DescriptorSystem
+    key: tuple[object, ...]
+
+    @classmethod
+    def of(cls, plant: DescriptorSystem) -> _Content:
+        plant = plant.dense()
+        origin = origin_of(plant)
+        numbers = (getattr(plant, name) for name in DECISIVE)
+        made = None if origin is None else (origin.sample_time, origin.computed)
+        return cls(plant, (plant.dt, made, *((matrix.shape, matrix.tobytes()) for matrix in numbers)))
+
+    def __hash__(self) -> int:
+        return hash(self.key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Content) and self.key == other.key
+
+
+# Conditions, synthesis and verification ask for the same plant's several times; plants never change.
+@lru_cache(maxsize=8)
+def _numbers_of(content: _Content) -> PlantNumbers | None:
+    plant = content.plant
     from obsynth.proofs.written_numbers import computed_entries, rational_matrix, written_matrix
 
     origin = origin_of(plant)
@@ -334,13 +375,12 @@ def _numbers_of(plant: DescriptorSystem) -> PlantNumbers | None:
         exact = {name: rational_matrix(origin.exact[name], sizes[name]) for name in DECISIVE}
         if origin.sample_time is None:
             written = WrittenNumbers(exact, plant.is_discrete, computed=origin.computed)
-            return written if states <= EXACT_STATES else None
+            return written if states <= (COMPUTED_STATES if origin.computed else EXACT_STATES) else None
         sampled = sampled_numbers(exact, origin.sample_time) if states <= SAMPLED_STATES else None
         return None if sampled is None else replace(sampled, computed=origin.computed)
-    if plant.nx > EXACT_STATES:
-        return None
-    plant = plant.dense()
     computed = any(computed_entries(getattr(plant, name)) for name in DECISIVE)
+    if computed and plant.nx > COMPUTED_STATES:
+        return None
     matrices = {name: written_matrix(getattr(plant, name)) for name in DECISIVE}
     return WrittenNumbers(matrices, plant.is_discrete, computed=computed)
 

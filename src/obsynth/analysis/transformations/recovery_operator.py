@@ -55,6 +55,12 @@ class RecoveryOperator:
         """Leave the factors behind: they belong to this process."""
         return {name: value for name, value in self.__dict__.items() if name != "factor"}
 
+    @property
+    def state_count(self) -> int:
+        """Number of states of the plant now."""
+        step = self.states.get("state")
+        return self.counts[0] if step is None else int(step.shape[1])
+
     def matrix(self, signal: str) -> FloatArray:
         """Return the dense map from one kind of signal, ``(nx, n)``."""
         first, last = self._columns(signal)

@@ -67,10 +67,10 @@ def affine_plant(plant: DescriptorSystem, box: ConstantsBox | None = None) -> Af
     matrices = uncertain.affine(written, box)
     steps = uncertain.steps
     if not steps:
-        basis = untouched_coordinates(_touched(matrices))
+        basis = untouched_coordinates(_touched(matrices), _moved(matrices))
         return AffinePlant(plant, box, _in_coordinates(matrices, basis), basis)
     first = _reduced(written, matrices, None)
-    basis = untouched_coordinates(_touched(first))
+    basis = untouched_coordinates(_touched(first), _moved(first))
     reduced = first if np.array_equal(basis, np.eye(len(basis))) else _reduced(written, matrices, basis)
     for kind, size in steps:
         if kind == SAMPLED:
@@ -90,10 +90,11 @@ def moving_family(plant: DescriptorSystem, box: ConstantsBox) -> AffineMatrix:
     return _reduced(written, uncertain.affine(written, box), None)["A"]
 
 
-def untouched_coordinates(touched: FloatArray) -> FloatArray:
+def untouched_coordinates(touched: FloatArray, moved: FloatArray) -> FloatArray:
     """Return ``V (n, n)`` such that ``touched V`` has zero columns where ``touched (m, n)`` has a kernel.
 
-    V is the identity but for some columns, so that its inverse is exact: ``2 I - V``.
+    V is the identity but for some columns, so that its inverse is exact: ``2 I - V``.  States whose own equations the
+    constants move most, ``moved (n,)``, become relative to those that they move least.
     """
     from scipy.linalg import qr
 
@@ -108,7 +109,8 @@ def untouched_coordinates(touched: FloatArray) -> FloatArray:
     seen = np.flatnonzero(np.abs(basis).max(axis=0) > UNTOUCHED_SHARE)
     if rank == len(seen):
         return np.eye(n)
-    pivots = seen[qr(basis[:, seen], pivoting=True, mode="r")[1][:rank]]
+    weights = moved[seen] / max(float(moved.max()), np.finfo(np.float64).tiny) + UNTOUCHED_SHARE
+    pivots = seen[qr(basis[:, seen] * weights, pivoting=True, mode="r")[1][:rank]]
     free = [j for j in seen.tolist() if j not in set(pivots.tolist())]
     found = np.eye(n)
     inside = np.round(np.linalg.solve(basis[:, pivots], basis[:, free]), COORDINATE_DIGITS)
@@ -120,6 +122,16 @@ def _touched(matrices: Mapping[str, AffineMatrix]) -> FloatArray:
     """Return what the constants multiply the state with, all rows of all of them."""
     stacked = [matrices[name].parts.reshape(-1, matrices[name].shape[1]) for name in ("E", "A", "C")]
     return np.vstack(stacked)
+
+
+def _moved(matrices: Mapping[str, AffineMatrix]) -> FloatArray:
+    """Return how much the constants move each state ``(n,)``: through its own equation, or those of others."""
+    a, e = matrices["A"], matrices["E"]
+    found = np.abs(a.parts).sum(axis=(0, 2)) + np.abs(e.parts).sum(axis=(0, 2))
+    size = np.abs(a.center) / max(float(np.abs(a.center).max(initial=0.0)), np.finfo(np.float64).tiny)
+    for _ in range(len(found)):
+        found = np.maximum(found, size @ found)
+    return np.asarray(found)
 
 
 def _in_coordinates(matrices: Mapping[str, AffineMatrix], basis: FloatArray) -> dict[str, AffineMatrix]:

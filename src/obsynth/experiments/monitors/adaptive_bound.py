@@ -243,9 +243,7 @@ def _rounding(
     pushed = absolute(observer.Az) @ largest + np.hstack([absolute(entered), np.zeros((nz, n + 1))])
     through = np.hstack([absolute(observer.Du), absolute(observer.Dy), np.zeros((len(observer.Cz), n + 1))])
     read = absolute(observer.Cz) @ largest + through
-    picked = np.zeros((len(structure.Co), len(observer.Cz)))
-    first = observer.fault_rows.start
-    picked[:, first : first + len(picked)] = np.eye(len(picked))
+    picked = absolute(structure.watching)
     rows = structure.channel_rows
 
     def spread(left: FloatArray, direct: FloatArray, into: FloatArray) -> FloatArray:

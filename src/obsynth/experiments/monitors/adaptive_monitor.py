@@ -11,12 +11,14 @@ from obsynth.analysis.transformations.uncertain_plant import AffinePlant, affine
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.experiments.monitors.adaptive_bound import Start, adaptive_bound
 from obsynth.experiments.monitors.adaptive_rule import AdaptivePlan
+from obsynth.experiments.monitors.residual_model import watches_estimates
 from obsynth.numerics.arguments import is_finite_number, require_mapping
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.uncertainty import SAMPLED
 from obsynth.results.design import ObserverDesign
 from obsynth.tolerances.responses import loop_radius
-from obsynth.tolerances.robustness import EXACT_MODEL, structure_of
+from obsynth.tolerances.robustness import EXACT_MODEL, structure_of, with_tolerances
 from obsynth.tolerances.tracking import Tracking, tracking_of
 
 #: What a statement adds where no tolerance is known.
@@ -43,7 +45,7 @@ def adaptive_plan(
         raise SpecError("A disturbance has no bound: give disturbance_bounds (--disturbance).",
                         path="disturbance_bounds")  # fmt: skip
     z = np.zeros(observer.order) if observer_state is None else observer_state
-    start = _start(plant, tracking, initial_error, initial_set, affine, z)
+    start = start_of(affine, tracking, initial_error, initial_set, z)
     later = Start(observer.order, norm=initial_error, state=z)
     reason, faults, same = "", None, False
     try:
@@ -57,17 +59,19 @@ def adaptive_plan(
         return AdaptivePlan(
             adaptive_bound(structure, observer, begin, varying=varying),
             None if faults is None else adaptive_bound(faults, observer, begin, varying=varying), same, reason,
-            begin.norm is None, affine.box.names, observer.fault_names, observer.residual_names,
+            begin.norm is None, watches_estimates(design), affine.box.names, observer.fault_names,
+            observer.residual_names,
         )  # fmt: skip
 
     return plan(start), plan(later)
 
 
-def _start(
-    plant: DescriptorSystem, tracking: Tracking, initial_error: float | None, initial_set: Mapping[str, Any] | None,
-    affine: AffinePlant, z: FloatArray,
+def start_of(
+    affine: AffinePlant, tracking: Tracking, initial_error: float | None, initial_set: Mapping[str, Any] | None,
+    z: FloatArray,
 ) -> Start:  # fmt: skip
     """Return what is known of eps at the start, ``z - T E(q) x`` for x in a box."""
+    plant = affine.plant
     if initial_set is None:
         return Start(len(z), norm=initial_error, state=z)
     center, radius = initial_box(plant, initial_set)
@@ -130,5 +134,28 @@ def adaptive_statement(plan: AdaptivePlan, design: ObserverDesign) -> str:
     ever = "" if radius < 1.0 else (
         f"; the loop through the tolerances has radius {radius:.3g}: the threshold holds at each sample, but may grow"
     )  # fmt: skip
+    steps = () if uncertain is None else uncertain.steps
+    held = "; inputs and disturbances are held between samples" if any(kind == SAMPLED for kind, _ in steps) else ""
     missing = "" if plan.intervals or not plan.fault_names else f"; no guaranteed interval of faults: {plan.reason}"
-    return f"{text}; {kept}{ever}{missing}"
+    return f"{text}; {kept}{held}{ever}{missing}"
+
+
+def tolerances_of(
+    design: ObserverDesign, kind: str, constants: Any, initial_set: Mapping[str, Any] | None,
+    initial_error: float | None,
+) -> tuple[ObserverDesign, bool]:  # fmt: skip
+    """Return the design with the tolerances asked for, and whether its threshold adapts to the signals."""
+    asked = [name for name, given in (("constants", constants), ("initial_set", initial_set)) if given is not None]
+    if asked and kind != "pointwise":
+        raise SpecError(f"{asked[0]} is for the pointwise monitor.", path=asked[0])
+    if initial_set is not None and initial_error is not None:
+        raise SpecError("Give initial_set or initial_error, not both.", path="initial_set")
+    found, plant = with_tolerances(design, constants)
+    if not plant.is_discrete:
+        if asked:
+            raise PreconditionError(
+                "The design is continuous in time: thresholds over tolerances are for sampled designs. Sample the "
+                "plant first (transform: sample_time, or obsynth.discretise).", condition="discrete time",
+            )  # fmt: skip
+        return design, False
+    return found, bool(asked)

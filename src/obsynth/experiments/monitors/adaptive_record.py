@@ -11,6 +11,8 @@ from obsynth.numerics.arrays import FloatArray
 
 #: Samples whose dependence on older ones is computed at once.
 BLOCK = 32
+#: Samples of all runs together whose first order is computed at once.
+CACHED_SAMPLES = 4000
 
 
 class Thresholds(NamedTuple):
@@ -54,21 +56,34 @@ def thresholds_of_records(
 
 def _first_constant(bound: AdaptiveBound, v: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return first-order bounds of channels, ``|phi|`` of each constant, and the shift of the outputs' middle."""
-    p, nz, rows, _, no = bound.counts
+    p, _, _, m, no = bound.counts
     runs, steps = v.shape[:2]
-    offsets = bound.structure.offsets
     if not p:
-        zero = np.zeros((runs, steps, no))
-        return np.zeros((runs, steps, bound.counts[3])), np.zeros((runs, steps, 0, no)), zero
-    w = (v @ bound.drive.reshape(-1, v.shape[2]).T).reshape(runs, steps, p, nz + rows + no)
-    psi = _filtered(bound.structure.Az, w[..., :nz])
-    seen = w[..., nz:] + psi @ bound.shown.T
-    channels, phi = seen[..., :rows], seen[..., rows:]
-    shift = -np.tensordot(phi, offsets, axes=(2, 0)) if offsets.any() else np.zeros((runs, steps, no))
-    moved = np.abs(channels).sum(axis=2)
-    if offsets.any():
-        moved += np.abs(np.tensordot(channels, offsets, axes=(2, 0)))
-    return _seen(bound, moved), np.abs(phi), shift
+        return np.zeros((runs, steps, m)), np.zeros((runs, steps, 0, no)), np.zeros((runs, steps, no))
+    # A few runs at a time stay in the processor's cache.
+    size = max(1, CACHED_SAMPLES // steps)
+    parts = [_first_of_some(bound, v[i : i + size]) for i in range(0, runs, size)]
+    channels, phi, shift = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return channels, phi, shift
+
+
+def _first_of_some(bound: AdaptiveBound, v: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    p, nz, rows, _, no = bound.counts
+    runs, steps, nv = v.shape
+    flat = np.ascontiguousarray(v).reshape(-1, nv)
+    into = flat @ np.ascontiguousarray(bound.drive[:, :nz]).reshape(-1, nv).T
+    seen = (flat @ np.ascontiguousarray(bound.drive[:, nz:]).reshape(-1, nv).T).reshape(-1, rows + no)
+    psi = _filtered(bound.structure.Az, into.reshape(runs, steps, p, nz))
+    seen += psi.reshape(-1, nz) @ bound.shown.T
+    whole = seen.reshape(runs, steps, p, rows + no)
+    offsets = bound.structure.offsets
+    middle = np.tensordot(whole, offsets, axes=(2, 0)) if offsets.any() else None
+    sizes = np.abs(whole, out=whole)
+    moved = sizes[..., :rows].sum(axis=2)
+    if middle is not None:
+        moved += np.abs(middle[..., :rows])
+    shift = np.zeros((runs, steps, no)) if middle is None else -middle[..., rows:]
+    return _seen(bound, moved), sizes[..., rows:].copy(), shift
 
 
 def _seen(bound: AdaptiveBound, values: FloatArray) -> FloatArray:
@@ -82,22 +97,22 @@ def _filtered(az: FloatArray, w: FloatArray) -> FloatArray:
     blocks = -(-steps // size)
     padded = np.zeros((runs, blocks * size, p, nz))
     padded[:, :steps] = w
-    inside = padded.reshape(runs, blocks, size, p, nz)
-    found = np.zeros((runs, blocks, size + 1, p, nz))
+    inside = np.ascontiguousarray(padded.reshape(runs, blocks, size, p, nz).transpose(2, 0, 1, 3, 4))
+    found = np.zeros((size + 1, runs, blocks, p, nz))
     turned = np.ascontiguousarray(az.T)
     for k in range(size):
-        found[:, :, k + 1] = found[:, :, k] @ turned + inside[:, :, k]
-    begin = np.zeros((runs, p, nz))
+        found[k + 1] = inside[k]
+        found[k + 1] += (found[k].reshape(-1, nz) @ turned).reshape(found[k].shape)
     power = np.linalg.matrix_power(turned, size)
-    begins = np.empty((runs, blocks, p, nz))
-    for b in range(blocks):
-        begins[:, b] = begin
-        begin = begin @ power + found[:, b, size]
+    begins = np.zeros((runs, blocks, p, nz))
+    for b in range(1, blocks):
+        begins[:, b] = (begins[:, b - 1].reshape(-1, nz) @ power).reshape(runs, p, nz) + found[size, :, b - 1]
     step = begins
     for k in range(size):
-        found[:, :, k] += step
-        step = step @ turned
-    return np.asarray(found[:, :, :size].reshape(runs, blocks * size, p, nz)[:, :steps])
+        found[k] += step
+        step = (step.reshape(-1, nz) @ turned).reshape(step.shape)
+    whole = found[:size].transpose(1, 2, 0, 3, 4).reshape(runs, blocks * size, p, nz)
+    return np.ascontiguousarray(whole[:, :steps])
 
 
 def _first_varying(bound: AdaptiveBound, v: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -30,6 +30,7 @@ class AdaptivePlan:
     same: bool
     reason: str
     start_beyond_nominal: bool
+    estimates: bool
     names: tuple[str, ...]
     fault_names: tuple[str, ...]
     residual_names: tuple[str, ...]
@@ -51,7 +52,9 @@ class AdaptivePlan:
 
     @property
     def residuals(self) -> slice:
-        """Rows of the outputs that are residuals."""
+        """Rows of the outputs whose norm is watched: residuals, or fault estimates where these do not see faults."""
+        if self.estimates:
+            return slice(0, len(self.fault_names))
         return slice(len(self.fault_names), len(self.fault_names) + len(self.residual_names))
 
 
@@ -89,7 +92,7 @@ class AdaptiveRule:
         if self._faults is not None and self._fault_state is not None:
             estimates = self._faults.structure.reading @ evidence.rows
             error = adaptive_step(self._faults, self._fault_state, estimates, evidence.inputs, evidence.outputs)
-        statistic, nominal, _ = self._nominal.take(time, residuals, None, deciding=deciding)
+        statistic, nominal, _ = self._nominal.take(time, residuals, evidence, deciding=deciding)
         threshold = (nominal + norm_beyond_nominal(self.plan, found)) * THRESHOLD_ROUNDING
         nf = len(self.plan.fault_names)
         values = evidence.rows[len(evidence.rows) - len(found.total) :]

@@ -108,6 +108,25 @@ class BetweenSamples:
                 raise
             return _assembled(smooth, dt, observer, *parts, np.eye(smooth.nx), endless=False)
 
+    @classmethod
+    def of_sampled(
+        cls, written: DescriptorSystem, plant: DescriptorSystem, observer: LinearObserver, tracking: FloatArray,
+        *, rows: slice,
+    ) -> BetweenSamples:  # fmt: skip
+        """Return a design for a sampled plant, whose states are those of ``written`` without its algebraic ones.
+
+        The identities hold at the samples, so that the plant's state does not enter: ``eps+ = Az eps - T q + By Dd d``.
+        """
+        smooth = eliminate_algebraic_states(written).plant
+        n, nz, exact = smooth.nx, observer.order, Ball.exact
+        m = block([[exact(np.zeros((n, n))), exact(np.zeros((n, nz)))], [exact(np.zeros((nz, n))), exact(observer.Az)]])
+        shown = np.hstack([np.zeros((len(observer.Cz[rows]), n)), observer.Cz[rows]])
+        into = Ball.exact(np.vstack([np.zeros((n, n)), -tracking]))
+        return cls(
+            smooth, plant.dt, m, shown, prove_contraction(m, discrete=True), into, np.zeros((nz, plant.ny)),
+            observer.By, observer.Dy[rows], rows, 0.0,
+        )  # fmt: skip
+
     @cached_property
     def per_unit(self) -> FloatArray:
         """What each disturbance does to a residual in the long run, per unit of its bound ``(nd,)``."""

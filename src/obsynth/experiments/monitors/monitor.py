@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -27,16 +28,21 @@ STATEMENTS: Mapping[str, str] = {
 BETWEEN_SAMPLES = "; disturbances may do anything within their bounds between samples, at the stated sample time"
 #: The assumption of a sampled design: what happens between its samples is not in its model.
 HELD = "; inputs and disturbances are held between samples, as the sampled model has them"
+SAMPLED = BETWEEN_SAMPLES + "; known inputs are held between samples"
 #: The other assumptions of every bound that is never passed.
 ASSUMED = "; the plant starts at rest, and known inputs are held or go in straight lines between samples"
 #: Where the residual is made not to see the faults that are modelled.
 OF_ESTIMATES = "the norm of the fault estimates, as the residual does not see the faults that are modelled: "
 
 
-def statement_of(kind: str, *, continuous: bool, estimates: bool = False) -> str:
-    """Return what a threshold promises; ``estimates``: of the fault estimates instead of the residual."""
+def statement_of(kind: str, *, continuous: bool, sampled: bool = False, estimates: bool = False) -> str:
+    """Return what a threshold promises; ``estimates``: of the fault estimates instead of the residual.
+
+    ``sampled``: the continuous plant behind a sampled one is known, and disturbances may move between samples.
+    """
     bounded = kind in ("pointwise", "window")
-    ending = (BETWEEN_SAMPLES + ASSUMED) if continuous and bounded else HELD if bounded else ""
+    held = SAMPLED if sampled else HELD
+    ending = (BETWEEN_SAMPLES + ASSUMED) if continuous and bounded else held if bounded else ""
     return (OF_ESTIMATES if estimates else "") + STATEMENTS[kind] + ending
 
 
@@ -163,6 +169,18 @@ class Monitor:
             ``(steps, runs, nr)``.
         """
         return np.asarray(self.statistic(residuals) > self.threshold[:, None] + self.floor)
+
+    def passed_in(self, runs: Any, residuals: slice) -> np.ndarray:
+        """Return the same from everything that happened in many runs.
+
+        Parameters
+        ----------
+        runs : Runs
+            With `rows` of the observer ``(steps, runs, rows)``.
+        residuals : slice
+            Which of them are residuals.
+        """
+        return self.passed(runs.rows[:, :, residuals])
 
     def isolated(self, faults: FloatArray, k: int) -> int:
         """Return the number of the fault that stands out after an alarm at ``k``.

@@ -98,6 +98,12 @@ class OnlineMonitor:
         self._decided = False
 
     @property
+    def bound(self) -> Any:
+        """Bound of an adaptive threshold, for exports; `None` for other monitors."""
+        plan = getattr(self._rule, "plan", None)
+        return None if plan is None else plan.bound
+
+    @property
     def columns(self) -> tuple[str, ...]:
         """Columns of a run besides statistic, threshold and alarm: those of an adaptive threshold."""
         plan = getattr(self._rule, "plan", None)
@@ -146,7 +152,7 @@ class OnlineMonitor:
         more = tuple(getattr(self._rule, "cells", ()))
         # A statistic that has overflowed has passed any threshold.
         if math.isnan(statistic) or not math.isfinite(threshold):
-            return UNDECIDED._replace(threshold=threshold if more else math.nan, more=more)
+            return UNDECIDED._replace(more=more)
         if statistic <= threshold:
             return Seen(statistic, threshold, False, "", more)
         if which is None and self._names and np.isfinite(faults).all():

@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.errors import PreconditionError, SpecError
-from obsynth.experiments.monitors.adaptive_monitor import EXACT, adaptive_plan, adaptive_statement
+from obsynth.errors import SpecError
+from obsynth.experiments.monitors.adaptive_monitor import EXACT, adaptive_plan, adaptive_statement, tolerances_of
+from obsynth.experiments.monitors.adaptive_records_monitor import noisy_design
 from obsynth.experiments.monitors.adaptive_rule import AdaptiveRule
 from obsynth.experiments.monitors.monitor import KINDS, statement_of
 from obsynth.experiments.monitors.online import OnlineMonitor, Rule
@@ -27,7 +28,6 @@ from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.plants.names import index_of
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario
-from obsynth.tolerances.robustness import with_tolerances
 
 _FORGOTTEN = ", once the error at the start, which is not stated, is forgotten (else give a longer warm-up)"
 _AFTER_A_GAP = " (after a gap, too, while the error there is no larger than stated for the start)"
@@ -90,13 +90,15 @@ def online_monitor(
         Nominal value of parameters by name; those at the observer's start by default.
     sample_time : float, optional, seconds
         Continuous designs: between the rows of the data; the scenario's by default.
-    constants : mapping, ConstantsBox or DescriptorSystem, optional
-        ``pointwise``, discrete linear designs: tolerances instead of the plant's own, as `obsynth.uncertain_system`
-        takes them.  Where there are tolerances, the threshold adapts to the signals and holds for every plant within
-        them; columns of `run_on_data` tell thresholds, guaranteed intervals of faults, and shares of the constants.
+    constants : mapping, ConstantsBox, Uncertainty or DescriptorSystem, optional
+        ``pointwise``, discrete linear designs: tolerances as `obsynth.uncertain_system` takes them; those of the
+        design's plant by ``plant.uncertainty``.  The threshold adapts to the signals and holds for every plant within
+        them; without, it assumes an exact model (but ``obsynth run`` takes the plant's own).  Columns of `run_on_data`
+        tell thresholds, guaranteed intervals of faults, and shares of the constants.
     initial_set : mapping, optional
         ``pointwise``, discrete linear designs: bounds of the plant's states at the first row (deviations), each a
-        number or ``[low, high]``; the threshold then holds from the first row on.
+        number or ``[low, high]``; the threshold then holds from the first row on, for the plant's own tolerances where
+        no others are given.
 
     Returns
     -------
@@ -126,7 +128,7 @@ def online_monitor(
         )
     if nominal:
         raise SpecError("nominal is for recursive designs, which estimate parameters.", path="nominal")
-    design, adaptive = _tolerances(design, kind, constants, initial_set, initial_error)
+    design, adaptive = tolerances_of(design, kind, constants, initial_set, initial_error)
     estimates = watches_estimates(design) and kind in ("pointwise", "window")
     model, dt = _endless_model(design, scenario, window, sample_time, estimates=estimates)
     bounds = bounds_of(design, model, disturbance_bounds)
@@ -161,7 +163,7 @@ def online_monitor(
             driven=driven,
         )  # fmt: skip
         if adaptive:
-            return _adaptive(design, norm, model, bounds, noise_bound, initial_error, initial_set)
+            return _adaptive(design, scenario, norm, model, bounds, noise_bound, initial_error, initial_set)
         rule = norm
         ending = _FORGOTTEN if initial_error is None else _AFTER_A_GAP
     else:
@@ -173,42 +175,27 @@ def online_monitor(
         ending += _NOT_CLOSER if model.Bw[:, model.sensor_noise[0].shape[1] :].any() else ""
     if kind in ("pointwise", "window") and model.continuous is not None:
         ending += _REGULAR + model.continuous.between.lasting_words(limit)
-    statement = statement_of(kind, continuous=model.flow is not None, estimates=estimates) + ending + EXACT
+    promised = statement_of(
+        kind, continuous=model.flow is not None, sampled=model.sampled is not None, estimates=estimates
+    )
+    statement = promised + ending + EXACT
     return OnlineMonitor(
         kind, statement, rule, residuals=len(design.linear[1].residual_names), fault_names=design.linear[1].fault_names,
         fault_scales=model.fault_scales(),
     )  # fmt: skip
 
 
-def _tolerances(
-    design: ObserverDesign, kind: str, constants: Any, initial_set: Mapping[str, Any] | None,
-    initial_error: float | None,
-) -> tuple[ObserverDesign, bool]:  # fmt: skip
-    """Return the design with the tolerances asked for, and whether its threshold adapts to the signals."""
-    asked = [name for name, given in (("constants", constants), ("initial_set", initial_set)) if given is not None]
-    if asked and kind != "pointwise":
-        raise SpecError(f"{asked[0]} is for the pointwise monitor.", path=asked[0])
-    if initial_set is not None and initial_error is not None:
-        raise SpecError("Give initial_set or initial_error, not both.", path="initial_set")
-    found, plant = with_tolerances(design, constants)
-    if not plant.is_discrete:
-        if asked:
-            raise PreconditionError(
-                "The design is continuous in time: thresholds over tolerances are for sampled designs. Sample the "
-                "plant first (transform: sample_time, or obsynth.discretise).", condition="discrete time",
-            )  # fmt: skip
-        return design, False
-    uncertain = plant.uncertainty is not None and bool(plant.uncertainty.box.names)
-    return found, kind == "pointwise" and (uncertain or initial_set is not None)
-
-
 def _adaptive(
-    design: ObserverDesign, norm: NormRule, model: ResidualModel, bounds: FloatArray, noise_bound: float | None,
-    initial_error: float | None, initial_set: Mapping[str, Any] | None,
+    design: ObserverDesign, scenario: Scenario | None, norm: NormRule, model: ResidualModel, bounds: FloatArray,
+    noise_bound: float | None, initial_error: float | None, initial_set: Mapping[str, Any] | None,
 ) -> OnlineMonitor:  # fmt: skip
     """Return the monitor whose threshold holds for every plant within its tolerances."""
     first, later = adaptive_plan(
-        design, bounds, noise_bound or 0.0, initial_error=initial_error, initial_set=initial_set
+        noisy_design(design, scenario),
+        bounds,
+        noise_bound or 0.0,
+        initial_error=initial_error,
+        initial_set=initial_set,
     )
     start = _FORGOTTEN if initial_error is None and initial_set is None else _AFTER_A_GAP if initial_set is None else (
         "; it holds from the first row on, and after a gap once the error there is forgotten"

@@ -55,6 +55,7 @@ class ResidualModel:
     start_noise: FloatArray | None = None
     sensor_noise: tuple[FloatArray, FloatArray] | None = None
     continuous: ContinuousDesign | None = None
+    sampled: BetweenSamples | None = None
 
     @property
     def initial_error(self) -> float:
@@ -163,9 +164,12 @@ def residual_model(
         heard = errors.noise[:, sensors], direct_w[:, sensors]
         continuous = ContinuousDesign(noisy, observer, found.tracking, drive.dt, endless, rows)
         direct_w, faults_w = held.direct(rows), held.direct(observer.fault_rows)
+    between = None
+    if plant.is_discrete and plant.nd and design.source is not None and design.source.sample_time is not None:
+        between = BetweenSamples.of_sampled(design.source.plant, plant, observer, found.tracking, rows=rows)
     return ResidualModel(
         a, -shown, driven, direct_d, noise, direct_w, -faults, faults_d, faults_w,
-        drive.steps, initial, bounds, means, deviations, steady, flow, start_noise, heard, continuous,
+        drive.steps, initial, bounds, means, deviations, steady, flow, start_noise, heard, continuous, between,
     )  # fmt: skip
 
 

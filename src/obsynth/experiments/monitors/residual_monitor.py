@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.experiments.batch_simulation import Bench, make_bench
+from obsynth.experiments.monitors.adaptive_monitor import EXACT, tolerances_of
 from obsynth.experiments.monitors.monitor import KINDS, Monitor, statement_of
 from obsynth.experiments.monitors.residual_model import ResidualModel, residual_model, watches_estimates
 from obsynth.experiments.monitors.thresholds import (
@@ -41,6 +43,8 @@ def monitor(
     false_alarms: float = 0.01,
     change: float = 1.0,
     isolation_delay: int = 0,
+    constants: Any = None,
+    initial_set: Mapping[str, Any] | None = None,
 ) -> Monitor:
     """Return a threshold for the residual of a linear design, and the statistic it belongs to.
 
@@ -73,6 +77,10 @@ def monitor(
         For ``cusum``: shift it is tuned for, in standard deviations of the whitened residual.
     isolation_delay : int, optional
         Samples from an alarm to the comparison of the fault estimates, where these answer later than the residual.
+    constants, initial_set : mapping, optional
+        ``pointwise``, discrete designs: tolerances and the plant's start, as for `obsynth.online_monitor`.  With either
+        of them the monitor adapts to the signals (see `obsynth.evaluate`); the start is the scenario's own by
+        default.
 
     Returns
     -------
@@ -100,9 +108,11 @@ def monitor(
     if kind not in KINDS:
         raise SpecError(f"kind is {kind!r}: use one of {', '.join(KINDS)}.", path="kind")
     require_options(noise_bound, initial_error, gamma, window, false_alarms, change, isolation_delay)
+    design, adaptive = tolerances_of(design, kind, constants, initial_set, initial_error)
     estimates = watches_estimates(design) and kind in ("pointwise", "window")
     model = residual_model(design, scenario, estimates=estimates)
-    start = model.initial_error if initial_error is None else float(initial_error)
+    start = 0.0 if adaptive else model.initial_error
+    start = start if initial_error is None else float(initial_error)
     bounds = bounds_of(design, model, disturbance_bounds)
     whitener, mean = np.zeros((0, 0)), np.zeros(len(model.C))
     if kind == "paper":
@@ -126,12 +136,20 @@ def monitor(
     rows = bench.observer.fault_rows if estimates else bench.observer.residual_rows
     if model.flow is not None:
         threshold = threshold + _straight_lines(design, scenario, model, kind, window, rows)
-    statement = statement_of(kind, continuous=model.flow is not None, estimates=estimates)
-    return Monitor(
+    statement = (
+        statement_of(kind, continuous=model.flow is not None, sampled=model.sampled is not None, estimates=estimates)
+        + EXACT
+    )
+    found = Monitor(
         kind, statement, threshold, _floor(bench, scenario, rows), bench.drive.dt,
         window,
         mean, whitener, float(change), model.fault_scales(), design.linear[1].fault_names, isolation_delay, estimates,
     )  # fmt: skip
+    if not adaptive:
+        return found
+    from obsynth.experiments.monitors.adaptive_records_monitor import with_box
+
+    return with_box(design, scenario, found, bounds, noise_bound, initial_error=initial_error, initial_set=initial_set)
 
 
 def require_options(

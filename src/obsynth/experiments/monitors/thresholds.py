@@ -52,6 +52,10 @@ def scaled_inputs(
     sizes = np.where(reached, bounds, 0.0)
     factor = 0.0 if noise_bound is None else noise_bound
     nothing = np.zeros(model.steps)
+    if model.sampled is not None:
+        table, limits = model.sampled.of_disturbances(sizes, model.steps)
+        none = np.zeros((len(model.A), 0))
+        return ScaledInputs(factor * model.Bw, factor * model.Dw, table, float(np.sum(limits)), none)
     if between is None or model.continuous is None or model.flow is None:
         return ScaledInputs(
             np.hstack([model.Bd * sizes, factor * model.Bw]), np.hstack([model.Dd * sizes, factor * model.Dw]), nothing,
@@ -117,7 +121,7 @@ def window_threshold(model: ResidualModel, inputs: ScaledInputs, initial_error: 
     """
     one_by_one = pointwise_threshold(model, inputs, initial_error)
     summed = np.array([np.linalg.norm(one_by_one[max(k - window + 1, 0) : k + 1]) for k in range(model.steps)])
-    if model.flow is not None:
+    if model.flow is not None or model.sampled is not None:
         return summed
     B, D = inputs.B, inputs.D
     powers = model.powers()

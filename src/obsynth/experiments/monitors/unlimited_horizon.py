@@ -70,7 +70,7 @@ def unlimited_bound(
     # Such a window may begin in the table, where more is left of the start.
     start = max(max(shown[-window:]), max(shown) * left) * begins
     limit = float(np.sqrt(window)) * (pointwise + start)
-    if model.flow is None:
+    if model.flow is None and model.sampled is None:
         limit = min(limit, _window_limit(model, inputs, (initial_error, left, last), window))
     return UnlimitedHorizonBound(table, limit)
 

@@ -49,13 +49,20 @@ class Signals:
 def signals_of_linear(found: Realisation, thresholds: Mapping[str, float] | None, warm_up: float) -> Signals:
     """Return the signals of a linear observer; fault estimates and residuals may be watched."""
     plant, observer = found.design.plant, found.observer
+    biases = getattr(plant, "sensor_faults", ())
     units, stated = dict(plant.units), dict(getattr(plant, "operating_point", {}))
     outputs = [
         Output(f"xhat[{name}]", name, units.get(name, ""), _late(f"estimate of {name}", delay))
         for name, delay in zip(observer.state_names, observer.state_delays, strict=True)
     ]
     outputs += [
-        Output(f"fhat[{name}]", name, units.get(name, ""), _late(f"estimate of the fault {name}", delay), True)
+        Output(
+            f"fhat[{name}]",
+            None if name in biases else name,
+            units.get(name, ""),
+            _late(f"estimate of the fault {name}", delay),
+            True,
+        )
         for name, delay in zip(observer.fault_names, observer.fault_delays, strict=True)
     ]
     outputs += [

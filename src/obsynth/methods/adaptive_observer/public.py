@@ -65,7 +65,7 @@ def adaptive_observer(
         Detect and reset: when the innovations of 20 samples pass a threshold (with this probability per sample where
         nothing has changed, such as 1e-6), S and the covariance of theta start again from S_0.  0, the default, never.
     outliers : {"none", "gate", "huber"}, optional
-        What is done with a sample that its prediction excludes: taken as it is; left out, at most three times in a row
+        What is done with a sample that its prediction excludes: taken as it is; left out, at most twice in a row
         of one sensor; or taken at the limit (Huber's weight).
     outlier_limit : float, optional
         In standard deviations of the prediction: 6 for ``gate`` and 3 for ``huber`` by default.

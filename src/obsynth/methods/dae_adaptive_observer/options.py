@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Literal, TypeAlias
 
 from obsynth.methods.method_spec import MethodOptions
 from obsynth.numerics.value_types import Count, ForgettingFactor, Positive, WrittenAs
-from obsynth.observers.dae.settings import Form, Guard, Integration, Weight
+from obsynth.observers.dae.settings import Form, Guard, Weight
 from obsynth.observers.outliers import Outliers
+
+IntegrationChoice: TypeAlias = Literal["backward-euler", "radau", "auto"]
 
 
 @dataclass(frozen=True)
@@ -25,7 +27,7 @@ class DaeAdaptiveObserverOptions(MethodOptions):
     forgetting: ForgettingFactor = 0.98
     guard: Guard = "regularise"
     weight: Weight = "innovation"
-    integration: Integration = "backward-euler"
+    integration: IntegrationChoice = "backward-euler"
     random_walk: Annotated[Any, WrittenAs("named covariance")] = None
     initial_state: Annotated[Any, WrittenAs("named vector")] = None
     initial_covariance: Annotated[Any, WrittenAs("named covariance")] = None

@@ -59,9 +59,11 @@ def dae_adaptive_observer(
         ``(1 - lambda) S_0^-1`` is added to the information, so that S never exceeds S_0 (default); or nothing.
     weight : {"innovation", "paper"}, optional
         Covariance in (18): that of the innovation, or R as printed.
-    integration : {"backward-euler", "radau"}, optional
+    integration : {"backward-euler", "radau", "auto"}, optional
         Backward Euler is the paper's; on data of a continuous plant with fast motion it finds wrong parameters, Radau
         IIA of order five does not.
+        ``"auto"`` takes Radau where a mode at the nominal point turns by more than 0.05 radians in a step; with
+        backward Euler a note says so.
     random_walk : array_like or mapping, optional
         Covariance of one step of the parameters: ``(nq, nq)``, one variance for all, or variances by parameter.
     initial_state, initial_parameters : array_like or mapping, optional
@@ -78,7 +80,7 @@ def dae_adaptive_observer(
     window : int, optional
         Samples over which excitation is watched.
     outliers : {"none", "gate", "huber"}, optional
-        What is done with a sample that its prediction excludes: taken as it is; left out, at most three times in a row
+        What is done with a sample that its prediction excludes: taken as it is; left out, at most twice in a row
         of one sensor; or taken at the limit (Huber's weight).
     outlier_limit : float, optional
         In standard deviations of the prediction: 6 for ``gate`` and 3 for ``huber`` by default.

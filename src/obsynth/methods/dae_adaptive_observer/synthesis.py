@@ -27,6 +27,7 @@ from obsynth.methods.dae_adaptive_observer.conditions import dae_conditions
 from obsynth.methods.dae_adaptive_observer.options import DaeAdaptiveObserverOptions
 from obsynth.methods.synthesis_result import Synthesis
 from obsynth.observers.dae.building import dae_observer_from_options, resolved_options
+from obsynth.observers.dae.integration import LARGEST_TURN, largest_turn
 from obsynth.observers.dae.nominal_run import NOMINAL_STEPS, DAEFacts, dae_facts
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.dae.steps import PROJECTION_NOTICE
@@ -62,6 +63,12 @@ def _notes(observer: DAEObserver, facts: DAEFacts) -> Iterator[str]:
         moved = [f"{name} by {move:.4g}" for name, move, size in
                  zip(observer.state_names, facts.projection, sizes, strict=True) if abs(move) > size]  # fmt: skip
         yield f"The initial state does not meet the algebraic equations; it is moved onto them: {', '.join(moved)}."
+    turn = largest_turn(observer.model, observer.dt)
+    if observer.integration == "backward-euler" and turn > LARGEST_TURN:
+        yield (
+            f"At the nominal point a mode turns by {turn:.2g} radians in a step, which backward Euler damps: "
+            "parameters that take up the difference will be wrong. Take integration: radau (or auto)."
+        )
     for direction in facts.identifiable.faint:
         shares = ", ".join(f"{name} ({share:+.3g})" for name, share in direction.items())
         yield (

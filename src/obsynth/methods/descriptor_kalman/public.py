@@ -47,7 +47,7 @@ def descriptor_kalman(
         Use the equations of step k + 1 in which x(k + 2) does not appear already for x(k + 1).  They need u(k + 1),
         which `step` has; Q must not couple them with the others.
     outliers : {"none", "gate", "huber"}, optional
-        What is done with a sample that its prediction excludes: taken as it is; left out, at most three times in a row
+        What is done with a sample that its prediction excludes: taken as it is; left out, at most twice in a row
         of one sensor; or taken at the limit (Huber's weight).
     outlier_limit : float, optional
         In standard deviations of the prediction: 6 for ``gate`` and 3 for ``huber`` by default.

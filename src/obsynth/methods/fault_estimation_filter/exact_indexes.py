@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import random
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -59,12 +58,19 @@ def numbers_with_fault_states(plant: DescriptorSystem) -> PlantNumbers | None:
     return numbers.with_matrices(changed, rational=rational)
 
 
-@lru_cache(maxsize=4)
 def exact_indexes(plant: DescriptorSystem) -> ExactIndexes | None:
     """Return them where ``rank [E; C]`` is full; ``None`` where that fails, or data were computed."""
-    numbers = numbers_with_fault_states(plant)
+    numbers = numbers_of(plant)
     if numbers is None or numbers.computed:
         return None  # a Markov parameter that is zero may have been computed as one that is not
+    found: ExactIndexes | None = numbers.remembered("indexes", lambda: _decided_indexes(plant))
+    return found
+
+
+def _decided_indexes(plant: DescriptorSystem) -> ExactIndexes | None:
+    numbers = numbers_with_fault_states(plant)
+    if numbers is None:
+        return None
     t = _nonsingular_t(numbers)
     if t is None:
         return None

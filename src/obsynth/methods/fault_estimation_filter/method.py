@@ -26,4 +26,5 @@ METHOD = MethodSpec(
     claims=CLAIMS,
     witnesses=frozenset({"P_factor", "tracking", "T0"}),
     tracked="obsynth.methods.fault_estimation_filter.checks:tracked_plant",
+    averaged=True,
 )

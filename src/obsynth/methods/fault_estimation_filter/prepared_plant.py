@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from obsynth.analysis.plant_units import FAR_UNITS, PlantUnits
+from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.transformations import augment_faults
 from obsynth.methods.fault_estimation_filter.detectability_indexes import (
     FaultDetectability,
@@ -29,6 +29,9 @@ from obsynth.methods.fault_estimation_filter.restricted_equivalent import (
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.scaling import Scaling, balance_system
 from obsynth.plants.descriptor import DescriptorSystem
+
+#: Balanced units are kept while the condition number of ``[E; C]`` is below this.
+MOST_CONDITION = 256.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,18 +65,27 @@ def with_sensor_faults_as_states(plant: DescriptorSystem) -> DescriptorSystem:
     return augment_faults(plant, direct).plant if direct else plant
 
 
+def _scaling(work: DescriptorSystem) -> Scaling:
+    """Return balanced units, or the natural ones where balancing leaves ``[E; C]``, on which T and N rest, worse."""
+    balanced = balance_system(work.E, work.A, inputs=[work.Bf], outputs=[work.C])
+    if _condition(work, balanced) <= MOST_CONDITION:
+        return balanced
+    units = PlantUnits.of(work).rounded()
+    natural = Scaling(units.equations, units.states, units.outputs)
+    return min(natural, balanced, key=lambda scaling: _condition(work, scaling))
+
+
+def _condition(work: DescriptorSystem, scaling: Scaling) -> float:
+    return float(np.linalg.cond(np.vstack([scaling.scale_dynamics(work.E), scaling.scale_output(work.C)])))
+
+
 def prepare(plant: DescriptorSystem, s: FloatArray | None = None) -> PreparedPlant:
     """Return the prepared plant; the rank conditions must hold.
 
     Shapes: ``s (na, na + ny)``.
     """
     work = with_sensor_faults_as_states(plant)
-    units = PlantUnits.of(work).rounded()
-    scaling = (
-        Scaling(units.equations, units.states, units.outputs)
-        if units.spread > FAR_UNITS
-        else balance_system(work.E, work.A, inputs=[work.Bf], outputs=[work.C])
-    )
+    scaling = _scaling(work)
     a, c = scaling.scale_dynamics(work.A), scaling.scale_output(work.C)
     if s is None:
         t, n = restricted_equivalent(scaling.scale_dynamics(work.E), c)

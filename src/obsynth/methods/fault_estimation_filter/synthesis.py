@@ -37,6 +37,7 @@ from obsynth.methods.fault_estimation_filter.prepared_plant import PreparedPlant
 from obsynth.methods.fault_estimation_filter.realisation import realise_filter
 from obsynth.methods.synthesis_result import Synthesis
 from obsynth.numerics.arrays import FloatArray, as_matrix
+from obsynth.observers.linear.averaging import averaged
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import Certificate
 
@@ -91,7 +92,12 @@ def synthesise(plant: DescriptorSystem, asked: FilterOptions, *, progress: Calla
         "engine": asked.engine,
         "solver": asked.solver,
         "tolerance": asked.tolerance,
+        "mean": asked.mean,
     }
+    if asked.mean > 1:
+        # Registers hold estimates, which see no state: nothing of the plant is tracked there.
+        tracking = np.vstack([tracking, np.zeros(((asked.mean - 1) * plant.nf, tracking.shape[1]))])
+        observer = averaged(observer, asked.mean)
     return Synthesis(
         resolved,
         gains,

@@ -37,6 +37,10 @@ from obsynth.numerics.ranks import decide_rank
 
 #: Share of its limit at which p, and delta where it is free, is taken.
 SHARE = 0.5
+#: Times that states are changed to those in which a Riccati solution is near one.
+MOST_NORMALISATIONS = 4
+#: Directions of a Riccati solution below this share are not told from zero.
+NEGLIGIBLE_SHARE = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,8 +87,47 @@ def reduced_lmi(task: PdTask, *, solver: str) -> PdSolution:
 def closed_form(task: PdTask, *, free_delta: bool) -> tuple[PdSolution, float]:
     """Return gains from a Riccati equation, with their certificate, and the delta that it is for.
 
-    The gain J is that of a Kalman filter for unit noise on all states and outputs, and L = 0.
+    The gain J is that of a Kalman filter for unit noise on all states and outputs, and L = 0.  Where modes show so
+    little that this is lost in rounding, the states are those in which the solution of the equation is near one.
     """
+    try:
+        return _closed_form(task, free_delta=free_delta)
+    except SolverError as error:
+        if "delta_limit" in error.record:
+            raise
+        failure = error
+    a, c = task.plants[0]
+    states = inverse = np.eye(len(a))
+    for _ in range(MOST_NORMALISATIONS):
+        found = _normalising(inverse @ a @ states, c @ states)
+        if found is None:
+            raise failure
+        states, inverse = states @ found[0], found[1] @ inverse
+        moved = replace(task, plants=((inverse @ a @ states, c @ states),))
+        try:
+            own, delta = _closed_form(moved, free_delta=free_delta)
+        except SolverError:
+            continue
+        p1, p3 = (inverse.T @ part @ inverse for part in (own.P1[0], own.P3))
+        return replace(own, J=states @ own.J, L=states @ own.L, P1=(0.5 * (p1 + p1.T),), P3=p3), delta
+    raise failure
+
+
+def _normalising(a: FloatArray, c: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+    """Return a change of states, and its inverse, in which the solution of the Riccati equation is near one."""
+    from scipy.linalg import solve_continuous_are
+
+    one = np.eye(len(a))
+    try:
+        p = solve_continuous_are(a.T, c.T, one, np.eye(len(c)))
+        sizes, directions = np.linalg.eigh(0.5 * (p + p.T))
+    except (np.linalg.LinAlgError, ValueError):
+        return None
+    roots = np.sqrt(np.maximum(sizes, NEGLIGIBLE_SHARE * sizes[-1]))
+    return directions * roots, (directions / roots).T
+
+
+def _closed_form(task: PdTask, *, free_delta: bool) -> tuple[PdSolution, float]:
     a, c = task.plants[0]
     shifted = a + task.decay * np.eye(len(a))
     record = {"what": _WHAT, "solver": "Riccati equation, LAPACK"}

@@ -114,6 +114,9 @@ def _eliminated(plant: DescriptorSystem) -> Transformation:
     found = eliminated_exactly(plant, None if basis is None else units.states[:, None] * basis)
     if found is not None:
         return found
+    found = eliminate_algebraic_states(plant)
+    if origin_of(found.plant) is not None:
+        return found
     exact = units.rounded()
     found = eliminate_algebraic_states(exact.scaled_plant(plant))
     if set(found.plant.state_names) <= set(plant.state_names):
@@ -136,8 +139,8 @@ def _in_given_units(found: Transformation, plant: DescriptorSystem, units: Plant
         own * old.from_disturbance / units.disturbances,
         own * old.from_noise * (1.0 if units.discrete else np.sqrt(units.time)), old.noise_kept,
     )  # fmt: skip
-    return Transformation(
-        plant, back.scaled_plant(found.plant).replace(E=None, dt=plant.dt), found.description, recovery
+    return replace(
+        found, source=plant, plant=back.scaled_plant(found.plant).replace(E=None, dt=plant.dt), recovery=recovery
     )
 
 

@@ -30,6 +30,12 @@ def exact_drops(plant: DescriptorSystem, model: Exosystem) -> ExactDrops | None:
     numbers = numbers_of(plant)
     if numbers is None:
         return None
+    key = ("drops", model.Phi.tobytes(), model.Cw.tobytes(), model.order)
+    found: ExactDrops = numbers.remembered(key, lambda: _drops(numbers, plant, model))
+    return found
+
+
+def _drops(numbers: PlantNumbers, plant: DescriptorSystem, model: Exosystem) -> ExactDrops:
     kept = numbers.independent_columns(numbers.blocks([[numbers.matrix("Bd")], [numbers.matrix("Dd")]]), plant.nd)
     augmented = _augmented(numbers, plant, model)
     bd = numbers.picked(numbers.matrix("Bd"), kept)

@@ -9,8 +9,9 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
+from obsynth.observers.dae.integration import chosen_integration
 from obsynth.observers.dae.observer import DAEObserver
-from obsynth.plants.dae.checks import finite_vector
+from obsynth.plants.dae.checks import finite_vector, step_length
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.names import index_of
 
@@ -48,10 +49,16 @@ def dae_observer_from_options(model: DAEModel, options: Mapping[str, Any]) -> DA
         ),
         random_walk=_covariance(options["random_walk"], parameters, "random_walk", np.zeros(model.nq)),
         lower=bounds[:, 0], upper=bounds[:, 1], form=options["form"], forgetting=options["forgetting"],
-        guard=options["guard"], weight=options["weight"], integration=options["integration"],
+        guard=options["guard"], weight=options["weight"], integration=_integration(model, options),
         largest_move=options["largest_move"], window=options["window"],
         outliers=options.get("outliers", "none"), outlier_limit=options.get("outlier_limit"),
     )  # fmt: skip
+
+
+def _integration(model: DAEModel, options: Mapping[str, Any]) -> str:
+    """Return the integration that is asked for, or that the plant needs."""
+    wanted: str = options["integration"]
+    return chosen_integration(model, step_length(options["dt"])) if wanted == "auto" else wanted
 
 
 def resolved_options(observer: DAEObserver) -> dict[str, Any]:

@@ -58,7 +58,7 @@ class DAEObserver(DAESettings):
     window : int
         Samples over which excitation is watched.
     outliers : {"none", "gate", "huber"}
-        What is done with a sample that its prediction excludes: taken as it is; left out, at most three times in a row
+        What is done with a sample that its prediction excludes: taken as it is; left out, at most twice in a row
         of one sensor; or taken at the limit.
     outlier_limit : float or None
         In standard deviations of the prediction: 6 for ``gate`` and 3 for ``huber`` by default.

@@ -35,7 +35,7 @@ class RecursiveObserver(RecursiveSettings):
     early_constraints : bool
         Whether equations without x(k+1) are used one step earlier, with u(k+1).
     outliers : {"none", "gate", "huber"}
-        What is done with a sample that its prediction excludes: taken as it is; left out, at most three times in a row
+        What is done with a sample that its prediction excludes: taken as it is; left out, at most twice in a row
         of one sensor; or taken at the limit.
     outlier_limit : float or None
         In standard deviations of the prediction: 6 for ``gate`` and 3 for ``huber`` by default.

@@ -168,12 +168,20 @@ def _consistency_rows(design: ObserverDesign, shipped: DAEObserver) -> Iterator[
     roots = [covariance_factor(stated.initial_parameter_covariance, "initial_parameter_covariance"),
              covariance_factor(stated.initial_covariance, "initial_covariance")]  # fmt: skip
     u = np.tile(stated.model.nominal_input, (STEPS + 1, 1))
+    walk = np.zeros((stated.model.nq, stated.model.nq))
+    if stated.form != "forgetting":
+        walk = covariance_factor(stated.random_walk, "random_walk")
     parameters, outputs = [], []
     for trial in range(TRIALS):
         theta = stated.initial_parameters + roots[0] @ rng.standard_normal(stated.model.nq)
-        parameters.append(np.clip(theta, stated.lower, stated.upper))
+        path = np.tile(theta, (STEPS + 1, 1))
+        if walk.any():
+            # Where a walk is stated, the parameters walk.
+            path[1:] += np.cumsum(rng.standard_normal((STEPS, stated.model.nq)) @ walk.T, axis=0)
+        path = np.clip(path, stated.lower, stated.upper)
+        parameters.append(path[-1])
         start = stated.initial_state + roots[1] @ rng.standard_normal(stated.model.nx)
-        truth = simulate_dae(stated.model, u, dt=stated.dt, parameters=parameters[-1], initial_state=start, Q=stated.Q,
+        truth = simulate_dae(stated.model, u, dt=stated.dt, parameters=path, initial_state=start, Q=stated.Q,
                              R=stated.R, integration=stated.integration, seed=SEED + trial)  # fmt: skip
         outputs.append(truth.outputs)
     # As C it would be faster, but the compiler takes longer than all of this.

@@ -1,0 +1,99 @@
+"""A proof of an alarm from measured data."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from obsynth.data.linear_log import DataObserver
+from obsynth.data.signals import Signals
+from obsynth.data.sources import Data, chunks
+from obsynth.data.stamps import Stamps
+from obsynth.errors import SpecError
+from obsynth.experiments.alarm_proofs.proof import WINDOW, AlarmProof, proved_alarm
+from obsynth.numerics.arguments import require_kind, require_mapping
+from obsynth.results.design import ObserverDesign
+
+#: Rows that are read at a time.
+_CHUNK = 10_000
+
+
+def prove_alarm(
+    design: ObserverDesign, data: Data, row: int, *, window: int = WINDOW,
+    disturbance_bounds: Mapping[str, float] | None = None, noise_bound: float | None = None,
+    initial_set: Mapping[str, Any] | None = None, state_bounds: Mapping[str, Any] | None = None,
+    columns: Mapping[str, str] | None = None, scales: Mapping[str, float] | None = None,
+) -> AlarmProof:  # fmt: skip
+    """Return a proof that measured data up to a row are not fault-free, or that there is none.
+
+    The window's samples are written as a linear programme over states, disturbances, noise and constants (products by
+    McCormick); its dual is checked in rational arithmetic.  "Cannot be proved" is an answer, not an error.
+
+    Parameters
+    ----------
+    design : ObserverDesign
+        Linear, discrete in time; its plant's tolerances count.
+    data : path, text stream or pandas.DataFrame
+        As for `run_on_data`, without gaps from the first row to ``row``.
+    row : int
+        Last row of the window, counted from 1.
+    window : int, optional
+        Samples.
+    disturbance_bounds : mapping, optional
+        Largest absolute value of each disturbance by name.
+    noise_bound : float, optional
+        Standard deviations that no component of the noise exceeds.
+    initial_set : mapping, optional
+        Bounds of the plant's states at the first row, as for `online_monitor`: bounds in the window follow from the
+        observer, and what is proved is a fault since the first row.
+    state_bounds : mapping, optional
+        Without ``initial_set``: bounds of the absolute value of every state in the window.
+    columns, scales : mapping, optional
+        As for `run_on_data`.
+
+    Returns
+    -------
+    AlarmProof
+        `proved`, a sentence, and the certificate, which `AlarmProof.save` writes for ``obsynth verify``.
+
+    Raises
+    ------
+    SpecError
+        The data or an option is malformed, or nothing bounds a signal.
+
+    Notes
+    -----
+    A. Neumaier and O. Shcherbina, "Safe bounds in linear and mixed-integer linear programming", Math. Programming 99,
+    2004; G. McCormick, "Computability of global solutions to factorable nonconvex programs", 1976.
+    """
+    require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
+    for name, value in (("columns", columns), ("scales", scales)):
+        require_mapping(value, name)
+    if isinstance(row, bool) or not isinstance(row, int) or row < 2:
+        raise SpecError(f"row is {row!r}: give the number of a row, 2 or more.", path="row")
+    reader = DataObserver(design)
+    signals = Signals.of(reader, columns, scales)
+    found: list[np.ndarray] = []
+    for chunk in chunks(data, signals, Stamps(), _CHUNK):
+        for line in chunk:
+            seconds, missing = reader.clock.advance(float(line[0]), len(found) + 1)
+            del seconds
+            values = signals.scale * line[1:] - signals.offset
+            if (len(found) and missing) or not np.isfinite(values).all():
+                raise SpecError(f"Row {len(found) + 1} has a gap before it or misses a sample: give complete rows.",
+                                path="data")  # fmt: skip
+            found.append(values)
+            if len(found) == row:
+                break
+        if len(found) == row:
+            break
+    if len(found) < row:
+        raise SpecError(f"The data have {len(found)} rows: row {row} is not among them.", path="row")
+    values = np.array(found)
+    nu = len(design.linear[1].input_names)
+    return proved_alarm(
+        design, values[:, :nu], values[:, nu:], window=window, disturbance_bounds=disturbance_bounds,
+        noise_bound=noise_bound, initial_set=initial_set, state_bounds=state_bounds,
+    )  # fmt: skip

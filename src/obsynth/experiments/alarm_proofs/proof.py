@@ -1,0 +1,205 @@
+"""From a record to a proof that it is not fault-free: the programme solved, its dual checked in exact arithmetic."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from obsynth.errors import PreconditionError, SpecError
+from obsynth.experiments.alarm_proofs.replay import window_data
+from obsynth.experiments.alarm_proofs.window import Window, window_programme
+from obsynth.files.outputs import write_atomically
+from obsynth.numerics.arrays import FloatArray
+from obsynth.plants.names import index_of
+from obsynth.results.design import ObserverDesign
+from obsynth.tolerances.robustness import EXACT_MODEL
+
+#: Samples of a window.
+WINDOW = 20
+#: Multipliers are kept to this many significant digits: any numbers prove a bound, and few digits stay readable.
+MULTIPLIER_DIGITS = 12
+
+
+@dataclass(frozen=True, eq=False)
+class AlarmProof:
+    """Whether a record up to a row is proved not to be fault-free; see `obsynth.prove_alarm`.
+
+    Parameters
+    ----------
+    proved : bool
+        Whether nothing explains the data without a fault since the start.
+    row : int
+        Last row of the window, from 1.
+    window : int
+        Samples of the window.
+    margin : float
+        Proved lower bound of what all bounds would have to be exceeded by, in the signals' units; 0 or less: no proof.
+    statement : str
+        What is proved, or why it cannot be.
+    origin : str
+        Where the bounds of the state come from.
+    certificate : mapping
+        Everything that `obsynth verify` needs; empty without a proof.
+    """
+
+    proved: bool
+    row: int
+    window: int
+    margin: float
+    statement: str
+    origin: str
+    certificate: Mapping[str, Any]
+
+    def save(self, path: str | Path) -> Path:
+        """Write the certificate as one JSON document, atomically.
+
+        Parameters
+        ----------
+        path : str or Path
+            Where to write.
+
+        Raises
+        ------
+        SpecError
+            There is no proof to write, or the file cannot be written.
+        """
+        from obsynth.experiments.alarm_proofs.certificate import document
+
+        if not self.proved:
+            raise SpecError("There is no proof to write: the alarm cannot be proved.", path="certificate")
+        return write_atomically(path, document(self.certificate))
+
+    def __str__(self) -> str:
+        return self.statement
+
+
+def proved_alarm(
+    design: ObserverDesign, u: FloatArray, y: FloatArray, *, window: int = WINDOW,
+    disturbance_bounds: Mapping[str, float] | None = None, noise_bound: float | None = None,
+    initial_set: Mapping[str, Any] | None = None, state_bounds: Mapping[str, Any] | None = None,
+) -> AlarmProof:  # fmt: skip
+    """Return the proof for the last sample of a record ``u (steps, nu)``, ``y (steps, ny)`` of deviations."""
+    question = Question.of(design, disturbance_bounds, noise_bound, initial_set, state_bounds, window)
+    row, length = len(y), min(window, len(y))
+    try:
+        programme, origin = question.programme(design, u, y)
+    except PreconditionError as error:
+        return AlarmProof(False, row, length, 0.0, f"Cannot be proved: {error}", "", {})
+    found = solved(programme)
+    if found is None:
+        text = "Cannot be proved: the solver of linear programmes gave no multipliers."
+        return AlarmProof(False, row, length, 0.0, text, origin, {})
+    equal, below = found
+    margin = float(programme.proved_least(equal, below))
+    if not margin > 0.0:
+        text = (
+            f"Cannot be proved: some plant within its tolerances, with disturbances and noise within their bounds, may "
+            f"explain the last {length} samples without a fault (the relaxed programme has a solution)."
+        )
+        return AlarmProof(False, row, length, margin, text, origin, {})
+    text = statement(design, length, origin)
+    certificate = {
+        **question.as_dict(), "u": u, "y": y, "row": row, "equal": equal, "below": below, "margin": margin,
+        "origin": origin, "statement": text,
+    }  # fmt: skip
+    from obsynth.results.gain_sets import design_as_dict, plain
+
+    return AlarmProof(True, row, length, margin, text, origin,
+                      {**plain(certificate), "gain_set": design_as_dict(design)})  # fmt: skip
+
+
+def statement(design: ObserverDesign, length: int, origin: str) -> str:
+    """Return what a proof says, with everything it rests on."""
+    uncertain = design.linear[0].uncertainty
+    box = None if uncertain is None or not uncertain.box.names else uncertain.box
+    outside = f"; it {EXACT_MODEL}" if box is None else f", or {box.sentence}"
+    since = "since the start" if "start" in origin else "in the window (states within their stated bounds)"
+    return (
+        f"Proved: the last {length} samples are not explained without a fault {since} by any plant within its "
+        f"tolerances, disturbances and noise within their bounds, and a start within its set (bounds of the state: "
+        f"{origin}): a fault{outside}."
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Question:
+    """What is asked of a record: bounds of what is unknown, and the window's length."""
+
+    bounds: FloatArray
+    noise_bound: float
+    initial_set: Mapping[str, Any] | None
+    state_bounds: Mapping[str, Any] | None
+    window: int
+
+    @classmethod
+    def of(
+        cls, design: ObserverDesign, disturbance_bounds: Mapping[str, float] | None, noise_bound: float | None,
+        initial_set: Mapping[str, Any] | None, state_bounds: Mapping[str, Any] | None, window: int,
+    ) -> Question:  # fmt: skip
+        """Return what is asked of a discrete linear design, checked."""
+        plant, _ = design.linear
+        if not plant.is_discrete:
+            raise SpecError("A window is proved for sampled designs: this one is continuous in time.", path="gains")
+        if isinstance(window, bool) or not isinstance(window, int) or window < 2:
+            raise SpecError(f"window is {window!r}: give a whole number of samples, 2 or more.", path="window")
+        bounds = np.full(plant.nd, np.nan)
+        for name, value in (disturbance_bounds or {}).items():
+            bounds[index_of(name, plant.disturbance_names, what="disturbance_bounds")] = value
+        if not np.all(bounds >= 0.0) or not np.isfinite(bounds).all():
+            missing = [name for name, bound in zip(plant.disturbance_names, bounds, strict=True) if not bound >= 0.0]
+            raise SpecError(f"The disturbance {(missing or ['?'])[0]!r} has no bound: give disturbance_bounds "
+                            "(--disturbance), finite and 0 or more.", path="disturbance_bounds")  # fmt: skip
+        if plant.nw and noise_bound is None:
+            raise SpecError("Noise has no bound: give noise_bound (--noise-bound), in standard deviations.",
+                            path="noise_bound")  # fmt: skip
+        if initial_set is None and state_bounds is None:
+            raise SpecError("Nothing bounds the state: give initial_set (--initial), or state_bounds.",
+                            path="initial_set")  # fmt: skip
+        return cls(bounds, float(noise_bound or 0.0) if plant.nw else 0.0, initial_set, state_bounds, window)
+
+    def programme(self, design: ObserverDesign, u: FloatArray, y: FloatArray) -> tuple[Window, str]:
+        """Return the programme of the last samples of a record, and where its bounds of the state come from."""
+        affine, data, origin = window_data(
+            design, u, y, self.window, bounds=self.bounds, noise_bound=self.noise_bound, initial_set=self.initial_set,
+            state_bounds=self.state_bounds,
+        )  # fmt: skip
+        bounds = np.concatenate([self.bounds, np.full(affine.plant.nw, self.noise_bound)])
+        return window_programme(affine, bounds, data), origin
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain data."""
+        return {
+            "bounds": self.bounds, "noise_bound": self.noise_bound, "window": self.window,
+            "initial_set": None if self.initial_set is None else _listed(self.initial_set),
+            "state_bounds": None if self.state_bounds is None else _listed(self.state_bounds),
+        }  # fmt: skip
+
+
+def _listed(given: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: list(value) if isinstance(value, (list, tuple)) else value for name, value in given.items()}
+
+
+def solved(programme: Window) -> tuple[FloatArray, FloatArray] | None:
+    """Return multipliers of equations and inequalities (0 or less) by HiGHS; `None` where it gives none."""
+    from scipy.optimize import linprog
+
+    equal, below = programme.matrices()
+    cost = np.zeros(len(programme.lower))
+    cost[-1] = 1.0
+    given = {"A_eq": equal, "b_eq": programme.equal.right} if programme.equal.right else {}
+    found = linprog(
+        cost, A_ub=below, b_ub=programme.below.right, bounds=np.stack([programme.lower, programme.upper], axis=1),
+        method="highs", **given,
+    )  # fmt: skip
+    if found.status != 0:
+        return None
+    y = np.asarray(found.eqlin.marginals) if programme.equal.right else np.zeros(0)
+    return _short(y), _short(np.minimum(found.ineqlin.marginals, 0.0))
+
+
+def _short(values: FloatArray) -> FloatArray:
+    return np.array([float(f"{value:.{MULTIPLIER_DIGITS}g}") for value in values])

@@ -1,0 +1,227 @@
+"""The linear programme of a window: states, disturbances and constants that explain its data without a fault.
+
+Products of a constant and a state are variables of their own, between the planes of McCormick on bounds of the state.
+``t >= 0`` relaxes every inequality: where its least value is above zero, nothing explains the data.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from fractions import Fraction
+
+import numpy as np
+
+from obsynth.analysis.transformations.uncertain_plant import AffinePlant
+from obsynth.numerics.arrays import FloatArray
+
+#: The largest value of t that is of interest.
+LARGEST_RELAXATION = 1e3
+#: Bounds of the state are widened by this share: more than rounding can take from them.
+OUTWARD = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Sparse rows ``sum value * variable (= or <=) right``: lists of columns and values, and right sides."""
+
+    columns: list[list[int]]
+    values: list[list[float]]
+    right: list[float]
+
+    def add(self, entries: Mapping[int, float], right: float) -> None:
+        """Append a row."""
+        kept = {column: value for column, value in entries.items() if value != 0.0}
+        self.columns.append(list(kept))
+        self.values.append([float(value) for value in kept.values()])
+        self.right.append(float(right))
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """The programme: equations, inequalities, bounds of all variables; the last variable is t."""
+
+    equal: Rows
+    below: Rows
+    lower: FloatArray
+    upper: FloatArray
+
+    def matrices(self) -> tuple[object, object]:
+        """Return both sets of rows as sparse matrices."""
+        from scipy.sparse import csr_array
+
+        found = []
+        for rows in (self.equal, self.below):
+            starts = np.cumsum([0, *(len(item) for item in rows.columns)])
+            columns = np.array([j for item in rows.columns for j in item], dtype=np.int64)
+            values = np.array([value for item in rows.values for value in item])
+            found.append(csr_array((values, columns, starts), shape=(len(rows.right), len(self.lower))))
+        return found[0], found[1]
+
+    def proved_least(self, equal: FloatArray, below: FloatArray) -> Fraction:
+        """Return a lower bound of the least t from multipliers (of inequalities: 0 or less), in exact arithmetic.
+
+        With all variables between bounds, any multipliers prove one: A. Neumaier and O. Shcherbina, "Safe bounds in
+        linear and mixed-integer linear programming", Math. Programming 99, 2004.
+        """
+        reduced: dict[int, Fraction] = {len(self.lower) - 1: Fraction(1)}
+        total = Fraction(0)
+        for rows, multipliers in ((self.equal, equal), (self.below, np.minimum(below, 0.0))):
+            for i in np.flatnonzero(multipliers):
+                weight = Fraction(float(multipliers[i]))
+                total += weight * Fraction(rows.right[i])
+                for j, entry in zip(rows.columns[i], rows.values[i], strict=True):
+                    reduced[j] = reduced.get(j, Fraction(0)) - weight * Fraction(entry)
+        for j, value in list(reduced.items()):
+            end = self.lower[j] if value > 0 else self.upper[j]
+            total += value * Fraction(float(end))
+        return total
+
+
+@dataclass(frozen=True, eq=False)
+class WindowData:
+    """What is known of a window of N samples: ``u (N, nu)``, ``y (N, ny)``, the state between ``low, high (N, n)``."""
+
+    u: FloatArray
+    y: FloatArray
+    low: FloatArray
+    high: FloatArray
+
+
+class _Variables:
+    """Places of the variables: x (N n), d (N nd), q, products (N m), t."""
+
+    def __init__(self, steps: int, n: int, nd: int, q: int, m: int, *, varying: bool) -> None:
+        self.n, self.nd, self.p, self.m, self.varying = n, nd, q, m, varying
+        self.d = steps * n
+        self.q = self.d + steps * nd
+        self.products = self.q + q * (steps if varying else 1)
+        self.t = self.products + steps * m
+        self.count = self.t + 1
+
+    def state(self, k: int, i: int) -> int:
+        return k * self.n + i
+
+    def disturbance(self, k: int, i: int) -> int:
+        return self.d + k * self.nd + i
+
+    def constant(self, k: int, i: int) -> int:
+        return self.q + (k * self.p if self.varying else 0) + i
+
+    def product(self, k: int, j: int) -> int:
+        return self.products + k * self.m + j
+
+
+def window_programme(plant: AffinePlant, bounds: FloatArray, data: WindowData) -> Window:
+    """Return the programme of a window; ``bounds (nd + nw,)`` of disturbances and noise."""
+    steps, n, p = len(data.y), plant.A.shape[0], plant.count
+    bd, dd = _with_noise(plant)
+    pairs = [
+        (i, j) for i in range(p) for j in range(n)
+        if plant.A.parts[i][:, j].any() or plant.E.parts[i][:, j].any() or plant.C.parts[i][:, j].any()
+    ]  # fmt: skip
+    at = _Variables(steps, n, bd.shape[1], p, len(pairs), varying=plant.box.variation == "varying")
+    size = np.maximum(np.abs(data.low), np.abs(data.high))
+    equal, below = Rows([], [], []), Rows([], [], [])
+    builder = _Builder(plant, at, pairs, data, size, bounds, bd, dd)
+    for k in range(steps):
+        builder.dynamics(k, equal, below)
+        builder.outputs(k, below)
+        builder.products(k, below)
+        builder.state(k, below)
+    lower, upper = np.zeros(at.count), np.zeros(at.count)
+    # The bounds of the state are rows that t relaxes; the variables themselves have room for that.
+    lower[: at.d], upper[: at.d] = (data.low - LARGEST_RELAXATION).ravel(), (data.high + LARGEST_RELAXATION).ravel()
+    upper[at.d : at.q] = np.tile(bounds, steps)
+    upper[at.q : at.products] = 1.0
+    sizes = [size[k, [j for _, j in pairs]] for k in range(steps)]
+    upper[at.products : at.t] = np.concatenate(sizes) + LARGEST_RELAXATION
+    lower[at.d : at.t] = -upper[at.d : at.t]
+    upper[at.t] = LARGEST_RELAXATION
+    return Window(equal, below, lower, upper)
+
+
+def _with_noise(plant: AffinePlant) -> tuple[FloatArray, FloatArray]:
+    system = plant.plant
+    return np.hstack([plant.Bd.center, system.Bw]), np.hstack([plant.Dd.center, system.Dw])
+
+
+class _Builder:
+    """Rows of one sample."""
+
+    def __init__(
+        self, plant: AffinePlant, at: _Variables, pairs: list[tuple[int, int]], data: WindowData, size: FloatArray,
+        bounds: FloatArray, bd: FloatArray, dd: FloatArray,
+    ) -> None:  # fmt: skip
+        self.plant, self.at, self.pairs, self.data, self.size = plant, at, pairs, data, size
+        self.bd, self.dd = bd, dd
+        e = plant.E
+        self.algebraic = (np.abs(e.center) + e.spread + e.radius).max(axis=1, initial=0.0) == 0.0
+        nd = plant.Bd.shape[1]
+        self.loose = (plant.Bd.spread + plant.Bd.radius) @ bounds[:nd]
+        self.seen = (plant.Dd.spread + plant.Dd.radius) @ bounds[:nd]
+
+    def dynamics(self, k: int, equal: Rows, below: Rows) -> None:
+        """Add ``E x(k+1) - A x(k) - Bd d = B u``: exactly, or between bounds of the remainders."""
+        plant, at, data = self.plant, self.at, self.data
+        last = k + 1 == len(data.y)
+        for r in range(at.n):
+            if last and not self.algebraic[r]:
+                continue
+            entries: dict[int, float] = {}
+            loose = float(self.loose[r] + plant.A.radius[r] @ self.size[k] + plant.B.radius[r] @ np.abs(data.u[k]))
+            if not self.algebraic[r]:
+                entries |= {at.state(k + 1, i): plant.E.center[r, i] for i in range(at.n)}
+                entries |= {at.product(k + 1, j): plant.E.parts[i][r, c] for j, (i, c) in enumerate(self.pairs)}
+                loose += float(plant.E.radius[r] @ self.size[k + 1])
+            for i in range(at.n):
+                entries[at.state(k, i)] = -plant.A.center[r, i]
+            for j, (i, c) in enumerate(self.pairs):
+                entries[at.product(k, j)] = -plant.A.parts[i][r, c]
+            for i in range(at.p):
+                entries[at.constant(k, i)] = -float(plant.B.parts[i][r] @ data.u[k])
+            for i in range(at.nd):
+                entries[at.disturbance(k, i)] = -self.bd[r, i]
+            right = float(plant.B.center[r] @ data.u[k])
+            # The right side is computed: what rounding may have taken from it counts as remainder.
+            loose += 1e-15 * float(plant.B.magnitude[r] @ np.abs(data.u[k]))
+            self._between(equal, below, entries, right, loose)
+
+    def outputs(self, k: int, below: Rows) -> None:
+        """Add ``y = C x + D u + Dd d``, relaxed by t."""
+        plant, at, data = self.plant, self.at, self.data
+        for r in range(len(plant.C.center)):
+            entries = {at.state(k, i): plant.C.center[r, i] for i in range(at.n)}
+            entries |= {at.product(k, j): plant.C.parts[i][r, c] for j, (i, c) in enumerate(self.pairs)}
+            entries |= {at.disturbance(k, i): self.dd[r, i] for i in range(at.nd)}
+            entries |= {at.constant(k, i): float(plant.D.parts[i][r] @ data.u[k]) for i in range(at.p)}
+            right = float(data.y[k, r] - plant.D.center[r] @ data.u[k])
+            loose = float(self.seen[r] + plant.C.radius[r] @ self.size[k] + plant.D.radius[r] @ np.abs(data.u[k]))
+            loose += 1e-15 * float(abs(data.y[k, r]) + plant.D.magnitude[r] @ np.abs(data.u[k]))
+            for sign in (1.0, -1.0):
+                row = {column: sign * value for column, value in entries.items()}
+                row[at.t] = -1.0
+                below.add(row, sign * right + loose)
+
+    def state(self, k: int, below: Rows) -> None:
+        """Add the bounds of the state, relaxed by t."""
+        for i in range(self.at.n):
+            place = self.at.state(k, i)
+            below.add({place: 1.0, self.at.t: -1.0}, float(self.data.high[k, i]))
+            below.add({place: -1.0, self.at.t: -1.0}, -float(self.data.low[k, i]))
+
+    def products(self, k: int, below: Rows) -> None:
+        """Add the four planes of McCormick of each product, relaxed by t."""
+        at, data = self.at, self.data
+        for j, (i, c) in enumerate(self.pairs):
+            low, high = float(data.low[k, c]), float(data.high[k, c])
+            for q, s, sign in ((-1.0, low, -1.0), (1.0, high, -1.0), (1.0, low, 1.0), (-1.0, high, 1.0)):
+                row = {at.product(k, j): sign, at.state(k, c): -sign * q, at.constant(k, i): -sign * s, at.t: -1.0}
+                below.add(row, -sign * q * s)
+
+    def _between(self, equal: Rows, below: Rows, entries: Mapping[int, float], right: float, loose: float) -> None:
+        if loose == 0.0:
+            equal.add(entries, right)
+            return
+        below.add(entries, right + loose)
+        below.add({column: -value for column, value in entries.items()}, -right + loose)

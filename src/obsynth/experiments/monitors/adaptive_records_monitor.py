@@ -1,0 +1,149 @@
+"""The adaptive threshold for records of one length: what `obsynth.monitor` gives for a plant with tolerances."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.experiments.batch_simulation import Runs
+from obsynth.experiments.monitors.adaptive_bound import THRESHOLD_ROUNDING
+from obsynth.experiments.monitors.adaptive_monitor import adaptive_plan, adaptive_statement
+from obsynth.experiments.monitors.adaptive_record import thresholds_of_records
+from obsynth.experiments.monitors.adaptive_rule import AdaptivePlan, record_columns
+from obsynth.experiments.monitors.monitor import Detection, Monitor
+from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.linear.observer import Estimates
+from obsynth.results.design import ObserverDesign
+from obsynth.simulation.scenario import Scenario
+from obsynth.simulation.scenario_signals import resolve
+
+
+def noisy_design(design: ObserverDesign, scenario: Scenario | None) -> ObserverDesign:
+    """Return a design whose plant has the noise of a scenario; tolerances stay."""
+    if scenario is None:
+        return design
+    plant, _ = design.linear
+    drive = resolve(plant, scenario)
+    noise = plant.replace(
+        Bw=np.hstack([scenario.noise * plant.Bw, np.zeros((plant.nx, plant.ny))]),
+        Dw=np.hstack([scenario.noise * plant.Dw, np.diag(drive.deviations)]), noise_names=None,
+    )  # fmt: skip
+    kept = noise.Bw.any(axis=0) | noise.Dw.any(axis=0)
+    return design.replace(plant=noise.replace(Bw=noise.Bw[:, kept], Dw=noise.Dw[:, kept], noise_names=None))
+
+
+@dataclass(frozen=True, eq=False)
+class AdaptiveMonitor(Monitor):
+    """A monitor whose threshold adapts to the signals; `threshold` is the nominal one, which it is never below.
+
+    Parameters
+    ----------
+    plan : AdaptivePlan
+        The bounds.
+    """
+
+    plan: AdaptivePlan | None = None
+
+    def bounds(self, runs: Runs) -> tuple[FloatArray, FloatArray]:
+        """Return thresholds of fault estimates and residuals ``(runs, steps, no)``, and intervals of the faults.
+
+        Parameters
+        ----------
+        runs : Runs
+            What happened, as `Bench.run` gives it.
+        """
+        return record_columns(self._plan, *_by_run(runs, slice(None)))
+
+    @property
+    def _plan(self) -> AdaptivePlan:
+        if self.plan is None:
+            raise SpecError("An adaptive monitor needs a plan: use obsynth.monitor.", path="plan")
+        return self.plan
+
+    def passed_in(self, runs: Runs, residuals: slice) -> np.ndarray:
+        """Return at which samples of which runs a threshold is passed, ``(steps, runs)``.
+
+        Parameters
+        ----------
+        runs : Runs
+            What happened.
+        residuals : slice
+            Rows of the observer that are residuals.
+        """
+        plan = self._plan
+        no = plan.bound.counts[4]
+        values = np.abs(runs.rows[:, :, runs.rows.shape[2] - no :])
+        norm = self.statistic(runs.rows[:, :, residuals])
+        # No threshold over the box is below the nominal one: runs that never pass that need no other.
+        m = plan.bound.counts[3]
+        start = np.array([plan.bound.start_at(k)[m:] for k in range(len(values))])
+        beyond = (values > (plan.bound.nominal[m:] + start)[:, None]).any(axis=(0, 2))
+        begun = np.linalg.norm(start[:, plan.residuals], axis=1) if plan.start_beyond_nominal else 0.0
+        beyond |= (norm > (self.threshold + begun)[:, None] + self.floor).any(axis=0)
+        passed = np.zeros(norm.shape, dtype=bool)
+        chosen = np.flatnonzero(beyond)
+        if not len(chosen):
+            return passed
+        rows, inputs, outputs = _by_run(runs, chosen)
+        found = thresholds_of_records(plan.bound, rows @ plan.bound.structure.reading.T, inputs, outputs)
+        at = plan.residuals
+        parts = [found.shift[..., at], found.rest[..., at], *np.moveaxis(found.first[..., at], 2, 0)]
+        if plan.start_beyond_nominal:
+            parts.append(found.start[..., at])
+        beside = sum(np.linalg.norm(part, axis=2) for part in parts) + np.linalg.norm(plan.bound.more[at])
+        limit = (self.threshold[:, None] + self.floor + np.asarray(beside).T) * THRESHOLD_ROUNDING
+        passed[:, chosen] = (norm[:, chosen] > limit) | (values[:, chosen] > np.moveaxis(found.total, 0, 1)).any(axis=2)
+        return passed
+
+    def watch(self, estimates: Estimates) -> Detection:
+        """Refuse: the threshold needs the record of inputs and outputs.
+
+        Parameters
+        ----------
+        estimates : Estimates
+            Alone they are not enough.
+
+        Raises
+        ------
+        SpecError
+            Always: use `obsynth.evaluate`, or `obsynth.online_monitor` with `obsynth.run_on_data`.
+        """
+        raise SpecError(
+            "An adaptive threshold follows inputs and outputs, which estimates do not hold: use obsynth.evaluate, or "
+            "obsynth.online_monitor with obsynth.run_on_data.", path="monitor",
+        )  # fmt: skip
+
+
+def _by_run(runs: Runs, chosen: Any) -> tuple[FloatArray, FloatArray, FloatArray]:
+    return (
+        np.ascontiguousarray(np.moveaxis(runs.rows[:, chosen], 1, 0)),
+        np.ascontiguousarray(np.moveaxis(runs.inputs[:, chosen], 1, 0)),
+        np.ascontiguousarray(np.moveaxis(runs.outputs[:, chosen], 1, 0)),
+    )
+
+
+def with_box(
+    design: ObserverDesign, scenario: Scenario, nominal: Monitor, bounds: FloatArray, noise_bound: float | None, *,
+    initial_error: float | None, initial_set: Mapping[str, Any] | None,
+) -> AdaptiveMonitor:  # fmt: skip
+    """Return a pointwise monitor that holds over the box of the design's plant.
+
+    The start is the scenario's own, unless its error or a set is given.
+    """
+    plant, observer = design.linear
+    state = None if scenario.observer_state is None else np.array(scenario.observer_state)
+    if initial_set is None and initial_error is None:
+        initial_set = {
+            name: (value, value) for name in plant.state_names for value in (scenario.initial_state.get(name, 0.0),)
+        }
+    first, _ = adaptive_plan(
+        noisy_design(design, scenario), bounds, noise_bound or 0.0, initial_error=initial_error,
+        initial_set=initial_set, observer_state=state,
+    )  # fmt: skip
+    del observer
+    values = {name: getattr(nominal, name) for name in Monitor.__dataclass_fields__}
+    return AdaptiveMonitor(**{**values, "statement": adaptive_statement(first, design)}, plan=first)

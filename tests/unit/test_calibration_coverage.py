@@ -1,0 +1,16 @@
+"""A seeded share of the coverage campaign: boxes of short logs hold the truth nearly always, and miss it by little."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+
+from benchmarks.campaigns._calibration_coverage import SEED, limit, root_at_truth
+
+
+def test_boxes_of_short_logs_hold_the_truth():
+    roots = [root_at_truth(56, SEED + run) for run in range(12)]
+    assert sum(root <= limit(56) for root in roots) >= 10
+    assert max(roots) < 6.0
