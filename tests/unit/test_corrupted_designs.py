@@ -718,7 +718,11 @@ def test_units_of_the_states_do_not_hide_a_corruption(name: str) -> None:
         for row in range(rows):
             for column in range(columns):
                 corrupted = entry(matrix, row, column)(design)
-                assert failed(in_units(corrupted, powers)) == failed(corrupted), (matrix, row, column)
+                here, there = failed(corrupted), failed(in_units(corrupted, powers))
+                # A residual is judged against the sizes in its row, which units may mix; the proofs are not.
+                assert there
+                mixed = {"unbiased: dynamics", "unbiased: state"}
+                assert there | mixed == here | mixed, (matrix, row, column)
 
 
 @pytest.mark.parametrize("name", PLANTS)
