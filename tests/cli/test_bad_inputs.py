@@ -148,7 +148,7 @@ SCHEMA = [
         "empty mapping",
         whole("{}"),
         "schema_version: this key is missing",
-        more=("plant: this key",),
+        more=("name: this key", "plant: this key"),
     ),
     Case("unknown schema version", put("schema_version", 2), "schema_version: version 2 is unknown"),
     Case("schema version as text", put("schema_version", "1"), "schema_version: must be a whole number"),
@@ -172,7 +172,7 @@ SCHEMA = [
     Case(
         "unknown method",
         put("method", "id", "kalman"),
-        "the known methods are: adaptive-observer, auto, dae-adaptive-observer, descriptor-kalman",
+        "the known methods are: adaptive-observer, auto, dae-adaptive-observer",
     ),
     Case("dt negative", put("plant", "dt", -0.1), "plant.dt: must be at least 0"),
     Case("dt as text", put("plant", "dt", "1.0"), "plant.dt: must be a number, not the text '1.0'"),

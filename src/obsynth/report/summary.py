@@ -233,6 +233,7 @@ def _warnings(design: ObserverDesign, gains: FaultGains | None) -> Iterator[str]
         return
     plant, observer = design.linear
     units = plant.units
+    told = []
     for i, fault in enumerate(observer.fault_names):
         for j, name in enumerate(plant.disturbance_names):
             leak = float(gains.leaks[i, j])
@@ -242,8 +243,9 @@ def _warnings(design: ObserverDesign, gains: FaultGains | None) -> Iterator[str]
         followed = float(gains.steady[i])
         if abs(followed - 1.0) > FOLLOWS:
             share = number(100.0 * followed, digits=3)
+            told.append(fault)
             yield f"the estimate of {fault} does not follow a step: in the end it shows {share} % of it."
-    yield from design_warnings(design)
+    yield from design_warnings(design, told=told)
     for check in design.report.checks:
         if check.name.startswith("limit at "):
             yield f"{check.name}: {check.claim}."
