@@ -194,6 +194,17 @@ class TestJson:
             read_json(tmp_path / "a.json", most=50)
 
 
+@pytest.fixture
+def _usual_signals():
+    """What signals do by default: whoever runs the tests may have them ignored."""
+    usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL, signal.SIGHUP: signal.SIG_DFL}
+    before = {number: signal.signal(number, handler) for number, handler in usual.items()}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.usefixtures("_usual_signals")
 class TestSignals:
     @pytest.fixture(autouse=True)
     def heeded(self):

@@ -185,10 +185,14 @@ def _structure_as_dict(structure: Structure) -> dict[str, Any]:
 def _is_alarm(path: Path) -> bool:
     """Whether a file begins like the certificate of an alarm."""
     from obsynth.experiments.alarm_proofs.document import CERTIFICATE
-    from obsynth.files.inputs import input_file
 
-    with input_file(path).open("rb") as stream:
-        return CERTIFICATE.mark in stream.read(200)
+    if not path.is_file():  # who reads it says so
+        return False
+    try:
+        with path.open("rb") as stream:
+            return CERTIFICATE.mark in stream.read(200)
+    except OSError:
+        return False
 
 
 def _verify_alarm(options: argparse.Namespace) -> int:
