@@ -201,7 +201,8 @@ def _estimates(design: ObserverDesign, gains: FaultGains | None) -> tuple[tuple[
         return missing if value is None else f"{number(value)} {units.get(name, '')}".strip()
 
     if gains is None or not isinstance(design.plant, DescriptorSystem):
-        return ("parameter", "deviation"), [(name, deviation(name, "-")) for name in observer.fault_names]
+        when = "after the nominal run" if isinstance(design.plant, DAEModel) else "at the end of the horizon"
+        return ("parameter", f"std {when}"), [(name, deviation(name, "-")) for name in observer.fault_names]
     plant, linear = design.linear
     none = "none stated" if not plant.nw else "by sampling"
     noise = "deviation" if plant.is_discrete else "dev. at 1 s"
