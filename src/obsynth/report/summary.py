@@ -145,7 +145,9 @@ def _plant(plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel) -> 
     if isinstance(plant, TimeVaryingDescriptorSystem):
         counts = ((len(plant.state_names), "state"), (len(plant.output_names), "output"),
                   (len(plant.parameter_names), "parameter"))  # fmt: skip
-        return f"{plant.dt:g} s between samples, changing with time; {_counted(counts)}"
+        varying = [name for name, matrix in plant.matrices.items() if not matrix.is_constant]
+        change = f"change with k: {', '.join(varying)}" if varying else "constant matrices"
+        return f"{plant.dt:g} s between samples; {change}; {_counted(counts)}"
     time = f"{plant.dt:g} s between samples" if plant.is_discrete else "continuous in time"
     faults = ((plant.nf, "fault"), (plant.nd, "unknown input"))
     return f"{time}; {_counted(((plant.nx, 'state'), (plant.ny, 'output'), *faults))}"
