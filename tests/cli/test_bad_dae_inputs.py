@@ -48,7 +48,7 @@ def run(document: dict[str, Any], folder: Path, capsys: pytest.CaptureFixture[st
     YAML(typ="safe").dump(document, text)
     spec = folder / "spec.yaml"
     spec.write_text(text.getvalue(), encoding="utf-8")
-    code = main(["design", "--system", str(spec), "--quiet", "--output", str(folder / "gains.json")])
+    code = main(["design", "--system", str(spec), "--quiet", "-v", "--output", str(folder / "gains.json")])
     captured = capsys.readouterr()
     return code, captured.err if code else captured.out
 
