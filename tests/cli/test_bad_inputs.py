@@ -271,7 +271,7 @@ SHAPES = [
     Case("unknown output", put("plant", "C", {"outputs": ["x2", "x9"]}), "C has no signal named 'x9'"),
     Case("unknown state of a fault", put("plant", "Bf", {"states": ["torque"]}), "Bf has no signal named 'torque'"),
     Case("unknown state of a disturbance", put("plant", "Bd", {"states": ["x5"]}), "Bd has no signal named 'x5'"),
-    Case("unknown noisy sensor", put("plant", "sensor_noise", {"y4": 1}), "sensor_noise names 'y4'"),
+    Case("unknown noisy sensor", put("plant", "sensor_noise", {"y4": 1}), "sensor_noise has no signal named 'y4'"),
     Case("unknown operating point", put("plant", "operating_point", {"q": 1}), "operating_point names 'q'"),
     Case("unknown unit", put("plant", "units", {"q": "rad"}), "units names 'q'"),
 ]

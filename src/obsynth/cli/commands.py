@@ -60,6 +60,14 @@ def _print_design(design: ObserverDesign, file: Path, *, verbose: bool) -> None:
         design_report(design, console=console)
         console.print()
     print_summary(summary(design, file=file, everything=verbose), console=console)
+    if not verbose and "delta_scan" in design.solver:
+        from obsynth.report.designs import delta_scan_table
+        from obsynth.report.layout import print_section
+        from obsynth.results.delta_scan import DeltaScan
+
+        console.print()
+        scan = DeltaScan.from_dict(design.solver["delta_scan"])
+        print_section(console, "Other values of delta", delta_scan_table(scan))
     if not verbose and not design.report.passed:
         console.print(checks_table(design.report.failures, width=console.width))
 
