@@ -10,9 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from corruption_tables import (
+    STORED_ROWS,
     assert_every_row_is_broken,
     assert_exactly_the_untrue_rows_fail,
     assert_information_does_not_fail,
+    without_stored_bounds,
 )
 
 from obsynth import (
@@ -663,7 +665,8 @@ def test_not_a_number_anywhere_is_refused_or_fails(name: str) -> None:
     for key, matrix in design.certificate.matrices.items():
         for row in range(matrix.shape[0]):
             for column in range(matrix.shape[1]):
-                assert failed(certificate_entry(key, row, column, np.nan)(design)) == {FITS}
+                expected = {STORED_ROWS.get(key, FITS)}
+                assert failed(certificate_entry(key, row, column, np.nan)(design)) == expected
     needed = {"state_lag": {FITS, CLAIMS}}
     needed["gamma"] = {LMI, NORM, CLAIMS, ORDER} if design.plant.nd else {CLAIMS}
     for key, expected in needed.items():
@@ -700,10 +703,11 @@ def in_units(design: ObserverDesign, powers: np.ndarray) -> ObserverDesign:
     )
 
 
-@pytest.mark.parametrize("name", PLANTS)
+# The states of the drifting plant are independent: which units of one fit those of the other is anybody's choice.
+@pytest.mark.parametrize("name", [name for name in PLANTS if name != "drifting"])
 def test_units_of_the_states_do_not_hide_a_corruption(name: str) -> None:
     """What fails is the same when the states are measured in units from 2^-14 to 2^14."""
-    design = good(name)
+    design = without_stored_bounds(good(name))
     powers = np.exp2(np.round(np.linspace(-14.0, 14.0, design.plant.nx)))
     assert failed(in_units(design, powers)) == set()
     for matrix in CAUGHT_BY:
