@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -112,7 +113,7 @@ def test_the_base_is_good(
     assert run(tmp_path, monkeypatch, None, {}) == 0
     assert main(["verify", "case.gains.json"]) == 0
     assert main(["check", "--system", "spec.yaml"]) == 0
-    assert "pd-observer: all conditions hold" in capsys.readouterr().out
+    assert re.search(r"pd-observer +possible: all conditions hold", capsys.readouterr().out)
 
 
 @pytest.mark.parametrize("plant", [HIDDEN_STABLE, HIDDEN_PAIR], ids=["real", "pair"])
@@ -140,7 +141,7 @@ def test_the_scan_is_in_the_report_and_in_the_file(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     path = written(tmp_path, HIDDEN_PAIR, {"theorem": 2, "decay": 0.0, "delta_scan": [0.1, 10.0]})
-    assert main(["design", "--system", str(path), "--quiet"]) == 0
+    assert main(["design", "--system", str(path), "--quiet", "-v"]) == 0
     assert "Other values of delta" in capsys.readouterr().out
     scan = json.loads((tmp_path / "case.gains.json").read_text())["design"]["solver"]["delta_scan"]
     assert scan["delta"] == [0.1, 10.0]

@@ -4,25 +4,11 @@ that then fail.
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
-from obsynth import Certificate, ObserverDesign, VerificationReport, verify
+from obsynth import ObserverDesign, VerificationReport, verify
 
 Corruption = Callable[[ObserverDesign], ObserverDesign]
 Table = Mapping[str, tuple[str, Corruption, Sequence[str]]]
 Maker = Callable[[str], ObserverDesign]
-
-
-#: What a certificate claims of the stored numbers -> the row that compares it.
-STORED_ROWS = {
-    "state_error": "stored numbers: states",
-    "input_error": "stored numbers: inputs",
-    "disturbance_error": "stored numbers: disturbances",
-}
-
-
-def without_stored_bounds(design: ObserverDesign) -> ObserverDesign:
-    """The design without bounds of what rounding adds: these are in the units of its signals."""
-    kept = {name: matrix for name, matrix in design.certificate.matrices.items() if name not in STORED_ROWS}
-    return design.replace(certificate=Certificate(kept, design.certificate.claims))
 
 
 def assert_exactly_the_untrue_rows_fail(table: Table, case: str, good: Maker) -> None:

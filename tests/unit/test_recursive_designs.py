@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -213,7 +214,7 @@ class TestSpec:
 
     def test_from_the_command_line_to_a_file_and_back(self, tmp_path: Path, capsys) -> None:
         path, gains = self.write(tmp_path), tmp_path / "gains.json"
-        assert main(["design", "--system", str(path), "--output", str(gains), "--quiet"]) == 0
+        assert main(["design", "--system", str(path), "--output", str(gains), "--quiet", "-v"]) == 0
         shown = capsys.readouterr().out
         for part in ("change with k", "E, A, Phi", "Parameter estimates", "torque", "N m", "least rank E_k + ny - nx"):
             assert part in shown
@@ -224,7 +225,7 @@ class TestSpec:
         assert found["structure"] == {}
         assert found["methods"]["fault-estimation-filter"]["passed"] is False
         assert main(["check", "--system", str(path)]) == 0
-        assert "adaptive-observer: all conditions hold" in capsys.readouterr().out
+        assert re.search(r"adaptive-observer +possible: all conditions hold", capsys.readouterr().out)
 
     def test_values(self, tmp_path: Path) -> None:
         (tmp_path / "plant.yaml").write_text(

@@ -124,12 +124,6 @@ def test_refusals_end_with_sensors_that_help(method: str) -> None:
     assert obsynth.design(equipped.replace(Dw=1e-3 * np.eye(3), Bw=None, noise_names=None), method).report.passed
 
 
-def test_refusals_end_with_what_to_leave_out() -> None:
-    plant = obsynth.discretise(load_spec(DESIGNS / "motor" / "spec.yaml").plant, 0.01).plant
-    with pytest.raises(obsynth.PreconditionError, match=r"Leave out one of: unknown input load torque\.$"):
-        obsynth.design(plant.replace(D=None, B=None, input_names=None, units={}), "descriptor-kalman")
-
-
 def test_bad_arguments() -> None:
     plant = one_encoder()
     with pytest.raises(obsynth.SpecError, match="use one of detect"):

@@ -184,7 +184,7 @@ def _structure_as_dict(structure: Structure) -> dict[str, Any]:
 
 def _is_alarm(path: Path) -> bool:
     """Whether a file begins like the certificate of an alarm."""
-    from obsynth.experiments.alarm_proofs.certificate import CERTIFICATE
+    from obsynth.experiments.alarm_proofs.document import CERTIFICATE
     from obsynth.files.inputs import input_file
 
     with input_file(path).open("rb") as stream:

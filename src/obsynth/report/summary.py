@@ -175,7 +175,12 @@ def _slowest(design: ObserverDesign) -> str:
 
 
 def _assumptions(design: ObserverDesign) -> Iterator[str]:
-    yield "an exact model" if isinstance(design.plant, DescriptorSystem) else "a model with the stated noise"
+    if isinstance(design.plant, DescriptorSystem):
+        uncertain = design.plant.uncertainty
+        some = uncertain is not None and bool(uncertain.box.names)
+        yield "an exact model, but in thresholds over its tolerances" if some else "an exact model"
+    else:
+        yield "a model with the stated noise"
     model = design.options.get("fault_model")
     if isinstance(model, str):
         yield f"faults like the model '{model}'"
