@@ -148,7 +148,7 @@ SCHEMA = [
         "empty mapping",
         whole("{}"),
         "schema_version: this key is missing",
-        more=("plant: this key",),
+        more=("name: this key", "plant: this key"),
     ),
     Case("unknown schema version", put("schema_version", 2), "schema_version: version 2 is unknown"),
     Case("schema version as text", put("schema_version", "1"), "schema_version: must be a whole number"),
@@ -172,7 +172,7 @@ SCHEMA = [
     Case(
         "unknown method",
         put("method", "id", "kalman"),
-        "the known methods are: adaptive-observer, auto, dae-adaptive-observer, descriptor-kalman",
+        "the known methods are: adaptive-observer, auto, dae-adaptive-observer",
     ),
     Case("dt negative", put("plant", "dt", -0.1), "plant.dt: must be at least 0"),
     Case("dt as text", put("plant", "dt", "1.0"), "plant.dt: must be a number, not the text '1.0'"),
@@ -271,7 +271,7 @@ SHAPES = [
     Case("unknown output", put("plant", "C", {"outputs": ["x2", "x9"]}), "C has no signal named 'x9'"),
     Case("unknown state of a fault", put("plant", "Bf", {"states": ["torque"]}), "Bf has no signal named 'torque'"),
     Case("unknown state of a disturbance", put("plant", "Bd", {"states": ["x5"]}), "Bd has no signal named 'x5'"),
-    Case("unknown noisy sensor", put("plant", "sensor_noise", {"y4": 1}), "sensor_noise names 'y4'"),
+    Case("unknown noisy sensor", put("plant", "sensor_noise", {"y4": 1}), "sensor_noise has no signal named 'y4'"),
     Case("unknown operating point", put("plant", "operating_point", {"q": 1}), "operating_point names 'q'"),
     Case("unknown unit", put("plant", "units", {"q": "rad"}), "units names 'q'"),
 ]
@@ -651,7 +651,7 @@ class TestGainSets:
 
     @pytest.mark.parametrize(
         ("prepare", "fragment"),
-        [(lambda path: None, "does not exist"), (lambda path: path.mkdir(), "is a folder")],
+        [(lambda path: None, "No such file"), (lambda path: path.mkdir(), "directory")],
         ids=["missing", "a folder"],
     )
     def test_unreadable(self, prepare: Any, fragment: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -72,7 +72,7 @@ def test_state_spaces_of_scipy():
 @pytest.mark.parametrize(
     ("roles", "words"),
     [
-        ({"faults": ["u9"]}, ["faults", "'u9'", "u1"]),
+        ({"faults": ["u9"]}, ["faults", "'u9'"]),
         ({"faults": ["u1"], "disturbances": ["u1"]}, ["'u1'", "fault", "disturbance"]),
         ({"faults": "u1"}, ["list of names"]),
         ({"faults": ["u1", "u1"]}, ["repeats"]),

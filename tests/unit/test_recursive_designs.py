@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 
 import numpy as np
@@ -225,7 +224,7 @@ class TestSpec:
         assert found["structure"] == {}
         assert found["methods"]["fault-estimation-filter"]["passed"] is False
         assert main(["check", "--system", str(path)]) == 0
-        assert re.search(r"adaptive-observer +possible: all conditions hold", capsys.readouterr().out)
+        assert "adaptive-observer: all conditions hold" in capsys.readouterr().out
 
     def test_values(self, tmp_path: Path) -> None:
         (tmp_path / "plant.yaml").write_text(

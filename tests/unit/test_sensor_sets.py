@@ -124,6 +124,13 @@ def test_refusals_end_with_sensors_that_help(method: str) -> None:
     assert obsynth.design(equipped.replace(Dw=1e-3 * np.eye(3), Bw=None, noise_names=None), method).report.passed
 
 
+def test_refusals_end_with_what_to_leave_out() -> None:
+    # The unknown input acts where the fault does, and every state is measured already.
+    plant = obsynth.DescriptorSystem(None, [[0.5]], None, ["x1"], Bf=[[1.0]], Bd=[[1.0]], Dw=[[0.1]], dt=1.0)
+    with pytest.raises(obsynth.PreconditionError, match=r"Leave out one of: unknown input d1\.$"):
+        obsynth.design(plant, "functional-filter")
+
+
 def test_bad_arguments() -> None:
     plant = one_encoder()
     with pytest.raises(obsynth.SpecError, match="use one of detect"):

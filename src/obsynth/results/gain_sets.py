@@ -174,6 +174,8 @@ def place_of(spec: Path) -> str:
 
 def written_for(gains: Path) -> str | None:
     """Return the digest of the place of the spec for which a gain set was written, `None` where it is not known."""
+    if not gains.is_file():  # a pipe would keep us waiting
+        return None
     with gains.open("rb") as stream:
         found = re.search(rb'"written_for":\s*"([0-9a-f]+)"', stream.read(_HEAD_BYTES))
     return None if found is None else found.group(1).decode()
