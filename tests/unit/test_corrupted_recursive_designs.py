@@ -151,6 +151,7 @@ TABLE: dict[str, tuple[str, Corruption, set[str]]] = {
     "claim: directions": ("innovation", times("residual_directions", 2.0), {CLAIMS}),
     "claim: steps": ("innovation", times("steps", 2.0), {CLAIMS}),
     "claim: sample of the condition": ("innovation", claim("condition_k", 3.5), {CLAIMS}),
+    "a listed gain": ("innovation", lambda d: d.replace(gains={**d.gains, "K": 1.001 * d.gains["K"]}), {"gains"}),
     "claim: a gain": ("innovation", claim("gamma", 1e-9), {"claims covered"}),
     "claim: not a number": ("innovation", claim("contraction", np.nan), {CLAIMS}),
     "claim: missing": (

@@ -305,7 +305,9 @@ TABLE: dict[str, tuple[str, Callable[[ObserverDesign], ObserverDesign], tuple[st
     "a sinusoidal fault like the disturbance, discrete": ("direct", like_the_disturbance(1), (SYLVESTER, D3_SINE)),
     "a zero where a long fault model hides": ("long", plant_entry("A", 0, 2, 0.96), (SYLVESTER, DECOUPLING, ORDER)),
     "a fault model at the zero": ("fixed", plant_field(Bf=[[0.0], [1], [0]]), (SYLVESTER, D3_STEP)),
-    # The last digits, and what nothing checks.
+    # The letters, and the last digits, and what nothing checks.
+    "a listed gain": ("paper", lambda d: d.replace(gains={**d.gains, "K": 1.001 * d.gains["K"]}), ("gains",)),
+    "an unknown letter": ("paper", lambda d: d.replace(gains={**d.gains, "Z": np.eye(2)}), ("gains",)),
     "By in the last digits": (
         "paper", lambda d: d.replace(observer=dataclasses.replace(d.observer, By=d.observer.By * (1.0 + 3e-12))),
         ("stored numbers: states",)),

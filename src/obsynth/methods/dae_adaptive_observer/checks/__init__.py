@@ -12,6 +12,7 @@ import numpy as np
 from obsynth.analysis.dae_index import SINGULAR_CONDITION
 from obsynth.errors import ObsynthError
 from obsynth.methods.dae_adaptive_observer.conditions import dae_conditions
+from obsynth.methods.recursive.checks import listed_gains
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.covariances import covariance_factor
 from obsynth.numerics.newton import LARGEST_RESIDUAL
@@ -60,6 +61,7 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     try:
         facts = dae_facts(observer)
         yield from _model_rows(observer, facts)
+        yield listed_gains(design, {"K": facts.K, "Upsilon": facts.Upsilon})
         yield _claims_row(design, facts)
         yield from _consistency_rows(design, observer)
     except (ObsynthError, np.linalg.LinAlgError, ValueError, KeyError, TypeError) as error:

@@ -5,7 +5,7 @@ Source of the claims: Moussa Ali, Zhang 2013, (6), (13), (26) and Lemma 3.1; the
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +14,7 @@ from obsynth.analysis.time_varying import HorizonRanks, horizon_ranks
 from obsynth.errors import ObsynthError
 from obsynth.methods.recursive.checks.batch import batch_residuals
 from obsynth.methods.recursive.conditions import recursive_conditions
+from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.recursive.building import observer_from_options
 from obsynth.observers.recursive.gain_schedule_summary import (
     STEPS_TO_CONTRACT,
@@ -33,6 +34,8 @@ from obsynth.verification.plant import condition_rows
 CLAIM_TOLERANCE = 1e-6
 #: The recursion may differ from the batch solution by this much, relative to standard deviations, times cond H.
 BATCH_TOLERANCE = 1e-9
+#: Gains smaller than this are compared as they are.
+LEAST_GAIN = 1e-12
 
 _SOURCE = "Moussa Ali, Zhang 2013"
 
@@ -95,6 +98,7 @@ def _dynamic_rows(design: ObserverDesign, observer: RecursiveObserver, stated: R
                 f"noise in fhat[{name}]", "standard deviation of the parameter after the last step", float(deviation),
                 source="recomputed", detail=observer.plant.units.get(name, ""),
             )  # fmt: skip
+    yield listed_gains(design, {"L": facts.L, "K": facts.K})
     yield _claims_row(design, facts, ranks)
     yield from consistency(stated, observer, looked_at(observer))
 
@@ -108,6 +112,22 @@ def _contraction_rows(facts: GainScheduleSummary) -> Iterator[Check]:
         yield upper_bound_check(
             "contraction", claim, facts.contraction, np.nextafter(1.0, 0.0), source=f"{_SOURCE}, (13)", detail=detail
         )
+
+
+def listed_gains(design: ObserverDesign, found: Mapping[str, FloatArray]) -> Check:
+    """Return the row on the listed gains, which are those of the last step of the run that is looked at."""
+    wrong = [letter for letter in design.gains if letter not in found]
+    gap = 0.0
+    for letter, matrix in found.items():
+        listed = design.gains.get(letter, matrix)
+        if listed.shape != matrix.shape:
+            wrong.append(letter)
+        elif matrix.size:
+            gap = max(gap, float(np.max(np.abs(listed - matrix)) / max(float(np.max(np.abs(matrix))), LEAST_GAIN)))
+    return upper_bound_check(
+        "gains", "the listed gains are those of the run that is looked at", np.inf if wrong else gap, CLAIM_TOLERANCE,
+        source="gain set", kind="equality", detail=f"wrong: {', '.join(wrong)}" if wrong else "",
+    )  # fmt: skip
 
 
 def _claims_row(design: ObserverDesign, facts: GainScheduleSummary, ranks: HorizonRanks) -> Check:

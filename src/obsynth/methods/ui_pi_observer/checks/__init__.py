@@ -13,6 +13,7 @@ from obsynth.analysis.plant_units import PlantUnits
 from obsynth.methods.ui_pi_observer.augmented_plant import AugmentedPlant
 from obsynth.methods.ui_pi_observer.checks.decoupling import decoupling_norm
 from obsynth.methods.ui_pi_observer.checks.fault_response import tracking_rows
+from obsynth.methods.ui_pi_observer.checks.gains import gain_rows
 from obsynth.methods.ui_pi_observer.checks.numbers import noise_rows, stability_rows
 from obsynth.methods.ui_pi_observer.conditions import existence
 from obsynth.numerics.arrays import FloatArray
@@ -34,6 +35,21 @@ _MATRICES = ("tracking", "Phi", "Cw", "poles", "stability")
 
 def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
     """Yield every check of ``design``; see `obsynth.verification.verify`."""
+    good = True
+    for row in _realisation_rows(design, printed_digits):
+        good &= row.passed
+        yield row
+    if good:
+        # Letters of a realisation that fails need no word of their own.
+        (plant, observer), matrices = design.linear, design.certificate.matrices
+        phi, cw = matrices["Phi"], matrices["Cw"]
+        model = Exosystem(phi, cw, tuple(f"w{i + 1}" for i in range(len(phi))), stated_eigenvalues(phi), ())
+        tolerance = relative_tolerance(printed_digits, plant.nx + len(phi) + plant.ny)
+        yield from gain_rows(design.gains, plant, observer, model, matrices["tracking"], tolerance)
+
+
+def _realisation_rows(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
+    """Yield every check of plant, realisation and certificate."""
     (plant, observer), certificate = design.linear, design.certificate
     yield from plant_information(plant)
     fitting = _fits(design)
