@@ -13,6 +13,7 @@ import numpy as np
 from obsynth.analysis.existence.distance import DROWNED, Distance, distance_to_loss
 from obsynth.analysis.existence.numbers import SystemFacts
 from obsynth.analysis.far_zeros import system_zeros
+from obsynth.analysis.zeros import is_outside
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import RankDecision
 
@@ -60,7 +61,9 @@ def zero_verdict(facts: SystemFacts, E: FloatArray, A: FloatArray, *, nx: int, d
     if not facts.full or facts.outside:
         return ZeroVerdict("no", facts)
     distance = distance_to_loss(E, A, nx=nx, discrete=discrete, zeros=facts.zeros)
-    return ZeroVerdict("yes" if distance.value > DROWNED else "unclear", facts, distance)
+    # Computed data do not tell a zero this close to the boundary from one on it: they hold more than one rounding.
+    on_boundary = facts.computed and any(is_outside(zero, 1.0 if discrete else 0.0) for zero in facts.zeros)
+    return ZeroVerdict("unclear" if distance.value <= DROWNED or on_boundary else "yes", facts, distance)
 
 
 def believed(facts: SystemFacts, E: FloatArray, A: FloatArray, *, nx: int) -> SystemFacts:
