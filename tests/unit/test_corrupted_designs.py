@@ -101,6 +101,8 @@ def drifting() -> DescriptorSystem:
     )  # fmt: skip
 
 
+#: In `drifting` any first column of R is as right, and sizes within a row differ by 1e5: residuals follow the units.
+BALANCED = ("paper", "chain", "direct", "quiet")
 PLANTS = {"paper": paper, "chain": chain, "direct": direct, "quiet": quiet, "drifting": drifting}
 
 
@@ -593,7 +595,7 @@ def test_good_claims_and_a_good_recovery_pass(name: str) -> None:
 
 
 @pytest.mark.parametrize("letter", ["T", "N", "L", "W", "Psi", "Upsilon", "R"])
-@pytest.mark.parametrize("name", PLANTS)
+@pytest.mark.parametrize("name", BALANCED)
 def test_every_single_entry_of_the_gain_set_counts(name: str, letter: str) -> None:
     rows, columns = good(name).gains[letter].shape
     for row in range(rows):
@@ -707,7 +709,7 @@ def in_units(design: ObserverDesign, powers: np.ndarray) -> ObserverDesign:
     )
 
 
-@pytest.mark.parametrize("name", PLANTS)
+@pytest.mark.parametrize("name", BALANCED)
 def test_units_of_the_states_do_not_hide_a_corruption(name: str) -> None:
     """What fails is the same when the states are measured in units from 2^-14 to 2^14."""
     design = good(name)
@@ -718,11 +720,7 @@ def test_units_of_the_states_do_not_hide_a_corruption(name: str) -> None:
         for row in range(rows):
             for column in range(columns):
                 corrupted = entry(matrix, row, column)(design)
-                here, there = failed(corrupted), failed(in_units(corrupted, powers))
-                # A residual is judged against the sizes in its row, which units may mix; the proofs are not.
-                assert there
-                mixed = {"unbiased: dynamics", "unbiased: state"}
-                assert there | mixed == here | mixed, (matrix, row, column)
+                assert failed(in_units(corrupted, powers)) == failed(corrupted), (matrix, row, column)
 
 
 @pytest.mark.parametrize("name", PLANTS)
