@@ -95,7 +95,7 @@ def _units(
 ) -> Iterable[tuple[FloatArray, FloatArray]]:
     """Return units of the augmented states and of the outputs: the user's, then those that balance the plant.
 
-    Units far from those in which the plant is near one are tried last: what is small there is not seen.
+    Where these are far from those in which the plant is near one, the latter come next.
     """
     found = [*_candidate_units(plant, asked)]
     if asked.gain_bound is not None:
@@ -104,7 +104,7 @@ def _units(
     natural = np.concatenate([units.states, units.faults]), 1.0 / units.outputs
     users, *others = found
     if units.spread > FAR_UNITS:
-        return [natural, *others, users]
+        return [users, natural, *others]
     # A Riccati equation has no objective that would weigh gains in the user's units.
     if balanced_first and len(others) == 2:
         return [others[0], users, others[1], natural]
