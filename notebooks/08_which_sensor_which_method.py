@@ -15,6 +15,7 @@
 # %%
 import numpy as np
 import pandas as pd
+from IPython.display import display
 
 import obsynth
 from obsynth.spec import load_spec
@@ -74,4 +75,4 @@ compared = obsynth.compare(better, scenario=scenario, options=options, within=0.
 compared
 
 # %%
-compared.plot()
+display(compared.plot())
