@@ -22,7 +22,11 @@ def test_a_share_of_the_campaign(name, part):
     assert not wrong, wrong
 
 
-@pytest.mark.parametrize("name", frame.campaign_names())
+#: A campaign that was not yet run as a whole has no table.
+TABLES = [name for name in frame.campaign_names() if (Path(frame.__file__).parent / f"{name}.md").exists()]
+
+
+@pytest.mark.parametrize("name", TABLES)
 def test_the_table_is_of_the_whole_campaign_and_nothing_is_wrong(name):
     campaign = frame.load_campaign(name)
     table = (Path(frame.__file__).parent / f"{name}.md").read_text(encoding="utf-8")

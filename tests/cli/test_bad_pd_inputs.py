@@ -140,7 +140,7 @@ def test_the_scan_is_in_the_report_and_in_the_file(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     path = written(tmp_path, HIDDEN_PAIR, {"theorem": 2, "decay": 0.0, "delta_scan": [0.1, 10.0]})
-    assert main(["design", "--system", str(path), "--quiet"]) == 0
+    assert main(["design", "--system", str(path), "--quiet", "-v"]) == 0
     assert "Other values of delta" in capsys.readouterr().out
     scan = json.loads((tmp_path / "case.gains.json").read_text())["design"]["solver"]["delta_scan"]
     assert scan["delta"] == [0.1, 10.0]

@@ -179,6 +179,12 @@ class TestStandardStreams:
         assert done.stderr == ""
 
 
+def heeds_signals() -> None:
+    """Undo what a shell in the background, or nohup, has told this process to ignore."""
+    for name in ("SIGTERM", "SIGHUP", "SIGINT"):
+        signal.signal(getattr(signal, name), signal.SIG_DFL)
+
+
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP", "SIGINT"])
 def test_a_stream_saves_its_state_when_it_is_ended(name):
     assert main([*RUN, "whole.csv"]) == 0
@@ -187,8 +193,10 @@ def test_a_stream_saves_its_state_when_it_is_ended(name):
     environment = {**os.environ, "PYTHONPATH": str(ROOT / "src")}
     line = [sys.executable, "-W", "error", "-m", "obsynth", *words]
     with subprocess.Popen(
-        line, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
-    ) as process:
+        line, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment,
+        # Whoever runs the tests may have it ignored.
+        preexec_fn=lambda: signal.signal(getattr(signal, name), signal.SIG_DFL),
+    ) as process:  # fmt: skip
         assert process.stdin is not None
         assert process.stdout is not None
         assert process.stderr is not None
@@ -196,7 +204,7 @@ def test_a_stream_saves_its_state_when_it_is_ended(name):
         process.stdin.flush()
         answers = [process.stdout.readline() for _ in range(6)]
         process.send_signal(getattr(signal, name))
-        assert process.wait(600) == 128 + getattr(signal, name)
+        assert process.wait(60) == 128 + getattr(signal, name)
         assert "Traceback" not in process.stderr.read()
     rest = command(*words, input=lines[0] + "".join(lines[6:]))
     assert rest.returncode == 0

@@ -33,9 +33,9 @@ def test_one_recommendation_with_its_reason(bicycle: obsynth.Comparison) -> None
 
 
 def test_refused_methods_say_why_in_one_line(bicycle: obsynth.Comparison) -> None:
-    text = bicycle["descriptor-kalman"].refused
-    assert "\n" not in text
-    assert text.endswith("Leave out one of: unknown input wind.")
+    assert bicycle["pd-observer"].refused.startswith("the condition 'continuous time' fails")
+    assert bicycle["descriptor-kalman"].refused == "estimates the state, but no fault"
+    assert all("\n" not in text for text in bicycle.refusals)
 
 
 def test_numbers_of_the_table_are_those_of_a_simulation(bicycle: obsynth.Comparison) -> None:

@@ -194,7 +194,31 @@ class TestJson:
             read_json(tmp_path / "a.json", most=50)
 
 
+@pytest.fixture
+def _usual_signals():
+    """What signals do by default: whoever runs the tests may have them ignored."""
+    usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL, signal.SIGHUP: signal.SIG_DFL}
+    before = {number: signal.signal(number, handler) for number, handler in usual.items()}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.usefixtures("_usual_signals")
 class TestSignals:
+    @pytest.fixture(autouse=True)
+    def heeded(self):
+        """As in a shell in the foreground, whatever this process was told to ignore."""
+        usual = {
+            signal.SIGTERM: signal.SIG_DFL,
+            signal.SIGHUP: signal.SIG_DFL,
+            signal.SIGINT: signal.default_int_handler,
+        }
+        before = {number: signal.signal(number, handler) for number, handler in usual.items()}
+        yield
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
     @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
     def test_an_ended_process_leaves_no_part_behind(self, name, tmp_path):
         number = getattr(signal, name)

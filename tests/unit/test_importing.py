@@ -72,7 +72,7 @@ def test_state_spaces_of_scipy():
 @pytest.mark.parametrize(
     ("roles", "words"),
     [
-        ({"faults": ["u9"]}, ["faults", "'u9'", "u1"]),
+        ({"faults": ["u9"]}, ["faults", "'u9'"]),
         ({"faults": ["u1"], "disturbances": ["u1"]}, ["'u1'", "fault", "disturbance"]),
         ({"faults": "u1"}, ["list of names"]),
         ({"faults": ["u1", "u1"]}, ["repeats"]),
@@ -202,7 +202,8 @@ def test_the_pencil_of_andes_as_shipped_in_designs():
     )  # fmt: skip
     written = spec.transformation.source
     for name in ("E", "A", "C", "Bf", "Bd", "Dw", "Bw"):
-        assert np.array_equal(getattr(plant, name), getattr(written, name)), name
+        # Entries of A are expressions in constants with tolerances there: equal to rounding.
+        np.testing.assert_allclose(getattr(plant, name), getattr(written, name), rtol=1e-12, atol=1e-12, err_msg=name)
     assert plant.state_names == written.state_names
     with pytest.raises(SpecError, match=r"no device 'GENROU 1'.*GENCLS 1"):
         obsynth.from_andes(ROOT / "designs" / "smib", outputs={"GENROU 1": ["omega"]})

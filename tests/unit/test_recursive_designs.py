@@ -213,7 +213,7 @@ class TestSpec:
 
     def test_from_the_command_line_to_a_file_and_back(self, tmp_path: Path, capsys) -> None:
         path, gains = self.write(tmp_path), tmp_path / "gains.json"
-        assert main(["design", "--system", str(path), "--output", str(gains), "--quiet"]) == 0
+        assert main(["design", "--system", str(path), "--output", str(gains), "--quiet", "-v"]) == 0
         shown = capsys.readouterr().out
         for part in ("change with k", "E, A, Phi", "Parameter estimates", "torque", "N m", "least rank E_k + ny - nx"):
             assert part in shown

@@ -104,7 +104,7 @@ def _range(name: str, text: str) -> tuple[float, float]:
 
 
 def _log_arguments(options: argparse.Namespace) -> dict[str, Any]:
-    from obsynth.cli.data_commands import numbers_of
+    from obsynth.cli.data_run import numbers_of
 
     given = {"rows": options.rows, "columns": dict(options.map), "scales": dict(numbers_of(options.scale))}
     return {name: value for name, value in given.items() if value}
@@ -113,7 +113,7 @@ def _log_arguments(options: argparse.Namespace) -> dict[str, Any]:
 def run_linearise(options: argparse.Namespace) -> int:
     """Run ``linearise``: spec or plant in, matrices and operating point out."""
     from obsynth.analysis.transformations.linearisation import linearise
-    from obsynth.cli.data_commands import numbers_of
+    from obsynth.cli.data_run import numbers_of
     from obsynth.report.linear_plants import linear_plant_text, plant_document
     from obsynth.spec.loader import load_model
 

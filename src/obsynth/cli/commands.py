@@ -60,6 +60,14 @@ def _print_design(design: ObserverDesign, file: Path, *, verbose: bool) -> None:
         design_report(design, console=console)
         console.print()
     print_summary(summary(design, file=file, everything=verbose), console=console)
+    if not verbose and "delta_scan" in design.solver:
+        from obsynth.report.designs import delta_scan_table
+        from obsynth.report.layout import print_section
+        from obsynth.results.delta_scan import DeltaScan
+
+        console.print()
+        scan = DeltaScan.from_dict(design.solver["delta_scan"])
+        print_section(console, "Other values of delta", delta_scan_table(scan))
     if not verbose and not design.report.passed:
         console.print(checks_table(design.report.failures, width=console.width))
 
@@ -184,11 +192,15 @@ def _structure_as_dict(structure: Structure) -> dict[str, Any]:
 
 def _is_alarm(path: Path) -> bool:
     """Whether a file begins like the certificate of an alarm."""
-    from obsynth.experiments.alarm_proofs.certificate import CERTIFICATE
-    from obsynth.files.inputs import input_file
+    from obsynth.experiments.alarm_proofs.document import CERTIFICATE
 
-    with input_file(path).open("rb") as stream:
-        return CERTIFICATE.mark in stream.read(200)
+    if not path.is_file():  # who reads it says so
+        return False
+    try:
+        with path.open("rb") as stream:
+            return CERTIFICATE.mark in stream.read(200)
+    except OSError:
+        return False
 
 
 def _verify_alarm(options: argparse.Namespace) -> int:

@@ -45,7 +45,7 @@ def add_evaluate_verb(verbs: Any) -> None:
 def run_evaluate(options: argparse.Namespace) -> int:
     """Run ``evaluate``: spec in, table of rates and errors out."""
     from obsynth.cli.commands import designed_or_loaded
-    from obsynth.cli.data_commands import numbers_of, own_tolerances, ranges_of
+    from obsynth.cli.data_run import numbers_of, own_tolerances, ranges_of
     from obsynth.spec import load_spec
 
     with progress(quiet=options.quiet) as report_stage:

@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import argparse
 import io
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from obsynth.cli.arguments import output_file
-from obsynth.cli.data_commands import STREAM, monitor_of, numbers_of, rows_done, summary_of_run
+from obsynth.cli.data_run import protect_inputs, run_in_memory, summary_of_run
 from obsynth.cli.output import print_json
 from obsynth.errors import SpecError
-from obsynth.files.inputs import protect, protect_stream
 
 if TYPE_CHECKING:
     from obsynth.data.run import DataRun
-    from obsynth.experiments.monitors.online import OnlineMonitor
     from obsynth.results.design import ObserverDesign
 
 #: Formats of pictures, with the mark by which an older one may be replaced.
@@ -49,32 +46,6 @@ def run_plot(options: argparse.Namespace) -> int:
         if target is not None:
             print(f"Written: {target}")
     return 0
-
-
-def protect_inputs(options: argparse.Namespace) -> None:
-    """Refuse to write over what is read."""
-    for file in (options.gains, options.system, None if options.data in (None, STREAM) else Path(options.data)):
-        if file is not None:
-            protect(file)
-    if options.data == STREAM:
-        protect_stream(sys.stdin)
-
-
-def run_in_memory(design: ObserverDesign, options: argparse.Namespace) -> tuple[DataRun, OnlineMonitor | None]:
-    """Return a run of a design on the data of the command line, with its table, and its monitor."""
-    from obsynth.data.run import run_on_data
-
-    watched = monitor_of(design, options, has_scenario=True)
-    with rows_done(options.data, quiet=getattr(options, "quiet", True)) as progress:
-        found = run_on_data(
-            design, sys.stdin if options.data == STREAM else Path(options.data), columns=dict(options.map),
-            time_column=options.time_column, scales=numbers_of(options.scale),
-            thresholds=numbers_of(options.threshold), monitor=watched, gap=options.gap, warm_up=options.warm_up,
-            progress=progress,
-        )  # fmt: skip
-    for text in found.warnings:
-        print(f"Warning: {text}", file=sys.stderr)
-    return found, watched
 
 
 def _draw(found: DataRun, design: ObserverDesign, parts: list[str], target: Path | None) -> None:

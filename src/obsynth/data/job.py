@@ -63,7 +63,7 @@ class Job:
             monitor.require_fit(len(residuals), engine.fault_names)
         self.header = (
             TIME, "status", *(f"time of {name}" for name, _ in lags), *names,
-            *(("statistic", "threshold", *monitor.columns) if monitor is not None else ()),
+            *((*monitor.columns, "statistic", "threshold") if monitor is not None else ()),
             *(("alarm",) if thresholds or monitor is not None else ()),
         )  # fmt: skip
         # Intervals of faults are in their own units, like the estimates.
@@ -126,7 +126,7 @@ class Job:
                 faults=row.values[self._faults], evidence=row.evidence,
             )  # fmt: skip
             more = seen.more or (math.nan,) * len(self.monitor.columns)
-            cells = [seen.statistic, seen.threshold, *(np.array(more) + self._shifts).tolist()]
+            cells = [*(np.array(more) + self._shifts).tolist(), seen.statistic, seen.threshold]
             if seen.alarm:
                 if self.monitor.kind not in self.alarms:
                     self.alarms[self.monitor.kind], self.isolated = time, seen.fault

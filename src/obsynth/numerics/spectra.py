@@ -19,7 +19,7 @@ DEAD_BEAT = 1e-6
 AGREEMENT = 1e-2
 #: Rounding, relative to a matrix, that scatters an eigenvalue of multiplicity m by its m-th root; and the largest share
 #: of a pole that counts as scatter, whatever the multiplicity.
-SCATTER, MOST_SCATTER = 1e4 * float(np.finfo(np.float64).eps), 0.05
+SCATTER, MOST_SCATTER = 1e7 * float(np.finfo(np.float64).eps), 0.05
 
 
 def eigenvalues(matrix: FloatArray) -> ComplexArray:

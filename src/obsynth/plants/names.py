@@ -43,17 +43,10 @@ def index_of(name: str, names: Sequence[str], *, what: str) -> int:
     raise SpecError(f"{what} has no signal named {name!r}.{suggestion(name, names)}", path=what)
 
 
-#: So many names are listed where none is close to a wrong one.
-_FEW = 8
-
-
 def suggestion(name: str, names: Iterable[str]) -> str:
     """Return a question with the names closest to a wrong one, beginning with a space; empty where none is close."""
-    listed = list(names)
-    close = difflib.get_close_matches(name, listed, n=3)
-    if close:
-        return f" Did you mean {' or '.join(map(repr, close))}?"
-    return f" There are {', '.join(listed)}." if 0 < len(listed) <= _FEW else ""
+    close = difflib.get_close_matches(name, list(names), n=3)
+    return f" Did you mean {' or '.join(map(repr, close))}?" if close else ""
 
 
 def require_known(given: Iterable[Any], known: Iterable[str], *, what: str, kind: str) -> None:
@@ -68,6 +61,15 @@ def require_known(given: Iterable[Any], known: Iterable[str], *, what: str, kind
     raise SpecError(f"{what} names {len(wrong)} that are no {kind} of the plant:", path=what, problems=told)
 
 
+def require_picked(picked: Iterable[str], names: Sequence[str], *, what: str) -> None:
+    """Raise one `SpecError` for all names that are not there, each with what may be meant."""
+    wrong = [f"{what} has no signal named {name!r}.{suggestion(name, names)}" for name in picked if name not in names]
+    if len(wrong) == 1:
+        raise SpecError(wrong[0], path=what)
+    if wrong:
+        raise SpecError(f"{what} picks {len(wrong)} signals that do not exist:", path=what, problems=wrong)
+
+
 def is_name_list(value: Any) -> bool:
     """Whether ``value`` is a non-empty list of texts: a pick by name, not a matrix."""
     return (
@@ -80,9 +82,7 @@ def is_name_list(value: Any) -> bool:
 
 def rows_picking(picked: Sequence[str], names: Sequence[str], *, what: str) -> FloatArray:
     """Return the selection matrix ``(len(picked), len(names))`` with a one for each picked name."""
-    wrong = [f"{what} has no signal named {name!r}.{suggestion(name, names)}" for name in picked if name not in names]
-    if len(wrong) > 1:
-        raise SpecError(f"{what} picks {len(wrong)} signals that do not exist:", path=what, problems=wrong)
+    require_picked(picked, names, what=what)
     selection = np.zeros((len(picked), len(names)))
     for row, name in enumerate(picked):
         selection[row, index_of(name, names, what=what)] = 1.0

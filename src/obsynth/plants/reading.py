@@ -12,7 +12,7 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.sparse import as_sparse_matrix, dense, is_sparse
 from obsynth.plants.frames import without_frames
-from obsynth.plants.names import checked_names, is_name_list, require_known, rows_picking
+from obsynth.plants.names import checked_names, is_name_list, require_picked, rows_picking
 from obsynth.plants.validation import (
     Problems,
     any_matrix,
@@ -155,7 +155,7 @@ def noise_of_sensors(sensor_noise: Any, given: dict[str, FloatArray | None], out
     if not isinstance(sensor_noise, Mapping):
         raise SpecError(f"sensor_noise is a {type(sensor_noise).__name__}: give a standard deviation by output, such "
                         "as {'speed': 0.01}.", path="sensor_noise")  # fmt: skip
-    require_known(sensor_noise, outputs, what="sensor_noise", kind="output")
+    require_picked(sensor_noise, outputs, what="sensor_noise")
     columns = np.zeros((len(outputs), len(sensor_noise)))
     for column, (name, value) in enumerate(sensor_noise.items()):
         deviation = float(as_matrix(value, f"sensor_noise[{name!r}]")[0, 0])

@@ -27,7 +27,7 @@ def method_lines(methods: Mapping[str, VerificationReport], *, own: str = "") ->
         names = {check.name for check in failed}
         asked = " (the spec's method)" if method == own else ""
         if report.passed:
-            yield method, f"possible: all conditions hold{asked}", "green"
+            yield method, f"all conditions hold, so a design exists{asked}", "green"
         elif _KIND in names and method != own:
             others.append(method)
         elif names & set(_TIME):
@@ -36,19 +36,18 @@ def method_lines(methods: Mapping[str, VerificationReport], *, own: str = "") ->
             reason = next(check.detail for check in failed if check.name == _OF_THIS_KIND)
             yield method, f"not for this plant{asked}: {reason}".rstrip("."), "yellow"
         else:
-            yield method, f"IMPOSSIBLE{asked}: {_reason(failed)}", "bold red"
+            yield method, f"IMPOSSIBLE for this plant{asked}: {_reason(failed)}", "bold red"
     if others:
         yield "other plants", f"{', '.join(others)}: for another kind of plant", "dim"
 
 
 def print_methods(methods: Mapping[str, VerificationReport], *, own: str, console: Console) -> None:
     """Print the lines of all methods."""
-    rows = list(method_lines(methods, own=own))
-    width = max((len(method) for method, _, _ in rows), default=0) + 2
-    for method, text, style in rows:
-        lines = textwrap.wrap(text, max(min(console.width, 120) - width, 30), break_on_hyphens=False)
-        for i, line in enumerate(lines):
-            console.print(Text(f"{method if i == 0 else '':<{width}}{line}", style=style), soft_wrap=True)
+    for method, text, style in method_lines(methods, own=own):
+        lines = textwrap.wrap(f"{method}: {text}", min(console.width, 120), subsequent_indent="  ",
+                              break_on_hyphens=False)  # fmt: skip
+        for line in lines:
+            console.print(Text(line, style=style), soft_wrap=True)
 
 
 def _reason(failed: Sequence[Check]) -> str:

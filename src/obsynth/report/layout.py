@@ -78,7 +78,9 @@ def headed_table(*headings: str) -> Table:
     """Return an empty table with a line below its headings; all columns but the first align right."""
     table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
     for position, heading in enumerate(headings):
-        table.add_column(heading, justify="right" if position else "left")
+        # A heading may be folded between its words, never within one.
+        longest = max(map(len, heading.split()), default=0)
+        table.add_column(heading, justify="right" if position else "left", min_width=longest)
     return table
 
 

@@ -145,7 +145,9 @@ def _plant(plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel) -> 
     if isinstance(plant, TimeVaryingDescriptorSystem):
         counts = ((len(plant.state_names), "state"), (len(plant.output_names), "output"),
                   (len(plant.parameter_names), "parameter"))  # fmt: skip
-        return f"{plant.dt:g} s between samples, changing with time; {_counted(counts)}"
+        varying = [name for name, matrix in plant.matrices.items() if not matrix.is_constant]
+        change = f"change with k: {', '.join(varying)}" if varying else "constant matrices"
+        return f"{plant.dt:g} s between samples; {change}; {_counted(counts)}"
     time = f"{plant.dt:g} s between samples" if plant.is_discrete else "continuous in time"
     faults = ((plant.nf, "fault"), (plant.nd, "unknown input"))
     return f"{time}; {_counted(((plant.nx, 'state'), (plant.ny, 'output'), *faults))}"
@@ -175,7 +177,12 @@ def _slowest(design: ObserverDesign) -> str:
 
 
 def _assumptions(design: ObserverDesign) -> Iterator[str]:
-    yield "an exact model" if isinstance(design.plant, DescriptorSystem) else "a model with the stated noise"
+    if isinstance(design.plant, DescriptorSystem):
+        uncertain = design.plant.uncertainty
+        some = uncertain is not None and bool(uncertain.box.names)
+        yield "an exact model, but in thresholds over its tolerances" if some else "an exact model"
+    else:
+        yield "a model with the stated noise"
     model = design.options.get("fault_model")
     if isinstance(model, str):
         yield f"faults like the model '{model}'"
@@ -201,7 +208,8 @@ def _estimates(design: ObserverDesign, gains: FaultGains | None) -> tuple[tuple[
         return missing if value is None else f"{number(value)} {units.get(name, '')}".strip()
 
     if gains is None or not isinstance(design.plant, DescriptorSystem):
-        return ("parameter", "deviation"), [(name, deviation(name, "-")) for name in observer.fault_names]
+        when = "after the nominal run" if isinstance(design.plant, DAEModel) else "at the end of the horizon"
+        return ("parameter", f"std {when}"), [(name, deviation(name, "-")) for name in observer.fault_names]
     plant, linear = design.linear
     none = "none stated" if not plant.nw else "by sampling"
     noise = "deviation" if plant.is_discrete else "dev. at 1 s"
@@ -228,6 +236,7 @@ def _warnings(design: ObserverDesign, gains: FaultGains | None) -> Iterator[str]
         return
     plant, observer = design.linear
     units = plant.units
+    told = []
     for i, fault in enumerate(observer.fault_names):
         for j, name in enumerate(plant.disturbance_names):
             leak = float(gains.leaks[i, j])
@@ -237,8 +246,9 @@ def _warnings(design: ObserverDesign, gains: FaultGains | None) -> Iterator[str]
         followed = float(gains.steady[i])
         if abs(followed - 1.0) > FOLLOWS:
             share = number(100.0 * followed, digits=3)
+            told.append(fault)
             yield f"the estimate of {fault} does not follow a step: in the end it shows {share} % of it."
-    yield from design_warnings(design)
+    yield from design_warnings(design, told=told)
     for check in design.report.checks:
         if check.name.startswith("limit at "):
             yield f"{check.name}: {check.claim}."

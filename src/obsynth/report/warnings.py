@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 
 from obsynth.analysis.diagnosis.columns import question
 from obsynth.analysis.diagnosis.diagnosing import rest_point
@@ -21,14 +21,19 @@ SETTLING_TIMES, MOST_STEPS = 30, 6000
 MOST_STATES = 80
 
 
-def design_warnings(design: ObserverDesign, horizon: float | None = None) -> tuple[str, ...]:
-    """Return what a user should know before trusting the fault estimates; ``horizon`` in s, of the spec's scenario."""
+def design_warnings(
+    design: ObserverDesign, horizon: float | None = None, *, told: Collection[str] = ()
+) -> tuple[str, ...]:
+    """Return what a user should know before trusting the fault estimates; ``horizon`` in s, of the spec's scenario.
+
+    Of faults that are ``told`` of already, steps are not followed again.
+    """
     plant, observer = design.plant, design.observer
     if not isinstance(plant, DescriptorSystem) or not isinstance(observer, LinearObserver):
         return ()
     if not observer.fault_names or plant.nx > MOST_STATES or set(observer.fault_names) - set(plant.fault_names):
         return ()
-    return (*_undetectable(plant, observer), *_followed(plant, observer, horizon))
+    return (*_undetectable(plant, observer), *_followed(plant, observer, horizon, told))
 
 
 def _undetectable(plant: DescriptorSystem, observer: LinearObserver) -> Iterator[str]:
@@ -45,7 +50,9 @@ def _undetectable(plant: DescriptorSystem, observer: LinearObserver) -> Iterator
         )
 
 
-def _followed(plant: DescriptorSystem, observer: LinearObserver, horizon: float | None) -> Iterator[str]:
+def _followed(
+    plant: DescriptorSystem, observer: LinearObserver, horizon: float | None, told: Collection[str]
+) -> Iterator[str]:
     """Yield steps that the estimates do not reach within the horizon."""
     step = plant.dt if plant.dt > 0.0 else settling_time(plant) / SAMPLES
     length = horizon if horizon is not None else SETTLING_TIMES * settling_time(plant)
@@ -56,7 +63,7 @@ def _followed(plant: DescriptorSystem, observer: LinearObserver, horizon: float 
     except ObsynthError:
         return
     for figures in fault_figures(sampled, clocked, steps):
-        if not figures.reaches:
+        if not figures.reaches and figures.fault not in told:
             yield (
                 f"A unit step of {figures.fault} reads {figures.at_horizon:.3g} after {steps * step:.3g} s: the "
                 "estimate does not reach it by then."

@@ -18,6 +18,7 @@ from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.results.gain_set_writing import save
 from obsynth.results.plant_source import PlantSource
 from obsynth.results.report import VerificationReport
 
@@ -176,8 +177,6 @@ class ObserverDesign:
         SpecError
             The file cannot be written.
         """
-        from obsynth.results.gain_sets import save
-
         return save(self, path)
 
     def to_control(self) -> control.StateSpace:

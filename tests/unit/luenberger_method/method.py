@@ -13,5 +13,5 @@ METHOD = MethodSpec(
     conditions="luenberger_method.synthesis:conditions",
     synthesise="luenberger_method.synthesis:synthesise",
     checks="luenberger_method.checks:checks",
-    claims={"radius": ClaimMeaning("", "spectral radius of the error")},
+    claims={"radius": ClaimMeaning("", "spectral radius of the error", "radius")},
 )

@@ -130,7 +130,7 @@ class Diagnosis:
 
     def verdict_rows(self) -> tuple[tuple[str, ...], ...]:
         """Return the table of verdicts as texts: the header, then one row per fault."""
-        header = ("fault", "detectable", "at rest", "as a step", "any course", "derivatives", "residual", "filter")
+        header = ("fault", "detectable", "at rest", "as a step", "any course", "delay", "residual", "filter")
         rows = [
             (
                 fault.name, _word(fault.detectable), _word(fault.detectable_at_rest), _word(fault.step_estimable),

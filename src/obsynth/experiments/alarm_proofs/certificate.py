@@ -10,24 +10,14 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import ObsynthError, SpecError
+from obsynth.experiments.alarm_proofs.document import KIND, SCHEMA_VERSION
 from obsynth.experiments.alarm_proofs.proof import Question, statement
 from obsynth.files.inputs import read_json
-from obsynth.files.outputs import FileKind
 from obsynth.results.gain_sets import digest_of, loaded, restored
 from obsynth.results.report import Check, VerificationReport
 
-SCHEMA_VERSION = 1
-KIND = "obsynth alarm certificate"
-CERTIFICATE = FileKind("an alarm certificate", b'"kind": "obsynth alarm certificate"')
 #: The stated margin may differ from the one found again by this share: matrices are made anew.
 SAME_MARGIN = 1e-3
-
-
-def document(certificate: Mapping[str, Any]) -> str:
-    """Return the text of the file."""
-    body = {"kind": KIND, "schema_version": SCHEMA_VERSION, "sha256": digest_of(certificate),
-            "certificate": certificate}  # fmt: skip
-    return json.dumps(body, indent=1, allow_nan=False) + "\n"
 
 
 def is_certificate(content: Any) -> bool:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import PreconditionError, SpecError
+from obsynth.experiments.alarm_proofs.document import document
 from obsynth.experiments.alarm_proofs.replay import window_data
 from obsynth.experiments.alarm_proofs.window import Window, window_programme
 from obsynth.files.outputs import write_atomically
@@ -67,8 +68,6 @@ class AlarmProof:
         SpecError
             There is no proof to write, or the file cannot be written.
         """
-        from obsynth.experiments.alarm_proofs.certificate import document
-
         if not self.proved:
             raise SpecError("There is no proof to write: the alarm cannot be proved.", path="certificate")
         return write_atomically(path, document(self.certificate))

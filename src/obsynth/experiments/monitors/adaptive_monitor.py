@@ -121,9 +121,9 @@ def adaptive_statement(plan: AdaptivePlan, design: ObserverDesign) -> str:
     box = None if uncertain is None or not uncertain.box.names else uncertain.box
     outside = "a model that is not exact" if box is None else box.sentence
     text = (
-        "passed by a fault since the start only, or by "
-        f"{outside}; no plant within its tolerances, disturbance or noise within its bounds and start explains it; a "
-        "fault that passes it need not last: an interval that excludes zero says that it does"
+        "never passed without a fault since the start while constants, disturbances, noise and the start keep their "
+        f"bounds: an alarm is a fault, or {outside}; a fault that passes it need not last: an interval that excludes "
+        "zero says that it does"
     )
     if box is None:
         return text + EXACT
