@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from obsynth.analysis.existence.distance import DROWNED, Distance, distance_to_loss
+from obsynth.analysis.existence.distance import DROWNED, Distance, distance_to_loss, relative_singular_value
 from obsynth.analysis.existence.numbers import SystemFacts
 from obsynth.analysis.far_zeros import system_zeros
 from obsynth.analysis.zeros import is_outside
@@ -32,6 +32,8 @@ def settled_rank(decision: RankDecision, exact_rank: int | None) -> RankDecision
     return replace(decision, rank=min(decision.rank, decision.expected - 1), means="unclear")
 
 
+#: Computed data hold more than one rounding: below this distance a zero of theirs is one.
+COMPUTED = 1e-12
 #: Rounding scatters a multiple zero by up to this, relative to its size or one.
 SCATTER = 1e-2
 
@@ -61,9 +63,20 @@ def zero_verdict(facts: SystemFacts, E: FloatArray, A: FloatArray, *, nx: int, d
     if not facts.full or facts.outside:
         return ZeroVerdict("no", facts)
     distance = distance_to_loss(E, A, nx=nx, discrete=discrete, zeros=facts.zeros)
-    # Computed data do not tell a zero this close to the boundary from one on it: they hold more than one rounding.
-    on_boundary = facts.computed and any(is_outside(zero, 1.0 if discrete else 0.0) for zero in facts.zeros)
-    return ZeroVerdict("unclear" if distance.value <= DROWNED or on_boundary else "yes", facts, distance)
+    lost = _lost_in_computing(facts, E, A, nx=nx, discrete=discrete)
+    distance = min(distance, lost or distance, key=lambda found: found.value)
+    return ZeroVerdict("unclear" if distance.value <= DROWNED or lost else "yes", facts, distance)
+
+
+def _lost_in_computing(facts: SystemFacts, E: FloatArray, A: FloatArray, *, nx: int, discrete: bool) -> Distance | None:
+    """Return a zero on or outside the boundary that computed data have but for their rounding; ``None`` without one."""
+    if not facts.computed:
+        return None
+    dt = 1.0 if discrete else 0.0
+    values = [*facts.zeros, *map(complex, system_zeros(E, A, nx=nx).values)]
+    found = [Distance(relative_singular_value(E, A, value, nx=nx), value) for value in values if is_outside(value, dt)]
+    best = min(found, key=lambda distance: distance.value, default=None)
+    return best if best is not None and best.value <= COMPUTED else None
 
 
 def believed(facts: SystemFacts, E: FloatArray, A: FloatArray, *, nx: int) -> SystemFacts:
