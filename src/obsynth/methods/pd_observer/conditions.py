@@ -152,6 +152,8 @@ def _detectability(plant: DescriptorSystem, numbers: PlantNumbers) -> Condition:
     if verdict.answer == "unclear":
         detail = unclear_detail(verdict, "An observer")
         hidden = list(analyse_structure(plant).undetectable_modes)
+        if not hidden and verdict.distance is not None:
+            hidden = [verdict.distance.point]
         if hidden:
             lost = _hidden_mode(plant, hidden)
             return replace(lost, detail=f"{detail} In floating point, {lost.detail}", unclear=True)
