@@ -43,7 +43,7 @@ linkcheck_ignore = [r"https?://localhost.*"]
 html_theme = "pydata_sphinx_theme"
 html_title = "obsynth"
 html_theme_options = {"show_toc_level": 2, "navigation_with_keys": False, "secondary_sidebar_items": ["page-toc"]}
-html_static_path = ["_static"]
+html_static_path: list[str] = []
 html_show_sourcelink = False
 
 write_sources(HERE)
