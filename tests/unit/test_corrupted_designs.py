@@ -595,7 +595,7 @@ def test_good_claims_and_a_good_recovery_pass(name: str) -> None:
 
 
 @pytest.mark.parametrize("letter", ["T", "N", "L", "W", "Psi", "Upsilon", "R"])
-@pytest.mark.parametrize("name", BALANCED)
+@pytest.mark.parametrize("name", PLANTS)
 def test_every_single_entry_of_the_gain_set_counts(name: str, letter: str) -> None:
     rows, columns = good(name).gains[letter].shape
     for row in range(rows):
@@ -709,7 +709,7 @@ def in_units(design: ObserverDesign, powers: np.ndarray) -> ObserverDesign:
     )
 
 
-@pytest.mark.parametrize("name", BALANCED)
+@pytest.mark.parametrize("name", PLANTS)
 def test_units_of_the_states_do_not_hide_a_corruption(name: str) -> None:
     """What fails is the same when the states are measured in units from 2^-14 to 2^14."""
     design = good(name)

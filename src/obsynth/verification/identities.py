@@ -57,13 +57,15 @@ class Identity:
     """A sum of terms that must vanish: ``terms[0] + terms[1] + ... = 0``.
 
     Fields: terms: All of one shape; factors: The products inside the terms, which also say what rounding can do; units:
-    Sizes of the columns' signals: multiplied by them, entries of one row compare; entrywise: Whether each entry is
-    judged by its own terms; by default it is by the largest ones of its row.
+    Sizes of the columns' signals: multiplied by them, entries of one row compare; driven: The same sizes where what
+    drives the plant tells them: the row must hold in both; entrywise: Whether each entry is judged by its own terms; by
+    default it is by the largest ones of its row.
     """
 
     terms: tuple[FloatArray, ...]
     factors: tuple[tuple[FloatArray, ...], ...] = ()
     units: FloatArray | None = None
+    driven: FloatArray | None = None
     entrywise: bool = False
 
     @property
@@ -87,17 +89,19 @@ class Identity:
         # Where the sizes are finite, the sum is.
         if not np.isfinite(size).all() or (allowance is not None and not np.isfinite(allowance).all()):
             return Residual(float("nan"), 1.0)
-        scale, missed = self._scale(size), np.abs(total)
+        scale, missed = self._scale(size, self.units), np.abs(total)
+        if self.driven is not None:
+            scale = np.minimum(scale, self._scale(size, self.driven))
         allowed = EQUALITY_TOLERANCE * scale if allowance is None else EQUALITY_TOLERANCE * scale + allowance
         worst = divmod(int((missed / allowed).argmax()), total.shape[1])
         more = 0.0 if allowance is None else float(allowance[worst])
         return Residual(float(missed[worst]), float(scale[worst]), more)
 
-    def _scale(self, size: FloatArray) -> FloatArray:
+    def _scale(self, size: FloatArray, units: FloatArray | None) -> FloatArray:
         if self.entrywise:
             # Nothing is a sum of nothing but zero itself: the least number makes any miss there a large one.
             return np.where(size > 0.0, size, np.finfo(np.float64).tiny)
-        columns = np.ones(size.shape[1]) if self.units is None else self.units
+        columns = np.ones(size.shape[1]) if units is None else units
         rows = np.max(size * columns, axis=1, keepdims=True)
         return np.asarray(np.where(rows > 0.0, rows, 1.0) / columns)
 
@@ -146,6 +150,9 @@ def tracking_identities(
     # A state in small units must not hide behind one in large units.
     scaling = balance_by_least_squares(plant.E, plant.A, outputs=[plant.C])
     units = np.tile(scaling.states, lag + 1)
+    # States that do not touch each other have sizes beside each other only by what drives both.
+    both = balance_by_least_squares(plant.E, plant.A, inputs=[plant.B, plant.Bf, plant.Bd], outputs=[plant.C])
+    driven = np.tile(both.states, lag + 1)
 
     # An observer state that tracks nothing but a sensor fault cancels what it is formed of down to rounding.
     formed = np.abs(tracking) @ np.abs(lagged.A) + np.abs(observer.By) @ np.abs(lagged.C)
@@ -155,13 +162,14 @@ def tracking_identities(
 
     def unseen(rows: slice) -> Identity:
         factors = ((cz[rows], tracking, lagged.E), (dy[rows], lagged.C), (cz[rows], formed))
-        return Identity((cz[rows] @ ve, dy[rows] @ lagged.C), factors, units)
+        return Identity((cz[rows] @ ve, dy[rows] @ lagged.C), factors, units, driven)
 
     return {
         "dynamics": Identity(
             (observer.Az @ ve, observer.By @ lagged.C, -tracking @ lagged.A),
             ((observer.Az, tracking, lagged.E), (taken, seen), (tracking, lagged.A)),
             units,
+            driven,
         ),
         "inputs": Identity(
             (observer.Bu, observer.By @ plant.D, -tracking @ lagged.B),
@@ -171,6 +179,7 @@ def tracking_identities(
             (cz[states] @ ve, dy[states] @ lagged.C, -lagged.oldest),
             ((cz[states], tracking, lagged.E), (dy[states], lagged.C)),
             units,
+            driven,
         ),
         "fault estimate": unseen(observer.fault_rows),
         "residual": unseen(observer.residual_rows),

@@ -89,6 +89,18 @@ class RemainderChannel:
         return tuple(found)
 
 
+    def rounding(self, tracked: TrackedPlant, observer: LinearObserver) -> float:
+        """Return how much K and J are at most of the terms that they are the sums of."""
+        size = np.abs
+        te, c = size(tracked.T) @ size(tracked.E), size(tracked.C)
+        formed = size(observer.Az) @ te + size(observer.By) @ c + size(tracked.T) @ size(tracked.A)
+        shown = size(observer.Cz) @ te + size(observer.Dy) @ c + size(tracked.goal)
+        if tracked.T0 is not None:
+            shown = shown + size(tracked.T0) @ size(tracked.A)
+        pairs = ((self.K.midpoint, formed), (self.J.midpoint, shown))
+        return max(float(np.max(size(k) / np.where(terms > 0.0, terms, 1.0), initial=0.0)) for k, terms in pairs)
+
+
 def magnitude(ball: Ball) -> FloatArray:
     """Return upper bounds on the absolute values of the entries of every member."""
     return np.asarray(rounded_up(np.abs(ball.midpoint) + ball.radius, 2))

@@ -34,6 +34,12 @@ SLOWEST, POINTS = 1e-7, 120
 SLOWER = tuple(10.0**-k for k in range(8, 17))
 #: Eigenvalues within this of the boundary of stability (relative to the unit circle, or to the largest) may be on it.
 BOUNDARY = 1e-8
+#: Multiple poles scatter; those this close to the boundary may be on it, and this far apart they are different ones.
+ABOUT_THE_BOUNDARY, APART, MOST_ANGLES = 1e-2, 1e-2, 8
+#: Beyond this distance (rad per sample) from such poles a gain is none that takes long to build up.
+MOST_DISTANCE = 0.1
+#: What rounding of the stored numbers leaves of an identity, relative to its terms.
+ROUNDED = 1e-12
 #: Without a claimed gain stored numbers matter when they turn a unit disturbance into this error.
 NOTICED = 1e-3
 #: Tolerance of the comparison of gains found in double precision.
@@ -134,22 +140,40 @@ def _gain_rows(
     system = _Composite(plant, observer, tracked, channel)
     unit = 1.0 if plant.dt > 0.0 else system.fastest
     frequencies = unit * np.geomspace(SLOWEST, np.pi if plant.dt > 0.0 else 10.0, POINTS)
+    angles = system.boundary_angles(unit)
+    frequencies = np.concatenate([frequencies, _around(angles[angles > SLOWEST * unit], unit, plant.dt)])
     gains = np.array([system.gain(frequency) for frequency in frequencies])
     worst = int(np.argmax(gains))
-    verdict, seconds = _when_it_matters(system, NOTICED if gamma is None else float(gamma), unit, gains[0])
+    level = NOTICED if gamma is None else float(gamma) * (1.0 + GAIN_TOLERANCE)
+    beyond = frequencies[gains > level]
+    nearest = np.min(np.abs(beyond[:, None] - angles[None, :]), axis=1, initial=np.inf) / unit
+    verdict, seconds = _when_it_matters(system, level, unit, float(np.max(nearest, initial=0.0)))
     if gamma is not None:
-        yield upper_bound_check(
-            "gain with stored numbers",
-            f"gain d -> fault error of the plant and the stored observer, from {SLOWEST:.0e} rad per sample up",
-            float(gains[worst]), float(gamma) * (1.0 + GAIN_TOLERANCE), source="recomputed, plant included",
-            detail=f"largest at {frequencies[worst]:.2g} rad per sample; {verdict}",
-        )  # fmt: skip
+        text = f"gain d -> fault error of the plant and the stored observer, from {SLOWEST:.0e} rad per sample up"
+        detail = f"largest at {frequencies[worst]:.2g} rad per sample; {verdict}"
+        drifting = np.isfinite(seconds) and np.all(nearest <= MOST_DISTANCE)
+        if beyond.size and drifting and channel.rounding(tracked, observer) <= ROUNDED:
+            # Nobody could store better numbers: no finite gain exists, and what can be said is for how long it holds.
+            yield information("gain with stored numbers", f"{text}; above gamma by rounding alone", float(gains[worst]),
+                              source="recomputed, plant included", detail=detail)  # fmt: skip
+        else:
+            yield upper_bound_check(
+                "gain with stored numbers", text, float(gains[worst]), level, source="recomputed, plant included",
+                detail=detail,
+            )  # fmt: skip
     yield information(
         "stored numbers: horizon",
         "seconds for which a unit disturbance may last before rounding of the stored numbers "
         + ("reaches the claimed gain" if gamma is not None else f"makes an error of {NOTICED:g} of it"),
         seconds, source="recomputed, plant included", detail=verdict,
     )  # fmt: skip
+
+
+def _around(angles: FloatArray, unit: float, dt: float) -> FloatArray:
+    """Return frequencies on both sides of each angle, ever closer to it."""
+    apart = unit * np.geomspace(SLOWEST, MOST_DISTANCE, POINTS // 4)
+    found = np.abs(np.concatenate([angles[:, None] - apart, angles[:, None] + apart], axis=1)).ravel()
+    return np.asarray(np.minimum(found, np.pi) if dt > 0.0 else found)
 
 
 class _Composite:
@@ -175,6 +199,15 @@ class _Composite:
         own = np.abs(np.linalg.eigvals(observer.Az)) if observer.order else np.ones(1)
         self.fastest = float(max(np.max(own, initial=0.0), np.finfo(np.float64).tiny))
 
+    def boundary_angles(self, unit: float) -> FloatArray:
+        """Return the frequencies (rad per sample, or rad/s) of the plant's poles on the boundary or about it."""
+        discrete, poles = self.plant.dt > 0.0, self.poles
+        near = poles[np.abs(np.abs(poles) - 1.0 if discrete else poles.real / unit) <= ABOUT_THE_BOUNDARY]
+        angles = np.unique(np.abs(np.angle(near) if discrete else near.imag))
+        # Scattered multiple poles have angles next to each other.
+        kept = [angle for i, angle in enumerate(angles) if not i or angle - angles[i - 1] > APART * unit]
+        return np.asarray(kept[:MOST_ANGLES], dtype=np.float64)
+
     def gain(self, frequency: float) -> float:
         """Return the largest singular value at a frequency (rad per sample, or rad/s); zero at a pole of the plant."""
         dt = self.plant.dt
@@ -191,33 +224,38 @@ class _Composite:
         return float(np.linalg.norm(whole, 2)) if np.all(np.isfinite(whole)) else 0.0
 
 
-def _when_it_matters(system: _Composite, level: float, unit: float, slow: float) -> tuple[str, float]:
-    """Return what to say of disturbances that last, and for how many seconds they may."""
+def _when_it_matters(system: _Composite, level: float, unit: float, beyond: float) -> tuple[str, float]:
+    """Return what to say of disturbances that last, and for how many seconds they may.
+
+    ``beyond`` is the largest distance from a pole on the boundary (in units of ``unit``) at which the gain is above the
+    level; zero where it is not.
+    """
     dt, poles = system.plant.dt, system.poles
     per_unit = dt if dt > 0.0 else 1.0 / unit
     size = max(float(np.max(np.abs(poles), initial=0.0)), np.finfo(np.float64).tiny)
     distance = np.abs(poles) - 1.0 if dt > 0.0 else poles.real / size
     outside = distance > BOUNDARY
+    seconds = per_unit / beyond if beyond > 0.0 else np.inf
     if not poles.size or np.all(distance < -BOUNDARY):
         return "the plant forgets: a finite gain exists", np.inf
     if outside.any():
         rate = float(np.max(np.log(np.abs(poles[outside])) / dt if dt > 0.0 else poles[outside].real))
         left = max(float(np.max(np.abs(system.K), initial=0.0)), float(np.max(np.abs(system.J), initial=0.0)))
-        seconds = float(np.log(max(level / max(left, 1e-300), 1.0)) / rate)
+        seconds = min(seconds, float(np.log(max(level / max(left, 1e-300), 1.0)) / rate))
         return (
             "the plant has a pole outside the region of stability: no finite gain exists for stored numbers; where its "
             f"state is not held down, they matter after about {seconds:.3g} s"
         ), seconds
     last = SLOWEST
-    for frequency in SLOWER:
+    for frequency in () if np.isfinite(seconds) else SLOWER:
         if system.gain(frequency * unit) > level:
             seconds = per_unit / frequency
-            return (
-                f"{_ON_THE_BOUNDARY}; they matter for disturbances that last longer than about "
-                f"{seconds:.3g} s ({seconds / 86_400:.3g} days)"
-            ), seconds
+            break
         last = frequency
-    if slow > level:
-        last = SLOWEST
+    if np.isfinite(seconds):
+        return (
+            f"{_ON_THE_BOUNDARY}; they matter for disturbances that last longer than about "
+            f"{seconds:.3g} s ({seconds / 86_400:.3g} days)"
+        ), seconds
     seconds = per_unit / last
     return f"{_ON_THE_BOUNDARY}; they do not matter within {seconds:.3g} s", seconds

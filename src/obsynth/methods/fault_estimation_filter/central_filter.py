@@ -110,9 +110,12 @@ def _decoupling_filter(problem: GainProblem, gain: float) -> tuple[Injection, fl
     """
     if not _follows_from_measurements(problem):
         return None
-    found = central_injection(problem, DECOUPLING_LEVEL * gain, noise=NOISES[0])
-    reached = np.inf if found is None else problem.achieved_gain(found)
-    return (found, reached) if found is not None and reached <= DECOUPLED_GAIN * gain else None
+    # Next to a zero on the unit circle only little noise leaves the equation a solution.
+    for noise in NOISES[:2]:
+        found = central_injection(problem, DECOUPLING_LEVEL * gain, noise=noise)
+        if found is not None and (reached := problem.achieved_gain(found)) <= DECOUPLED_GAIN * gain:
+            return found, reached
+    return None
 
 
 def _follows_from_measurements(problem: GainProblem) -> bool:

@@ -114,7 +114,8 @@ def _gain_set_rows(
     if printed_digits is not None:
         allowances = printed_allowances(plant, work, observer, gains, scaling, printed_digits)
     equations = Equations.of(plant, work, observer.fault_delays)
-    yield from gain_rows(work, gains, observer, tracking, equations, scaling, allowances)
+    fixed = design.options.get("free_residual_weight") is False and design.options.get("S") is None
+    yield from gain_rows(work, gains, observer, tracking, equations, scaling, allowances, fixed_weight=fixed)
     return allowances
 
 

@@ -71,6 +71,8 @@ def gain_rows(
     equations: Equations,
     scaling: Scaling,
     allowances: Mapping[str, FloatArray],
+    *,
+    fixed_weight: bool,
 ) -> Iterator[Check]:
     """Yield the rows on the gain set, which must fit."""
     identities = gain_identities(work, gains, equations, scaling)
@@ -89,8 +91,9 @@ def gain_rows(
     if "R" in gains:
         yield equality(
             "gains: R",
-            "R is the free part of L: R Upsilon = 0, and L - R = T A Psi G with G Upsilon = I",
-            worst([identity.residual() for identity in _free_part_identities(work, gains, scaling)]),
+            "R is the free part of L: R Upsilon = 0, and L - R = T A Psi G with G Upsilon = I"
+            + (", G = W" if fixed_weight else ""),
+            worst([identity.residual() for identity in _free_part_identities(work, gains, scaling, fixed_weight)]),
             "Wang 2015, eq. (60)",
         )
     yield equality(
@@ -112,8 +115,10 @@ def _detectability_identities(
     ]
 
 
-def _free_part_identities(work: DescriptorSystem, gains: Mapping[str, FloatArray], scaling: Scaling) -> list[Identity]:
-    # Which left inverse G of Upsilon is taken depends on the units of the outputs: any one is right.
+def _free_part_identities(
+    work: DescriptorSystem, gains: Mapping[str, FloatArray], scaling: Scaling, fixed_weight: bool
+) -> list[Identity]:
+    # Beside a free weight, which left inverse G of Upsilon is taken depends on the units of the outputs: any is right.
     outputs, fixed, free = 1.0 / scaling.outputs, gains["L"] - gains["R"], gains["R"]
     moved = gains["T"] @ work.A @ gains["Psi"]
     # The columns of L - R are combinations of those of T A Psi: nothing is left beside their span.
@@ -129,11 +134,12 @@ def _free_part_identities(work: DescriptorSystem, gains: Mapping[str, FloatArray
     formed = parts + np.abs(gains["T"]) @ np.abs(work.A) @ np.abs(gains["Psi"]) @ np.abs(gains["W"])
     # The projection mixes the rows in balanced units.
     mixed = scaling.states[:, None] * np.max(formed / scaling.states[:, None], axis=0, initial=0.0)
-    return [
+    found = [
         Identity((free @ upsilon,), products),
         Identity((fixed @ upsilon, -moved), products),
         Identity((fixed, -span @ (shares @ fixed)), ((mixed,),), outputs),
     ]
+    return [*found, Identity((fixed, -moved @ gains["W"]), ((mixed,),), outputs)] if fixed_weight else found
 
 
 def _realisation_identities(
