@@ -17,9 +17,6 @@ SAME_POLE = 1e-3
 DEAD_BEAT = 1e-6
 #: Relative difference of two ways of computing a variance up to which it counts as known.
 AGREEMENT = 1e-2
-#: Rounding, relative to a matrix, that scatters an eigenvalue of multiplicity m by its m-th root; and the largest share
-#: of a pole that counts as scatter, whatever the multiplicity.
-SCATTER, MOST_SCATTER = 1e7 * float(np.finfo(np.float64).eps), 0.05
 
 
 def eigenvalues(matrix: FloatArray) -> ComplexArray:
@@ -42,21 +39,17 @@ def spectrum_error(matrix: FloatArray, wanted: Sequence[complex] | ComplexArray,
     return max((abs(complex(np.mean(misses))) for misses in groups), default=0.0)
 
 
-def lost_poles(matrix: FloatArray, wanted: Sequence[complex] | ComplexArray, dt: float) -> float:
-    """Return how far the worst eigenvalue is from the wanted one it belongs to, if that is more than rounding scatters.
+def farthest_pole(
+    found: Sequence[complex] | ComplexArray, wanted: Sequence[complex] | ComplexArray, dt: float
+) -> float:
+    """Return how far the worst of some eigenvalues is from the wanted one it belongs to, relative as `spectrum_error`.
 
-    Zero where each eigenvalue of a group of m equal wanted ones lies within the m-th root of the rounding, and within
-    `MOST_SCATTER`; distances are relative, as in `spectrum_error`.
+    Nothing is a mean here: each eigenvalue counts.
     """
-    goal = np.asarray(wanted, dtype=np.complex128)
-    if matrix.shape[0] != goal.size or not np.all(np.isfinite(matrix)):
+    values, goal = (np.asarray(given, dtype=np.complex128) for given in (found, wanted))
+    if values.size != goal.size or not np.all(np.isfinite(values)):
         return float("inf")
-    worst = 0.0
-    for misses in _groups(eigenvalues(matrix), goal, dt):
-        far = float(np.max(np.abs(misses)))
-        if far > min(MOST_SCATTER, SCATTER ** (1.0 / len(misses))):
-            worst = max(worst, far)
-    return worst
+    return max((float(np.max(np.abs(misses))) for misses in _groups(values, goal, dt)), default=0.0)
 
 
 def _groups(found: ComplexArray, goal: ComplexArray, dt: float) -> list[ComplexArray]:

@@ -10,11 +10,20 @@ definiteness):
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.spectra import decay_rates, eigenvalues
 from obsynth.proofs.balls import Enclosed, block
+from obsynth.proofs.contraction import prove_contraction
 from obsynth.proofs.definiteness import DefinitenessProof, prove_positive_definite, unproved
+from obsynth.proofs.extended_balls import enclosed_eigenvalues
+from obsynth.results.report import Check, CheckKind
+
+#: A claimed rate is proved for all but this share of it.
+RATE_TOLERANCE = 1e-4
 
 
 def prove_stable(a: FloatArray, factor: FloatArray, dt: float) -> DefinitenessProof:
@@ -42,3 +51,50 @@ def prove_stable(a: FloatArray, factor: FloatArray, dt: float) -> DefinitenessPr
         return -(half + half.T)
 
     return prove_positive_definite(formula)
+
+
+def decay_row(a: FloatArray, dt: float, claimed: float) -> Check:
+    """Return the row on a claimed decay (1/s): proved for all but `RATE_TOLERANCE` of it, whatever poles there are.
+
+    By a Lyapunov inequality shifted by the rate, or where multiple poles leave none, by an enclosure of each eigenvalue
+    of the stored numbers.
+    """
+    slowest = float(np.min(decay_rates(eigenvalues(a), dt), initial=np.inf))
+    wanted = claimed - RATE_TOLERANCE * abs(claimed)
+    source, passed = "recomputed eigenvalues", bool(slowest >= wanted)
+    status: CheckKind = "computed"
+    if not len(a) or _contracts(a, dt, wanted):
+        source, passed, status = "Lyapunov inequality, shifted by the rate", True, "proved"
+        slowest = max(slowest, wanted)
+    elif (enclosed := enclosed_eigenvalues(a)) is not None:
+        slowest = enclosed_decay(enclosed, dt)
+        source, passed, status = "enclosure of each eigenvalue of the stored numbers", bool(slowest >= wanted), "proved"
+    slow = f"slowest time constant {1.0 / slowest:.3g} s; " if 0.0 < slowest < np.inf else ""
+    return Check(
+        "decay", "every mode decays at the claimed rate (1/s) or faster", slowest, wanted, slowest - wanted, passed,
+        source, status, f"{slow}{status} for {wanted:.6g} 1/s",
+    )  # fmt: skip
+
+
+def slowest_decay(a: FloatArray, dt: float) -> float:
+    """Return the rate of the slowest mode (1/s), such that `decay_row` can find it again; infinite without modes."""
+    slowest = float(np.min(decay_rates(eigenvalues(a), dt), initial=np.inf))
+    if not np.isfinite(slowest) or _contracts(a, dt, slowest - RATE_TOLERANCE * abs(slowest)):
+        return slowest
+    enclosed = enclosed_eigenvalues(a)
+    return slowest if enclosed is None else enclosed_decay(enclosed, dt)
+
+
+def enclosed_decay(enclosed: tuple[Any, ...], dt: float) -> float:
+    """Return a lower bound on the rate of the slowest of some enclosed eigenvalues."""
+    if dt == 0.0:
+        return float(np.nextafter(min(float((-ball.real).lower()) for ball in enclosed), -np.inf))
+    # The two roundings of the logarithm's argument are far below the tolerance of a rate.
+    radius = max(float(abs(ball).upper()) for ball in enclosed)
+    return float(-np.log(np.nextafter(radius, np.inf)) / dt) if radius > 0.0 else np.inf
+
+
+def _contracts(a: FloatArray, dt: float, rate: float) -> bool:
+    if not rate > 0.0 or not np.isfinite(rate):
+        return False
+    return prove_contraction(a, discrete=dt > 0.0, rate=float(np.exp(-rate * dt)) if dt > 0.0 else rate) is not None

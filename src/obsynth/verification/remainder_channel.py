@@ -88,7 +88,6 @@ class RemainderChannel:
             found.append(np.asarray(rounded_up(bound + magnitude(direct), 2)))
         return tuple(found)
 
-
     def rounding(self, tracked: TrackedPlant, observer: LinearObserver) -> float:
         """Return how much K and J are at most of the terms that they are the sums of."""
         size = np.abs

@@ -30,10 +30,10 @@ from obsynth.methods.placement.eigenstructure import place
 from obsynth.methods.synthesis_result import Synthesis
 from obsynth.methods.ui_pi_observer.options import checked_poles, plain
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.spectra import decay_rates, eigenvalues
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.exosystems import Exosystem, exosystem
 from obsynth.results.design import Certificate
+from obsynth.verification.lyapunov import slowest_decay
 
 #: Errors that need longer than so many times the settling time are mentioned.
 SLOW = 20.0
@@ -63,7 +63,7 @@ def synthesise(
         "tracking": tracking_map(plant, observer, t, model.Phi, model.Cw),
     }  # fmt: skip
     matrices["deviations"] = estimate_deviations(noisy, observer, matrices)
-    slowest = float(np.min(decay_rates(eigenvalues(observer.Az), plant.dt), initial=np.inf))
+    slowest = slowest_decay(observer.Az, plant.dt)
     claims = {"order": float(observer.order), **({"decay": slowest} if np.isfinite(slowest) else {})}
     options = _resolved(asked, plant, model, rates, estimated)
     return Synthesis(

@@ -40,14 +40,18 @@ from obsynth.methods.ui_pi_observer.pencils import number
 from obsynth.methods.ui_pi_observer.placement_problem import PlacementProblem, placement_problem, with_faults
 from obsynth.methods.ui_pi_observer.realisation import ObserverGains, combinations_seen, realise
 from obsynth.numerics.arrays import ComplexArray, FloatArray, as_matrix
-from obsynth.numerics.spectra import abscissa, certain_noise_covariance, decay_rates, eigenvalues
+from obsynth.numerics.spectra import abscissa, certain_noise_covariance, decay_rates, eigenvalues, farthest_pole
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.exosystems import Exosystem, exosystem
+from obsynth.proofs.extended_balls import enclosed_eigenvalues, middle_of
 from obsynth.results.design import Certificate
+from obsynth.verification.lyapunov import slowest_decay
 
 #: A region with a radius and no decay asks for at most this share of its radius.
 RADIUS_SHARE = 0.5
+#: Poles of what is shipped that are this close to those asked for, relative to their size, are claimed as asked.
+SAME_AS_ASKED = 5e-5
 
 
 def conditions(plant: DescriptorSystem, *, fault_model: Any = "step", exactly: bool = True) -> tuple[Condition, ...]:
@@ -225,7 +229,7 @@ def _assembled(
         letters |= {"U": gains.U[:nx, :nx], "D": gains.D[:nx], "K": gains.K[:nx], "F": gains.K[nx:]}
         letters["Hhat"] = letters["U"] @ plant.Bf
     letters |= {"Phi": model.Phi, "Cw": model.Cw}
-    poles = eigenvalues(observer.Az) if poles is None else poles
+    poles = _shipped_poles(observer, poles)
     order = np.lexsort((poles.imag, poles.real))
     matrices = {
         "tracking": gains.U,
@@ -234,10 +238,31 @@ def _assembled(
         "poles": np.column_stack([poles.real, poles.imag])[order] if poles.size else np.zeros((0, 2)),
         "stability": lyapunov_factor(observer.Az, plant.dt),
     }
-    slowest = float(np.min(decay_rates(eigenvalues(observer.Az), plant.dt), initial=np.inf))
+    slowest = slowest_decay(observer.Az, plant.dt)
     claims = {"decay": slowest, "noise_amplification": noise_amplification(observer), **claims}
     finite = {name: value for name, value in claims.items() if np.isfinite(value)}
     return Synthesis({}, letters, observer, Certificate(matrices, finite))
+
+
+def _shipped_poles(observer: LinearObserver, asked: ComplexArray | None) -> ComplexArray:
+    """Return the poles as asked for where the stored numbers have them, else those that they have.
+
+    A multiple pole is scattered by the rounding of its gains: what is claimed is what is shipped.
+    """
+    found = eigenvalues(observer.Az)
+    if asked is not None and farthest_pole(found, asked, observer.dt) <= SAME_AS_ASKED:
+        return asked
+    if (
+        asked is None
+        and len(found)
+        and slowest_decay(observer.Az, observer.dt) == np.min(decay_rates(found, observer.dt), initial=np.inf)
+    ):
+        return found
+    enclosed = enclosed_eigenvalues(observer.Az)
+    if enclosed is None:
+        return found
+    exact = np.array([middle_of(ball) for ball in enclosed])
+    return asked if asked is not None and farthest_pole(exact, asked, observer.dt) <= SAME_AS_ASKED else exact
 
 
 def noise_amplification(observer: LinearObserver) -> float:
