@@ -17,18 +17,25 @@ from flint import fmpq, fmpq_mat, fmpq_poly
 
 #: Exponents of the powers of two that signals and equations are multiplied by.
 UNITS = 13
+#: Share of the plants in discrete time that are sampled by the package.
+SAMPLED = 0.3
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """A plant as integers (or quarters), its truth, and the same plant as the package is given it."""
+    """A plant in rational numbers, its truth, and the same plant as the package is given it.
+
+    ``exists`` is ``None`` where nothing is known; with ``step`` the plant is given in continuous time, with algebraic
+    states, to be sampled so many seconds apart.
+    """
 
     matrices: dict[str, np.ndarray]
     dt: float
-    exists: bool
+    exists: bool | None
     why: str
     given: dict[str, np.ndarray]
     units: dict[str, np.ndarray] = field(repr=False)
+    step: Fraction | None = None
 
 
 def drawn_plant(method: str, seed: int) -> Drawn:
@@ -40,14 +47,25 @@ def _draw(method: str, seed: str) -> Drawn | None:
     rng = random.Random(f"{method} {seed}")
     matrices = _base(rng, method)
     dt = 0.0 if method == "pd-observer" else 1.0 if method == "fault-estimation-filter" else rng.choice([0.0, 1.0])
-    _plant_obstacle(rng, matrices, dt)
-    truth = {"pd-observer": _pd_truth, "fault-estimation-filter": _filter_truth, "ui-pi-observer": _ui_pi_truth}
-    verdict = truth[method](matrices, dt)
+    step = Fraction(1, rng.choice([1, 2])) if dt and rng.random() < SAMPLED else None
+    _plant_obstacle(rng, matrices, 0.0 if step else dt)
+    true = matrices
+    if step:
+        _without_poles_but_zero(rng, matrices)
+        reduced = _eliminated(matrices)
+        if reduced is None:
+            return None
+        true = _sampled(reduced, step)
+    truth = {
+        "pd-observer": _pd_truth, "fault-estimation-filter": _filter_truth, "ui-pi-observer": _ui_pi_truth,
+        "functional-filter": _functional_truth,
+    }  # fmt: skip
+    verdict = truth[method](true, dt)
     if verdict is None:
         return None
     exists, why = verdict
     given, units = _other_words(rng, matrices)
-    return Drawn(matrices, dt, exists, why, given, units)
+    return Drawn(true, dt, exists, why, given, units, step)
 
 
 def _base(rng: random.Random, method: str) -> dict[str, np.ndarray]:
@@ -97,6 +115,27 @@ def _plant_obstacle(rng: random.Random, m: dict[str, np.ndarray], dt: float) -> 
         m["C"][:, -1] = 0
         m["Df"][:, 0] = 0
         m["Bf"][:, 0] = m["A"][:, -1]
+
+
+def _without_poles_but_zero(rng: random.Random, m: dict[str, np.ndarray]) -> None:
+    """Make the dynamics nilpotent, whose exponential is rational: integrators, and algebraic states on one side."""
+    nx, n = len(m["A"]), int(sum(m["E"].diagonal()))
+    for i in range(n):
+        m["A"][i, : i + 1] = 0
+    if rng.random() < 0.5:
+        m["A"][:n, n:] = 0
+    else:
+        m["A"][n:nx, :n] = 0
+
+
+def _sampled(m: dict[str, np.ndarray], step: Fraction) -> dict[str, np.ndarray]:
+    """Return a plant with ``E = I`` and nilpotent A under inputs that are held: the series ends."""
+    n = len(m["A"])
+    power, moved, driven = np.eye(n, dtype=int).astype(object), m["A"] * 0, m["A"] * 0
+    for k in range(n + 1):
+        moved, driven = moved + power, driven + power * step / (k + 1)
+        power = power @ m["A"] * step / (k + 1)
+    return {**m, "A": moved, "Bf": driven @ m["Bf"], "Bd": driven @ m["Bd"]}
 
 
 def _small_vectors(n: int) -> list[np.ndarray]:
@@ -282,3 +321,15 @@ def _decoupled(m: dict[str, np.ndarray]) -> bool:
     )  # fmt: skip
     direct = _rank([m["Dd"]]) if nd else 0
     return whole == nx + direct + (_rank([m["Bd"]], [m["Dd"]]) if nd else 0)
+
+
+def _functional_truth(m: dict[str, np.ndarray], dt: float) -> tuple[bool | None, str] | None:
+    """Return what is known: an observer of the whole state is one, and no filter sees a constant that nothing shows."""
+    if m["Bf"].shape[1] != 1:
+        return None
+    still = m["A"] - m["E"] if dt else m["A"]
+    known = [still, m["Bd"]], [m["C"], m["Dd"]]
+    if _rank(*known) == _rank([*known[0], m["Bf"]], [*known[1], m["Df"]]):
+        return False, "a constant fault is hidden"
+    whole = _ui_pi_truth(m, dt)
+    return (True, "exists") if whole is not None and whole[0] else (None, "not known")

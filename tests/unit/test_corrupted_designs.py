@@ -101,8 +101,6 @@ def drifting() -> DescriptorSystem:
     )  # fmt: skip
 
 
-#: In `drifting` any first column of R is as right, and sizes within a row differ by 1e5: residuals follow the units.
-BALANCED = ("paper", "chain", "direct", "quiet")
 PLANTS = {"paper": paper, "chain": chain, "direct": direct, "quiet": quiet, "drifting": drifting}
 
 
@@ -571,7 +569,7 @@ TABLE: dict[str, tuple[str, Callable[[ObserverDesign], ObserverDesign], tuple[st
     "a claimed error that is no number": ("paper", certificate_entry("state_error", 0, 0, np.nan), (STORED_X,)),
     "a claimed error of another shape": ("paper", certificate_cut("state_error", slice(1, None)), (STORED_X,)),
     "a leak from a state that never forgets": (
-        "drifting", lambda d: without_stored_errors(entry("By", 1, 0, 5e-10)(d)), (COMPOSITE,)),
+        "drifting", lambda d: without_stored_errors(entry("By", 1, 0, 5e-10)(d)), (DYNAMICS, COMPOSITE)),
     "a matrix that nothing checks": ("paper", lambda d: with_certificate(d, more=np.eye(2)), (COVERED,)),
 }  # fmt: skip
 

@@ -22,6 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.scaling import balance_by_least_squares
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.balls import Ball, rounded_up
@@ -89,15 +90,19 @@ class RemainderChannel:
         return tuple(found)
 
     def rounding(self, tracked: TrackedPlant, observer: LinearObserver) -> float:
-        """Return how much K and J are at most of the terms that they are the sums of."""
+        """Return how much K and J are at most of the largest terms of their rows, in natural units of the states."""
         size = np.abs
+        units = np.ones(tracked.E.shape[1])
+        if tracked.E.shape[0] == tracked.E.shape[1]:
+            units = balance_by_least_squares(tracked.E, tracked.A, outputs=[tracked.C]).states
         te, c = size(tracked.T) @ size(tracked.E), size(tracked.C)
         formed = size(observer.Az) @ te + size(observer.By) @ c + size(tracked.T) @ size(tracked.A)
         shown = size(observer.Cz) @ te + size(observer.Dy) @ c + size(tracked.goal)
         if tracked.T0 is not None:
             shown = shown + size(tracked.T0) @ size(tracked.A)
         pairs = ((self.K.midpoint, formed), (self.J.midpoint, shown))
-        return max(float(np.max(size(k) / np.where(terms > 0.0, terms, 1.0), initial=0.0)) for k, terms in pairs)
+        largest = [(size(k) * units, np.max(terms * units, axis=1, initial=0.0, keepdims=True)) for k, terms in pairs]
+        return max(float(np.max(k / np.where(row > 0.0, row, 1.0), initial=0.0)) for k, row in largest)
 
 
 def magnitude(ball: Ball) -> FloatArray:

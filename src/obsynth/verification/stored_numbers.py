@@ -39,7 +39,7 @@ ABOUT_THE_BOUNDARY, APART, MOST_ANGLES = 1e-2, 1e-2, 8
 #: Beyond this distance (rad per sample) from such poles a gain is none that takes long to build up.
 MOST_DISTANCE = 0.1
 #: What rounding of the stored numbers leaves of an identity, relative to its terms.
-ROUNDED = 1e-12
+ROUNDED = 1e-11
 #: Without a claimed gain stored numbers matter when they turn a unit disturbance into this error.
 NOTICED = 1e-3
 #: Tolerance of the comparison of gains found in double precision.
