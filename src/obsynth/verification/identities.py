@@ -19,6 +19,8 @@ from obsynth.verification.error_system import LaggedPlant
 
 #: Equalities may miss by this much, relative to the terms they are made of.
 EQUALITY_TOLERANCE = 1e-9
+#: Sizes of states that are told by what drives them alone are known to within this factor.
+ROUGHLY = 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +93,7 @@ class Identity:
             return Residual(float("nan"), 1.0)
         scale, missed = self._scale(size, self.units), np.abs(total)
         if self.driven is not None:
-            scale = np.minimum(scale, self._scale(size, self.driven))
+            scale = np.minimum(scale, ROUGHLY * self._scale(size, self.driven))
         allowed = EQUALITY_TOLERANCE * scale if allowance is None else EQUALITY_TOLERANCE * scale + allowance
         worst = divmod(int((missed / allowed).argmax()), total.shape[1])
         more = 0.0 if allowance is None else float(allowance[worst])
