@@ -6,12 +6,12 @@ do to the terms, and, for gains that were printed to some decimals, against what
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.scaling import balance_by_least_squares
+from obsynth.numerics.scaling import Scaling, balance_by_least_squares
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.report import Check, upper_bound_check
@@ -59,16 +59,17 @@ class Identity:
     """A sum of terms that must vanish: ``terms[0] + terms[1] + ... = 0``.
 
     Fields: terms: All of one shape; factors: The products inside the terms, which also say what rounding can do; units:
-    Sizes of the columns' signals: multiplied by them, entries of one row compare; driven: The same sizes where what
-    drives the plant tells them: the row must hold in both; entrywise: Whether each entry is judged by its own terms; by
-    default it is by the largest ones of its row.
+    Sizes of the columns' signals: multiplied by them, entries of one row compare; entrywise: Whether each entry is
+    judged by its own terms; by default it is by the largest ones of its row; rough: Factor within which the sizes are
+    known; also: The same terms with sizes that are told otherwise: both must hold.
     """
 
     terms: tuple[FloatArray, ...]
     factors: tuple[tuple[FloatArray, ...], ...] = ()
     units: FloatArray | None = None
-    driven: FloatArray | None = None
     entrywise: bool = False
+    rough: float = 1.0
+    also: Identity | None = None
 
     @property
     def total(self) -> FloatArray:
@@ -91,19 +92,20 @@ class Identity:
         # Where the sizes are finite, the sum is.
         if not np.isfinite(size).all() or (allowance is not None and not np.isfinite(allowance).all()):
             return Residual(float("nan"), 1.0)
-        scale, missed = self._scale(size, self.units), np.abs(total)
-        if self.driven is not None:
-            scale = np.minimum(scale, ROUGHLY * self._scale(size, self.driven))
+        scale, missed = self.rough * self._scale(size), np.abs(total)
         allowed = EQUALITY_TOLERANCE * scale if allowance is None else EQUALITY_TOLERANCE * scale + allowance
         worst = divmod(int((missed / allowed).argmax()), total.shape[1])
         more = 0.0 if allowance is None else float(allowance[worst])
-        return Residual(float(missed[worst]), float(scale[worst]), more)
+        found = Residual(float(missed[worst]), float(scale[worst]), more)
+        if self.also is None:
+            return found
+        return max(found, self.also.residual(allowance), key=lambda item: item.severity)
 
-    def _scale(self, size: FloatArray, units: FloatArray | None) -> FloatArray:
+    def _scale(self, size: FloatArray) -> FloatArray:
         if self.entrywise:
             # Nothing is a sum of nothing but zero itself: the least number makes any miss there a large one.
             return np.where(size > 0.0, size, np.finfo(np.float64).tiny)
-        columns = np.ones(size.shape[1]) if units is None else units
+        columns = np.ones(size.shape[1]) if self.units is None else self.units
         rows = np.max(size * columns, axis=1, keepdims=True)
         return np.asarray(np.where(rows > 0.0, rows, 1.0) / columns)
 
@@ -146,15 +148,26 @@ def tracking_identities(
     plant: DescriptorSystem, observer: LinearObserver, tracking: FloatArray, lag: int
 ) -> dict[str, Identity]:
     """Return the identities that make the observer unbiased without faults and disturbances."""
+    # A state in small units must not hide behind one in large units.
+    found = _tracking_identities(
+        plant, observer, tracking, lag, balance_by_least_squares(plant.E, plant.A, outputs=[plant.C])
+    )
+    # States that do not touch each other have sizes beside each other only by what drives both.
+    driven = balance_by_least_squares(plant.E, plant.A, inputs=[plant.B, plant.Bf, plant.Bd], outputs=[plant.C])
+    others = _tracking_identities(plant, observer, tracking, lag, driven)
+    return {
+        name: identity if identity.units is None else replace(identity, also=replace(others[name], rough=ROUGHLY))
+        for name, identity in found.items()
+    }
+
+
+def _tracking_identities(
+    plant: DescriptorSystem, observer: LinearObserver, tracking: FloatArray, lag: int, scaling: Scaling
+) -> dict[str, Identity]:
     lagged = LaggedPlant.of(plant, lag)
     ve = tracking @ lagged.E
     states, cz, dy, du = observer.state_rows, observer.Cz, observer.Dy, observer.Du
-    # A state in small units must not hide behind one in large units.
-    scaling = balance_by_least_squares(plant.E, plant.A, outputs=[plant.C])
     units = np.tile(scaling.states, lag + 1)
-    # States that do not touch each other have sizes beside each other only by what drives both.
-    both = balance_by_least_squares(plant.E, plant.A, inputs=[plant.B, plant.Bf, plant.Bd], outputs=[plant.C])
-    driven = np.tile(both.states, lag + 1)
 
     # An observer state that tracks nothing but a sensor fault cancels what it is formed of down to rounding.
     formed = np.abs(tracking) @ np.abs(lagged.A) + np.abs(observer.By) @ np.abs(lagged.C)
@@ -164,14 +177,13 @@ def tracking_identities(
 
     def unseen(rows: slice) -> Identity:
         factors = ((cz[rows], tracking, lagged.E), (dy[rows], lagged.C), (cz[rows], formed))
-        return Identity((cz[rows] @ ve, dy[rows] @ lagged.C), factors, units, driven)
+        return Identity((cz[rows] @ ve, dy[rows] @ lagged.C), factors, units)
 
     return {
         "dynamics": Identity(
             (observer.Az @ ve, observer.By @ lagged.C, -tracking @ lagged.A),
             ((observer.Az, tracking, lagged.E), (taken, seen), (tracking, lagged.A)),
             units,
-            driven,
         ),
         "inputs": Identity(
             (observer.Bu, observer.By @ plant.D, -tracking @ lagged.B),
@@ -181,7 +193,6 @@ def tracking_identities(
             (cz[states] @ ve, dy[states] @ lagged.C, -lagged.oldest),
             ((cz[states], tracking, lagged.E), (dy[states], lagged.C)),
             units,
-            driven,
         ),
         "fault estimate": unseen(observer.fault_rows),
         "residual": unseen(observer.residual_rows),
