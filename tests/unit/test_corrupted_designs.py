@@ -380,7 +380,7 @@ def without_stored_errors(design: ObserverDesign) -> ObserverDesign:
 
 #: Rows on the stored numbers, and on claims that nothing checks.
 STORED_X, STORED_U, COVERED = "stored numbers: states", "stored numbers: inputs", "claims covered"
-COMPOSITE = "gain with stored numbers"
+COMPOSITE, LEAST = "gain with stored numbers", "least gain"
 
 #: What is corrupted -> (good design, corruption, exactly the rows that fail).
 TABLE: dict[str, tuple[str, Callable[[ObserverDesign], ObserverDesign], tuple[str, ...]]] = {
@@ -478,8 +478,16 @@ TABLE: dict[str, tuple[str, Callable[[ObserverDesign], ObserverDesign], tuple[st
     "lag a text": ("chain", claim("state_lag", "2"), (FITS, CLAIMS)),
     "a claim that nobody knows": ("paper", claim("delay_margin", 1.0), (CLAIMS,)),
     "a claim that nobody knows, no disturbance": ("quiet", claim("gamma_max", 1.0), (CLAIMS,)),
-    "gamma_min above gamma": ("paper", claim("gamma_min", 1.6), (ORDER,)),
-    "gamma_min negative": ("chain", claim("gamma_min", -0.1), (ORDER,)),
+    "gamma_min above gamma": ("paper", claim("gamma_min", 1.6), (ORDER, LEAST)),
+    "gamma_min a little too high": ("paper", lambda d: claim("gamma_min", 1.001 * d.certificate.claims["gamma_min"])(d),
+                                    (LEAST,)),
+    "gamma_min a little too low": ("chain", lambda d: claim("gamma_min", 0.999 * d.certificate.claims["gamma_min"])(d),
+                                   (LEAST,)),
+    "a proof of the least gain, of another": (
+        "paper", lambda d: with_certificate(d, least_gain_last=1.1 * d.certificate.matrices["least_gain_last"]),
+        (LEAST,)),
+    "a proof of the least gain, cut": ("paper", certificate_cut("least_gain_last", slice(1, None)), (LEAST,)),
+    "gamma_min negative": ("chain", claim("gamma_min", -0.1), (ORDER, LEAST)),
     "gamma_min NaN": ("direct", claim("gamma_min", np.nan), (CLAIMS, ORDER)),
     "gamma_min without gamma": ("quiet", claim("gamma_min", 0.1), (ORDER,)),
     "bracket above gamma_min": ("paper", claimed_bracket(1.001, 1.002), (ORDER,)),
@@ -492,7 +500,7 @@ TABLE: dict[str, tuple[str, Callable[[ObserverDesign], ObserverDesign], tuple[st
     "T": ("paper", gain_entry("T", 0, 0), (RESTRICTED, MATRIX, FREE, REALISED)),
     "N": ("paper", gain_entry("N", 1, 0), (RESTRICTED, REALISED)),
     "L": ("paper", gain_entry("L", 3, 2), (FREE, REALISED)),
-    "W": ("chain", gain_entry("W", 1, 1), (WEIGHT, REALISED)),
+    "W": ("chain", gain_entry("W", 1, 1), (WEIGHT, REALISED, LEAST)),
     "Psi": ("paper", gain_entry("Psi", 2, 0), (MATRIX, FREE)),
     "Upsilon": ("direct", gain_entry("Upsilon", 3, 1), (MATRIX, FREE)),
     "R": ("paper", gain_entry("R", 0, 0), (FREE,)),
@@ -524,13 +532,13 @@ TABLE: dict[str, tuple[str, Callable[[ObserverDesign], ObserverDesign], tuple[st
     "E": ("paper", plant_entry("E", 0, 0, 1e-6), (DYNAMICS, STATE, RESTRICTED)),
     "A": ("paper", plant_entry("A", 3, 2, 1e-6), (DYNAMICS, FREE, REALISED)),
     "B": ("paper", plant_entry("B", 1, 1, 1e-6), (INPUTS, REALISED)),
-    "C": ("paper", plant_entry("C", 0, 1, 1e-6), (*UNBIASED, RESTRICTED, *OTHER_GAINS)),
+    "C": ("paper", plant_entry("C", 0, 1, 1e-6), (*UNBIASED, RESTRICTED, *OTHER_GAINS, LEAST)),
     "D": ("direct", plant_entry("D", 1, 0, 1e-6), (INPUTS, FEEDTHROUGH, REALISED)),
     "fault direction": ("quiet", plant_entry("Bf", 0, 0, 1e-6), (*WRONG_FAULT, *OTHER_GAINS)),
     "fault direction, index 3": ("chain", plant_entry("Bf", 2, 0, 1e-6), (*ESTIMATES, *OTHER_GAINS)),
     "direction of a sensor fault": (
         "direct", plant_entry("Df", 1, 0, 1e-6), (*WRONG_FAULT, RESTRICTED, *OTHER_GAINS)),
-    "disturbance twice as large": ("paper", lambda d: with_plant(d, Bd=2.0 * d.plant.Bd), (LMI, NORM)),
+    "disturbance twice as large": ("paper", lambda d: with_plant(d, Bd=2.0 * d.plant.Bd), (LMI, NORM, LEAST)),
     "disturbance in the outputs": ("direct", plant_entry("Dd", 1, 0, 5.0), (LMI, NORM)),
     "sampling time of the plant": ("paper", plant_field(dt=0.5), (FITS,)),
     "continuous plant": ("paper", plant_field(dt=0.0), ("exists: discrete time", FITS)),

@@ -64,7 +64,7 @@ def prove_by_ball_arithmetic(formula: Formula) -> ExtendedProof:
         # A local precision: the one in python-flint's context is for the whole process.
         with flint.ctx.workprec(bits):
             matrix = formula(ExtendedBall)
-            pivot = _undecided_pivot(matrix.entries())
+            pivot = undecided_pivot(matrix.entries())
             if pivot is None:
                 return ExtendedProof(True, _lower_bound(matrix), bits)
         if pivot.certain:
@@ -109,7 +109,7 @@ class _Pivot:
     hopeless: bool  # digits do not help: it is not finite
 
 
-def _undecided_pivot(rows: list[list[Any]]) -> _Pivot | None:
+def undecided_pivot(rows: list[list[Any]]) -> _Pivot | None:
     """Return the first pivot of ``L D L'`` that is not certainly positive, ``None`` when all are.
 
     Only the upper triangle is read: a symmetric member of the matrix lies in it.

@@ -56,6 +56,14 @@ def written_matrix(matrix: FloatArray) -> fmpq_mat:
     return fmpq_mat(rows, columns, [_as_fmpq(written_fraction(value)) for value in np.ravel(matrix).tolist()])
 
 
+def stored_matrix(matrix: FloatArray) -> fmpq_mat:
+    """Return a matrix ``(m, n)`` of doubles as the rational numbers that are stored, whatever they stand for."""
+    from flint import fmpq_mat
+
+    rows, columns = matrix.shape
+    return fmpq_mat(rows, columns, [_as_fmpq(Fraction(value)) for value in np.ravel(matrix).tolist()])
+
+
 def rational_matrix(rows: FractionRows, columns: int) -> fmpq_mat:
     """Return rows of fractions as a matrix ``(m, columns)``."""
     from flint import fmpq_mat

@@ -54,7 +54,7 @@ def claim_rows(plant: DescriptorSystem, claims: Mapping[str, Any]) -> Iterator[C
             "0 <= bracket's lower end <= gamma_min <= its upper end, and gamma_min <= gamma",
             _disorder(claims, bracketed=bool(bracket)),
             ORDER_TOLERANCE,
-            source="certificate; that no filter reaches less is the search's finding and is not proved here",
+            source="certificate; whether a filter reaches less is said by the row 'least gain'",
             detail="the largest step backwards, as a share of gamma",
         )
 

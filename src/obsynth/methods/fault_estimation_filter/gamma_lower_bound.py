@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -17,6 +17,7 @@ from obsynth.methods.fault_estimation_filter.injection_problem import (
     NormalisedProblem,
     normalise,
 )
+from obsynth.methods.fault_estimation_filter.least_gain_proof import ALONE, LAST, PAIRS, PROVED_SHARE, InvisiblePairs
 from obsynth.methods.fault_estimation_filter.output_nulling import (
     invisible_pairs,
     null_space,
@@ -24,6 +25,8 @@ from obsynth.methods.fault_estimation_filter.output_nulling import (
     strict_point,
 )
 from obsynth.numerics.arrays import FloatArray
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.proofs.written_numbers import nearest_doubles
 
 #: A dual point must be positive definite by this margin, where the point of `strict_point` is the identity, and beat
 #: the level by this relative one.
@@ -31,6 +34,9 @@ DUAL_MARGIN = 1e-8
 BOUND_MARGIN = 1e-6
 #: Disturbances smaller than these, relative to the largest, may be left out of the proof.
 NEGLIGIBLE_DISTURBANCES = (1e-3, 3e-2)
+#: Errors that invisible disturbances reach from rest: with more of them the inequalities take seconds.
+MOST_REACHED = 24
+_PARTS = ("S", "top", "bottom", "image", "shown", "Z", "Zd")
 
 
 def proved_lower_bound(
@@ -107,14 +113,20 @@ class _DualProblem:
 
     @classmethod
     def of(cls, work: GainProblem) -> _DualProblem:
-        top, bottom, image = invisible_pairs(work)
+        return cls.on(*invisible_pairs(work), work.Z, work.Zd, work.weight_is_free)[0]
+
+    @classmethod
+    def on(
+        cls, top: FloatArray, bottom: FloatArray, image: FloatArray, z: FloatArray, zd: FloatArray, free_weight: bool
+    ) -> tuple[_DualProblem, FloatArray, FloatArray]:
+        """Return the problem on given pairs, and the factors of its coordinates of pairs and of states."""
         point = strict_point(top, image)
         slack = image @ point @ image.T - top @ point @ top.T
         invisible, states = np.linalg.cholesky(point), np.linalg.cholesky(0.5 * (slack + slack.T))
-        back, outputs = np.linalg.inv(states), np.hstack([work.Z @ states, work.Zd])
-        shown = (work.Z @ top + work.Zd @ bottom) @ invisible
+        back, outputs = np.linalg.inv(states), np.hstack([z @ states, zd])
+        shown = (z @ top + zd @ bottom) @ invisible
         moved = (back @ top @ invisible, bottom @ invisible, back @ image @ invisible)
-        return cls(*moved, shown, outputs, work.weight_is_free)
+        return cls(*moved, shown, outputs, free_weight), np.asarray(invisible), np.asarray(states)
 
 
 def _best_dual_point(dual: _DualProblem, *, solver: str) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -160,6 +172,91 @@ def _checked_bound(dual: _DualProblem, z1: FloatArray, corner: FloatArray, last:
         shown += float(np.trace(dual.outputs @ second @ dual.outputs.T))
         energy += float(np.trace(last))
     return float(np.sqrt(max(shown, 0.0) / energy)) * (1.0 - BOUND_MARGIN) if energy > 0.0 else 0.0
+
+
+def least_gain_certificate(
+    work: DescriptorSystem, gains: Mapping[str, FloatArray], factor: FloatArray, *, gain: float, free_weight: bool,
+    solver: str,
+) -> dict[str, FloatArray]:  # fmt: skip
+    """Return the matrices of a proof that no such filter has a gain below ``gain``; none where none is found.
+
+    Shapes: ``factor (n, n)`` maps errors to coordinates in which they are of natural sizes.
+    """
+    pairs = InvisiblePairs.of(work, gains)
+    if pairs is None:
+        return {}
+    s, top, bottom, image, shown, z, zd = (nearest_doubles(getattr(pairs, name)) for name in _PARTS)
+    # Orthonormal coordinates: of the errors in the given sizes, of the pairs as they come.
+    back = np.linalg.pinv(np.linalg.qr(factor @ s, mode="r")) if s.shape[1] else np.zeros((0, 0))
+    whole = np.vstack([np.linalg.pinv(back) @ top, bottom]) if s.shape[1] else bottom
+    turn = np.linalg.pinv(np.linalg.qr(whole, mode="r")) if whole.shape[1] else np.zeros((0, 0))
+    if not all(np.all(np.isfinite(part)) for part in (back, turn)):
+        return {}
+    forth = np.linalg.pinv(back)
+    moved = (forth @ top @ turn, bottom @ turn, forth @ image @ turn)
+    best: dict[str, FloatArray] = {}
+    least = 0.0
+    for attempt in range(2 if np.any(top) and s.shape[1] <= MOST_REACHED else 1):
+        if least >= gain * (1.0 - PROVED_SHARE):
+            break
+        try:
+            f, last, alone = (
+                _mixture(*moved, z @ back, zd, free_weight, solver) if attempt
+                else _two_steps(*moved, shown @ turn, z @ back, zd, free_weight)
+            )  # fmt: skip
+        except (SolverError, np.linalg.LinAlgError):
+            continue
+        made = {PAIRS: turn @ f, LAST: last @ forth, ALONE: alone}
+        found = {name: matrix for name, matrix in made.items() if np.any(matrix)}
+        bound = pairs.bound(found, free_weight=free_weight)
+        if bound > least:
+            best, least = found, bound
+    return best if least >= gain * (1.0 - PROVED_SHARE) else {}
+
+
+def _two_steps(
+    top: FloatArray, bottom: FloatArray, image: FloatArray, shown: FloatArray, z: FloatArray, zd: FloatArray,
+    free_weight: bool,
+) -> tuple[FloatArray, FloatArray, FloatArray]:  # fmt: skip
+    """Return the best disturbance of one sample from rest that no gain sees, with one more where W is fixed."""
+    starts = null_space(top) if top.shape[0] else np.eye(bottom.shape[1])
+    # In units of the disturbance.
+    sizes = np.linalg.pinv(np.linalg.qr(bottom @ starts, mode="r")) if starts.shape[1] else np.zeros((0, 0))
+    starts = starts @ sizes
+    nd, s = zd.shape[1], top.shape[0]
+    first = shown @ starts
+    if free_weight:
+        return starts @ _strongest(first)[:, None], np.zeros((nd, s)), np.zeros((nd, 1))
+    moved = image @ starts
+    both = np.block([[first, np.zeros((len(first), nd))], [z @ moved, zd]])
+    strongest = _strongest(both)
+    f, later = starts @ strongest[: starts.shape[1]], strongest[starts.shape[1] :]
+    reached = moved @ strongest[: starts.shape[1]]
+    size = float(reached @ reached)
+    last = np.outer(later, reached) / size if size > 0.0 else np.zeros((nd, s))
+    return f[:, None], last, np.zeros((nd, 1)) if size > 0.0 else later[:, None]
+
+
+def _strongest(matrix: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.svd(matrix)[2][0]) if matrix.size else np.zeros(matrix.shape[1])
+
+
+def _mixture(
+    top: FloatArray, bottom: FloatArray, image: FloatArray, z: FloatArray, zd: FloatArray, free_weight: bool,
+    solver: str,
+) -> tuple[FloatArray, FloatArray, FloatArray]:  # fmt: skip
+    """Return the best mixture of pairs of all kinds, from the dual inequalities."""
+    dual, invisible, states = _DualProblem.on(top, bottom, image, z, zd, free_weight)
+    z1, corner, last = _best_dual_point(dual, solver=solver)
+    z1 = 0.5 * (z1 + z1.T) + DUAL_MARGIN * np.eye(len(z1))
+    f = invisible @ np.linalg.cholesky(z1)
+    nd, s = zd.shape[1], top.shape[0]
+    if free_weight:
+        return f, np.zeros((nd, s)), np.zeros((nd, 1))
+    q = dual.image @ z1 @ dual.image.T - dual.top @ z1 @ dual.top.T
+    later = corner @ np.linalg.inv(0.5 * (q + q.T))
+    values, vectors = np.linalg.eigh(0.5 * (last + last.T) - later @ q @ later.T)
+    return f, later @ np.linalg.inv(states), vectors * np.sqrt(np.maximum(values, 0.0))
 
 
 def require_reachable(problem: GainProblem, least: LeastGain, gain: float, *, solver: str) -> None:

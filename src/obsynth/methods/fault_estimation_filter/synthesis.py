@@ -29,6 +29,7 @@ from obsynth.methods.conic.lmi import FILTER_SOLVERS
 from obsynth.methods.fault_estimation_filter.certificate import bounded_real_certificate
 from obsynth.methods.fault_estimation_filter.conditions import examine_fault_filter, fault_filter_conditions
 from obsynth.methods.fault_estimation_filter.filter_search import NOMINAL_GAIN, found_gains, found_within
+from obsynth.methods.fault_estimation_filter.gamma_lower_bound import least_gain_certificate
 from obsynth.methods.fault_estimation_filter.inequality_solutions import null_basis
 from obsynth.methods.fault_estimation_filter.injection_problem import GainProblem, Injection, WeightLimit
 from obsynth.methods.fault_estimation_filter.notes import notes
@@ -82,6 +83,12 @@ def synthesise(plant: DescriptorSystem, asked: FilterOptions, *, progress: Calla
     )
     if plant.nd and asked.gamma_search == "bisection":
         claims |= {"gamma_bracket_low": least.bracket[0], "gamma_bracket_high": least.bracket[1]}
+    witnesses = {"P_factor": factor, "tracking": tracking}
+    if plant.nd:
+        progress("proving that no filter does better")
+        witnesses |= least_gain_certificate(
+            prepared.plant, gains, factor, gain=least.gain, free_weight=free, solver=asked.solver
+        )
     resolved = {
         "gamma": asked.gamma,
         "gamma_search": asked.gamma_search,
@@ -96,13 +103,14 @@ def synthesise(plant: DescriptorSystem, asked: FilterOptions, *, progress: Calla
     }
     if asked.mean > 1:
         # Registers hold estimates, which see no state: nothing of the plant is tracked there.
-        tracking = np.vstack([tracking, np.zeros(((asked.mean - 1) * plant.nf, tracking.shape[1]))])
+        zeros = np.zeros(((asked.mean - 1) * plant.nf, tracking.shape[1]))
+        witnesses["tracking"] = np.vstack([tracking, zeros])
         observer = averaged(observer, asked.mean)
     return Synthesis(
         resolved,
         gains,
         observer,
-        Certificate({"P_factor": factor, "tracking": tracking}, claims),
+        Certificate(witnesses, claims),
         {"engine": _engine_of([*least.records, *records]), "runs": [*least.records, *records]},
         (
             *_gamma_notes(asked.gamma, level if plant.nd else np.inf),

@@ -15,6 +15,7 @@ from obsynth.methods.fault_estimation_filter.checks.gains import gain_rows, gain
 from obsynth.methods.fault_estimation_filter.checks.printed_gains import printed_allowances
 from obsynth.methods.fault_estimation_filter.checks.realisation import Equations
 from obsynth.methods.fault_estimation_filter.conditions import fault_filter_conditions
+from obsynth.methods.fault_estimation_filter.least_gain_proof import WITNESSES, least_gain_row
 from obsynth.methods.fault_estimation_filter.prepared_plant import with_sensor_faults_as_states
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.modal_response import Modes
@@ -103,6 +104,7 @@ def _gain_set_rows(
     """Yield the rows on the gain set, and return what its printed digits allow the identities to miss."""
     (plant, observer), gains = design.linear, design.gains
     if not gains:
+        yield from _least_gain(design, None)
         return {}  # nothing is said about gains: the realisation stands for itself
     if work is None or scaling is None:
         return {}  # a failed existence condition says so already
@@ -116,7 +118,18 @@ def _gain_set_rows(
     equations = Equations.of(plant, work, observer.fault_delays)
     fixed = design.options.get("free_residual_weight") is False and design.options.get("S") is None
     yield from gain_rows(work, gains, observer, tracking, equations, scaling, allowances, fixed_weight=fixed)
+    yield from _least_gain(design, work)
     return allowances
+
+
+def _least_gain(design: ObserverDesign, work: DescriptorSystem | None) -> Iterator[Check]:
+    """Yield the row on the least gain; without gains there is no family of filters to prove anything of."""
+    claims, matrices = design.certificate.claims, design.certificate.matrices
+    if "gamma_min" not in claims and not WITNESSES & matrices.keys():
+        return
+    free = bool(design.options.get("free_residual_weight"))
+    kept = matrices if work is not None else {}
+    yield least_gain_row(work, design.gains, kept, claimed(claims, "gamma_min"), free_weight=free)
 
 
 def _with_sensor_faults(plant: DescriptorSystem) -> DescriptorSystem | None:

@@ -1,0 +1,188 @@
+r"""Proof that no filter of a family has a smaller gain: a mixture of disturbances that its gains cannot see.
+
+The filters with these T and N, and W unless it is free, differ from the shipped one by ``L' - L`` and ``W' - W`` that
+vanish on Upsilon.  So a pair (e, d) with ``C e + D d`` in the range of Upsilon leads to the next error ``A e + B d``
+and to ``xi = Z e + Zd d`` whatever the gains: it is invisible.  With columns S of the errors that invisible pairs reach
+from rest, and of the pairs that stay there ``top`` and ``image`` (in S) and ``bottom`` (d), each F with
+
+.. math::
+    Q = \mathrm{image}\, F F^T \mathrm{image}^T - \mathrm{top}\, F F^T \mathrm{top}^T \ge 0
+
+is a mixture of pairs that can follow each other.  Summed over it, the dissipation inequality of any filter with gain g
+gives ``g^2 |bottom F|^2 >= |xi of F|^2 + tr P Q`` with ``P >= 0``; where W is fixed, one more disturbance ``d = K e``
+(and M, from rest) shows before any gain can act: ``tr P Q >= |xi of (e, K e)|^2 - g^2 |K e|^2`` over Q.
+
+S and the pairs are found in rational arithmetic from the stored numbers, so nothing is nearly invisible; the sums are
+in ball arithmetic.  Source: ours, the dual of the eliminated form of Wang 2015, eq. (45).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from obsynth.numerics.arrays import FloatArray
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.results.report import Check, information
+
+#: Filters of more states are not examined: exact null spaces of that many doubles take seconds.
+MOST_STATES = 64
+#: Digits (bits) of the sums.
+BITS = 512
+#: Names of the certificate's matrices: F, K and M; one that is left out is zero.
+PAIRS, LAST, ALONE = "least_gain_pairs", "least_gain_last", "least_gain_alone"
+WITNESSES = frozenset({PAIRS, LAST, ALONE})
+#: The least gain found counts as proved where the proved bound is below it by this share at most.
+PROVED_SHARE = 1e-4
+#: Norms are computed in double precision: a bound may be above one by this share.
+NORM_TOLERANCE = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class InvisiblePairs:
+    """What no gain sees, as rational matrices (``flint.fmpq_mat``).
+
+    ``S (n, s)``; ``top (s, k)``, ``bottom (nd, k)``, ``image (s, k)``; ``shown (nf, k)`` is xi of the pairs, ``Z (nf,
+    s)`` and ``Zd (nf, nd)`` that of any error in S and any disturbance.
+    """
+
+    S: Any
+    top: Any
+    bottom: Any
+    image: Any
+    shown: Any
+    Z: Any
+    Zd: Any
+
+    @classmethod
+    def of(cls, work: DescriptorSystem, gains: Mapping[str, FloatArray]) -> InvisiblePairs | None:
+        """Return the pairs of a plant with its sensor faults as states; ``None`` where there are too many states."""
+        from obsynth.proofs.exact_matrices import blocks, null_basis, zeros_matrix
+        from obsynth.proofs.written_numbers import stored_matrix
+
+        if work.nx > MOST_STATES or not work.nd:
+            return None
+        t, n, feedback, w, upsilon = (stored_matrix(gains[letter]) for letter in ("T", "N", "L", "W", "Upsilon"))
+        plain, c, bd, dd = (stored_matrix(part) for part in (work.A, work.C, work.Bd, work.Dd))
+        ta, direct = t * plain, dd - c * (n * dd)
+        a, b = ta - feedback * c, t * bd - ta * (n * dd) - feedback * direct
+        z, zd = w * c, w * direct
+        pairs = null_basis(blocks([[c, direct, upsilon]]))
+        count, states, inputs = int(pairs.ncols()), work.nx, work.nd
+        tops, bottoms = _rows(pairs, 0, states), _rows(pairs, states, states + inputs)
+        images = a * tops + b * bottoms
+        reached = zeros_matrix(states, 0)
+        while True:
+            staying = null_basis(blocks([[tops, reached]]))
+            chosen = _rows(staying, 0, count)
+            larger = _echelon(blocks([[reached, images * chosen]]))
+            if larger.ncols() == reached.ncols():
+                break
+            reached = larger
+        places = _pivot_rows(reached)
+        top, image = _picked(tops * chosen, places), _picked(images * chosen, places)
+        bottom = bottoms * chosen
+        return cls(reached, top, bottom, image, z * (tops * chosen) + zd * bottom, z * reached, zd)
+
+    def bound(self, matrices: Mapping[str, FloatArray], *, free_weight: bool) -> float:
+        """Return the lower bound that a certificate proves, rounded down; zero where it proves nothing."""
+        import flint
+
+        from obsynth.proofs.written_numbers import stored_matrix
+
+        k, s, nd = int(self.top.ncols()), int(self.S.ncols()), int(self.Zd.ncols())
+        empty = {PAIRS: np.zeros((k, 1)), LAST: np.zeros((nd, s)), ALONE: np.zeros((nd, 1))}
+        f, last, alone = (np.asarray(matrices.get(name, part)) for name, part in empty.items())
+        if any(part.ndim != 2 or not np.all(np.isfinite(part)) for part in (f, last, alone)):
+            return 0.0
+        if len(f) != k or last.shape != (nd, s) or len(alone) != nd:
+            return 0.0
+        with flint.ctx.workprec(BITS):
+            mixed, later, direct = (_stored_balls(part) for part in (f, last, alone))
+            image, top = (_balls(part) * mixed for part in (self.image, self.top))
+            slack = image * image.transpose() - top * top.transpose()
+            shown, energy = _square(_balls(self.shown) * mixed), _square(_balls(self.bottom) * mixed)
+            # Without pairs that start anywhere but at rest, Q is a square.
+            if any(value != 0 for value in (self.top * stored_matrix(f)).entries()) and not _definite(slack):
+                return 0.0
+            if not free_weight:
+                zd = _balls(self.Zd)
+                seen = _balls(self.Z) + zd * later
+                shown += (seen * slack * seen.transpose()).trace() + _square(zd * direct)
+                energy += (later * slack * later.transpose()).trace() + _square(direct)
+            if not energy > 0 or not shown > 0:
+                return 0.0
+            return max(float(np.nextafter(float((shown / energy).sqrt().lower()), 0.0)), 0.0)
+
+
+def least_gain_row(
+    work: DescriptorSystem | None, gains: Mapping[str, FloatArray], matrices: Mapping[str, FloatArray], claimed: float,
+    *, free_weight: bool,
+) -> Check:  # fmt: skip
+    """Return the row on the least gain: proved from the certificate, or named as the least that was found."""
+    family = "these T and N" if free_weight else "these T, N and W"
+    if not WITNESSES & matrices.keys():
+        return information(
+            "least gain", f"the least gain found of all filters with {family}; that none is below is not proved",
+            claimed, source="stated by the search", status="assumed",
+        )  # fmt: skip
+    pairs = None if work is None else InvisiblePairs.of(work, gains)
+    found = 0.0 if pairs is None else pairs.bound(matrices, free_weight=free_weight)
+    holds = found * (1.0 - NORM_TOLERANCE) <= claimed and claimed * (1.0 - PROVED_SHARE) <= found
+    return Check(
+        "least gain", f"no filter with {family} has a smaller gain than the claimed one, to {PROVED_SHARE:.0e} of it",
+        found, claimed, min(claimed * (1.0 + NORM_TOLERANCE) - found, found - claimed * (1.0 - PROVED_SHARE)),
+        bool(holds), "disturbances that no gain sees, exactly; sums in ball arithmetic", "proved",
+        f"proved: at least {found:.9g}",
+    )  # fmt: skip
+
+
+def _definite(matrix: Any) -> bool:
+    from obsynth.proofs.extended_balls import undecided_pivot
+
+    size = int(matrix.nrows())
+    return undecided_pivot([[matrix[i, j] for j in range(size)] for i in range(size)]) is None
+
+
+def _square(matrix: Any) -> Any:
+    import flint
+
+    return sum((value * value for value in matrix.entries()), flint.arb(0))
+
+
+def _balls(matrix: Any) -> Any:
+    import flint
+
+    return flint.arb_mat(int(matrix.nrows()), int(matrix.ncols()), [flint.arb(value) for value in matrix.entries()])
+
+
+def _stored_balls(matrix: FloatArray) -> Any:
+    import flint
+
+    rows, columns = matrix.shape
+    return flint.arb_mat(rows, columns, [flint.arb(value) for value in np.ravel(matrix).tolist()])
+
+
+def _rows(matrix: Any, start: int, end: int) -> Any:
+    return _picked(matrix, range(start, end))
+
+
+def _picked(matrix: Any, rows: Any) -> Any:
+    from flint import fmpq_mat
+
+    width, places = int(matrix.ncols()), list(rows)
+    return fmpq_mat(len(places), width, [matrix[i, j] for i in places for j in range(width)])
+
+
+def _echelon(matrix: Any) -> Any:
+    """Return a basis of the range whose rows at `_pivot_rows` are the identity."""
+    reduced, rank = matrix.transpose().rref()
+    return _rows(reduced, 0, int(rank)).transpose()
+
+
+def _pivot_rows(basis: Any) -> list[int]:
+    rows, width = int(basis.nrows()), int(basis.ncols())
+    return [next(i for i in range(rows) if basis[i, j] != 0) for j in range(width)]
