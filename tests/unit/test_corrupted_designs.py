@@ -484,7 +484,7 @@ TABLE: dict[str, tuple[str, Callable[[ObserverDesign], ObserverDesign], tuple[st
     "gamma_min a little too low": ("chain", lambda d: claim("gamma_min", 0.999 * d.certificate.claims["gamma_min"])(d),
                                    (LEAST,)),
     "a proof of the least gain, of another": (
-        "paper", lambda d: with_certificate(d, least_gain_last=1.1 * d.certificate.matrices["least_gain_last"]),
+        "paper", lambda d: with_certificate(d, least_gain_pairs=d.certificate.matrices["least_gain_pairs"][::-1]),
         (LEAST,)),
     "a proof of the least gain, cut": ("paper", certificate_cut("least_gain_last", slice(1, None)), (LEAST,)),
     "gamma_min negative": ("chain", claim("gamma_min", -0.1), (ORDER, LEAST)),
@@ -500,7 +500,7 @@ TABLE: dict[str, tuple[str, Callable[[ObserverDesign], ObserverDesign], tuple[st
     "T": ("paper", gain_entry("T", 0, 0), (RESTRICTED, MATRIX, FREE, REALISED)),
     "N": ("paper", gain_entry("N", 1, 0), (RESTRICTED, REALISED)),
     "L": ("paper", gain_entry("L", 3, 2), (FREE, REALISED)),
-    "W": ("chain", gain_entry("W", 1, 1), (WEIGHT, REALISED, LEAST)),
+    "W": ("chain", gain_entry("W", 1, 1), (WEIGHT, FREE, REALISED)),
     "Psi": ("paper", gain_entry("Psi", 2, 0), (MATRIX, FREE)),
     "Upsilon": ("direct", gain_entry("Upsilon", 3, 1), (MATRIX, FREE)),
     "R": ("paper", gain_entry("R", 0, 0), (FREE,)),
