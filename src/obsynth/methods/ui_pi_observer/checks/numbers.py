@@ -18,8 +18,8 @@ from obsynth.numerics.spectra import (
 from obsynth.proofs.extended_balls import enclosed_eigenvalues, middle_of
 from obsynth.results.design import ObserverDesign
 from obsynth.results.report import Check, information, upper_bound_check
+from obsynth.verification.certificates import decay_row, prove_stable
 from obsynth.verification.claims import UNCERTAIN
-from obsynth.verification.lyapunov import decay_row, prove_stable
 
 #: Recomputed poles may miss the claimed ones by this, relative to their size; claimed rates and norms likewise.
 SPECTRUM_TOLERANCE = 1e-4

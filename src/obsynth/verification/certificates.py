@@ -1,4 +1,17 @@
-r"""Stability of a shipped matrix, proved with a Lyapunov factor and bounds on every rounding error.
+r"""The bounded real inequality of a shipped observer, formed with guaranteed error bounds and proved.
+
+With ``e+ = M e + B d`` and the fault error ``-C e + D d`` taken from the shipped realisation, and the certificate
+P = Q'Q, the gain d -> fault error is below g, and M is Schur stable, if
+
+.. math::
+    \begin{bmatrix} P & 0 & (QM)^T & C^T \\ & g^2 I & (QB)^T & -D^T \\ & & I & 0 \\ & & & I \end{bmatrix} > 0 .
+
+This is the paper's (45) before its Schur complements (Wang 2015), with its P on the third diagonal block divided out,
+and extended by D.  The certificate is the triangular factor Q: P itself, rounded to double precision, would lose
+definiteness where its condition number nears 1e16, and its square root has half the digits to lose.  The first block is
+moved by S, close to the inverse of Q; S is triangular with a nonzero diagonal, so this congruence is one.
+
+Stability of a shipped matrix, proved with a Lyapunov factor and bounds on every rounding error.
 
 With P = Q'Q, Q triangular and nonsingular, and S close to the inverse of Q (a congruence with any nonsingular S keeps
 definiteness):
@@ -16,11 +29,82 @@ import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.spectra import decay_rates, eigenvalues
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.balls import Enclosed, block
 from obsynth.proofs.contraction import prove_contraction
 from obsynth.proofs.definiteness import DefinitenessProof, prove_positive_definite, unproved
 from obsynth.proofs.extended_balls import enclosed_eigenvalues
 from obsynth.results.report import Check, CheckKind
+from obsynth.verification.error_system import LaggedPlant
+
+
+def prove_bounded_real(
+    plant: DescriptorSystem,
+    observer: LinearObserver,
+    tracking: FloatArray,
+    factor: FloatArray,
+    gain: float,
+    *,
+    lag: int,
+) -> DefinitenessProof:
+    """Try to prove the bounded real inequality for the shipped observer.
+
+    Shapes: ``factor (core, core)``.
+    """
+    core = factor.shape[0]
+    outside = (observer.Az[:core, core:], observer.Cz[observer.fault_rows, core:])
+    # What follows the core must be a chain of delays: strictly lower triangular, hence stable.
+    chain = np.triu(observer.Az[core:, core:])
+    triangular = np.all(np.tril(factor, -1) == 0.0) and np.all(np.diag(factor) != 0.0)
+    if any(np.any(part != 0.0) for part in (*outside, chain)):
+        return unproved("the states after the core are no chain of delays, or act on the core or the fault estimate")
+    if not triangular or not gain > 0.0:
+        return unproved("the certificate is not triangular and nonsingular, or the gain is not positive")
+    inverse = np.triu(np.linalg.inv(factor))
+    if not np.all(np.isfinite(inverse)) or np.any(np.diag(inverse) == 0.0):
+        return unproved("the certificate cannot be inverted")
+
+    def formula(kind: type[Enclosed]) -> Enclosed:
+        return _formed(kind, plant, observer, tracking, factor, inverse, gain, lag)
+
+    return prove_positive_definite(formula)
+
+
+def _formed(
+    kind: type[Enclosed],
+    plant: DescriptorSystem,
+    observer: LinearObserver,
+    tracking: FloatArray,
+    factor: FloatArray,
+    inverse: FloatArray,
+    gain: float,
+    lag: int,
+) -> Enclosed:
+    """Return the matrix of the inequality with the bounds on the errors of forming it."""
+    exact = kind.exact
+    core, nd = factor.shape[0], plant.nd
+    bd = LaggedPlant.of(plant, lag).input(plant.Bd)
+    q, s = exact(factor), exact(inverse)
+    b = exact(tracking[:core]) @ exact(bd) - exact(observer.By[:core]) @ exact(plant.Dd)
+    qs, qms = q @ s, q @ (exact(observer.Az[:core, :core]) @ s)
+    cs = exact(observer.Cz[observer.fault_rows, :core]) @ s
+    d = exact(observer.Dy[observer.fault_rows]) @ exact(plant.Dd)
+    level = exact(np.eye(nd)).scaled(gain).scaled(gain)
+    qb, nf = q @ b, cs.shape[0]
+
+    def zero(rows: int, columns: int) -> Enclosed:
+        return exact(np.zeros((rows, columns)))
+
+    return block(
+        [
+            [qs.T @ qs, zero(core, nd), qms.T, cs.T],
+            [zero(nd, core), level, qb.T, -d.T],
+            [qms, qb, exact(np.eye(core)), zero(core, nf)],
+            [cs, -d, zero(nf, core), exact(np.eye(nf))],
+        ]
+    )
+
 
 #: A claimed rate is proved for all but this share of it.
 RATE_TOLERANCE = 1e-4
