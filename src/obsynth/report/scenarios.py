@@ -22,7 +22,7 @@ from obsynth.experiments.monte_carlo import Evaluation
 from obsynth.experiments.parameter_monte_carlo import ParameterMonitor
 from obsynth.experiments.parameter_simulation import RecursiveSimulation
 from obsynth.experiments.simulation import Simulation
-from obsynth.report.layout import headed_table, number, print_section
+from obsynth.results.layout import headed_table, number, print_section
 
 #: Rows of a table; of a large plant the worst estimates are shown.
 SHOWN = 12
