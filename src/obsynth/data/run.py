@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any, TextIO
 import numpy as np
 
 from obsynth.data.job import Job
+from obsynth.data.linear_log import engine_of
 from obsynth.data.saved_state import digest_of_gains, resume_state, save_state
 from obsynth.data.signals import TIME, Signals
 from obsynth.data.sinks import FrameSink, Sink, TextSink, file_sink
 from obsynth.data.sources import Data, chunks
 from obsynth.data.stamps import Stamps
-from obsynth.data.start import engine_of
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.monitors.online import OnlineMonitor
 from obsynth.files.outputs import check_output, require_distinct

@@ -1,9 +1,4 @@
-"""The engine of a design: which kind of observer it ships decides.
-
-An observer of a nonlinear plant on a log.
-
-A recursive observer on a log: it takes missing samples itself, and knows how much they cost.
-"""
+"""Recursive and nonlinear observers on a log: they take missing samples themselves, and know how much they cost."""
 
 from __future__ import annotations
 
@@ -11,14 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.data.linear_log import DataObserver
 from obsynth.data.log_estimator import Engine
 from obsynth.data.step_log import SteppingEngine, without_outliers
 from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.experiments.monitors.online import Evidence
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.estimates import DAEEstimates
-from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.linear.warm_up import checked_warm_up
 from obsynth.observers.recursive.estimates import deviations_of
 from obsynth.observers.recursive.observer import RecursiveObserver
@@ -153,17 +146,8 @@ class DAEDataObserver(SteppingEngine[DAEEstimates]):
         return Evidence(found.parameters[0], found.parameter_covariances[0], white, np.zeros((degrees, 0)))
 
 
-def engine_of(
-    design: ObserverDesign, *, gap: float | None = None, warm_up: float | None = None, outliers: str | None = None
-) -> Engine:
-    """Return a running design, at its start; ``outliers`` takes the place of what the design says of them."""
-    if not isinstance(design.observer, (RecursiveObserver, DAEObserver)):
-        if outliers not in (None, "none"):
-            raise SpecError("outliers is for recursive and nonlinear designs, which know how far a sample may be from "
-                            "its prediction.", path="outliers")  # fmt: skip
-        return DataObserver(design, gap=gap, warm_up=warm_up)
-    if gap is not None:
-        raise SpecError("gap is for continuous-time designs: a sampled one knows which rows are missing.", path="gap")
+def stepping_engine(design: ObserverDesign, *, warm_up: float | None = None, outliers: str | None = None) -> Engine:
+    """Return a running recursive or nonlinear design, at its start."""
     if isinstance(design.observer, RecursiveObserver):
         return RecursiveDataObserver(design, warm_up=warm_up, outliers=outliers)
     return DAEDataObserver(design, warm_up=warm_up, outliers=outliers)
