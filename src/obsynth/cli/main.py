@@ -141,6 +141,7 @@ def _parser() -> argparse.ArgumentParser:
         "--printed-digits", type=_digits, metavar="N",
         help="judge the gains as numbers that were printed with N decimals",
     )  # fmt: skip
+    add_verbose(verify, "every claim and every check")
     add_json(verify)
     verify.set_defaults(verb="verify")
 
