@@ -65,17 +65,24 @@ class Spec:
 
 def load_model(path: str | Path) -> tuple[DAEModel, Spec | None]:
     """Return the nonlinear plant of a spec, with the spec, or of a file that holds a plant alone."""
+    plant, spec = load_plant(path)
+    if not isinstance(plant, DAEModel):
+        raise SpecError(f"{path} holds no nonlinear plant (kind: dae).", path=str(path))
+    return plant, spec
+
+
+def load_plant(
+    path: str | Path,
+) -> tuple[DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel, Spec | None]:
+    """Return the plant of a spec as it was written, with the spec, or that of a file that holds a plant alone."""
     source = Path(path)
     document = read_yaml(source)
-    if "method" in document or "plant" in document:
-        spec = load_spec(source)
-        model = spec.model
-    else:
-        spec, found = None, built_plant(checked_plant(document, source), source, "")
-        model = found if isinstance(found, DAEModel) else None
-    if model is None:
-        raise SpecError(f"{source} holds no nonlinear plant (kind: dae).", path=str(source))
-    return model, spec
+    if "method" not in document and "plant" not in document:
+        return built_plant(checked_plant(document, source), source, ""), None
+    spec = load_spec(source)
+    if spec.model is not None:
+        return spec.model, spec
+    return spec.plant if spec.transformation is None else spec.transformation.source, spec
 
 
 def load_spec(path: str | Path) -> Spec:
