@@ -13,8 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.calibration.logs import Log
-from obsynth.calibration.refusals import refused
+from obsynth.calibration.logs import Log, refused
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.dae.functions import BUTCHER
