@@ -14,7 +14,7 @@ from obsynth.cli.sweep import chosen_executor
 
 if TYPE_CHECKING:
     from obsynth.experiments.monitors.monitor import Monitor
-    from obsynth.experiments.parameter_monte_carlo import ParameterMonitor
+    from obsynth.observers.decisions import ParameterMonitor
 
 _EVALUATE = "Design an observer from a spec, run the spec's scenario many times, and count alarms, delays and errors."
 
@@ -56,7 +56,7 @@ def run_evaluate(options: argparse.Namespace) -> int:
         report_stage("running")
         from obsynth.experiments.monitors.residual_monitor import monitor
         from obsynth.experiments.monte_carlo import evaluate
-        from obsynth.experiments.parameter_monte_carlo import ParameterMonitor
+        from obsynth.observers.decisions import ParameterMonitor
         from obsynth.observers.linear.observer import LinearObserver
 
         watched: Monitor | ParameterMonitor | None = None

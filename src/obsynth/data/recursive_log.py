@@ -44,7 +44,7 @@ class RecursiveDataObserver(SteppingEngine[RawEstimate]):
         self.point, self.scales = self.plant.operating_point, self.plant.scales
         self.theta = np.zeros(len(self.fault_names))
 
-    def started(self) -> RunningObserver[Any, Any, Any]:
+    def started(self) -> RunningObserver[Any, Any]:
         """Return the running observer, at k = 0."""
         return self.observer.start()
 

@@ -12,7 +12,7 @@ from rich.text import Text
 from obsynth.experiments.intervals import Interval
 from obsynth.experiments.monitors.monitor import Monitor
 from obsynth.experiments.monte_carlo import Evaluation
-from obsynth.experiments.parameter_monte_carlo import ParameterMonitor
+from obsynth.observers.decisions import ParameterMonitor
 from obsynth.report.layout import headed_table, number, print_section
 
 #: Rows of a table; of a large plant the worst estimates are shown.

@@ -7,7 +7,6 @@ from collections.abc import Iterator, Mapping
 from rich.console import Console
 from rich.text import Text
 
-from obsynth.experiments.parameter_simulation import RecursiveSimulation
 from obsynth.experiments.simulation import Simulation
 from obsynth.report.layout import headed_table, number, print_section
 
@@ -17,7 +16,7 @@ SHOWN = 12
 
 def simulation_report(
     name: str,
-    found: Simulation | RecursiveSimulation,
+    found: Simulation,
     *,
     console: Console,
     units: Mapping[str, str],
@@ -27,7 +26,7 @@ def simulation_report(
     summary = found.summary()
     console.print(Text(f"{name}: {summary['samples']} samples, {found.time[-1]:g} s", style="bold"))
     console.print()
-    linear = isinstance(found, Simulation)
+    linear = not found.estimates.has_deviations
     for kind, title in (
         ("faults", "Fault estimates" if linear else "Parameter estimates"),
         ("states", "State estimates"),
@@ -58,9 +57,9 @@ def simulation_report(
         console.print(Text(f"Written: {file}"))
 
 
-def _last_column(found: Simulation | RecursiveSimulation, kind: str) -> Iterator[str]:
+def _last_column(found: Simulation, kind: str) -> Iterator[str]:
     """Yield a heading, and a cell for each signal: delays of a linear observer, coverage of a recursive one."""
-    if isinstance(found, Simulation):
+    if not found.estimates.has_deviations:
         yield "delay (samples)"
         yield from map(str, found.estimates.fault_delays if kind == "faults" else found.estimates.state_delays)
     else:

@@ -11,9 +11,9 @@ from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.simulation.failures import KINDS
-from obsynth.simulation.parameter_scenario_signals import check_recursive
 from obsynth.simulation.profiles import Profile
 from obsynth.simulation.scenario import Scenario
+from obsynth.simulation.scenario_signals import check_parameters
 from obsynth.spec.checking import DocumentProblems
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def built_scenario(
             scenario.check_names(plant)
             scenario.step_of(plant)
         else:
-            check_recursive(plant, scenario)
+            check_parameters(plant, scenario)
     except SpecError as error:
         problems.add(f"scenario.{error.path}", str(error))
         problems.raise_if_any()
