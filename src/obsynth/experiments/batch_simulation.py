@@ -18,7 +18,7 @@ from obsynth.observers.linear.sampling import sample_observer
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.plants.names import index_of
 from obsynth.results.design import ObserverDesign
-from obsynth.simulation.batch import Stepper, make_stepper
+from obsynth.simulation.linear import Stepper, make_stepper
 from obsynth.simulation.scenario import Scenario
 from obsynth.simulation.scenario_signals import Drive, resolve
 
