@@ -31,9 +31,9 @@ from obsynth.plotting.panels import names_as_they_are
 from obsynth.plotting.simulation import plot_simulation
 from obsynth.plotting.spectra import plot_poles
 from obsynth.plotting.states import plot_states
-from obsynth.report.layout import headed_table, number
 from obsynth.report.page_tables import copied_table, fact_rows
 from obsynth.results.design import ObserverDesign
+from obsynth.results.layout import headed_table, number
 from obsynth.simulation.scenario import Scenario
 
 if TYPE_CHECKING:

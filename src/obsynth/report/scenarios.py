@@ -21,7 +21,7 @@ from obsynth.experiments.monitors.monitor import Monitor
 from obsynth.experiments.monte_carlo import Evaluation
 from obsynth.experiments.simulation import Simulation
 from obsynth.observers.decisions import ParameterMonitor
-from obsynth.report.layout import headed_table, number, print_section
+from obsynth.results.layout import headed_table, number, print_section
 
 #: Rows of a table; of a large plant the worst estimates are shown.
 SHOWN = 12
