@@ -17,8 +17,8 @@ from obsynth.data.step_log import SteppingEngine, without_outliers
 from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.experiments.monitors.online import Evidence
 from obsynth.numerics.arrays import FloatArray
-from obsynth.observers.dae.estimates import DAEEstimates
 from obsynth.observers.dae.observer import DAEObserver
+from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.warm_up import checked_warm_up
 from obsynth.observers.recursive.estimates import deviations_of
 from obsynth.observers.recursive.observer import RecursiveObserver
@@ -54,7 +54,7 @@ class RecursiveDataObserver(SteppingEngine[RawEstimate]):
         self.point, self.scales = self.plant.operating_point, self.plant.scales
         self.theta = np.zeros(len(self.fault_names))
 
-    def started(self) -> RunningObserver[Any, Any, Any]:
+    def started(self) -> RunningObserver[Any, Any]:
         """Return the running observer, at k = 0."""
         return self.observer.start()
 
@@ -92,7 +92,7 @@ class RecursiveDataObserver(SteppingEngine[RawEstimate]):
         return Evidence(known.theta, known.spread @ known.spread.T, found.innovation, found.regressor)
 
 
-class DAEDataObserver(SteppingEngine[DAEEstimates]):
+class DAEDataObserver(SteppingEngine[Estimates]):
     """A running observer of a DAE on measured data; signals are absolute values, as the model's.
 
     Fields: design: Of a nonlinear plant; warm_up: Seconds that are marked after a start, and after rows with unknown
@@ -109,7 +109,7 @@ class DAEDataObserver(SteppingEngine[DAEEstimates]):
             dt=self.observer.dt, warm_up=checked_warm_up(warm_up, 0.0), may_restart=True,
         )  # fmt: skip
 
-    def started(self) -> RunningObserver[Any, Any, Any]:
+    def started(self) -> RunningObserver[Any, Any]:
         """Return the running observer, at k = 0."""
         return self.observer.start()
 
@@ -125,13 +125,13 @@ class DAEDataObserver(SteppingEngine[DAEEstimates]):
             )  # fmt: skip
         return values
 
-    def taken(self, y: FloatArray, u: FloatArray, row: int) -> DAEEstimates | Exception | None:
+    def taken(self, y: FloatArray, u: FloatArray, row: int) -> Estimates | Exception | None:
         """Take one sample, or return why it cannot be taken.
 
         Shapes: ``y (ny,)``, ``u (nu,)``.
         """
         try:
-            found: DAEEstimates = self.running.step(y, u)
+            found: Estimates = self.running.step(y, u)
         except SolverError as error:
             return SolverError(f"Row {row}: {error}")
         except (np.linalg.LinAlgError, ValueError):
@@ -139,12 +139,12 @@ class DAEDataObserver(SteppingEngine[DAEEstimates]):
         arrays = (found.states, found.parameters, found.state_deviations, found.parameter_covariances)
         return found if all(bool(np.isfinite(array).all()) for array in arrays) else None
 
-    def values(self, found: DAEEstimates) -> FloatArray:
+    def values(self, found: Estimates) -> FloatArray:
         """Return a row: estimates, standard deviations, innovation."""
         parts = (found.states, found.parameters, found.state_deviations, found.parameter_deviations, found.innovations)
         return np.concatenate([part[0] for part in parts])
 
-    def evidence(self, found: DAEEstimates) -> Evidence:
+    def evidence(self, found: Estimates) -> Evidence:
         """Return what the sample says, for decisions; to first order, as the covariances."""
         # Only the length of the innovation counts, which is known in units of its own covariance.
         degrees = int(found.nis_degrees[0])

@@ -48,7 +48,7 @@ class SteppingEngine(ABC, Generic[Found]):
         self.scales: Mapping[str, float] = {}
         self.notes: tuple[str, ...] = ()
         self.clock = Clock(dt, None)
-        self.running: RunningObserver[Any, Any, Any] = self.started()
+        self.running: RunningObserver[Any, Any] = self.started()
         self.u: FloatArray | None = None
         self.settled_at, self.phase = math.inf, WARM_UP
 
@@ -59,7 +59,7 @@ class SteppingEngine(ABC, Generic[Found]):
         return {name: int(count) for name, count in zip(self.output_names, counts, strict=True) if count}
 
     @abstractmethod
-    def started(self) -> RunningObserver[Any, Any, Any]:
+    def started(self) -> RunningObserver[Any, Any]:
         """Return the running observer, at k = 0."""
 
     @abstractmethod

@@ -16,9 +16,9 @@ from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.simulation.failures import KINDS
-from obsynth.simulation.parameter_scenario_signals import check_recursive
 from obsynth.simulation.profiles import Profile
 from obsynth.simulation.scenario import Scenario
+from obsynth.simulation.scenario_signals import check_parameters
 from obsynth.spec.checking import DocumentProblems, checked_plant, checked_spec
 from obsynth.spec.documents import read_yaml
 from obsynth.spec.plants import built_plant, linearised, read_value, transformed
@@ -52,7 +52,7 @@ def built_scenario(
             scenario.check_names(plant)
             scenario.step_of(plant)
         else:
-            check_recursive(plant, scenario)
+            check_parameters(plant, scenario)
     except SpecError as error:
         problems.add(f"scenario.{error.path}", str(error))
         problems.raise_if_any()

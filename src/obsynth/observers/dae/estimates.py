@@ -1,4 +1,4 @@
-"""What an observer of a DAE says, sample by sample, with honest spreads."""
+"""The rows of an observer of a DAE, sample by sample or several at once, and the estimates in them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from obsynth.analysis.dae_index import SINGULAR_CONDITION, involved
 from obsynth.errors import SolverError
-from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.estimates import Estimates, named_estimates
 
 if TYPE_CHECKING:
     from obsynth.observers.dae.settings import DAESettings
@@ -98,64 +99,8 @@ class DAERow:
         return np.asarray(np.abs(np.linalg.eigvals(self.several.part("kept"))).max(axis=1))
 
 
-@dataclass(frozen=True, eq=False)
-class DAEEstimates:
-    """Estimates of an observer of a DAE, one row per sample.
-
-    Parameters
-    ----------
-    states, state_deviations : FloatArray
-        ``(samples, nx)``: after the measurement of the same sample, and standard deviations of their errors.
-    parameters : FloatArray
-        ``(samples, nq)``.
-    parameter_covariances : FloatArray
-        ``(samples, nq, nq)``: the covariance of the estimates while the parameters are constant (or walk as stated).
-        S is none: with forgetting it says how much is still remembered.
-    innovations : FloatArray
-        ``(samples, ny)``, in units of the outputs; NaN where a sample is missing.
-    innovation_covariances : FloatArray
-        ``(samples, ny, ny)``: what is expected of the innovations; rows and columns of missing samples are those of the
-        identity.
-    nis, nis_degrees : FloatArray
-        ``(samples,)``: squared innovations in units of their covariance, and degrees of freedom.
-    excitation : FloatArray
-        ``(samples,)``: least eigenvalue of the information on the parameters in the last `window` samples, in units of
-        ``S_0^-1``: below one, a window says less than was known before.  Zero while the window fills.
-    residuals, conditions : FloatArray
-        ``(samples,)``: scaled residual of each step, and condition of (7).
-    contraction : FloatArray
-        ``(samples,)``: spectral radius of F (I - K H); an error of the state filter decays in about
-        ``-1 / log`` of it steps, which should not be longer than the window ``1 / (1 - lambda)``.
-    projection : FloatArray
-        ``(nx,)``: how far the initial state was moved onto its constraint.
-    state_names, parameter_names : tuple of str
-        Names of the columns.
-    """
-
-    states: FloatArray
-    state_deviations: FloatArray
-    parameters: FloatArray
-    parameter_covariances: FloatArray
-    innovations: FloatArray
-    innovation_covariances: FloatArray
-    nis: FloatArray
-    nis_degrees: FloatArray
-    excitation: FloatArray
-    residuals: FloatArray
-    conditions: FloatArray
-    contraction: FloatArray
-    projection: FloatArray
-    state_names: tuple[str, ...]
-    parameter_names: tuple[str, ...]
-
-    @property
-    def parameter_deviations(self) -> FloatArray:
-        """Standard deviations of the parameters ``(samples, nq)``."""
-        return np.asarray(np.sqrt(np.einsum("kii->ki", self.parameter_covariances)))
-
-
 class GatheredRows:
-    """What `DAEEstimates` keeps of the rows of a record, while it is being run.
+    """What the estimates keep of the rows of a record, while it is being run.
 
     Fields: observer: Whose rows they are.
     """
@@ -179,7 +124,7 @@ class GatheredRows:
         if len(conditions) and conditions.max() > SINGULAR_CONDITION:
             raise _singular(self.observer, rows.several, int(np.argmax(conditions > SINGULAR_CONDITION)))
 
-    def estimates(self, informations: FloatArray | None = None) -> DAEEstimates:
+    def estimates(self, informations: FloatArray | None = None) -> Estimates:
         """Return what was gathered.
 
         Shapes: ``informations (any, nq, nq)``.
@@ -188,10 +133,9 @@ class GatheredRows:
         seen = whole.pop("information")
         levels = _excitation(self.observer, seen if informations is None else informations)
         whole["excitation"] = levels[len(levels) - len(whole["nis"]) :]
-        return DAEEstimates(
-            **{name: read_only(value) for name, value in whole.items()}, projection=read_only(self.projection),
-            state_names=self.observer.state_names, parameter_names=self.observer.fault_names,
-        )  # fmt: skip
+        received = ~np.isnan(whole["innovations"])
+        received.setflags(write=False)
+        return named_estimates(self.observer, **whole, projection=self.projection, received=received)
 
 
 def _singular(observer: DAESettings, rows: DAERow, i: int) -> SolverError:
@@ -205,13 +149,13 @@ def _singular(observer: DAESettings, rows: DAERow, i: int) -> SolverError:
 
 
 def _columns(rows: DAERow) -> dict[str, FloatArray]:
-    """Return what `DAEEstimates` keeps of some samples."""
+    """Return what the estimates keep of some samples."""
     variances = np.einsum("kii->ki", rows.part("covariance"))
     return {
         "states": rows.x, "state_deviations": np.sqrt(np.maximum(variances, 0.0)),
-        "parameters": rows.theta, "parameter_covariances": rows.parameter_covariance,
+        "faults": rows.theta, "fault_covariances": rows.parameter_covariance,
         "innovations": rows.innovation, "innovation_covariances": rows.part("expected"), "nis": rows.nis,
-        "nis_degrees": rows.seen.sum(axis=1).astype(np.float64), "residuals": rows.part("residual")[:, 0],
+        "nis_degrees": rows.seen.sum(axis=1).astype(np.float64), "residuals": rows.part("residual"),
         "conditions": rows.conditions, "contraction": rows.contractions, "information": rows.part("information"),
     }  # fmt: skip
 

@@ -11,11 +11,12 @@ from numpy.typing import ArrayLike
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.compiled_library import DAELibrary
-from obsynth.observers.dae.estimates import DAEEstimates, DAERow, GatheredRows
+from obsynth.observers.dae.estimates import DAERow, GatheredRows
 from obsynth.observers.dae.records import run_record
 from obsynth.observers.dae.settings import DAESettings
 from obsynth.observers.dae.step_graph import ObserverGraph
 from obsynth.observers.dae.steps import DAEState, Steps
+from obsynth.observers.estimates import Estimates
 from obsynth.observers.recursive.records import measured_record
 from obsynth.observers.running import RunningObserver
 from obsynth.plants.dae.checks import checked_inputs, require_known
@@ -90,7 +91,7 @@ class DAEObserver(DAESettings):
         """
         return self.steps.advance(state, y, u)
 
-    def step(self, state: DAEState, y: ArrayLike, u: ArrayLike = ()) -> tuple[DAEState, DAEEstimates]:
+    def step(self, state: DAEState, y: ArrayLike, u: ArrayLike = ()) -> tuple[DAEState, Estimates]:
         """Return the state after a sample, and the estimates at it.
 
         Parameters
@@ -122,7 +123,7 @@ class DAEObserver(DAESettings):
         found.add_regular(row)
         return after, found.estimates(np.array(after.informations))
 
-    def start(self) -> RunningObserver[DAEState, DAERow, DAEEstimates]:
+    def start(self) -> RunningObserver[DAEState, DAERow]:
         """Return a running observer, at k = 0."""
         return RunningObserver(self)
 
@@ -145,7 +146,7 @@ class DAEObserver(DAESettings):
     def run(
         self, y: ArrayLike, u: ArrayLike | None = None, *, compiled: bool | None = None,
         progress: bool | Callable[[int], None] | None = None,
-    ) -> DAEEstimates:  # fmt: skip
+    ) -> Estimates:  # fmt: skip
         """Run over a whole record.
 
         Parameters
@@ -164,7 +165,7 @@ class DAEObserver(DAESettings):
 
         Returns
         -------
-        DAEEstimates
+        Estimates
             One row per sample.
 
         Raises
