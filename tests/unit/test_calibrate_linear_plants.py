@@ -178,7 +178,8 @@ def test_the_command_takes_a_linear_plant_in_a_file(tmp_path, capsys):
     from obsynth.cli.main import main
 
     (tmp_path / "plant.yaml").write_text(
-        "schema_version: 1\ndt: 0.5\nconstants: {a: {nominal: 0.8, tolerance: 50 %}}\nA: [[a]]\nB: [[1.5]]\nC: [[0.5]]\n",
+        "schema_version: 1\ndt: 0.5\nconstants: {a: {nominal: 0.8, tolerance: 50 %}}\n"
+        "A: [[a]]\nB: [[1.5]]\nC: [[0.5]]\n",
         encoding="utf-8",
     )
     rng, u, x = np.random.default_rng(0), held_inputs(60, 2), 0.0
