@@ -37,6 +37,50 @@ class Observer(Protocol[State, Row]):
         ...
 
 
+class ParameterRow(Protocol):
+    """What an observer with deviations knows at one sample."""
+
+    @property
+    def x(self) -> FloatArray:
+        """The states ``(nx,)``."""
+        ...
+
+    @property
+    def theta(self) -> FloatArray:
+        """The parameters ``(nq,)``."""
+        ...
+
+    @property
+    def state_deviations(self) -> FloatArray:
+        """Standard deviations of `x` ``(nx,)``."""
+        ...
+
+    @property
+    def parameter_covariance(self) -> FloatArray:
+        """Covariance of `theta` ``(nq, nq)``."""
+        ...
+
+    @property
+    def gap(self) -> FloatArray:
+        """The innovation at the parameters estimated one sample before ``(m,)``."""
+        ...
+
+    @property
+    def whitened(self) -> FloatArray:
+        """The innovation of the model without parameters, whitened ``(m,)``."""
+        ...
+
+    @property
+    def regressor(self) -> FloatArray:
+        """Its regressor ``(m, nq)``."""
+        ...
+
+    @property
+    def is_finite(self) -> bool:
+        """Whether no number has overflown."""
+        ...
+
+
 class RunningObserver(Generic[State, Row]):
     """An observer with its state: `step` takes y(k) and u(k) and returns the estimates at k.
 

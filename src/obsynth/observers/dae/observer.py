@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.compiled_library import DAELibrary
-from obsynth.observers.dae.estimates import DAERow, GatheredRows
+from obsynth.observers.dae.estimates import DAERow, GatheredRows, require_regular
 from obsynth.observers.dae.records import run_record
 from obsynth.observers.dae.settings import DAESettings
 from obsynth.observers.dae.step_graph import ObserverGraph
@@ -91,6 +91,25 @@ class DAEObserver(DAESettings):
         """
         return self.steps.advance(state, y, u)
 
+    def accept(self, state: DAEState, y: FloatArray, u: FloatArray) -> tuple[DAEState, DAERow]:
+        """Return the same as `advance`, unless the step is singular to working precision.
+
+        Parameters
+        ----------
+        state : DAEState
+            Before the sample.
+        y, u : FloatArray
+            ``(ny,)``, NaN for what is missing, and ``(nu,)``.
+
+        Raises
+        ------
+        SolverError
+            The step has no solution, or more than one.
+        """
+        after, row = self.steps.advance(state, y, u)
+        require_regular(self, row, row.conditions)
+        return after, row
+
     def step(self, state: DAEState, y: ArrayLike, u: ArrayLike = ()) -> tuple[DAEState, Estimates]:
         """Return the state after a sample, and the estimates at it.
 
@@ -118,9 +137,9 @@ class DAEObserver(DAESettings):
         if inputs.shape != (self.model.nu,):
             raise SpecError(f"u must be {self.model.nu} finite number(s) at k = {state.k}.", path="u")
         require_known(self.model, inputs[None], state.k)
-        after, row = self.advance(state, outputs, inputs)
+        after, row = self.accept(state, outputs, inputs)
         found = GatheredRows(self)
-        found.add_regular(row)
+        found.add(row)
         return after, found.estimates(np.array(after.informations))
 
     def start(self) -> RunningObserver[DAEState, DAERow]:

@@ -68,6 +68,24 @@ class RecursiveObserver(RecursiveSettings):
         """
         return self.recursion.advance(state, y, u)
 
+    def accept(self, state: RecursiveState, y: FloatArray, u: FloatArray) -> tuple[RecursiveState, RawEstimate]:
+        """Return the same as `advance`, unless the plant is not known for so long.
+
+        Parameters
+        ----------
+        state : RecursiveState
+            Before the sample.
+        y, u : FloatArray
+            ``(ny,)``, NaN for what is missing, and ``(nu,)``.
+
+        Raises
+        ------
+        SpecError
+            The horizon is passed.
+        """
+        require_horizon(self.plant.horizon, state.k + 1, early=self.early_constraints)
+        return self.recursion.advance(state, y, u)
+
     def step(self, state: RecursiveState, y: ArrayLike, u: ArrayLike = ()) -> tuple[RecursiveState, Estimates]:
         """Return the state after a sample, which keeps u(k) for the next, and the estimates at it.
 
@@ -89,8 +107,7 @@ class RecursiveObserver(RecursiveSettings):
         """
         outputs = measured_record(np.atleast_2d(real_array(y, "y")), self.plant.ny)[0]
         inputs = real_vector(u, self.plant.nu, "u")
-        require_horizon(self.plant.horizon, state.k + 1, early=self.early_constraints)
-        after, row = self.advance(state, outputs, inputs)
+        after, row = self.accept(state, outputs, inputs)
         return after, recursive_estimates(self, [row], window=after.regressors)
 
     def start(self) -> RunningObserver[RecursiveState, RawEstimate]:
