@@ -193,8 +193,8 @@ def solved(programme: Window) -> tuple[FloatArray, FloatArray] | None:
     cost[-1] = 1.0
     given = {"A_eq": equal, "b_eq": programme.equal.right} if programme.equal.right else {}
     found = linprog(
-        cost, options={"time_limit": SOLVER_SECONDS}, A_ub=below, b_ub=programme.below.right, bounds=np.stack([programme.lower, programme.upper], axis=1),
-        method="highs", **given,
+        cost, A_ub=below, b_ub=programme.below.right, bounds=np.stack([programme.lower, programme.upper], axis=1),
+        method="highs", options={"time_limit": SOLVER_SECONDS}, **given,
     )  # fmt: skip
     if found.status != 0:
         return None
