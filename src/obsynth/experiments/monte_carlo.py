@@ -228,8 +228,8 @@ def _trial(task: _Task) -> dict[str, FloatArray]:
     false, found_at, wrong = np.full(count, np.nan), np.full(count, np.nan), np.full(count, np.nan)
     if task.watched is not None:
         watched = observer.fault_rows if task.watched.watches_estimates else observer.residual_rows
-        passed = task.watched.passed_in(runs, watched)
-        begin = len(passed) if task.onset is None else task.onset
+        begin = len(runs.rows) if task.onset is None else task.onset
+        passed = task.watched.passed_in(runs, watched, onset=begin)
         false[:] = passed[:begin].any(axis=0)
         for run in np.flatnonzero(passed[begin:].any(axis=0)):
             k = begin + int(np.argmax(passed[begin:, run]))
