@@ -15,7 +15,7 @@ import numpy as np
 from obsynth.experiments.monitors.adaptive_bound import THRESHOLD_ROUNDING, AdaptiveBound
 from obsynth.experiments.monitors.adaptive_record import filtered
 from obsynth.numerics.arrays import FloatArray
-from obsynth.proofs.nonnegative import inverse_bound
+from obsynth.proofs.contraction import inverse_bound
 
 if TYPE_CHECKING:
     from obsynth.experiments.monitors.adaptive_rule import AdaptivePlan
