@@ -216,7 +216,8 @@ def test_what_an_evaluation_counts_does_not_depend_on_what_is_left_out(design, s
     plant, _ = design.linear
     steps, onset = 90, 45
     scenario = obsynth.Scenario(
-        horizon=(steps - 0.5) * plant.dt, noise=1.0, inputs={name: obsynth.Sine(1.0, 2.0) for name in plant.input_names},
+        horizon=(steps - 0.5) * plant.dt, noise=1.0,
+        inputs={name: obsynth.Sine(amplitude=1.0, frequency=2.0) for name in plant.input_names},
         faults={plant.fault_names[0]: obsynth.Step(size=size, start=onset * plant.dt)},
         disturbances={name: obsynth.Uniform(low=-0.1, high=0.1) for name in plant.disturbance_names},
     )  # fmt: skip

@@ -18,7 +18,7 @@ from obsynth.experiments.monitors.adaptive_rule import AdaptivePlan, record_colu
 from obsynth.experiments.monitors.adaptive_screening import Records, Screening, first_passed
 from obsynth.experiments.monitors.monitor import Detection, Monitor
 from obsynth.numerics.arrays import FloatArray
-from obsynth.observers.linear.observer import Estimates
+from obsynth.observers.estimates import Estimates
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario
 from obsynth.simulation.scenario_signals import resolve
