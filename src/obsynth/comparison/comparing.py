@@ -17,6 +17,7 @@ from obsynth.methods.designing import design
 from obsynth.methods.functional_filter.rates import settling_time
 from obsynth.numerics.arguments import is_finite_number, require_kind
 from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.threads import on_one_thread_if_small
 from obsynth.numerics.value_types import Count, NonNegative, Positive, Probability, checked_value
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
@@ -28,6 +29,7 @@ RUNS, SAMPLES, SETTLING_TIMES, MOST_STEPS = 20, 40, 8, 6000
 SEED = 7
 
 
+@on_one_thread_if_small
 def compare(
     plant: DescriptorSystem,
     *,

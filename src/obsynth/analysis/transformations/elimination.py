@@ -22,6 +22,7 @@ from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
 from obsynth.numerics.scaling import equilibrate_pencil, power_of_two_below
 from obsynth.numerics.sparse import is_sparse
+from obsynth.numerics.threads import on_one_thread_if_small
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.origin import note_source, with_origin
 from obsynth.plants.uncertainty import ELIMINATED
@@ -32,6 +33,7 @@ MANY_VARIABLES = 500
 SPARSE_SHARE = 0.05
 
 
+@on_one_thread_if_small
 def eliminate_algebraic_states(plant: DescriptorSystem) -> Transformation:
     """Solve the algebraic equations of an index-1 plant, so that ``E = I``.
 

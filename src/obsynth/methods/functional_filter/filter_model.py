@@ -9,6 +9,7 @@ import numpy as np
 
 from obsynth.analysis.diagnosis.decoupled import DecoupledPlant, decoupled
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.ranks import rank_from
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.exosystems import Exosystem
 
@@ -61,19 +62,30 @@ def _with_fault_models(found: DecoupledPlant, phi: FloatArray, cw: FloatArray, f
     inverse = np.linalg.inv(found.E) if k else np.zeros((0, 0))
     zeros = np.zeros((count, k))
     known = np.hstack([found.Bu, found.By])
+    rows = _telling_rows(np.hstack([found.C, found.G @ cw, -found.Du, found.H, found.M]))
     return FilterModel(
         A=np.block([[inverse @ found.A, inverse @ found.F @ cw], [zeros, phi]]),
-        C=np.hstack([found.C, found.G @ cw]),
+        C=rows @ np.hstack([found.C, found.G @ cw]),
         B=np.vstack([inverse @ known, np.zeros((count, plant.nu + plant.ny))]),
-        L=np.hstack([-found.Du, found.H]),
+        L=rows @ np.hstack([-found.Du, found.H]),
         N=np.vstack([inverse @ found.N, np.zeros((count, plant.nw))]),
-        M=found.M,
+        M=rows @ found.M,
         estimate=np.hstack([np.zeros((len(faults), k)), cw]),
         drive=np.vstack([np.zeros((k, count)), np.eye(count)]),
         T=np.vstack([inverse @ found.rows[:k, : plant.nx], np.zeros((count, plant.nx))]),
-        T0=-found.rows[k:, : plant.nx],
+        T0=-rows @ found.rows[k:, : plant.nx],
         faults=faults,
         order=k,
         fault_sizes=found.fault_sizes,
         dt=plant.dt,
     )
+
+
+def _telling_rows(whole: FloatArray) -> FloatArray:
+    """Return combinations ``(q, p)`` of the rows ``whole (p, columns)`` that say something: some are empty."""
+    if not whole.size:
+        return np.eye(len(whole))
+    sizes = np.max(np.abs(whole), axis=0)
+    left, values, _ = np.linalg.svd(whole / np.where(sizes > 0.0, sizes, 1.0))
+    rank = rank_from(values, expected=len(whole)).rank
+    return np.eye(len(whole)) if rank == len(whole) else np.asarray(left[:, :rank].T)
