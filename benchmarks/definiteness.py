@@ -16,12 +16,11 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 
 import obsynth
-from obsynth.methods.pd_observer.checks.inequality import prove_gains
+from obsynth.methods.pd_observer.checks.certificate import prove_gains
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.proofs.definiteness import DefinitenessProof, prove_positive_definite
 from obsynth.proofs.extended_balls import MOST_ROWS
-from obsynth.verification.bounded_real import prove_bounded_real
-from obsynth.verification.lyapunov import prove_stable
+from obsynth.verification.certificates import prove_bounded_real, prove_stable
 
 SECONDS_PER_CELL = 1.0
 Action = Callable[[], DefinitenessProof]

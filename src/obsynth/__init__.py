@@ -31,9 +31,8 @@ if TYPE_CHECKING:
     from obsynth.analysis.structure import analyse_structure
     from obsynth.analysis.transformations import discretise, eliminate_algebraic_states
     from obsynth.analysis.transformations.linearisation import linearise
-    from obsynth.calibration.box import CalibratedBox
     from obsynth.calibration.calibrating import calibrate
-    from obsynth.calibration.result import Calibration
+    from obsynth.calibration.result import CalibratedBox, Calibration
     from obsynth.calibration.validating import validate
     from obsynth.calibration.validation import Validation
     from obsynth.calibration.validity import Validity, validity
@@ -143,7 +142,7 @@ _HOMES = {
     "SensorSets": "obsynth.comparison.sensor_sets",
     "sensor_sets": "obsynth.comparison.sensor_sets",
     "functional_filter": "obsynth.methods.functional_filter.public",
-    "CalibratedBox": "obsynth.calibration.box",
+    "CalibratedBox": "obsynth.calibration.result",
     "Calibration": "obsynth.calibration.result",
     "calibrate": "obsynth.calibration.calibrating",
     "linearise": "obsynth.analysis.transformations.linearisation",

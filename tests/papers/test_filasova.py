@@ -10,7 +10,7 @@ from scipy.linalg import expm, solve_continuous_are
 
 import obsynth
 from obsynth.analysis.zeros import fault_zeros
-from obsynth.methods.pd_observer.augmentation import with_faults_as_states
+from obsynth.methods.pd_observer.realisation import with_faults_as_states
 from obsynth.spec import load_spec
 from obsynth.spec.documents import read_yaml
 

@@ -16,8 +16,7 @@ import obsynth
 from obsynth.analysis.zeros import fault_zeros
 from obsynth.errors import InfeasibleError
 from obsynth.methods.fault_estimation_filter import inequality_search, inequality_solutions
-from obsynth.methods.fault_estimation_filter.prepared_plant import prepare
-from obsynth.methods.fault_estimation_filter.restricted_equivalent import restricted_equivalent_from
+from obsynth.methods.fault_estimation_filter.prepared_plant import prepare, restricted_equivalent_from
 from obsynth.methods.fault_estimation_filter.synthesis import gain_problem
 from obsynth.numerics.norms import hinf_norm, spectral_radius
 from obsynth.simulation import simulate_plant

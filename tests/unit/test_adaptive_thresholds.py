@@ -13,8 +13,7 @@ import obsynth
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.experiments.monitors.adaptive_monitor import adaptive_plan
 from obsynth.experiments.monitors.adaptive_record import thresholds_of_records
-from obsynth.experiments.monitors.adaptive_rule import record_columns
-from obsynth.experiments.monitors.adaptive_step import AdaptiveState, adaptive_step
+from obsynth.experiments.monitors.adaptive_rule import AdaptiveState, adaptive_step, record_columns
 from obsynth.tolerances.exact_plant import drawn_points, plant_at
 
 START = 0.2

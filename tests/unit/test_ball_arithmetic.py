@@ -9,14 +9,13 @@ import numpy as np
 import pytest
 
 import obsynth
-from obsynth.methods.pd_observer.checks.inequality import prove_gain, prove_gains
+from obsynth.methods.pd_observer.checks.certificate import prove_gain, prove_gains
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.proofs import definiteness
 from obsynth.proofs.balls import Ball, Enclosed, block
 from obsynth.proofs.definiteness import prove_positive_definite
 from obsynth.proofs.extended_balls import MOST_ROWS, ExtendedBall, prove_by_ball_arithmetic
-from obsynth.verification.bounded_real import prove_bounded_real
-from obsynth.verification.lyapunov import prove_stable
+from obsynth.verification.certificates import prove_bounded_real, prove_stable
 
 ULP = 2.0**-52
 

@@ -27,7 +27,7 @@ from obsynth import (
 )
 from obsynth.analysis.transformations import StateRecovery
 from obsynth.spec.loader import load_spec
-from obsynth.verification.closed_claims import WITNESS_CLAIMS
+from obsynth.verification.claims import WITNESS_CLAIMS
 
 PAPER = Path(__file__).parents[2] / "designs" / "wang2015" / "spec.yaml"
 

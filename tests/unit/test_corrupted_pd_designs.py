@@ -25,7 +25,7 @@ from obsynth import (
     verify,
 )
 from obsynth.spec import load_spec
-from obsynth.verification.closed_claims import WITNESS_CLAIMS
+from obsynth.verification.claims import WITNESS_CLAIMS
 
 PAPER = Path(__file__).parents[2] / "designs" / "filasova" / "spec.yaml"
 

@@ -285,7 +285,7 @@ def test_a_long_run_shows_a_bar_and_a_short_one_does_not(capsys, monkeypatch) ->
 
 
 def test_truths_are_the_same_in_stretches_and_step_by_step(monkeypatch) -> None:
-    from obsynth.plants.dae import stretches as dae_stretches
+    from obsynth.plants.dae import functions as dae_stretches
 
     model = exchanger()
     u = np.tile(model.nominal_input, (300, 1))

@@ -8,8 +8,7 @@ import scipy.linalg
 
 from obsynth import FaultModel, SpecError, fault_model
 from obsynth.plants.exosystems import exosystem
-from obsynth.plants.fault_model_spectra import stated_eigenvalues
-from obsynth.plants.fault_models import summed
+from obsynth.plants.fault_models import stated_eigenvalues, summed
 
 
 def course(data: object, start: list[float], times: np.ndarray) -> np.ndarray:

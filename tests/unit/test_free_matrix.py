@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from obsynth.methods.fault_estimation_filter.restricted_equivalent import restricted_equivalent_from
+from obsynth.methods.fault_estimation_filter.prepared_plant import restricted_equivalent_from
 
 
 @pytest.mark.parametrize("seed", range(6))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from obsynth import DAEModel, dae_adaptive_observer, simulate_dae
-from obsynth.observers.dae.integration import largest_turn
+from obsynth.observers.dae.building import largest_turn
 
 
 def oscillator(frequency: float = 1.0) -> DAEModel:

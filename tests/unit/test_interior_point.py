@@ -9,8 +9,7 @@ from scipy.optimize import linprog
 
 from obsynth.errors import SolverError
 from obsynth.methods.conic import interior_point, lmi
-from obsynth.methods.conic.interior_point import solve_cone_programme
-from obsynth.methods.conic.normal_equations import NormalEquations
+from obsynth.methods.conic.interior_point import NormalEquations, solve_cone_programme
 from obsynth.methods.conic.semidefinite_block import SemidefiniteBlock
 
 
@@ -63,7 +62,7 @@ class TestBlock:
 
 class TestNormalEquations:
     def test_refinement_takes_the_shift_back(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr("obsynth.methods.conic.normal_equations.SHIFTS", (1e-5,))
+        monkeypatch.setattr("obsynth.methods.conic.interior_point.SHIFTS", (1e-5,))
         rng = np.random.default_rng(3)
         columns, wanted = rng.standard_normal((6, 40)) * np.logspace(0.0, 3.0, 6)[:, None], rng.standard_normal(6)
         found = NormalEquations(columns).solution(columns @ (columns.T @ wanted))

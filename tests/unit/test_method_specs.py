@@ -16,7 +16,7 @@ from obsynth.methods.pd_observer.options import PdOptions
 from obsynth.methods.placement.eigenstructure import OBJECTIVES
 from obsynth.methods.registry import REGISTRY, method_spec, methods_for
 from obsynth.methods.ui_pi_observer.options import UiPiOptions
-from obsynth.numerics.value_types import Count, ForgettingFactor, Positive, problem_with
+from obsynth.numerics.arguments import Count, ForgettingFactor, Positive, problem_with
 
 
 @pytest.mark.parametrize("method", REGISTRY)

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from obsynth.numerics.level_crossings import SAFE_CONDITION, level_crossings
-from obsynth.numerics.modal_response import ModalResponse, Modes
+from obsynth.numerics.modal_response import SAFE_CONDITION, ModalResponse, Modes, level_crossings
 from obsynth.numerics.norms import frequency_response, highest_gain_found, hinf_norm
 
 

@@ -161,7 +161,7 @@ def response(a: np.ndarray, b: np.ndarray, c: np.ndarray, t: float) -> float:
 def test_peak_gains_are_integrals():
     from scipy.integrate import quad
 
-    from obsynth.numerics.peak_gain import peak_gain
+    from obsynth.numerics.continuous import peak_gain
 
     rng = np.random.default_rng(3)
     for stiff in (1.0, 1e3):

@@ -12,10 +12,10 @@ import scipy.linalg
 import obsynth
 from obsynth.methods.pd_observer import gain_search as pd_design
 from obsynth.methods.pd_observer import reduced_inequality as pd_reduced
-from obsynth.methods.pd_observer.augmentation import with_faults_as_states
-from obsynth.methods.pd_observer.checks.inequality import prove_gains, prove_symmetric_positive
+from obsynth.methods.pd_observer.checks.certificate import prove_gains, prove_symmetric_positive
 from obsynth.methods.pd_observer.inequalities import PdTask, solve
 from obsynth.methods.pd_observer.options import MOST_STATES_FOR_LMI, PdOptions
+from obsynth.methods.pd_observer.realisation import with_faults_as_states
 from obsynth.spec import load_spec
 
 PLANT = load_spec(Path(__file__).parents[2] / "designs" / "filasova" / "spec.yaml").plant

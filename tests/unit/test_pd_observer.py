@@ -11,14 +11,13 @@ import pytest
 import obsynth
 from obsynth.methods.conic import lmi
 from obsynth.methods.pd_observer import gain_search as pd_design
-from obsynth.methods.pd_observer.augmentation import with_faults_as_states, with_sensor_noise
 from obsynth.methods.pd_observer.certificate import (
     coupled_certificate,
     explicit_certificate,
     gain_certificate,
     symmetric_certificate,
 )
-from obsynth.methods.pd_observer.checks.inequality import (
+from obsynth.methods.pd_observer.checks.certificate import (
     error_inputs,
     prove_gain,
     prove_gains,
@@ -27,6 +26,7 @@ from obsynth.methods.pd_observer.checks.inequality import (
 )
 from obsynth.methods.pd_observer.conditions import pd_observer_conditions
 from obsynth.methods.pd_observer.limits import least_noise_gain
+from obsynth.methods.pd_observer.realisation import with_faults_as_states, with_sensor_noise
 from obsynth.numerics.continuous import continuous_hinf_norm
 from obsynth.simulation import simulate_plant
 from obsynth.spec import load_spec

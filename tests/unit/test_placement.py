@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from obsynth import DescriptorSystem, PreconditionError, SolverError, SpecError, ui_pi_observer
-from obsynth.methods.placement.compromise import NOISE_PRICE, compromise
 from obsynth.methods.placement.eigenstructure import jordan_form, place
-from obsynth.methods.placement.kalman import KalmanProblem
+from obsynth.methods.placement.kalman import NOISE_PRICE, KalmanProblem, compromise
 from obsynth.methods.placement.observable import observable_split
 from obsynth.methods.placement.region import Region, region_gain
 from obsynth.numerics.spectra import decay_rates, spectrum_error

@@ -12,7 +12,7 @@ import pytest
 import obsynth
 from obsynth.analysis.diagnosis.additions import state_sensors, with_sensors
 from obsynth.analysis.diagnosis.columns import Question
-from obsynth.analysis.diagnosis.sensor_responses import SensorResponses
+from obsynth.analysis.diagnosis.sensor_search import SensorResponses
 from obsynth.spec.loader import load_spec
 
 DESIGNS = Path(__file__).parents[2] / "designs"

@@ -13,8 +13,7 @@ from scipy.integrate import solve_ivp
 
 import obsynth
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.simulation.batch import make_stepper
-from obsynth.simulation.linear import simulate_plant
+from obsynth.simulation.linear import make_stepper, simulate_plant
 from obsynth.simulation.profiles import sampled
 from obsynth.simulation.scenario_signals import resolve
 from obsynth.spec import load_spec

@@ -14,8 +14,8 @@ import scipy.sparse as sp
 import obsynth
 from obsynth.analysis.transformations.elimination import eliminated_by_sparsity
 from obsynth.methods.designing import check
+from obsynth.numerics.sparse import blocks_of, coarse_structure
 from obsynth.numerics.sparse_factor import SparseFactor
-from obsynth.numerics.sparse_structure import blocks_of, coarse_structure
 from obsynth.spec.loader import load_spec
 
 sys.path.insert(0, str(Path(__file__).parent))

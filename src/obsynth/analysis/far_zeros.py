@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.pencil_points import FEW_COLUMNS, smallest_singular
 from obsynth.numerics.pencils import FiniteZeros, finite_zeros
 from obsynth.numerics.ranks import BOUNDARY_RANK_TOLERANCE, CLUSTER_TOLERANCE
 from obsynth.numerics.scaling import EquilibratedPencil, equilibrate_pencil, power_of_two_below
-from obsynth.numerics.small_singular_values import FEW_COLUMNS, smallest_singular
 
 #: Steps in which a computed zero is improved before the pencil there is judged.
 NEWTON_STEPS = 4

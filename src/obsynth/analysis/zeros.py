@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from obsynth.analysis.far_zeros import equilibrated_at, system_zeros
 from obsynth.numerics.arrays import ComplexArray, FloatArray
-from obsynth.numerics.pencil_points import MOST_DIRECTIONS, PencilPoints
+from obsynth.numerics.pencil_points import FEW_COLUMNS, MOST_DIRECTIONS, PencilPoints, smallest_singular
 from obsynth.numerics.pencils import FiniteZeros
 from obsynth.numerics.ranks import (
     BOUNDARY_NEIGHBOURHOOD,
@@ -24,7 +24,6 @@ from obsynth.numerics.ranks import (
     RankDecision,
 )
 from obsynth.numerics.scaling import EquilibratedPencil, equilibrate_pencil
-from obsynth.numerics.small_singular_values import FEW_COLUMNS, smallest_singular
 from obsynth.plants.descriptor import DescriptorSystem
 
 #: Points without meaning, tried as generic ones; the clearest of them is used.

@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.calibration.innovations_fit import Timing, chosen_timing, innovations_fit
-from obsynth.calibration.integration_choice import IntegrationError, integration_error
 from obsynth.calibration.logs import LogData, read_log
 from obsynth.calibration.problem import Problem, calibration_problem, require_variation
-from obsynth.calibration.reporting import reported
+from obsynth.calibration.reporting import IntegrationError, integration_error, reported
 from obsynth.calibration.result import Calibration
 from obsynth.calibration.simulation_error import Fit, SimulationError, simulation_fits
 from obsynth.errors import SolverError, SpecError

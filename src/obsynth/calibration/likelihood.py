@@ -15,8 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.calibration.compilation import compiled
-from obsynth.calibration.step_graphs import SampleGraphs
+from obsynth.calibration.step_graphs import SampleGraphs, compiled
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.dae.functions import Compiled
 

@@ -1,4 +1,7 @@
-"""Recorded logs: their columns by signal, a regular grid of stamps, and what makes a log unusable."""
+"""Recorded logs: their columns by signal, a regular grid of stamps, and what makes a log unusable.
+
+Why a log cannot be used, or a model not be fitted to it: errors with a code that stays the same.
+"""
 
 from __future__ import annotations
 
@@ -11,20 +14,37 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from obsynth.calibration.refusals import bad_log
-from obsynth.errors import SpecError
+from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arrays import FloatArray, read_only
 
 if TYPE_CHECKING:
     import pandas as pd
 
+
+def bad_log(code: str, message: str, *, path: str = "log") -> SpecError:
+    """Return the error of a log that is malformed: ``irregular``, ``nan``, ``time``, ``empty``, ``too-short``."""
+    return SpecError(message, path=path, code=code)
+
+
+def refused(code: str, message: str, *, signals: Sequence[str] = ()) -> PreconditionError:
+    """Return the error of a log that cannot determine what is asked, or of a model that cannot follow it."""
+    return PreconditionError(message, condition=code, signals=signals)
+
+
 LogData: TypeAlias = "str | Path | pd.DataFrame | Mapping[str, Any] | Log"
+
 
 #: Stamps further off the grid than this share of a step are refused, and further than the second are told.
 LARGEST_JITTER = 0.2
+
+
 NOTED_JITTER = 0.02
+
+
 #: What counts as one quantum between values of a column: all differences are whole multiples within this.
 QUANTUM_SLACK = 0.02
+
+
 #: Share of distinct values above which a column shows no quantum that limits its noise: a ramp has none twice.
 REPEATED = 0.7
 

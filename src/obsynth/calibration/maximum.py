@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.calibration.likelihood import IMPOSSIBLE, Likelihood
+from obsynth.calibration.logs import refused
 from obsynth.calibration.problem import Problem
-from obsynth.calibration.refusals import refused
 from obsynth.calibration.simulation_error import Fit
 from obsynth.numerics.arrays import FloatArray
 

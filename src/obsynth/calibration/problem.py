@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.calibration.logs import Log, quantum, repeats
-from obsynth.calibration.refusals import bad_log, refused
+from obsynth.calibration.logs import Log, bad_log, quantum, refused, repeats
 from obsynth.calibration.step_graphs import SampleGraphs, promoted, sample_graphs
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, as_matrix

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from obsynth.calibration.likelihood import LARGEST_RESIDUAL
+from obsynth.calibration.logs import refused
 from obsynth.calibration.problem import Problem
-from obsynth.calibration.refusals import refused
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.dae.functions import Compiled
 

@@ -2,26 +2,59 @@
 
 The derivative of a likelihood needs that of F and of the noise's way, but not of Newton's iterations: the solved stages
 and their first derivatives enter the differentiated part as numbers, and the implicit function theorem does the rest.
+
+CasADi functions as machine code, where a C compiler is there and the work is long enough to wait for it.
 """
 
 from __future__ import annotations
 
+import subprocess
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from obsynth.calibration.compilation import compiled
 from obsynth.errors import SpecError
 from obsynth.numerics.symbolic_solve import largest_entries
+from obsynth.observers.dae.compiled_library import compiler
 from obsynth.plants.dae.functions import DAEFunctions
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.dae.symbols import symbols_of
 from obsynth.plants.names import index_of
 
+#: Optimisation costs more than it gains on straight code of thousands of lines.
+FLAGS = ("-std=c99", "-O1", "-ffp-contract=off", "-shared", "-fPIC")
+
+
+def compiled(functions: Sequence[Any]) -> list[Any]:
+    """Return the same functions as machine code; as they are where there is no compiler or it fails."""
+    import casadi as ca
+
+    command = compiler()
+    if command is None:
+        return list(functions)
+    with tempfile.TemporaryDirectory(prefix="obsynth-") as folder:
+        generator = ca.CodeGenerator("calibration.c")
+        for function in functions:
+            generator.add(function)
+        generator.generate(f"{folder}/")
+        source, library = Path(folder) / "calibration.c", Path(folder) / "calibration.so"
+        done = subprocess.run(
+            [*command, *FLAGS, str(source), "-o", str(library), "-lm"], capture_output=True, text=True, check=False
+        )
+        if done.returncode != 0:
+            return list(functions)
+        # What is loaded stays when the file is gone.
+        return [ca.external(function.name(), str(library)) for function in functions]
+
+
 #: Newton iterations of every step, from the last sample's state, and further ones where the residual is above `SOLVED`.
 ITERATIONS, FURTHER = 3, 8
+
+
 SOLVED = 1e-11
 
 

@@ -1,25 +1,137 @@
-"""Comparing a recorded, fault-free log with a design: the public function."""
+"""Comparing a recorded, fault-free log with a design: the public function.
+
+Which variances of a design a log contradicts: likeliest ones beside those that were designed with.
+
+The innovations of a design along a log, with what the design expects of them.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from obsynth.calibration.diagnostics import SIGNIFICANT, change_of_mean, consistency, consistency_of, whiteness
-from obsynth.calibration.logs import Log, LogData, read_log
-from obsynth.calibration.noise_ratios import noise_ratios
-from obsynth.calibration.recorded_innovations import RecordedInnovations, recorded_innovations
+from obsynth.calibration.logs import Log, LogData, quantum, read_log
+from obsynth.calibration.maximum import Objective, greatest_likelihood
+from obsynth.calibration.problem import Problem
+from obsynth.calibration.simulation_error import Fit
+from obsynth.calibration.step_graphs import sample_graphs
 from obsynth.calibration.validation import SensorValidation, Validation
-from obsynth.errors import SpecError
+from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.results.design import ObserverDesign
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedInnovations:
+    """Innovations ``(n, ny)`` and their deviations; sum of NIS and of its degrees; each parameter ``(n, 2)``."""
+
+    innovations: FloatArray
+    deviations: FloatArray
+    squares: float
+    degrees: int
+    estimates: Mapping[str, FloatArray]
+
+    @property
+    def standardised(self) -> FloatArray:
+        """Innovations in their own deviations ``(n, ny)``, NaN where nothing was measured."""
+        return np.asarray(self.innovations / self.deviations)
+
+
+def recorded_innovations(design: ObserverDesign, log: Log) -> RecordedInnovations:
+    """Run a design over a log."""
+    observer = design.observer
+    if isinstance(observer, DAEObserver):
+        return _nonlinear(observer, log)
+    if isinstance(observer, RecursiveObserver):
+        return _recursive(observer, log, dict(getattr(design.plant, "operating_point", {})))
+    raise TypeError(f"{type(observer).__name__} has no innovations with a covariance")
+
+
+def _nonlinear(observer: DAEObserver, log: Log) -> RecordedInnovations:
+    found = observer.run(log.y, log.u, progress=False)
+    deviations = np.sqrt(np.einsum("kii->ki", found.innovation_covariances))
+    return RecordedInnovations(
+        found.innovations, deviations, float(found.nis.sum()), int(found.nis_degrees.sum()),
+        _estimates(found.parameter_names, found.parameters, found.parameter_covariances),
+    )  # fmt: skip
+
+
+def _recursive(observer: RecursiveObserver, log: Log, point: Mapping[str, float]) -> RecordedInnovations:
+    """Predict each sample from those before it: a step without measurements, beside the one with them."""
+    plant = observer.plant
+    y = log.y - np.array([point.get(name, 0.0) for name in plant.output_names])
+    u = log.u - np.array([point.get(name, 0.0) for name in plant.input_names])
+    state, nothing = observer.init(), np.full(plant.ny, np.nan)
+    e, deviations = np.full(y.shape, np.nan), np.full(y.shape, np.nan)
+    for k in range(len(y)):
+        if k:
+            mean, spread = observer.recursion.predicted(state, nothing, u[k])
+            e[k], deviations[k] = np.where(np.isfinite(spread), y[k] - mean, np.nan), spread
+        state, _ = observer.advance(state, y[k], u[k])
+    found = observer.run(y, u)
+    return RecordedInnovations(
+        e, deviations, float(found.nis.sum()), int(found.nis_degrees.sum()),
+        _estimates(found.parameter_names, found.parameters, found.parameter_covariances),
+    )  # fmt: skip
+
+
+def _estimates(names: tuple[str, ...], values: FloatArray, covariances: FloatArray) -> dict[str, FloatArray]:
+    deviations = np.sqrt(np.einsum("kii->ki", covariances))
+    return {name: read_only(np.column_stack([values[:, i], deviations[:, i]])) for i, name in enumerate(names)}
+
+
+#: Nats that a variance of the design must cost, the others being free, before its ratio is told.
+CLEAR_NATS = 3.0
+
+
+#: Ratios nearer to one than this factor are not told: nobody knows a variance better.
+TOLD_FACTOR = 1.5
+
+
+def noise_ratios(observer: DAEObserver, log: Log) -> Mapping[str, float]:
+    """Return likeliest over designed variance for each that the log contradicts, parameters at their start."""
+    model = observer.model
+    held = model.replace(parameters=dict(zip(model.parameter_names, observer.initial_parameters, strict=True)))
+    designed_Q, designed_R = np.diag(observer.Q), np.diag(observer.R)
+    noisy = tuple(name for name, variance in zip(model.equation_names, designed_Q, strict=True) if variance > 0.0)
+    names = (*noisy, *model.output_names)
+    designed = np.concatenate([designed_Q[designed_Q > 0.0], designed_R])
+    nothing, free_Q = np.zeros(0), np.full(len(noisy), np.nan)
+    graphs = sample_graphs(held, (), log.dt, integration=observer.integration, substeps=1, samples=log.samples)
+    quanta = np.array([quantum(column) for column in log.y.T])
+    problem = Problem(
+        held, log, (), nothing, nothing, nothing, nothing, nothing, noisy, free_Q, np.full(model.ny, np.nan),
+        np.array(observer.initial_state), np.array(observer.initial_covariance), quanta, 1e-6 * designed_R, graphs,
+        observer.integration, 1,
+    )  # fmt: skip
+    fit = Fit(nothing, np.array(observer.initial_state), np.sqrt(designed_R), 0.0, np.zeros((0, 0)))
+    objective = Objective(problem, fit)
+    try:
+        best = greatest_likelihood(objective, [fit], lambda text: None)
+    except PreconditionError:
+        # Without a likelihood nothing can be told of its variances.
+        return {}
+    found = {}
+    for i, (name, variance) in enumerate(zip(names, designed, strict=True)):
+        ratio = float(np.exp(best.z[i]) / variance)
+        z = best.z.copy()
+        z[i] = np.log(variance)
+        if max(ratio, 1.0 / ratio) > TOLD_FACTOR and objective(z)[0] - best.value > CLEAR_NATS:
+            found[name] = ratio
+    return found
+
 
 #: A mean of innovations, or a parameter's deviation from its start, beyond so many standard deviations is told.
 OFFSET = 3.0
+
+
 #: Rows that a log must have at least.
 LEAST_ROWS = 20
 

@@ -114,7 +114,7 @@ def run_linearise(options: argparse.Namespace) -> int:
     """Run ``linearise``: spec or plant in, matrices and operating point out."""
     from obsynth.analysis.transformations.linearisation import linearise
     from obsynth.cli.data_run import numbers_of
-    from obsynth.report.linear_plants import linear_plant_text, plant_document
+    from obsynth.report.plants import linear_plant_text, plant_document
     from obsynth.spec.loader import load_model
 
     model, _ = load_model(options.system)

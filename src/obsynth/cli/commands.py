@@ -154,8 +154,7 @@ def run_check(options: argparse.Namespace) -> int:
         })  # fmt: skip
     else:
         from obsynth.report import check_report
-        from obsynth.report.diagnosis import diagnosis_report
-        from obsynth.report.existence import print_methods
+        from obsynth.report.plants import diagnosis_report, print_methods
 
         console = stdout_console()
         if diagnosis is not None:
@@ -170,7 +169,7 @@ def run_check(options: argparse.Namespace) -> int:
 
 def _ask(spec: Spec) -> None:
     """Ask on stderr what may not be meant, as it may be the reason for all that follows."""
-    from obsynth.analysis.plausibility import questions
+    from obsynth.analysis.structure import questions
     from obsynth.plants.descriptor import DescriptorSystem
 
     for text in questions(spec.plant) if isinstance(spec.plant, DescriptorSystem) else ():
@@ -192,7 +191,7 @@ def _structure_as_dict(structure: Structure) -> dict[str, Any]:
 
 def _is_alarm(path: Path) -> bool:
     """Whether a file begins like the certificate of an alarm."""
-    from obsynth.experiments.alarm_proofs.document import CERTIFICATE
+    from obsynth.experiments.alarm_proofs.proof import CERTIFICATE
 
     if not path.is_file():  # who reads it says so
         return False

@@ -1,27 +1,83 @@
 """The commands ``design`` and ``obsynth``: arguments in, exit code out.
 
 Nothing heavy is imported here, so that ``--help`` answers at once.
+
+The process around a verb: standard streams that may be closed or full, and what numbers can do to a computation.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import sys
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from obsynth import __version__
 from obsynth.cli.arguments import add_force, add_json, add_quiet, add_system, add_verbose
 from obsynth.cli.calibration import add_calibration_verbs
-from obsynth.cli.compare import add_compare_verb
 from obsynth.cli.data_arguments import add_data_verbs
-from obsynth.cli.evaluate import add_evaluate_verb
 from obsynth.cli.output import print_error, print_json
-from obsynth.cli.process import told_error, unwritable_output, usable_streams
 from obsynth.cli.prove_alarm import add_prove_alarm_verb
+from obsynth.cli.scenarios import add_compare_verb, add_evaluate_verb
 from obsynth.cli.sweep import add_sweep_verb
-from obsynth.errors import ObsynthError
+from obsynth.errors import ObsynthError, SolverError, SpecError
 from obsynth.files.inputs import protected_inputs
+
+#: Exit code of a program whose reader has left, as shells give it.
+BROKEN_PIPE = 141
+
+
+@contextmanager
+def usable_streams() -> Iterator[None]:
+    """Let texts go to nowhere where a stream is closed, print characters that an encoding lacks, warn in one line."""
+    with warnings.catch_warnings(), ExitStack() as stack:
+        warnings.showwarning = _told_warning
+        for name in ("stdout", "stderr"):
+            stream = getattr(sys, name)
+            if stream is None:
+                # The first file that is opened would get its number, and what is meant for the terminal.
+                setattr(sys, name, stack.enter_context(open(os.devnull, "w", encoding="utf-8")))
+                stack.callback(setattr, sys, name, None)
+            elif hasattr(stream, "reconfigure"):
+                stream.reconfigure(errors="backslashreplace")
+        yield
+
+
+def _told_warning(message: Warning | str, *_: object, **__: object) -> None:
+    # Where in a library it arose is no use to the user.
+    print(f"Warning: {message}", file=sys.stderr)
+
+
+def unwritable_output(error: OSError) -> int:
+    """Say that standard output takes no more, and return the exit code; nothing more is written to it."""
+    with suppress(OSError, ValueError, AttributeError):
+        # The interpreter's own flush at exit must not complain.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    if isinstance(error, BrokenPipeError):
+        return BROKEN_PIPE
+    place = error.filename or "Standard output"
+    with suppress(OSError):
+        print(f"Malformed input: {place} cannot be written: {error.strerror or error}.", file=sys.stderr)
+    return SpecError.exit_code
+
+
+def told_error(error: Exception) -> ObsynthError | None:
+    """Return what an error of Python or of a library is for the user; `None` if it is a mistake of obsynth."""
+    if isinstance(error, MemoryError):
+        return SolverError("The computation does not fit into the memory: nothing is known.")
+    if isinstance(error, RecursionError):
+        return SpecError("An expression or a document is nested too deeply.")
+    if isinstance(error, ImportError):
+        is_ours = (error.name or "").startswith("obsynth")
+        text = f"This needs the library {error.name or error}, which cannot be loaded: install it with pip."
+        return None if is_ours else SpecError(text)
+    from obsynth.numerics.failures import failure_of
+
+    return failure_of(error)
+
 
 _EXIT_CODES = """\
 exit codes:
@@ -50,8 +106,14 @@ def design_command(arguments: Sequence[str] | None = None) -> int:
 
 
 _DESIGN = "Design an observer from a spec, prove it, print a report and write the gain set."
+
+
 _CHECK = "Analyse the plant of a spec, and check for every method whether a design can exist."
+
+
 _VERIFY = "Verify a saved gain set again, from the plant and the shipped realisation alone."
+
+
 _SIMULATE = "Design an observer from a spec, and simulate it on the spec's scenario."
 
 
@@ -128,11 +190,9 @@ def _verb(name: str) -> Callable[[argparse.Namespace], int]:
     from obsynth.cli import (
         calibration,
         commands,
-        compare,
         data_commands,
-        evaluate,
-        plot,
         prove_alarm,
+        scenarios,
         simulate,
         sweep,
     )
@@ -142,12 +202,12 @@ def _verb(name: str) -> Callable[[argparse.Namespace], int]:
         "check": commands.run_check,
         "verify": commands.run_verify,
         "simulate": simulate.run_simulate,
-        "compare": compare.run_compare,
-        "evaluate": evaluate.run_evaluate,
+        "compare": scenarios.run_compare,
+        "evaluate": scenarios.run_evaluate,
         "sweep": sweep.run_sweep,
         "run": data_commands.run_run,
         "export": data_commands.run_export,
-        "plot": plot.run_plot,
+        "plot": data_commands.run_plot,
         "report": data_commands.run_report,
         "linearise": calibration.run_linearise,
         "calibrate": calibration.run_calibrate,

@@ -40,7 +40,7 @@ def run_prove_alarm(options: argparse.Namespace) -> int:
     """Run ``prove-alarm``: 0 whether there is a proof or not; every failure is an error."""
     from obsynth.cli.data_run import numbers_of, ranges_of
     from obsynth.data.alarm_proof import prove_alarm
-    from obsynth.experiments.alarm_proofs.document import CERTIFICATE
+    from obsynth.experiments.alarm_proofs.proof import CERTIFICATE
     from obsynth.results.gain_sets import load
 
     design = load(options.gains)

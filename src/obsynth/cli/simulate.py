@@ -45,7 +45,7 @@ def run_simulate(options: argparse.Namespace) -> int:
     if options.json:
         print_json({"command": "simulate", "spec": str(spec.path), "file": written, **found.summary()})
         return 0
-    from obsynth.report.simulation import simulation_report
+    from obsynth.report.scenarios import simulation_report
 
     simulation_report(design.name, found, console=stdout_console(), units=design.plant.units, file=written)
     return 0

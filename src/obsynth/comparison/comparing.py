@@ -15,10 +15,17 @@ from obsynth.methods.choosing.candidates import Candidate, candidate, linear_met
 from obsynth.methods.choosing.figures import DECOUPLED, on_the_clock, step_responses
 from obsynth.methods.designing import design
 from obsynth.methods.functional_filter.rates import settling_time
-from obsynth.numerics.arguments import is_finite_number, require_kind
+from obsynth.numerics.arguments import (
+    Count,
+    NonNegative,
+    Positive,
+    Probability,
+    checked_value,
+    is_finite_number,
+    require_kind,
+)
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.threads import on_one_thread_if_small
-from obsynth.numerics.value_types import Count, NonNegative, Positive, Probability, checked_value
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.profiles import Sine, Step

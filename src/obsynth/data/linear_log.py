@@ -9,11 +9,10 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from obsynth.data.clock import Clock
-from obsynth.data.gap_model import GapModel
-from obsynth.data.linear_signals import LinearSignalNames
+from obsynth.data.gap_model import GapModel, KeptHolds
 from obsynth.data.log_estimator import GAP, LONGEST_BRIDGE, OK, RECOVERING, WARM_UP, Row, estimate_columns
-from obsynth.data.observer_holds import KeptHolds
+from obsynth.data.signals import LinearSignalNames
+from obsynth.data.stamps import Clock
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.monitors.online import LinearSample
 from obsynth.numerics.arguments import is_finite_number

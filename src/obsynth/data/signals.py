@@ -1,4 +1,7 @@
-"""From the columns of a log to deviations from the operating point, and back."""
+"""From the columns of a log to deviations from the operating point, and back.
+
+The names of what a linear design reads and estimates, as an engine has them.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,7 @@ from obsynth.data.log_estimator import Engine
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.results.design import ObserverDesign
 
 #: The column of time stamps, in seconds.
 TIME = "time"
@@ -91,3 +95,58 @@ def _advice(header: tuple[str, ...], missing: list[str]) -> str:
     if TIME in missing and found is not None:
         return f"If {found!r} is the time: --time-column {found!r}, or columns={{'time': {found!r}}}."
     return "Map signals to columns where their names differ."
+
+
+class LinearSignalNames:
+    """Names, delays, operating point and scales of a linear design.
+
+    Fields: design: Linear.
+    """
+
+    def __init__(self, design: ObserverDesign) -> None:
+        self.plant, self.observer = design.linear
+
+    @property
+    def input_names(self) -> tuple[str, ...]:
+        """Known inputs."""
+        return self.observer.input_names
+
+    @property
+    def output_names(self) -> tuple[str, ...]:
+        """Outputs of the plant."""
+        return self.observer.output_names
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """States that are estimated."""
+        return self.observer.state_names
+
+    @property
+    def fault_names(self) -> tuple[str, ...]:
+        """Faults that are estimated."""
+        return self.observer.fault_names
+
+    @property
+    def state_delays(self) -> tuple[int, ...]:
+        """Samples by which each state estimate lags."""
+        return self.observer.state_delays
+
+    @property
+    def fault_delays(self) -> tuple[int, ...]:
+        """Samples by which each fault estimate lags."""
+        return self.observer.fault_delays
+
+    @property
+    def dt(self) -> float:
+        """Seconds between samples; 0 for continuous time."""
+        return self.observer.dt
+
+    @property
+    def scales(self) -> Mapping[str, float]:
+        """Factor of inputs and outputs by name."""
+        return self.plant.scales
+
+    @property
+    def point(self) -> Mapping[str, float]:
+        """Operating point by name of the signal."""
+        return self.plant.operating_point

@@ -9,8 +9,8 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from obsynth.data.clock import Clock
 from obsynth.data.log_estimator import GAP, LONGEST_BRIDGE, OK, PARTIAL, RECOVERING, WARM_UP, Row, estimate_columns
+from obsynth.data.stamps import Clock
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.monitors.online import Evidence
 from obsynth.numerics.arrays import FloatArray

@@ -13,7 +13,7 @@ from obsynth.numerics.holds import first_order_hold
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.linear.sampling import sample_observer
 from obsynth.results.design import ObserverDesign
-from obsynth.simulation.batch import Stepper, make_stepper
+from obsynth.simulation.linear import Stepper, make_stepper
 from obsynth.simulation.scenario import Scenario
 from obsynth.simulation.scenario_signals import Drive, resolve
 

@@ -18,9 +18,8 @@ from obsynth.errors import PreconditionError, SpecError, VerificationError
 from obsynth.methods.advice import with_advice
 from obsynth.methods.choosing.automatic import automatic_design
 from obsynth.methods.drowned_designs import require_above_rounding
-from obsynth.methods.method_spec import MethodSpec, PlantKind
+from obsynth.methods.method_spec import MethodSpec, PlantKind, Synthesis
 from obsynth.methods.registry import AUTO, REGISTRY, method_spec, methods_for
-from obsynth.methods.synthesis_result import Synthesis
 from obsynth.methods.verifying import verify
 from obsynth.numerics.failures import failed_computations
 from obsynth.numerics.threads import one_thread_if_small

@@ -1,14 +1,25 @@
-"""What a method is: one declaration, from which schema, checks of arguments, reports and lists of methods derive."""
+"""What a method is: one declaration, from which schema, checks of arguments, reports and lists of methods derive.
+
+What a method hands to the pipeline: gains, realisation and certificate, not yet verified.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from importlib import import_module
 from typing import Any, ClassVar, Literal, TypeAlias, cast, get_type_hints
 
+from obsynth.analysis.transformations import Transformation
 from obsynth.errors import SpecError
-from obsynth.numerics.value_types import problem_with
+from obsynth.numerics.arguments import problem_with
+from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.dae.observer import DAEObserver
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.results.design import Certificate
 
 PlantKind: TypeAlias = Literal["time-invariant", "time-varying", "nonlinear"]
 
@@ -47,7 +58,7 @@ def option_types(options: type[MethodOptions]) -> dict[str, Any]:
 class ClaimMeaning:
     """A number that a method may claim: its unit (empty: dimensionless), what it means, and the row that checks it.
 
-    Without a row the claim is refused; `obsynth.verification.closed_claims.STATED` is for numbers of a search that no
+    Without a row the claim is refused; `obsynth.verification.claims.STATED` is for numbers of a search that no
     check recomputes: these get a row that says so.
     """
 
@@ -111,3 +122,24 @@ class MethodSpec:
                 path="method.options",
             )
         return self.options_type(**given)
+
+
+@dataclass(frozen=True, eq=False)
+class Synthesis:
+    """The unverified outcome of a method.
+
+    Fields: options: Options as resolved, plain data; gains: Gains with the paper's letters; observer: The realisation;
+    certificate: Witnesses and claims; solver: Records of the solver runs; notes: What a user should know;
+    transformation: What the method did to the plant before it designed for it (such as the elimination of algebraic
+    states): the design is then for the transformed plant, with the way back; plant: The plant as the recursive methods
+    see it, where they were given another kind; or with the noise that the design is for.
+    """
+
+    options: Mapping[str, Any]
+    gains: Mapping[str, FloatArray]
+    observer: LinearObserver | RecursiveObserver | DAEObserver
+    certificate: Certificate
+    solver: Mapping[str, Any] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    transformation: Transformation | None = None
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem | None = None

@@ -8,8 +8,7 @@ import numpy as np
 
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.doubling import compared_gain, gain_is_below
-from obsynth.numerics.level_crossings import level_crossings
-from obsynth.numerics.modal_response import ModalResponse, Modes
+from obsynth.numerics.modal_response import ModalResponse, Modes, level_crossings
 
 #: Relative gap between the attained value and the certified level of an H-infinity norm.
 NORM_TOLERANCE = 1e-9

@@ -1,10 +1,18 @@
-"""Sparse matrices of scipy as checked, read-only data, and dense arrays where they are needed."""
+"""Sparse matrices of scipy as checked, read-only data, and dense arrays where they are needed.
+
+Structure of sparse matrices by their pattern alone: matching, over- and underdetermined parts, blocks.
+
+Source: A. L. Dulmage and N. S. Mendelsohn, *Coverings of bipartite graphs*, Canadian J. Math. 10, 1958; the matching
+and the strongly connected components are scipy's.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, TypeGuard
 
 import numpy as np
+from numpy.typing import NDArray
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, read_only
@@ -56,3 +64,93 @@ def selection(rows: Any, count: int) -> Any:
 
     places = np.asarray(rows, dtype=np.int64)
     return csr_array((np.ones(len(places)), (np.arange(len(places)), places)), shape=(len(places), count))
+
+
+Indices = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class CoarseStructure:
+    """The Dulmage-Mendelsohn parts of a pattern.
+
+    Parameters
+    ----------
+    row_of_column : Indices
+        ``(columns,)``: the row that a maximum matching gives to each column, -1 for none.
+    over_rows, over_columns : Indices
+        The overdetermined part: more rows than columns, or empty.
+    under_rows, under_columns : Indices
+        The underdetermined part: more columns than rows, or empty.
+    """
+
+    row_of_column: Indices
+    over_rows: Indices
+    over_columns: Indices
+    under_rows: Indices
+    under_columns: Indices
+
+    @property
+    def structural_rank(self) -> int:
+        """Rank of almost every matrix of this pattern."""
+        return int(np.sum(self.row_of_column >= 0))
+
+
+def coarse_structure(pattern: Any) -> CoarseStructure:
+    """Return the over- and underdetermined parts of a sparse matrix, by its pattern."""
+    from scipy.sparse.csgraph import maximum_bipartite_matching
+
+    matrix = csr(pattern)
+    row_of_column = np.asarray(maximum_bipartite_matching(matrix, perm_type="row"), dtype=np.int64)
+    column_of_row = np.full(matrix.shape[0], -1, dtype=np.int64)
+    matched = np.flatnonzero(row_of_column >= 0)
+    column_of_row[row_of_column[matched]] = matched
+    free_rows = np.flatnonzero(column_of_row < 0)
+    free_columns = np.flatnonzero(row_of_column < 0)
+    over_rows, over_columns = _alternating(matrix, free_rows, row_of_column)
+    under_columns, under_rows = _alternating(csr(matrix.T), free_columns, column_of_row)
+    return CoarseStructure(row_of_column, over_rows, over_columns, under_rows, under_columns)
+
+
+def _alternating(matrix: Any, start: Indices, back: Indices) -> tuple[Indices, Indices]:
+    """Return rows and columns on paths from ``start`` (rows) along any entry to a column and back to its own row."""
+    seen_rows, seen_columns = set(map(int, start)), set[int]()
+    waiting = list(seen_rows)
+    while waiting:
+        row = waiting.pop()
+        for column in map(int, matrix.indices[matrix.indptr[row] : matrix.indptr[row + 1]]):
+            if column in seen_columns:
+                continue
+            seen_columns.add(column)
+            other = int(back[column])
+            if other >= 0 and other not in seen_rows:
+                seen_rows.add(other)
+                waiting.append(other)
+    return np.array(sorted(seen_rows), dtype=np.int64), np.array(sorted(seen_columns), dtype=np.int64)
+
+
+def blocks_of(pattern: Any, row_of_column: Indices) -> tuple[int, Indices]:
+    """Return the number of diagonal blocks of the block triangular form, and the block of each column.
+
+    Parameters
+    ----------
+    pattern : sparse matrix
+        Square.
+    row_of_column : Indices
+        A perfect matching.
+    """
+    from scipy.sparse.csgraph import connected_components
+
+    count, labels = connected_components(csr(pattern)[row_of_column], directed=True, connection="strong")
+    return int(count), np.asarray(labels, dtype=np.int64)
+
+
+def components_of(pattern: Any) -> tuple[Indices, Indices]:
+    """Return the connected component of each row and each column; two that share an entry are in the same."""
+    from scipy.sparse import block_array
+    from scipy.sparse.csgraph import connected_components
+
+    matrix = csr(pattern)
+    rows = matrix.shape[0]
+    both = block_array([[None, abs(matrix)], [abs(matrix).T, None]], format="csr")
+    _, labels = connected_components(both, directed=False)
+    return np.asarray(labels[:rows], dtype=np.int64), np.asarray(labels[rows:], dtype=np.int64)

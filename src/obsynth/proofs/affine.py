@@ -14,7 +14,7 @@ import numpy as np
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.proofs.balls import gamma, rounded_up
-from obsynth.proofs.nonnegative import inverse_bound, spectral_radius_bound
+from obsynth.proofs.contraction import inverse_bound, spectral_radius_bound
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,7 @@
-"""A finished design for people: what it is, what it promises, and where it was written."""
+"""A finished design for people: what it is, what it promises, and where it was written.
+
+What a design promises over the tolerances of its plant, for people.
+"""
 
 from __future__ import annotations
 
@@ -18,10 +21,22 @@ from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.report.layout import facts_table, headed_table, name_list, number, print_section
-from obsynth.report.tolerances import tolerances_report
 from obsynth.report.verification import verification_report
 from obsynth.results.delta_scan import DeltaScan
 from obsynth.results.design import ObserverDesign
+
+
+def tolerances_report(design: ObserverDesign, *, console: Console) -> None:
+    """Print what holds for every plant within its tolerances, or that the design assumes an exact model."""
+    from obsynth.tolerances.robustness import EXACT_MODEL, robustness
+
+    if not isinstance(design.plant, DescriptorSystem) or not isinstance(design.observer, LinearObserver):
+        return
+    uncertain = design.plant.uncertainty
+    if uncertain is None or not uncertain.box.names:
+        console.print(Text(f"Model: {EXACT_MODEL} (no constant has a tolerance)."))
+        return
+    print_section(console, "Within the tolerances of the plant", facts_table(robustness(design).facts()))
 
 
 def plant_facts(plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel) -> Iterator[tuple[str, str]]:

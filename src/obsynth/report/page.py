@@ -10,10 +10,9 @@ from obsynth.data.run import DataRun
 from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.methods.registry import REGISTRY, method_spec
 from obsynth.report.designs import delay_curves, fault_estimates_table, plant_facts, promises, recovered_states
-from obsynth.report.own_data import data_section
 from obsynth.report.page_style import STYLE
 from obsynth.report.page_tables import check_rows, copied_table, fact_rows, matrix_rows, value_text
-from obsynth.report.pictures import pictures_of
+from obsynth.report.pictures import data_section, pictures_of
 from obsynth.report.summary import summary
 from obsynth.report.verification import verdict_line
 from obsynth.results.design import ObserverDesign

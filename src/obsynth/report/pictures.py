@@ -1,12 +1,21 @@
-"""Pictures of a design for a page: drawn without a window, held as text."""
+"""Pictures of a design for a page: drawn without a window, held as text.
+
+The section of a page about measured data: a picture first, then what was counted.
+"""
 
 from __future__ import annotations
 
 import base64
 import io
 from collections.abc import Callable, Iterator, Sequence
+from html import escape
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
+import numpy as np
+from rich.text import Text
+
+from obsynth.data.log_estimator import DECIDING
+from obsynth.data.run import DataRun
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.demonstration import demonstration_scenario
 from obsynth.experiments.monitors.monitor import Detection
@@ -18,23 +27,33 @@ from obsynth.observers.decisions import decide
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.recursive.estimates import RecursiveEstimates
 from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.plotting.data import panel_count, plot_data
 from obsynth.plotting.frequency import plot_gains
 from obsynth.plotting.panels import names_as_they_are
 from obsynth.plotting.simulation import plot_simulation
 from obsynth.plotting.spectra import plot_poles
 from obsynth.plotting.states import plot_states
+from obsynth.report.layout import headed_table, number
+from obsynth.report.page_tables import copied_table, fact_rows
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+
 #: Dots per inch: sharp on a screen that shows two for each pixel.
 RESOLUTION = 160
+
+
 #: Inches: a picture beside another one, and one of a row of its own; small, so that texts stay readable on a phone.
 HALF, WIDE = 5.6, 6.6
+
+
 #: Inches: a panel of several, and what the axis of time takes.
 PANEL, MARGIN = 1.5, 0.6
+
+
 #: More states than this are not drawn.
 MOST_STATES = 6
 
@@ -155,3 +174,47 @@ def drawn(size: tuple[float, float], panels: int, draw: Callable[[Sequence[Axes]
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=RESOLUTION)
     return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
+
+
+def data_section(design: ObserverDesign, run: DataRun, statement: str) -> Iterator[str]:
+    """Yield a picture of a run, what was counted, and statistics of estimates and residuals in decided rows."""
+    count = panel_count(run)
+    if count:
+        text = ("Measured outputs and their estimates, fault estimates, residuals and the monitor's statistic, as far "
+                "as there are any. Nothing is decided in grey rows; rows with an alarm are red.")  # fmt: skip
+        source = drawn((WIDE, PANEL * count + MARGIN), count, lambda axes: plot_data(run, design=design, axes=axes))
+        yield (f'<figure class="wide"><img alt="{escape(text)}" src="{source}"><figcaption>{escape(text)}</figcaption>'
+               "</figure>")  # fmt: skip
+    yield from fact_rows(_counts(run, statement))
+    yield from (f'<p class="warning">Warning: {escape(text)}</p>' for text in run.warnings)
+    yield from _statistics(design, run)
+
+
+def _counts(run: DataRun, statement: str) -> Iterator[tuple[str, str]]:
+    yield "rows", f"{run.rows}: " + ", ".join(f"{count} {status}" for status, count in run.statuses.items())
+    for name, time in run.alarms.items():
+        fault = f"; {run.isolated} stands out" if run.isolated and name not in run.thresholds else ""
+        yield "alarm", f"{name}, first at {run.stamps.shown(time)}{fault}"
+    if not run.alarms:
+        yield "alarm", "none"
+    if statement:
+        yield "threshold", statement
+
+
+def _statistics(design: ObserverDesign, run: DataRun) -> Iterator[str]:
+    if run.table is None:
+        return
+    decided = run.table[run.table["status"].isin(DECIDING)]
+    names = [name for name in run.table.columns if name.startswith(("fhat[", "r["))]
+    if not len(decided) or not names:
+        return
+    table = headed_table("in decided rows", "unit", "least", "mean", "largest", "deviation")
+    for name in names:
+        values = decided[name].to_numpy(dtype=np.float64)
+        values = values[np.isfinite(values)]
+        if values.size:
+            unit = design.plant.units.get(name[name.index("[") + 1 : -1], "")
+            found = (number(float(f(values))) for f in (np.min, np.mean, np.max, np.std))
+            table.add_row(Text(name), unit, *found)
+    yield "<h3>Statistics</h3>"
+    yield from copied_table(table)

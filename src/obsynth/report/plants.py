@@ -1,20 +1,33 @@
-"""The structure of a plant and the existence conditions of each method, for people."""
+"""The structure of a plant and the existence conditions of each method, for people.
+
+The diagnosis of a plant as tables.
+
+Whether each method can serve a plant: one line each, with the reason and what to add.
+
+A linear plant as text for people, and as a document that specs can name.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import io
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
+import numpy as np
 from rich.console import Console
+from rich.table import Table
 from rich.text import Text
 
+from obsynth.analysis.diagnosis.verdicts import Diagnosis
 from obsynth.analysis.structure import Structure
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.report.designs import plant_facts
-from obsynth.report.layout import complex_numbers, facts_table, name_list, print_section
+from obsynth.report.layout import complex_numbers, facts_table, headed_table, name_list, print_section
 from obsynth.report.verification import checks_table
-from obsynth.results.report import VerificationReport
+from obsynth.results.report import Check, VerificationReport
 
 
 def check_report(
@@ -86,3 +99,130 @@ def structure_facts(structure: Structure) -> dict[str, str]:
 
 def _yes(value: bool) -> str:
     return "yes" if value else "no"
+
+
+#: Of a bank of residuals so many rows are shown.
+MOST_ROWS = 12
+
+
+def diagnosis_report(diagnosis: Diagnosis, *, console: Console, everything: bool = True) -> None:
+    """Print what can be diagnosed: verdicts and sentences; isolability and banks with ``everything``."""
+    if not diagnosis.faults:
+        return
+    print_section(console, diagnosis.heading, _table(diagnosis.verdict_rows()))
+    if everything and len(diagnosis.faults) > 1:
+        rows = diagnosis.bank_rows()
+        print_section(console, "Which fault can be told from which", _table(diagnosis.isolability_rows()))
+        more = len(rows) - 1 - MOST_ROWS
+        title = "Structured residuals" + (f" ({more} more are not shown)" if more > 0 else "")
+        if len(rows) > 1:
+            print_section(console, title, _table(rows[: MOST_ROWS + 1]))
+    for sentence in diagnosis.sentences:
+        console.print(Text(sentence))
+    for warning in diagnosis.warnings:
+        console.print(Text(f"Warning: {warning}", style="yellow"))
+    if diagnosis.sentences or diagnosis.warnings:
+        console.print()
+
+
+def _table(rows: Sequence[Sequence[str]]) -> Table:
+    table = headed_table(*rows[0])
+    for column in table.columns:
+        column.overflow = "fold"
+    for row in rows[1:]:
+        table.add_row(*(Text(text) for text in row))
+    return table
+
+
+#: Conditions that ask for another time than the plant's, and what to do about each.
+_TIME = {
+    "exists: continuous time": "continuous only: design for the plant in continuous time (dt: 0, without sample_time), "
+    "and sample the observer afterwards (obsynth.sample_observer)",
+    "exists: discrete time": "discrete only: sample the plant first (transform: {sample_time: ...})",
+}
+
+
+_KIND, _OF_THIS_KIND = "exists: kind of plant", "exists: plant of this kind"
+
+
+def method_lines(methods: Mapping[str, VerificationReport], *, own: str = "") -> Iterator[tuple[str, str, str]]:
+    """Yield method, verdict in words and style; methods for other kinds of plants come last, in one line."""
+    others = []
+    for method, report in methods.items():
+        failed = report.failures
+        names = {check.name for check in failed}
+        asked = " (the spec's method)" if method == own else ""
+        if report.passed:
+            yield method, f"all conditions hold, so a design exists{asked}", "green"
+        elif _KIND in names and method != own:
+            others.append(method)
+        elif names & set(_TIME):
+            yield method, next(text for name, text in _TIME.items() if name in names) + asked, "yellow"
+        elif _OF_THIS_KIND in names:
+            reason = next(check.detail for check in failed if check.name == _OF_THIS_KIND)
+            yield method, f"not for this plant{asked}: {reason}".rstrip("."), "yellow"
+        else:
+            yield method, f"IMPOSSIBLE for this plant{asked}: {_reason(failed)}", "bold red"
+    if others:
+        yield "other plants", f"{', '.join(others)}: for another kind of plant", "dim"
+
+
+def print_methods(methods: Mapping[str, VerificationReport], *, own: str, console: Console) -> None:
+    """Print the lines of all methods."""
+    for method, text, style in method_lines(methods, own=own):
+        lines = textwrap.wrap(f"{method}: {text}", min(console.width, 120), subsequent_indent="  ",
+                              break_on_hyphens=False)  # fmt: skip
+        for line in lines:
+            console.print(Text(line, style=style), soft_wrap=True)
+
+
+def _reason(failed: Sequence[Check]) -> str:
+    if not failed:
+        return "no condition was checked"
+    first, *more = failed
+    told = f"{first.name.removeprefix('exists: ')} FAILS: {first.claim}"
+    told += f"; found {first.detail}" if first.detail else ""
+    return told.rstrip(".") + (f" (and {len(more)} more with -v)" if more else "")
+
+
+_MATRICES = ("E", "A", "B", "C", "D", "Bf", "Df", "Bd", "Dd")
+
+
+_NAMES = ("state_names", "input_names", "output_names", "fault_names", "disturbance_names")
+
+
+def linear_plant_text(plant: DescriptorSystem) -> str:
+    """Return operating point and matrices, each with its signals."""
+    lines = ["Operating point:"]
+    for name, value in plant.operating_point.items():
+        unit = plant.units.get(name, "1")
+        lines.append(f"  {name} = {value:.8g}{'' if unit == '1' else ' ' + unit}")
+    for name, signals in (("E", plant.state_names), ("A", plant.state_names), ("B", plant.input_names),
+                          ("C", plant.state_names), ("Bf", plant.fault_names), ("Df", plant.fault_names),
+                          ("Bd", plant.disturbance_names)):  # fmt: skip
+        matrix = getattr(plant, name)
+        if matrix.size and (np.any(matrix) or name in "EABC"):
+            lines += [f"{name}, columns {', '.join(signals)}:"]
+            lines += ["  " + "  ".join(f"{value + 0.0:>11.5g}" for value in row) for row in matrix]
+    return "\n".join(lines)
+
+
+def plant_document(plant: DescriptorSystem, source: str) -> str:
+    """Return the plant as YAML that a spec can name; every number as exact as it is."""
+    from ruamel.yaml import YAML
+
+    data: dict[str, Any] = {"schema_version": 1, "dt": float(plant.dt)}
+    for name in _MATRICES:
+        matrix = getattr(plant, name)
+        if matrix.size and (np.any(matrix) or name in "EAC"):
+            data[name] = [[float(value) + 0.0 for value in row] for row in matrix]
+    data |= {name: list(getattr(plant, name)) for name in _NAMES if getattr(plant, name)}
+    data["operating_point"] = {name: float(value) for name, value in plant.operating_point.items()}
+    data["units"] = dict(plant.units)
+    text = io.StringIO()
+    yaml: Any = YAML(typ="safe", pure=True)
+    yaml.default_flow_style = None
+    yaml.width = 4096
+    yaml.sort_base_mapping_type_on_output = False
+    yaml.dump(data, text)
+    return f"# Linearised by obsynth from {source}, at the operating point below.\n{text.getvalue()}"

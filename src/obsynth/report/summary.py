@@ -13,7 +13,7 @@ from typing import Any
 from rich.console import Console
 from rich.text import Text
 
-from obsynth.analysis.plausibility import questions
+from obsynth.analysis.structure import questions
 from obsynth.methods.registry import REGISTRY, method_spec
 from obsynth.observers.linear.warm_up import FORGOTTEN, transient
 from obsynth.plants.dae.model import DAEModel

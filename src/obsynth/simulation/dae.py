@@ -12,10 +12,9 @@ from obsynth.errors import SolverError, SpecError
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.covariances import covariance_factor
 from obsynth.plants.dae.checks import checked_inputs, finite_vector, step_length
-from obsynth.plants.dae.functions import Compiled, DAEFunctions
+from obsynth.plants.dae.functions import Compiled, DAEFunctions, take_samples
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.dae.step import ImplicitStep
-from obsynth.plants.dae.stretches import take_samples
 
 #: A step of backward Euler this much shorter than dt puts a state onto its constraint and moves it no further.
 PROJECTION_SHARE = 1e-6

@@ -1,9 +1,12 @@
-"""From a spec file to a plant that a method can use."""
+"""From a spec file to a plant that a method can use.
+
+From the scenario of a document to one that can be simulated.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,15 +15,71 @@ from obsynth.numerics.threads import one_thread_if_small
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.simulation.failures import KINDS
+from obsynth.simulation.parameter_scenario_signals import check_recursive
+from obsynth.simulation.profiles import Profile
+from obsynth.simulation.scenario import Scenario
 from obsynth.spec.checking import DocumentProblems, checked_plant, checked_spec
 from obsynth.spec.documents import read_yaml
 from obsynth.spec.plants import built_plant, linearised, read_value, transformed
-from obsynth.spec.scenarios import built_scenario
 
 if TYPE_CHECKING:
     from obsynth.analysis.transformations import Transformation
     from obsynth.simulation.scenario import Scenario
-    from obsynth.spec.schema import TransformSection
+    from obsynth.spec.schema import ProfileSection, ScenarioSection, TransformSection
+
+
+_GROUPS = ("inputs", "faults", "disturbances", "sensors")
+
+
+def built_scenario(
+    section: ScenarioSection | None, plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel, source: Path
+) -> Scenario | None:
+    """Return the scenario of a spec; `None` if it has none."""
+    if section is None:
+        return None
+    problems = DocumentProblems(source, what="spec")
+    given: dict[str, Any] = {name: getattr(section, name) for name in section.model_fields_set}
+    for group in _GROUPS:
+        given[group] = {
+            name: [_profile(item, f"scenario.{group}.{name}", problems) for item in _listed(value)]
+            for name, value in getattr(section, group).items()
+        }
+    problems.raise_if_any()
+    try:
+        scenario = Scenario(**given)
+        if isinstance(plant, DescriptorSystem):
+            scenario.check_names(plant)
+            scenario.step_of(plant)
+        else:
+            check_recursive(plant, scenario)
+    except SpecError as error:
+        problems.add(f"scenario.{error.path}", str(error))
+        problems.raise_if_any()
+    return scenario
+
+
+def _listed(value: Any) -> list[ProfileSection]:
+    return value if isinstance(value, list) else [value]
+
+
+def _profile(section: ProfileSection, where: str, problems: DocumentProblems) -> Profile | None:
+    """Return the profile; note what is wrong with it."""
+    kind = KINDS[section.kind]
+    given = {name: getattr(section, name) for name in section.model_fields_set - {"kind"}}
+    known = {field.name: field.default is MISSING for field in fields(kind)}
+    for name in sorted(given.keys() - known.keys()):
+        problems.add(f"{where}.{name}", f"a {section.kind} has no {name}: it takes {', '.join(known)}.")
+    missing = [name for name, needed in known.items() if needed and name not in given]
+    for name in missing:
+        problems.add(f"{where}.{name}", f"a {section.kind} needs this key.")
+    if missing or given.keys() - known.keys():
+        return None
+    try:
+        return kind(**given)
+    except SpecError as error:
+        problems.add(f"{where}.{error.path}", str(error))
+        return None
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from pydantic import Field, create_model
 
 from obsynth.methods.method_spec import option_types
 from obsynth.methods.registry import REGISTRY, method_spec
-from obsynth.numerics.value_types import NonNegative, OpenUnitInterval, Positive, WrittenAs
+from obsynth.numerics.arguments import NonNegative, OpenUnitInterval, Positive, WrittenAs
 from obsynth.spec.schema_values import Covariance, Matrix, Section, Text, VaryingCovariance
 
 Two = Annotated[list[float], Field(min_length=2, max_length=2)]

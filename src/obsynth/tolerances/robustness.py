@@ -22,10 +22,8 @@ from obsynth.proofs.affine import AffineMatrix
 from obsynth.results.design import ObserverDesign
 from obsynth.tolerances.error_structure import ErrorStructure, error_structure
 from obsynth.tolerances.exact_plant import is_sampled, moving_at, plant_at
-from obsynth.tolerances.index_one import index_one_on_box
-from obsynth.tolerances.loop import blame, blamed_rows, largest_factor
-from obsynth.tolerances.responses import Responses, loop_radius, responses_of
-from obsynth.tolerances.subdivision import BoxVerdict, proved_stable
+from obsynth.tolerances.responses import Responses, blame, blamed_rows, largest_factor, loop_radius, responses_of
+from obsynth.tolerances.subdivision import BoxVerdict, index_one_on_box, proved_stable
 from obsynth.tolerances.tracking import Tracking, tracking_of
 
 #: A design without tolerances says this.

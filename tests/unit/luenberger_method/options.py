@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 from obsynth.methods.method_spec import MethodOptions
-from obsynth.numerics.value_types import OpenUnitInterval
+from obsynth.numerics.arguments import OpenUnitInterval
 
 
 @dataclass(frozen=True)

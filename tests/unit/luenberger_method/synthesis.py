@@ -8,7 +8,7 @@ import numpy as np
 from luenberger_method.options import LuenbergerOptions
 from obsynth.analysis.conditions import Condition, require_all
 from obsynth.methods.designing import design
-from obsynth.methods.synthesis_result import Synthesis
+from obsynth.methods.method_spec import Synthesis
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import Certificate, ObserverDesign

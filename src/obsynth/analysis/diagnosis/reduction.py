@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from obsynth.numerics.arrays import ComplexArray, FloatArray
-from obsynth.numerics.log_balance import LogBalance
 from obsynth.numerics.ranks import RankDecision, rank_from
+from obsynth.numerics.scaling import LogBalance
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,6 +2,8 @@
 
 *No* is exact on the numbers as written.  *Yes* is exact too, and comes with how far the data are from another answer.
 Where that is no more than what rounding of the data or of any gains can bridge, the answer is *unclear*.
+
+Modes that no output shows: those of the numbers as written, and those that only rounding of the data shows.
 """
 
 from __future__ import annotations
@@ -10,12 +12,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from obsynth.analysis.existence.distance import DROWNED, Distance, distance_to_loss, relative_singular_value
-from obsynth.analysis.existence.numbers import SystemFacts
+from obsynth.analysis.existence.distance import (
+    DROWNED,
+    Distance,
+    distance_to_loss,
+    drowned_zeros,
+    relative_singular_value,
+)
+from obsynth.analysis.existence.numbers import SystemFacts, numbers_of
 from obsynth.analysis.far_zeros import system_zeros
-from obsynth.analysis.zeros import is_outside
+from obsynth.analysis.plant_units import PlantUnits
+from obsynth.analysis.zeros import are_outside, is_outside
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.pencils import finite_zeros
 from obsynth.numerics.ranks import RankDecision
+from obsynth.plants.descriptor import DescriptorSystem
 
 
 def settled_rank(decision: RankDecision, exact_rank: int | None) -> RankDecision:
@@ -34,6 +45,8 @@ def settled_rank(decision: RankDecision, exact_rank: int | None) -> RankDecision
 
 #: Computed data hold more than one rounding: below this distance a zero of theirs is one.
 COMPUTED = 1e-12
+
+
 #: Rounding scatters a multiple zero by up to this, relative to its size or one.
 SCATTER = 1e-2
 
@@ -118,3 +131,34 @@ def unclear_detail(verdict: ZeroVerdict, what: str) -> str:
         f"{DROWNED:.0e}. Data with more digits in other states or units, or an output in which this shows more, would "
         "decide it."
     )
+
+
+@dataclass(frozen=True, eq=False)
+class HiddenModes:
+    """Unobservable modes, the undetectable ones of them, the normal rank of ``[A - z E; C]``, and ranks on the way."""
+
+    modes: tuple[complex, ...]
+    undetectable: tuple[complex, ...]
+    normal_rank: int
+    decisions: tuple[RankDecision, ...]
+
+
+def hidden_modes(plant: DescriptorSystem) -> HiddenModes:
+    """Return the modes that no output shows, decided exactly where the plant is small enough."""
+    plant = plant.dense()
+    tall_e, tall_a = np.vstack([plant.E, np.zeros_like(plant.C)]), np.vstack([plant.A, plant.C])
+    hidden = finite_zeros(tall_e, tall_a)
+    found = [complex(value) for value in hidden.values]
+    outside = are_outside(tall_e, tall_a, hidden, plant.dt)
+    numbers = numbers_of(plant)
+    if numbers is None:
+        undetectable = tuple(value for value, out in zip(found, outside, strict=True) if out)
+        return HiddenModes(tuple(found), undetectable, hidden.normal_rank, hidden.decisions)
+    exact = numbers.system(numbers.zeros(plant.nx, 0), numbers.zeros(plant.ny, 0))
+    exact = believed(exact, tall_e, tall_a, nx=plant.nx)
+    scaled = PlantUnits.of(plant).rounded().scaled_pencil(tall_e, tall_a)
+    drowned = drowned_zeros(*scaled, found, exact.zeros, nx=plant.nx)
+    unstable = {value for value, out in zip(found, outside, strict=True) if out}
+    modes = tuple(sorted((*exact.zeros, *drowned), key=lambda value: (value.real, value.imag)))
+    undetectable = (*exact.outside, *(value for value in drowned if value in unstable))
+    return HiddenModes(modes, undetectable, exact.normal_rank, ())

@@ -15,9 +15,8 @@ import numpy as np
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import RANK_TOLERANCE
-from obsynth.numerics.sparse import csr
+from obsynth.numerics.sparse import Indices, blocks_of, coarse_structure, csr
 from obsynth.numerics.sparse_factor import SparseFactor
-from obsynth.numerics.sparse_structure import Indices, blocks_of, coarse_structure
 from obsynth.plants.descriptor import DescriptorSystem
 
 #: A point without meaning, at which a pencil has its normal rank.

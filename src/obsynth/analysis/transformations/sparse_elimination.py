@@ -13,9 +13,8 @@ from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, RANK_TOLERANCE
 from obsynth.numerics.scaling import power_of_two_below
-from obsynth.numerics.sparse import csr, dense, selection
+from obsynth.numerics.sparse import coarse_structure, components_of, csr, dense, selection
 from obsynth.numerics.sparse_factor import NullVectors, SolutionBounds, SparseFactor
-from obsynth.numerics.sparse_structure import coarse_structure, components_of
 from obsynth.plants.descriptor import DescriptorSystem
 
 #: Points without meaning, at which a pencil has its normal rank.

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import ObsynthError, SpecError
-from obsynth.experiments.alarm_proofs.document import KIND, SCHEMA_VERSION
-from obsynth.experiments.alarm_proofs.proof import Question, statement
+from obsynth.experiments.alarm_proofs.proof import KIND, SCHEMA_VERSION, Question, statement
 from obsynth.files.inputs import read_json
 from obsynth.results.gain_sets import digest_of, loaded, restored
 from obsynth.results.report import Check, VerificationReport

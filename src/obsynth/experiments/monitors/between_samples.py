@@ -26,8 +26,8 @@ import numpy as np
 from obsynth.analysis.transformations import eliminate_algebraic_states
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.continuous import peak_gain
 from obsynth.numerics.holds import first_order_hold
-from obsynth.numerics.peak_gain import peak_gain
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.balls import Ball, block, rounded_up

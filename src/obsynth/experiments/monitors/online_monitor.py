@@ -17,8 +17,7 @@ from obsynth.experiments.monitors.parameter_rules import PARAMETER_KINDS, Parame
 from obsynth.experiments.monitors.residual_model import ResidualModel, residual_model, watches_estimates
 from obsynth.experiments.monitors.residual_monitor import bounds_of, require_options
 from obsynth.experiments.monitors.residual_rules import NormRule, WhitenedRule
-from obsynth.experiments.monitors.thresholds import scaled_inputs
-from obsynth.experiments.monitors.unlimited_horizon import samples_of, unlimited_bound, unlimited_paper
+from obsynth.experiments.monitors.thresholds import samples_of, scaled_inputs, unlimited_bound, unlimited_paper
 from obsynth.experiments.monitors.whitening import cusum_whitener, steady_mean, whitener_of, window_covariance
 from obsynth.numerics.arguments import is_finite_number, require_kind, require_mapping
 from obsynth.numerics.arrays import FloatArray

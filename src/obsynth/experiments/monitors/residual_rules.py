@@ -12,7 +12,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.experiments.monitors.between_samples import InputResponse
 from obsynth.experiments.monitors.online import share_of_look
-from obsynth.experiments.monitors.unlimited_horizon import UnlimitedHorizonBound
+from obsynth.experiments.monitors.thresholds import UnlimitedHorizonBound
 from obsynth.numerics.arrays import FloatArray
 
 #: Share of an interval by which the data's sampling may differ from the one that a threshold is for.

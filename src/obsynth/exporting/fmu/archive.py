@@ -19,12 +19,15 @@ from obsynth.exporting.c_words import c_identifier, comment
 from obsynth.exporting.dae_c_source import dae_c_texts, require_no_sample_time
 from obsynth.exporting.fmu.description import (
     Model,
+    Signals,
     build_description,
+    finite_warm_up,
     fmi2_description,
     fmi3_description,
+    signals_of_dae,
+    signals_of_linear,
     start_values,
 )
-from obsynth.exporting.fmu.variables import Signals, finite_warm_up, signals_of_dae, signals_of_linear
 from obsynth.exporting.realisation import Realisation
 from obsynth.files.outputs import write_atomically
 from obsynth.numerics.arguments import chosen

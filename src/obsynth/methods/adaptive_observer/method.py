@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from obsynth.methods.method_spec import ClaimMeaning, MethodSpec
-from obsynth.methods.recursive.claims import RECURSIVE_CLAIMS
+from obsynth.methods.recursive import RECURSIVE_CLAIMS
 
 CLAIMS = {
     **RECURSIVE_CLAIMS,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar
 
 from obsynth.methods.descriptor_kalman.options import DescriptorKalmanOptions
-from obsynth.numerics.value_types import Count, ForgettingFactor, Probability, WrittenAs
+from obsynth.numerics.arguments import Count, ForgettingFactor, Probability, WrittenAs
 from obsynth.observers.recursive.settings import Form, Guard
 
 

@@ -21,9 +21,9 @@ from collections.abc import Callable
 from obsynth.analysis.conditions import Condition, require_all
 from obsynth.analysis.time_varying import as_time_varying
 from obsynth.methods.adaptive_observer.options import AdaptiveObserverOptions
+from obsynth.methods.method_spec import Synthesis
 from obsynth.methods.recursive.conditions import recursive_conditions
 from obsynth.methods.recursive.synthesis_parts import recursive_synthesis, with_stated_noise
-from obsynth.methods.synthesis_result import Synthesis
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 

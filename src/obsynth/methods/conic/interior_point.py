@@ -18,6 +18,8 @@ factorisation of the order of x, shared by Mehrotra's predictor and corrector.
 Sources: Todd, Toh and Tutuncu, SIAM J. Optim. 8 (1998) 769-796; Andersen, Dahl, Liu and Vandenberghe, "Interior-point
 methods for large-scale cone programming", in Optimization for Machine Learning (2011), whose start we take.  Primal and
 dual steps have lengths of their own.  Nobody believes the numbers that come out: callers judge what is made of them.
+
+The normal equations of an interior-point method, which become ever more singular towards the solution.
 """
 
 from __future__ import annotations
@@ -27,28 +29,92 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from obsynth.methods.conic.normal_equations import NormalEquations
 from obsynth.methods.conic.semidefinite_block import SemidefiniteBlock
 from obsynth.numerics.arrays import FloatArray
 
+#: Relative shifts of the diagonal, tried in turn, that let a matrix through which rounding has made indefinite.
+SHIFTS = (0.0, 1e-15, 1e-14, 1e-13, 1e-12, 1e-11)
+
+
+REFINEMENTS = 2
+
+
+class NormalEquations:
+    """``G'G x = r``, by a Cholesky factorisation in units of the diagonal.
+
+    Fields: columns: The columns of G, as rows: ``(n, m)``.
+    """
+
+    def __init__(self, columns: FloatArray) -> None:
+        from scipy.linalg import cho_factor
+
+        self._columns = columns
+        matrix = columns @ columns.T
+        self._unit = 1.0 / np.sqrt(np.maximum(np.diag(matrix), np.finfo(np.float64).tiny))
+        matrix *= np.outer(self._unit, self._unit)
+        if not np.all(np.isfinite(matrix)):
+            raise np.linalg.LinAlgError("the normal equations are not finite")
+        for shift in SHIFTS:
+            try:
+                self._factor = cho_factor(matrix + shift * np.eye(len(matrix)), overwrite_a=True, check_finite=False)
+                return
+            except np.linalg.LinAlgError:
+                continue
+        raise np.linalg.LinAlgError("the normal equations are not positive definite")
+
+    def solution(self, right: FloatArray) -> FloatArray:
+        """Return the solution ``(n,)``, refined with the columns themselves."""
+        found = np.zeros_like(right)
+        for _ in range(1 + REFINEMENTS):
+            found = found + self._solved(right - self._columns @ (self._columns.T @ found))
+        return found
+
+    def _solved(self, right: FloatArray) -> FloatArray:
+        from scipy.linalg import cho_solve
+
+        return np.asarray(self._unit * cho_solve(self._factor, self._unit * right, check_finite=False))
+
+
 #: Relative gap, and relative residuals of both equations, at which the search ends.
 TOLERANCE = 1e-6
+
+
 #: The gap is relative to the objective, or to this where that is smaller.
 SMALLEST_OBJECTIVE = 1e-2
+
+
 #: What a search that cannot go on must have reached to count as an inaccurate answer.
 INACCURATE_GAP = 1e-2
+
+
 INACCURATE_RESIDUAL = 1e-4
+
+
 #: Multipliers whose equation is met to this accuracy, relative to the objective, show that there is no solution.
 INFEASIBLE_RAY = 1e-8
+
+
 MOST_ITERATIONS = 80
+
+
 #: Steps without coming closer than ever before, after which rounding has the upper hand; only close to the end.
 PATIENCE = 5
+
+
 #: Share of the way to the boundary; the step below which a plain one towards the middle is tried, and this share of the
 #: mean of s z as its target; and the step below which nothing moves any more.
 STEP_SHARE = 0.98
+
+
 SHORT_STEP = 0.1
+
+
 CENTRING = 0.5
+
+
 SHORTEST_STEP = 1e-4
+
+
 #: Distance to the boundary, relative to the size, below which a starting point is moved inside.
 START_MARGIN = 1e-8
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal, TypeAlias
 
 from obsynth.methods.method_spec import MethodOptions
-from obsynth.numerics.value_types import Count, ForgettingFactor, Positive, WrittenAs
+from obsynth.numerics.arguments import Count, ForgettingFactor, Positive, WrittenAs
 from obsynth.observers.dae.settings import Form, Guard, Weight
 from obsynth.observers.outliers import Outliers
 

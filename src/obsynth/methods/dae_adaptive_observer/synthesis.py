@@ -25,9 +25,8 @@ import numpy as np
 from obsynth.analysis.conditions import Condition, require_all
 from obsynth.methods.dae_adaptive_observer.conditions import dae_conditions
 from obsynth.methods.dae_adaptive_observer.options import DaeAdaptiveObserverOptions
-from obsynth.methods.synthesis_result import Synthesis
-from obsynth.observers.dae.building import dae_observer_from_options, resolved_options
-from obsynth.observers.dae.integration import LARGEST_TURN, largest_turn
+from obsynth.methods.method_spec import Synthesis
+from obsynth.observers.dae.building import LARGEST_TURN, dae_observer_from_options, largest_turn, resolved_options
 from obsynth.observers.dae.nominal_run import NOMINAL_STEPS, DAEFacts, dae_facts
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.dae.steps import PROJECTION_NOTICE

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar
 
 from obsynth.methods.method_spec import MethodOptions
-from obsynth.numerics.value_types import Positive, WrittenAs
+from obsynth.numerics.arguments import Positive, WrittenAs
 from obsynth.observers.outliers import Outliers
 
 

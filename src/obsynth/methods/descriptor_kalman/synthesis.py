@@ -24,9 +24,9 @@ from obsynth.analysis.time_varying import as_time_varying
 from obsynth.errors import SpecError
 from obsynth.methods.descriptor_kalman.options import DescriptorKalmanOptions
 from obsynth.methods.descriptor_kalman.unknown_inputs import without_unknown_inputs
+from obsynth.methods.method_spec import Synthesis
 from obsynth.methods.recursive.conditions import recursive_conditions
 from obsynth.methods.recursive.synthesis_parts import recursive_synthesis, with_stated_noise
-from obsynth.methods.synthesis_result import Synthesis
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 

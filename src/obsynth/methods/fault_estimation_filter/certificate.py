@@ -12,7 +12,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.norms import balancing_factors, output_covariance
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.verification.bounded_real import prove_bounded_real
+from obsynth.verification.certificates import prove_bounded_real
 from obsynth.verification.error_system import ErrorSystem
 
 #: Levels, relative to the claimed one, at which coordinates are improved on the way to it.

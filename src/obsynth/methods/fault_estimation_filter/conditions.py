@@ -18,8 +18,10 @@ from obsynth.analysis.existence.verdicts import described_distance, settled_rank
 from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.zeros import Zero, fault_zeros, hidden_direction, leading_names, system_pencil, zero_at
 from obsynth.errors import PreconditionError
-from obsynth.methods.fault_estimation_filter.detectability_indexes import detectability_conditions
-from obsynth.methods.fault_estimation_filter.exact_indexes import numbers_with_fault_states
+from obsynth.methods.fault_estimation_filter.detectability_indexes import (
+    detectability_conditions,
+    numbers_with_fault_states,
+)
 from obsynth.methods.fault_estimation_filter.prepared_plant import PreparedPlant, prepare, with_sensor_faults_as_states
 from obsynth.numerics.pencils import PencilStructure, regularity
 from obsynth.numerics.ranks import decide_rank

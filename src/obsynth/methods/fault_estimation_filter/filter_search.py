@@ -1,4 +1,7 @@
-"""The search for the gains of a fault-estimation filter: the least gain, the one to ship, and small gains for it."""
+"""The search for the gains of a fault-estimation filter: the least gain, the one to ship, and small gains for it.
+
+The least gain by bisection: the paper's Algorithm 1, made to end.
+"""
 
 from __future__ import annotations
 
@@ -9,26 +12,87 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SolverError
-from obsynth.methods.fault_estimation_filter import inequality_search
-from obsynth.methods.fault_estimation_filter.gamma_bisection import search_by_bisection
+from obsynth.methods.fault_estimation_filter import inequality_search, inequality_solutions
+from obsynth.methods.fault_estimation_filter.central_filter import central_filter_at
 from obsynth.methods.fault_estimation_filter.gamma_lower_bound import require_reachable
+from obsynth.methods.fault_estimation_filter.inequality_search import LeastGain, coordinates
 from obsynth.methods.fault_estimation_filter.injection_problem import GainProblem, Injection, WeightLimit
 from obsynth.methods.fault_estimation_filter.options import FilterOptions
 from obsynth.methods.fault_estimation_filter.small_gains import small_gain_design
 
+#: The bracket ends at this share of the width asked for: the filter in hand is at its upper end.
+BRACKET_SHARE = 0.1
+
+
+def bisected_gain(
+    problem: GainProblem, start: Injection, *, tolerance: float, solver: str, polish: bool
+) -> tuple[float, float, Injection, list[dict[str, Any]]]:
+    """Return ``(high, low, gains, records)``: the final bracket of a bisection on the gain, and the best filter.
+
+    Algorithm 1 of the paper, made to end: every upper end of the bracket is the true norm of a filter in hand, and
+    the lower end is a level at which none was found.
+    """
+    best, high, low = start, problem.achieved_gain(start), 0.0
+    records = []
+    while high - low > BRACKET_SHARE * tolerance * high:
+        middle = 0.5 * (low + high)
+        better = central_filter_at(problem, middle)
+        if better is None and polish:
+            found = inequality_solutions.feasible_point(problem, middle, solver=solver)
+            better = None if found is None else found.injection
+            records += [] if found is None else [found.record]
+        if better is None:
+            low = middle
+        else:
+            best, high = better, min(middle, problem.achieved_gain(better))
+    return high, low, best, records
+
+
+def search_by_bisection(problem: GainProblem, *, tolerance: float, solver: str, polish: bool = True) -> LeastGain:
+    """Minimise the gain by bisection (the paper's Algorithm 1, made to end)."""
+    normalised = coordinates(problem, solver=solver)
+    gain = normalised.start_gain
+    if problem.measured == 0 or gain == 0.0:
+        return LeastGain(gain, normalised, normalised.start, gain, (gain, gain))
+    start = normalised.contracted(normalised.start)
+    high, low, found, records = bisected_gain(
+        normalised.problem, start, tolerance=tolerance, solver=solver, polish=polish
+    )
+    injection = normalised.restore(found)
+    return LeastGain(
+        problem.achieved_gain(injection),
+        normalised,
+        injection,
+        gain,
+        (low * normalised.gain, high * normalised.gain),
+        records,
+    )
+
+
 #: Asking for a gain above this multiple of the starting filter's adds nothing but bad scaling.
 LARGEST_USEFUL_GAIN = 1e3
+
+
 #: The gains are designed for a slightly smaller gamma than claimed, so that the claim has a well-conditioned proof.
 CERTIFICATE_MARGIN = 5e-3
+
+
 CERTIFICATE_SHARE = 0.2
+
+
 #: Gains below this, relative to the disturbance and the output it could reach, are rounding errors.
 ROUNDING_GAIN = 1e-11
+
+
 #: Level of the certificate, relative to the same, when no disturbance reaches the fault estimate at all.
 NOMINAL_GAIN = 1e-3
+
 
 #: A gamma between these multiples of the least gain found by the equations calls the inequality by default, up to so
 #: many states: far below the least no polish helps, and far above none is needed.
 BELOW_LEAST, ABOVE_LEAST = 0.95, 1.0 + 1e-4
+
+
 MOST_STATES_TO_POLISH = 64
 
 

@@ -20,7 +20,7 @@ from obsynth.methods.fault_estimation_filter.detectability_indexes import FaultD
 from obsynth.methods.fault_estimation_filter.notes import notes
 from obsynth.methods.fault_estimation_filter.prepared_plant import prepare, with_sensor_faults_as_states
 from obsynth.methods.fault_estimation_filter.realisation import realise_filter
-from obsynth.methods.synthesis_result import Synthesis
+from obsynth.methods.method_spec import Synthesis
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.ranks import decide_rank
 from obsynth.plants.descriptor import DescriptorSystem

@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from annotated_types import Ge
 
 from obsynth.methods.method_spec import MethodOptions
-from obsynth.numerics.value_types import Count, OpenUnitInterval, Positive, WrittenAs
+from obsynth.numerics.arguments import Count, OpenUnitInterval, Positive, WrittenAs
 
 #: The least relative distance to the optimum at which a proof can be expected: less leaves no room for one.
 LEAST_MARGIN = 1e-2

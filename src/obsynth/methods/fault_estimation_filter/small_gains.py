@@ -18,8 +18,7 @@ from obsynth.methods.fault_estimation_filter.central_filter import (
 )
 from obsynth.methods.fault_estimation_filter.inequality_search import LeastGain
 from obsynth.methods.fault_estimation_filter.injection_problem import GainProblem, Injection
-from obsynth.methods.fault_estimation_filter.second_stage_goal import Goal, radius
-from obsynth.methods.fault_estimation_filter.small_gains_by_inequality import gains_by_inequality
+from obsynth.methods.fault_estimation_filter.small_gains_by_inequality import Goal, gains_by_inequality, radius
 
 #: The error shall be forgotten at least this fast (spectral radius), or half as fast as the starting filter does: the
 #: smallest gains alone would leave an observable mode at the very edge of stability.

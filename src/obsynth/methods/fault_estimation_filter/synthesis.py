@@ -35,7 +35,7 @@ from obsynth.methods.fault_estimation_filter.notes import notes
 from obsynth.methods.fault_estimation_filter.options import FilterOptions
 from obsynth.methods.fault_estimation_filter.prepared_plant import PreparedPlant, prepare
 from obsynth.methods.fault_estimation_filter.realisation import realise_filter
-from obsynth.methods.synthesis_result import Synthesis
+from obsynth.methods.method_spec import Synthesis
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.observers.linear.averaging import averaged
 from obsynth.plants.descriptor import DescriptorSystem

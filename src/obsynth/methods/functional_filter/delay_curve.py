@@ -11,8 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from obsynth.errors import ObsynthError
-from obsynth.methods.functional_filter.filter_model import filter_model
-from obsynth.methods.functional_filter.kalman_gain import kalman_gain
+from obsynth.methods.functional_filter.kalman_gain import filter_model, kalman_gain
 from obsynth.methods.functional_filter.rates import default_rates, settling_time
 from obsynth.methods.riccati import riccati_solution
 from obsynth.numerics.arrays import FloatArray

@@ -11,9 +11,8 @@ from annotated_types import Ge
 
 from obsynth.errors import SpecError
 from obsynth.methods.method_spec import MethodOptions
-from obsynth.numerics.arguments import is_finite_number
+from obsynth.numerics.arguments import Count, NonNegative, WrittenAs, is_finite_number
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.value_types import Count, NonNegative, WrittenAs
 from obsynth.plants.descriptor import DescriptorSystem
 
 #: What residuals may be asked for by one word.

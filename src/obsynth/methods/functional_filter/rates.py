@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from obsynth.errors import SolverError
-from obsynth.methods.functional_filter.filter_model import FilterModel
-from obsynth.methods.functional_filter.kalman_gain import KalmanGain, kalman_gain
+from obsynth.methods.functional_filter.kalman_gain import FilterModel, KalmanGain, kalman_gain
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.spectra import speeds

@@ -17,8 +17,7 @@ from functools import reduce
 import numpy as np
 from scipy.linalg import block_diag
 
-from obsynth.methods.functional_filter.filter_model import FilterModel
-from obsynth.methods.functional_filter.kalman_gain import KalmanGain
+from obsynth.methods.functional_filter.kalman_gain import FilterModel, KalmanGain
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem

@@ -18,16 +18,21 @@ import numpy as np
 from obsynth.analysis.conditions import Condition
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.methods.functional_filter.conditions import conditions
-from obsynth.methods.functional_filter.deviations import estimate_deviations
-from obsynth.methods.functional_filter.filter_model import FilterModel, filter_model
-from obsynth.methods.functional_filter.kalman_gain import KalmanGain, kalman_gain, require_noise, whitening
+from obsynth.methods.functional_filter.kalman_gain import (
+    FilterModel,
+    KalmanGain,
+    filter_model,
+    kalman_gain,
+    require_noise,
+    whitening,
+)
 from obsynth.methods.functional_filter.options import FunctionalFilterOptions
 from obsynth.methods.functional_filter.rates import default_rates, settling_time
 from obsynth.methods.functional_filter.realisation import FilterPart, assembled, filter_part
-from obsynth.methods.functional_filter.tracking import tracking_map
-from obsynth.methods.lyapunov import lyapunov_factor
+from obsynth.methods.functional_filter.tracking import estimate_deviations, tracking_map
+from obsynth.methods.method_spec import Synthesis
 from obsynth.methods.placement.eigenstructure import place
-from obsynth.methods.synthesis_result import Synthesis
+from obsynth.methods.riccati import lyapunov_factor
 from obsynth.methods.ui_pi_observer.options import checked_poles, plain
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.spectra import decay_rates, eigenvalues

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from obsynth.methods.pd_observer.checks.inequality import prove_gain
+from obsynth.methods.pd_observer.checks.certificate import prove_gain
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import spectral_abscissa
 from obsynth.proofs.balls import Ball

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.errors import InfeasibleError, SolverError
-from obsynth.methods.pd_observer.augmentation import with_faults_as_states, with_sensor_noise
 from obsynth.methods.pd_observer.checks.error_system import PdErrorSystem
 from obsynth.methods.pd_observer.gain_search import gains_for
 from obsynth.methods.pd_observer.gains import PdGains
 from obsynth.methods.pd_observer.options import PdOptions
+from obsynth.methods.pd_observer.realisation import with_faults_as_states, with_sensor_noise
 from obsynth.numerics.continuous import spectral_abscissa
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.delta_scan import DeltaScan

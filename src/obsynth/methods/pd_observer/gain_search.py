@@ -11,11 +11,11 @@ import numpy as np
 from obsynth.analysis.plant_units import FAR_UNITS, PlantUnits
 from obsynth.analysis.structure import analyse_structure
 from obsynth.errors import InfeasibleError, SolverError
-from obsynth.methods.pd_observer.augmentation import with_faults_as_states, with_sensor_noise
 from obsynth.methods.pd_observer.gains import PdGains, certified
 from obsynth.methods.pd_observer.inequalities import PdSolution, PdTask, solve
 from obsynth.methods.pd_observer.limits import default_delta, fastest_mode, require_possible
 from obsynth.methods.pd_observer.options import PdOptions
+from obsynth.methods.pd_observer.realisation import with_faults_as_states, with_sensor_noise
 from obsynth.methods.pd_observer.reduced_inequality import closed_form, reduced_lmi
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem

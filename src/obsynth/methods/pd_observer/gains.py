@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.methods.pd_observer.augmentation import with_faults_as_states, with_sensor_noise
 from obsynth.methods.pd_observer.certificate import explicit_certificate, gain_certificate
-from obsynth.methods.pd_observer.checks.certificate import GAIN_CLAIMS
-from obsynth.methods.pd_observer.checks.inequality import (
+from obsynth.methods.pd_observer.checks.certificate import (
+    GAIN_CLAIMS,
     error_inputs,
     prove_gains,
     prove_shipped_stability,
@@ -19,7 +18,7 @@ from obsynth.methods.pd_observer.checks.inequality import (
 )
 from obsynth.methods.pd_observer.inequalities import PdSolution
 from obsynth.methods.pd_observer.options import PdOptions
-from obsynth.methods.pd_observer.realisation import realise_pd_observer
+from obsynth.methods.pd_observer.realisation import realise_pd_observer, with_faults_as_states, with_sensor_noise
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import spectral_abscissa
 from obsynth.observers.linear.observer import LinearObserver

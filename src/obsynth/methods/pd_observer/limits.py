@@ -8,8 +8,8 @@ import numpy as np
 
 from obsynth.analysis.structure import analyse_structure
 from obsynth.errors import InfeasibleError
-from obsynth.methods.pd_observer.augmentation import with_sensor_noise
 from obsynth.methods.pd_observer.options import PdOptions
+from obsynth.methods.pd_observer.realisation import with_sensor_noise
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import NEGLIGIBLE_MODE, decide_rank
 from obsynth.numerics.scaling import equilibrate_pencil

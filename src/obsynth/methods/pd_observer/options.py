@@ -10,9 +10,9 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.methods.method_spec import MethodOptions
+from obsynth.numerics.arguments import NonNegative, Positive, WrittenAs
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.ranks import decide_rank
-from obsynth.numerics.value_types import NonNegative, Positive, WrittenAs
 
 #: Engines for stability and a decay rate alone.
 ENGINES_OF_STABILITY = ("reduced-lmi", "riccati")

@@ -29,15 +29,14 @@ import numpy as np
 from obsynth.analysis.conditions import Condition, require_all
 from obsynth.analysis.existence.numbers import decided
 from obsynth.errors import SpecError
-from obsynth.methods.pd_observer.augmentation import with_faults_as_states
+from obsynth.methods.method_spec import Synthesis
 from obsynth.methods.pd_observer.certificate import explicit_certificate
 from obsynth.methods.pd_observer.conditions import explicit_form, pd_observer_conditions
 from obsynth.methods.pd_observer.delta_scan import scan_delta
 from obsynth.methods.pd_observer.gain_search import design_gains
 from obsynth.methods.pd_observer.gains import PdGains
 from obsynth.methods.pd_observer.options import PdOptions, checked_adaptation_gain
-from obsynth.methods.pd_observer.realisation import realise_pd_observer
-from obsynth.methods.synthesis_result import Synthesis
+from obsynth.methods.pd_observer.realisation import realise_pd_observer, with_faults_as_states
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem

@@ -1,1 +1,16 @@
-"""What the recursive methods share: conditions, synthesis, checks."""
+"""What the recursive methods share: conditions, synthesis, checks.
+
+The claims that recursive methods share.
+"""
+
+from __future__ import annotations
+
+from obsynth.methods.method_spec import ClaimMeaning
+
+RECURSIVE_CLAIMS = {
+    "condition": ClaimMeaning("", "largest condition number of [E_k; C_k]", "claims"),
+    "condition_k": ClaimMeaning("samples", "step at which it is", "claims"),
+    "residual_directions": ClaimMeaning("", "least rank E_k + ny - nx: what the literal form (18) sees", "claims"),
+    "contraction": ClaimMeaning("", "mean factor per step by which an error shrinks", "claims"),
+    "steps": ClaimMeaning("samples", "steps that were looked at", "claims"),
+}

@@ -10,8 +10,8 @@ import numpy as np
 from obsynth.analysis.time_varying import WARN_CONDITION, HorizonRanks, horizon_ranks
 from obsynth.analysis.zeros import leading_names
 from obsynth.errors import PreconditionError, SpecError
+from obsynth.methods.method_spec import Synthesis
 from obsynth.methods.recursive.steady_filter import reached_condition
-from obsynth.methods.synthesis_result import Synthesis
 from obsynth.numerics.covariances import covariance_factor
 from obsynth.observers.recursive.building import observer_from_options, plain_options
 from obsynth.observers.recursive.gain_schedule_summary import (

@@ -33,8 +33,12 @@ from obsynth.methods.ui_pi_observer.decoupling_condition import (
     decoupling_rank,
     disturbance_rank,
 )
-from obsynth.methods.ui_pi_observer.exact_fault_model import exact_drops
-from obsynth.methods.ui_pi_observer.fault_model_condition import lost_in_rounding, model_conditions, order_conditions
+from obsynth.methods.ui_pi_observer.fault_model_condition import (
+    exact_drops,
+    lost_in_rounding,
+    model_conditions,
+    order_conditions,
+)
 from obsynth.methods.ui_pi_observer.pencils import (
     MOST_NAMES,
     in_disturbances,

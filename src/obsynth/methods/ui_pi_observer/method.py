@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from obsynth.methods.method_spec import ClaimMeaning, MethodSpec
-from obsynth.verification.closed_claims import STATED
+from obsynth.verification.claims import STATED
 
 CLAIMS = {
     "decay": ClaimMeaning("1/s", "rate of the slowest pole: every error decays at least like this in the end", "decay"),

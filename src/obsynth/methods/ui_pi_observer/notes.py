@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from obsynth.analysis.conditions import Condition
-from obsynth.methods.placement.compromise import NOISE_PRICE
+from obsynth.methods.placement.kalman import NOISE_PRICE
 from obsynth.methods.ui_pi_observer.options import UiPiOptions
 from obsynth.methods.ui_pi_observer.pencils import numbers
 from obsynth.methods.ui_pi_observer.placement_problem import PlacementProblem

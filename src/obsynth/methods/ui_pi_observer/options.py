@@ -11,10 +11,10 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.methods.method_spec import MethodOptions
 from obsynth.methods.placement.region import Region
-from obsynth.methods.ui_pi_observer.noise import NoiseWeights
+from obsynth.methods.ui_pi_observer.placement_problem import NoiseWeights
+from obsynth.numerics.arguments import NonNegative, Positive, WrittenAs, problem_with
 from obsynth.numerics.arrays import ComplexArray
 from obsynth.numerics.spectra import decay_rates
-from obsynth.numerics.value_types import NonNegative, Positive, WrittenAs, problem_with
 from obsynth.plants.exosystems import Exosystem
 from obsynth.plants.fault_models import FaultModel
 

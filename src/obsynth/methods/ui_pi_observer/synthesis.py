@@ -26,18 +26,22 @@ from obsynth.analysis.conditions import Condition, require_all
 from obsynth.analysis.existence.numbers import decided
 from obsynth.analysis.zeros import is_outside
 from obsynth.errors import PreconditionError, SolverError, SpecError
-from obsynth.methods.lyapunov import lyapunov_factor
-from obsynth.methods.placement.compromise import compromise
+from obsynth.methods.method_spec import Synthesis
 from obsynth.methods.placement.eigenstructure import place
-from obsynth.methods.placement.kalman import KalmanProblem
+from obsynth.methods.placement.kalman import KalmanProblem, compromise
 from obsynth.methods.placement.region import Region, region_gain
-from obsynth.methods.synthesis_result import Synthesis
+from obsynth.methods.riccati import lyapunov_factor
 from obsynth.methods.ui_pi_observer.conditions import existence
-from obsynth.methods.ui_pi_observer.noise import NoiseWeights, kalman_problem
 from obsynth.methods.ui_pi_observer.notes import elimination_note, fixed_mode_notes, slow_note
 from obsynth.methods.ui_pi_observer.options import UiPiOptions, checked_poles, plain
 from obsynth.methods.ui_pi_observer.pencils import number
-from obsynth.methods.ui_pi_observer.placement_problem import PlacementProblem, placement_problem, with_faults
+from obsynth.methods.ui_pi_observer.placement_problem import (
+    NoiseWeights,
+    PlacementProblem,
+    kalman_problem,
+    placement_problem,
+    with_faults,
+)
 from obsynth.methods.ui_pi_observer.realisation import ObserverGains, combinations_seen, realise
 from obsynth.numerics.arrays import ComplexArray, FloatArray, as_matrix
 from obsynth.numerics.spectra import abscissa, certain_noise_covariance, decay_rates, eigenvalues

@@ -18,7 +18,7 @@ from obsynth.observers.dae.step_graph import ObserverGraph
 from obsynth.observers.dae.steps import PROJECTION_NOTICE, PROJECTION_SHARE, Steps
 from obsynth.plants.dae import step as implicit_step
 from obsynth.plants.dae.functions import DAEFunctions
-from obsynth.plants.dae.step_graph import step_graph
+from obsynth.plants.dae.step import step_graph
 
 #: What ``record.c`` hands out of a batch, in this order.
 BATCH_PARTS = ("posterior", "theta", "spread", "innovation", "nis", "residual")

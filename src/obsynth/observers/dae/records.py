@@ -12,8 +12,7 @@ from obsynth.observers.dae.compiled_library import DAELibrary
 from obsynth.observers.dae.estimates import DAEEstimates, DAERow, GatheredRows
 from obsynth.observers.dae.steps import DAEState, Steps
 from obsynth.observers.progress import shown_progress
-from obsynth.plants.dae.functions import Compiled
-from obsynth.plants.dae.stretches import take_samples
+from obsynth.plants.dae.functions import Compiled, take_samples
 
 #: Samples in one call of the C: a tenth of a second or less, so that progress shows and memory stays small.
 SAMPLES_PER_CALL = 10_000

@@ -9,9 +9,9 @@ from typing import Any, Literal, Self, TypeAlias
 import numpy as np
 
 from obsynth.errors import SpecError
+from obsynth.numerics.arguments import Count, ForgettingFactor, Positive, checked_value
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.covariances import covariance_factor, is_definite
-from obsynth.numerics.value_types import Count, ForgettingFactor, Positive, checked_value
 from obsynth.observers.outliers import Outliers, checked_limit
 from obsynth.plants.dae.checks import finite_vector, step_length
 from obsynth.plants.dae.model import DAEModel

@@ -14,7 +14,7 @@ import numpy as np
 from obsynth.numerics.symbolic_solve import definite_solved
 from obsynth.observers.dae.memory_layout import Layout, memory_layout, row_layout
 from obsynth.plants.dae.functions import DAEFunctions
-from obsynth.plants.dae.step_graph import StepGraph, step_graph
+from obsynth.plants.dae.step import StepGraph, step_graph
 
 if TYPE_CHECKING:
     from obsynth.observers.dae.settings import DAESettings

@@ -15,8 +15,8 @@ from obsynth.numerics.arguments import real_array
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.least_squares_step import least_squares_step, rank_revealing_step
 from obsynth.numerics.recursive_least_squares import update
-from obsynth.observers.recursive.literal_form import posterior_residual
 from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.recursive.parameter_steps import posterior_residual
 from obsynth.observers.recursive.records import require_horizon
 from obsynth.observers.recursive.step_model import EarlyConstraintSteps, StepMatrices, require_in_range
 

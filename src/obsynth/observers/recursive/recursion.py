@@ -19,14 +19,17 @@ from obsynth.numerics.least_squares_step import (
 from obsynth.numerics.recursive_least_squares import ParameterState, start_of, update
 from obsynth.observers.outliers import checked_limit, no_refusals, robust_advance
 from obsynth.observers.recursive.estimates import UNDETERMINED_SHARE
-from obsynth.observers.recursive.literal_form import posterior_residual
-from obsynth.observers.recursive.parameter_reset import ParameterReset
-from obsynth.observers.recursive.prepared_step import PreparedStep
-from obsynth.observers.recursive.random_walk_parameters import RandomWalkParameterSteps, WalkingEarlySteps
+from obsynth.observers.recursive.parameter_steps import (
+    ParameterReset,
+    RandomWalkParameterSteps,
+    WalkingEarlySteps,
+    posterior_residual,
+)
 from obsynth.observers.recursive.settings import RecursiveSettings
 from obsynth.observers.recursive.step_model import (
     EarlyConstraintSteps,
     PlantSteps,
+    PreparedStep,
     StepMatrices,
     StepModel,
     require_in_range,

@@ -9,10 +9,9 @@ from typing import Any, Literal, Self, TypeAlias
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import real_vector, truth
+from obsynth.numerics.arguments import Count, ForgettingFactor, Probability, checked_value, real_vector, truth
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.covariances import covariance_factor
-from obsynth.numerics.value_types import Count, ForgettingFactor, Probability, checked_value
 from obsynth.observers.outliers import Outliers, checked_limit
 from obsynth.plants.sequences import MatrixSequence
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem

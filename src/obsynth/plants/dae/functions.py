@@ -1,7 +1,11 @@
-"""Compiled evaluation of a DAE: the residual of one implicit step and the outputs, with exact derivatives."""
+"""Compiled evaluation of a DAE: the residual of one implicit step and the outputs, with exact derivatives.
+
+Many samples in one call, and single samples where such a call cannot go on.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,6 +16,8 @@ from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.dae.symbols import DAESymbols, symbols_of
 
 _ROOT = np.sqrt(6.0)
+
+
 #: Butcher matrices of the implicit methods whose last stage is the result (stiffly accurate).
 BUTCHER: dict[str, FloatArray] = {
     "backward-euler": np.array([[1.0]]),
@@ -119,3 +125,24 @@ def _stage_equations(symbols: DAESymbols, stages: Any, start: Any, dt: Any, weig
         rows.append(ca.substitute(symbols.equations, ca.vertcat(symbols.x, symbols.rates),
                                   ca.vertcat(stages[:, i], rates)))  # fmt: skip
     return ca.vertcat(*rows)
+
+
+#: Samples in one call.  After a sample that had to be taken by itself the shorter stretch is tried first: hard samples
+#: come together, and what follows one inside a stretch is lost.
+STRETCHES = (16, 256)
+
+
+def take_samples(
+    first: int, samples: int, together: Callable[[int, int], int], alone: Callable[[int], object],
+    note: Callable[[int], object] = bool,
+) -> None:  # fmt: skip
+    """Go through samples in stretches."""
+    k, allowed = first, STRETCHES[-1]
+    while k < samples:
+        length = next((size for size in reversed(STRETCHES) if size <= min(allowed, samples - k)), 0)
+        taken = together(k, length) if length else 0
+        k, allowed = k + taken, STRETCHES[-1] if length == 0 or taken == length else STRETCHES[0]
+        if taken < max(length, 1):
+            alone(k)
+            k += 1
+        note(k)

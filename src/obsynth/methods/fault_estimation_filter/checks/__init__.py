@@ -11,8 +11,7 @@ import numpy as np
 
 from obsynth.errors import PreconditionError
 from obsynth.methods.fault_estimation_filter.checks.faults import fault_rows
-from obsynth.methods.fault_estimation_filter.checks.gains import gain_rows, gains_fit
-from obsynth.methods.fault_estimation_filter.checks.printed_gains import printed_allowances
+from obsynth.methods.fault_estimation_filter.checks.gains import gain_rows, gains_fit, printed_allowances
 from obsynth.methods.fault_estimation_filter.checks.realisation import Equations
 from obsynth.methods.fault_estimation_filter.conditions import fault_filter_conditions
 from obsynth.methods.fault_estimation_filter.prepared_plant import with_sensor_faults_as_states
@@ -26,7 +25,7 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
 from obsynth.results.report import Check, information, upper_bound_check
-from obsynth.verification.bounded_real import prove_bounded_real
+from obsynth.verification.certificates import prove_bounded_real
 from obsynth.verification.claims import UNCERTAIN, claim_rows, claimed, recovery_rows
 from obsynth.verification.error_system import ErrorSystem, LaggedPlant
 from obsynth.verification.identities import equality, tracking_identities

@@ -1,4 +1,7 @@
-"""Checks of a functional filter, from the plant, the shipped realisation and T, T0 alone."""
+"""Checks of a functional filter, from the plant, the shipped realisation and T, T0 alone.
+
+Deviations of the estimates, recomputed from the shipped realisation and the stated noise.
+"""
 
 from __future__ import annotations
 
@@ -7,26 +10,61 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from obsynth.methods.functional_filter.checks.leaks import leak_rows
-from obsynth.methods.functional_filter.checks.noise import noise_rows
 from obsynth.methods.functional_filter.conditions import conditions
-from obsynth.methods.functional_filter.tracking import wanted_faults
+from obsynth.methods.functional_filter.tracking import estimate_deviations, wanted_faults
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.scaling import balance_by_least_squares
 from obsynth.numerics.spectra import decay_rates, eigenvalues
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.exosystems import Exosystem
-from obsynth.plants.fault_model_spectra import stated_eigenvalues
+from obsynth.plants.fault_models import stated_eigenvalues
 from obsynth.results.design import ObserverDesign
-from obsynth.results.report import Check, lower_bound_check, upper_bound_check
+from obsynth.results.report import Check, information, lower_bound_check, upper_bound_check
+from obsynth.verification.certificates import prove_stable
 from obsynth.verification.identities import Identity, equality, relative_tolerance
-from obsynth.verification.lyapunov import prove_stable
 from obsynth.verification.plant import condition_rows, plant_information
 from obsynth.verification.remainder_channel import TrackedPlant
 
+#: Claimed deviations may be missed by this share: two ways through a Lyapunov equation.
+DEVIATION_TOLERANCE = 1e-4
+
+
+def noise_rows(design: ObserverDesign) -> Iterator[Check]:
+    """Yield, for each estimate, the deviation that noise causes, and that of its error with the stated walk."""
+    (plant, observer), matrices = design.linear, design.certificate.matrices
+    if not plant.nw or not observer.fault_names:
+        return
+    found = estimate_deviations(plant, observer, matrices)
+    unit = "" if plant.dt > 0.0 else " (for a sample time of 1 s, times its root for others)"
+    for name, (alone, total), (claimed, claimed_total) in zip(
+        observer.fault_names, found, matrices["deviations"], strict=True
+    ):
+        if np.isnan(alone):
+            yield information(
+                f"noise in fhat[{name}]", "standard deviation under the stated noise", alone,
+                source="recomputed, Lyapunov equation", detail="all digits are rounding",
+            )  # fmt: skip
+            continue
+        yield upper_bound_check(
+            f"noise in fhat[{name}]", f"standard deviation under the stated noise is at most the claimed one{unit}",
+            float(alone), float(claimed) * (1.0 + DEVIATION_TOLERANCE), source="recomputed, Lyapunov equation",
+        )  # fmt: skip
+        if np.isfinite(total) and matrices["walks"].any():
+            yield upper_bound_check(
+                f"error of fhat[{name}]", f"standard deviation of the error with the walk of the fault{unit}",
+                float(total), float(claimed_total) * (1.0 + DEVIATION_TOLERANCE),
+                source="recomputed, Lyapunov equation",
+            )  # fmt: skip
+
+
 _MATRICES = ("T", "T0", "Phi", "Cw", "walks", "stability", "tracking", "deviations")
+
+
 #: A claimed rate may be missed by this share.
 RATE_TOLERANCE = 1e-4
+
+
 _SOURCE = "identities of the error z - T E x, ours"
 
 

@@ -12,11 +12,10 @@ from dataclasses import replace
 import numpy as np
 
 from obsynth.analysis.plant_units import PlantUnits
-from obsynth.methods.pd_observer.augmentation import with_faults_as_states, with_sensor_noise
 from obsynth.methods.pd_observer.checks.certificate import fitting_claims, proof_rows, stacked_gains
-from obsynth.methods.pd_observer.checks.error_system import PdErrorSystem
-from obsynth.methods.pd_observer.checks.norms import norm_rows
+from obsynth.methods.pd_observer.checks.error_system import PdErrorSystem, norm_rows
 from obsynth.methods.pd_observer.conditions import pd_observer_conditions
+from obsynth.methods.pd_observer.realisation import with_faults_as_states, with_sensor_noise
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import spectral_abscissa
 from obsynth.numerics.pencils import pencil_structure

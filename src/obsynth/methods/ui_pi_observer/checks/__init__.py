@@ -20,7 +20,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.exosystems import Exosystem
-from obsynth.plants.fault_model_spectra import stated_eigenvalues
+from obsynth.plants.fault_models import stated_eigenvalues
 from obsynth.results.design import ObserverDesign
 from obsynth.results.report import Check, information, upper_bound_check
 from obsynth.verification.identities import Residual, equality, relative_tolerance, residual

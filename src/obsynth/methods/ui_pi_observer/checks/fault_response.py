@@ -26,7 +26,7 @@ from obsynth.numerics.ranks import NEGLIGIBLE_INPUT
 from obsynth.numerics.spectra import abscissa, boundary_points, decay_rates, eigenvalues, response
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.fault_model_spectra import balanced_transition
+from obsynth.plants.fault_models import balanced_transition
 from obsynth.results.report import Check, information
 from obsynth.verification.error_system import ErrorSystem
 

@@ -21,8 +21,8 @@ from obsynth.numerics.spectra import (
 from obsynth.proofs.contraction import prove_contraction
 from obsynth.results.design import ObserverDesign
 from obsynth.results.report import Check, information, upper_bound_check
+from obsynth.verification.certificates import prove_stable
 from obsynth.verification.claims import UNCERTAIN
-from obsynth.verification.lyapunov import prove_stable
 
 #: Recomputed poles may miss the claimed ones by this, relative to their size; claimed rates and norms likewise.
 SPECTRUM_TOLERANCE = 1e-4

@@ -10,6 +10,15 @@ This is the paper's (45) before its Schur complements (Wang 2015), with its P on
 and extended by D.  The certificate is the triangular factor Q: P itself, rounded to double precision, would lose
 definiteness where its condition number nears 1e16, and its square root has half the digits to lose.  The first block is
 moved by S, close to the inverse of Q; S is triangular with a nonzero diagonal, so this congruence is one.
+
+Stability of a shipped matrix, proved with a Lyapunov factor and bounds on every rounding error.
+
+With P = Q'Q, Q triangular and nonsingular, and S close to the inverse of Q (a congruence with any nonsingular S keeps
+definiteness):
+
+.. math::
+    -S^T (A^T Q^T Q + Q^T Q A) S > 0 \quad (\dot z = A z), \qquad
+    \begin{bmatrix} (QS)^T QS & (QAS)^T \\ QAS & I \end{bmatrix} > 0 \quad (z^+ = A z).
 """
 
 from __future__ import annotations
@@ -89,3 +98,30 @@ def _formed(
             [cs, -d, zero(nf, core), exact(np.eye(nf))],
         ]
     )
+
+
+def prove_stable(a: FloatArray, factor: FloatArray, dt: float) -> DefinitenessProof:
+    """Try to prove that every mode of ``a`` dies out.
+
+    Shapes: ``a (n, n)``, ``factor (n, n)``.
+    """
+    if factor.shape != a.shape or not np.all(np.isfinite(factor)) or not np.all(np.isfinite(a)):
+        return unproved("the certificate does not fit, or a number is not finite")
+    if a.shape[0] == 0:
+        return DefinitenessProof(True, np.inf, 0.0, "Cholesky")
+    if np.any(np.tril(factor, -1) != 0.0) or np.any(np.diag(factor) == 0.0):
+        return unproved("the certificate is not triangular and nonsingular")
+    inverse = np.triu(np.linalg.inv(factor))
+    if not np.all(np.isfinite(inverse)) or np.any(np.diag(inverse) == 0.0):
+        return unproved("the certificate cannot be inverted")
+
+    def formula(kind: type[Enclosed]) -> Enclosed:
+        q, s = kind.exact(factor), kind.exact(inverse)
+        whole, moved = q @ s, q @ (kind.exact(a) @ s)
+        if dt > 0.0:
+            identity = kind.exact(np.eye(a.shape[0]))
+            return block([[whole.T @ whole, moved.T], [moved, identity]])
+        half = whole.T @ moved
+        return -(half + half.T)
+
+    return prove_positive_definite(formula)

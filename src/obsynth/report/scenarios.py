@@ -1,0 +1,172 @@
+"""Simulations, evaluations and comparisons for people: how far estimates were off, how often alarms were right.
+
+Methods side by side, as a table that fits the console.
+
+A simulation for people: how far each estimate was off, and when the start was forgotten.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.text import Text
+
+from obsynth.comparison.result import Comparison
+from obsynth.experiments.intervals import Interval
+from obsynth.experiments.monitors.monitor import Monitor
+from obsynth.experiments.monte_carlo import Evaluation
+from obsynth.experiments.parameter_monte_carlo import ParameterMonitor
+from obsynth.experiments.parameter_simulation import RecursiveSimulation
+from obsynth.experiments.simulation import Simulation
+from obsynth.report.layout import headed_table, number, print_section
+
+#: Rows of a table; of a large plant the worst estimates are shown.
+SHOWN = 12
+
+
+_DECISIONS = {
+    "false_alarm_rate": ("false alarms", "share of runs"),
+    "missed_detection_rate": ("missed detections", "share of runs"),
+    "detection_delay": ("detection delay", "s"),
+    "isolation_error_rate": ("wrong fault named", "share of detections"),
+}
+
+
+def evaluation_report(
+    name: str,
+    found: Evaluation,
+    *,
+    monitor: Monitor | ParameterMonitor | None,
+    console: Console,
+    units: Mapping[str, str],
+) -> None:
+    """Print rates, delays and errors over many runs."""
+    share = f"{100.0 * found.confidence:g} % interval"
+    console.print(Text(f"{name}: {found.runs} runs", style="bold"))
+    console.print()
+    if monitor is not None:
+        table = headed_table("decisions", "value", share, "of", "unit")
+        for key, (title, unit) in _DECISIONS.items():
+            item: Interval = getattr(found, key)
+            if item.count:
+                table.add_row(Text(title), number(item.value), _interval(item), str(item.count), Text(unit))
+        kind, statement = described(monitor)
+        print_section(console, f"Monitor {kind}", table)
+        end = final_threshold(monitor)
+        size = "" if end is None else f" ({number(end)} at the end of a run)"
+        console.print(Text(f"Its threshold{size}: {statement}."))
+        console.print()
+    for title, errors in (("Fault estimates", found.fault_rmse), ("State estimates", found.state_rmse)):
+        if not errors:
+            continue
+        table = headed_table("signal", "RMSE after warm-up", share, "unit")
+        rows = sorted(errors.items(), key=lambda row: -row[1].value) if len(errors) > SHOWN else list(errors.items())
+        if len(rows) > SHOWN:
+            title = f"{title}: the worst {SHOWN} of {len(rows)}"
+        for signal, item in rows[:SHOWN]:
+            table.add_row(Text(signal), number(item.value), _interval(item), Text(units.get(signal, "")))
+        print_section(console, f"{title} (mean over runs)", table)
+
+
+def described(monitor: Monitor | ParameterMonitor) -> tuple[str, str]:
+    """Return which monitor it is, and what its threshold means."""
+    if isinstance(monitor, Monitor):
+        return monitor.kind, monitor.statement
+    return monitor.statistic, (
+        "of a decision on parameters, passed in a run without a change with about the stated probability "
+        f"({monitor.false_alarms:g})"
+    )
+
+
+def final_threshold(monitor: Monitor | ParameterMonitor) -> float | None:
+    """Return the threshold at the end of a run; ``None`` where it is not the same in each run, or decides nothing."""
+    if not isinstance(monitor, Monitor) or not monitor.threshold.size or not np.isfinite(monitor.threshold[-1]):
+        return None
+    return float(monitor.threshold[-1])
+
+
+def _interval(item: Interval) -> str:
+    return "-" if math.isnan(item.low) else f"{number(item.low)} to {number(item.high)}"
+
+
+#: Columns left out where the console is narrower than so many characters.
+NARROW = 130
+
+
+_LESS = ("order", "50 % s", "peak", "bias", "alarm s", "smallest", "ms")
+
+
+def comparison_report(found: Comparison, *, console: Console, file: Path | None = None) -> None:
+    """Print what was compared, the table, the refusals and the recommendation."""
+    header, *rows = found.rows()
+    kept = [i for i, name in enumerate(header) if console.width >= NARROW or name not in _LESS]
+    table = headed_table(*(header[i] for i in kept))
+    for column in table.columns:
+        column.overflow = "fold"
+    for row in rows:
+        table.add_row(*(Text(row[i]) for i in kept))
+    console.print(Text(found.setting))
+    if rows:
+        print_section(console, "", table)
+    for refusal in found.refusals:
+        console.print(Text(refusal, style="yellow"))
+    console.print(Text(found.advice, style="bold"))
+    if file is not None:
+        console.print(Text(f"Written: {file}"), soft_wrap=True)
+
+
+def simulation_report(
+    name: str,
+    found: Simulation | RecursiveSimulation,
+    *,
+    console: Console,
+    units: Mapping[str, str],
+    file: str | None = None,
+) -> None:
+    """Print errors of all estimates: after warm-up for linear designs, with the coverage of their bands for others."""
+    summary = found.summary()
+    console.print(Text(f"{name}: {summary['samples']} samples, {found.time[-1]:g} s", style="bold"))
+    console.print()
+    linear = isinstance(found, Simulation)
+    for kind, title in (
+        ("faults", "Fault estimates" if linear else "Parameter estimates"),
+        ("states", "State estimates"),
+    ):
+        if not summary[kind]:
+            continue
+        lasts = _last_column(found, kind)
+        table = headed_table("signal", "RMSE", "largest error", next(lasts), "unit")
+        rows = list(zip(summary[kind].items(), lasts, strict=True))
+        if len(rows) > SHOWN:
+            title = f"{title}: the worst {SHOWN} of {len(rows)}"
+            rows = sorted(rows, key=lambda row: -row[0][1]["rmse"])[:SHOWN]
+        for (signal, row), last in rows:
+            table.add_row(Text(signal), number(row["rmse"]), number(row["largest"]), last, Text(units.get(signal, "")))
+        if linear:
+            end = summary[f"{kind[:-1]}_warm_up"]
+            told = (
+                "the start still shows at the end: errors are of the whole record"
+                if end is None
+                else f"warm-up ended at {end:g} s, errors are of what follows"
+            )
+        else:
+            told = "errors are of the whole record, start included"
+        print_section(console, f"{title} ({told})", table)
+    for note in summary["notes"]:
+        console.print(Text(note))
+    if file is not None:
+        console.print(Text(f"Written: {file}"))
+
+
+def _last_column(found: Simulation | RecursiveSimulation, kind: str) -> Iterator[str]:
+    """Yield a heading, and a cell for each signal: delays of a linear observer, coverage of a recursive one."""
+    if isinstance(found, Simulation):
+        yield "delay (samples)"
+        yield from map(str, found.estimates.fault_delays if kind == "faults" else found.estimates.state_delays)
+    else:
+        yield "in its 95 % band"
+        yield from (f"{100.0 * row['within_band']:.0f} %" for row in found.summary()[kind].values())
