@@ -14,7 +14,7 @@ from obsynth.report.page_style import STYLE
 from obsynth.report.page_tables import check_rows, copied_table, fact_rows, matrix_rows, value_text
 from obsynth.report.pictures import data_section, pictures_of
 from obsynth.report.summary import summary
-from obsynth.report.verification import verdict_line
+from obsynth.results.checks_table import verdict_line
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import gain_set_digest
 from obsynth.results.report import VerificationReport

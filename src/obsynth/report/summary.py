@@ -20,10 +20,10 @@ from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.plotting.frequency import FaultGains, fault_gains
-from obsynth.report.layout import number
-from obsynth.report.verification import verdict_line
 from obsynth.report.warnings import design_warnings
+from obsynth.results.checks_table import verdict_line
 from obsynth.results.design import ObserverDesign
+from obsynth.results.layout import number
 
 #: Faults, warnings and notes that are listed; the others are counted.
 _MOST_FAULTS, _MOST_NOTES = 5, 1

@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING
 
 from rich import box
 from rich.console import Console, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from obsynth.results.report import Check
+if TYPE_CHECKING:
+    from obsynth.results.report import Check
 
 
 def number(value: float, *, digits: int = 4) -> str:
