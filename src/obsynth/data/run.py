@@ -19,7 +19,6 @@ from obsynth.data.signals import TIME, Signals
 from obsynth.data.sinks import FrameSink, Sink, TextSink, file_sink
 from obsynth.data.sources import Data, chunks
 from obsynth.data.stamps import Stamps
-from obsynth.data.step_log import SteppingEngine
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.monitors.online import OnlineMonitor
 from obsynth.files.outputs import check_output, require_distinct
@@ -247,6 +246,9 @@ def _engine_of(
         return DataObserver(design, gap=gap, warm_up=warm_up)
     if gap is not None:
         raise SpecError("gap is for continuous-time designs: a sampled one knows which rows are missing.", path="gap")
+    # What most logs do not need is loaded only where it is used: a run starts in a fraction of a second.
+    from obsynth.data.step_log import SteppingEngine
+
     return SteppingEngine(design, warm_up=warm_up, outliers=outliers)
 
 
