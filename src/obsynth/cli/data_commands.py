@@ -49,7 +49,7 @@ def run_run(options: argparse.Namespace) -> int:
             columns=dict(options.map), time_column=options.time_column, scales=numbers_of(options.scale),
             thresholds=numbers_of(options.threshold), monitor=watched, gap=options.gap, warm_up=options.warm_up,
             recovered=_recovered(options.recovered),
-            outliers=options.outliers,
+            outliers=options.outliers, smooth=options.smooth, lag=options.lag,
             state=options.state, progress=progress,
         )  # fmt: skip
     for text in found.warnings:

@@ -56,7 +56,8 @@ class RecursiveDataObserver(SteppingEngine[RawEstimate]):
 
     def started(self) -> RunningObserver[Any, Any, Any]:
         """Return the running observer, at k = 0."""
-        return self.observer.start()
+        found: RunningObserver[Any, Any, Any] = self.observer.start()
+        return found
 
     def taken(self, y: FloatArray, u: FloatArray, row: int) -> RawEstimate | Exception | None:
         """Take one sample, or return why it cannot be taken.
@@ -111,7 +112,8 @@ class DAEDataObserver(SteppingEngine[DAEEstimates]):
 
     def started(self) -> RunningObserver[Any, Any, Any]:
         """Return the running observer, at k = 0."""
-        return self.observer.start()
+        found: RunningObserver[Any, Any, Any] = self.observer.start()
+        return found
 
     def first_inputs(self, values: FloatArray, row: int) -> FloatArray:
         """Return the inputs of the first row, in which they must be known.
@@ -131,7 +133,8 @@ class DAEDataObserver(SteppingEngine[DAEEstimates]):
         Shapes: ``y (ny,)``, ``u (nu,)``.
         """
         try:
-            found: DAEEstimates = self.running.step(y, u)
+            said = self.running.raw_step(y, u)
+            found: DAEEstimates = self.observer.estimates(self.running.state, said)
         except SolverError as error:
             return SolverError(f"Row {row}: {error}")
         except (np.linalg.LinAlgError, ValueError):

@@ -38,6 +38,8 @@ class SteppingEngine(ABC, Generic[Found]):
 
     #: Whether the outputs of the first row are used.
     uses_first_outputs = True
+    #: What runs: an observer, or one that keeps what it says.
+    observer: Any
 
     def __init__(self, signals: tuple[tuple[str, ...], ...], *, dt: float, warm_up: float, may_restart: bool) -> None:
         self.input_names, self.output_names, self.state_names, self.fault_names, residuals = signals

@@ -118,9 +118,21 @@ class DAEObserver(DAESettings):
             raise SpecError(f"u must be {self.model.nu} finite number(s) at k = {state.k}.", path="u")
         require_known(self.model, inputs[None], state.k)
         after, row = self.advance(state, outputs, inputs)
+        return after, self.estimates(after, row)
+
+    def estimates(self, state: DAEState, row: DAERow) -> DAEEstimates:
+        """Return the estimates at one sample.
+
+        Parameters
+        ----------
+        state : DAEState
+            After the sample.
+        row : DAERow
+            What was said at it.
+        """
         found = GatheredRows(self)
         found.add_regular(row)
-        return after, found.estimates(np.array(after.informations))
+        return found.estimates(np.array(state.informations))
 
     def start(self) -> RunningObserver[DAEState, DAERow, DAEEstimates]:
         """Return a running observer, at k = 0."""
