@@ -98,7 +98,7 @@ def innovations_fit(problem: Problem, fits: list[Fit], level: float, note: Calla
     variances = int((objective.is_q | objective.is_r).sum())
     root = quantile(level, objective.nt, problem.log.samples, variances)
     note("boxes by profile likelihood")
-    sides = profile_box(objective, maximum, root)
+    sides = profile_box(objective, maximum, root, found)
     Q, R = objective.noise(maximum.z)
     limited, limits = _limits(objective, maximum)
     Q, R = np.where(limited[: len(Q)], limits[: len(Q)], Q), np.where(limited[len(Q) :], limits[len(Q) :], R)

@@ -163,18 +163,18 @@ def _simulated(problem: Problem) -> Any:
     nx, ny, nt, size = g.nx, g.ny, g.nt, g.nt + g.nx
     packed, u, t = ca.MX.sym("packed", nx + nx * size), ca.MX.sym("u", g.nu), ca.MX.sym("t", nt)
 
-    def row(x: Any, S: Any, t: Any, left: Any) -> Any:
-        y, H, L = g.outputs(x, t)
+    def row(x: Any, S: Any, u: Any, t: Any, left: Any) -> Any:
+        y, H, L = g.outputs(x, u, t)
         return ca.vertcat(y, ca.vec(H @ S + ca.horzcat(L, ca.MX.zeros(ny, nx))), left)
 
     x, S = packed[:nx], ca.reshape(packed[nx:], nx, size)
     stages, left = g.solve(x, u, t)
     after, F, G, _ = g.fast(x, u, t, t, g.sensitivities(x, u, t, stages))
     S = F @ S + ca.horzcat(G, ca.MX.zeros(nx, nx))
-    one = ca.Function("one", [packed, u, t], [ca.vertcat(after, ca.vec(S)), row(after, S, t, left)])
+    one = ca.Function("one", [packed, u, t], [ca.vertcat(after, ca.vec(S)), row(after, S, u, t, left)])
     v = ca.MX.sym("v", size)
     first = ca.DM(np.hstack([np.zeros((nx, nt)), np.eye(nx)]))
-    rows = row(v[nt:], ca.MX(first), v[:nt], ca.MX(0.0))
+    rows = row(v[nt:], ca.MX(first), ca.DM(problem.u[0]), v[:nt], ca.MX(0.0))
     if n > 1:
         begin = ca.vertcat(v[nt:], ca.vec(first))
         _, later = one.mapaccum(n - 1)(begin, ca.DM(problem.u[1:].T), ca.repmat(v[:nt], 1, n - 1))

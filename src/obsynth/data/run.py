@@ -16,10 +16,9 @@ from obsynth.data.log_estimator import Engine
 from obsynth.data.saved_state import digest_of_gains, resume_state, save_state
 from obsynth.data.signals import TIME, Signals
 from obsynth.data.sinks import FrameSink, Sink, TextSink, file_sink
-from obsynth.data.smoothing import LaterRows
+from obsynth.data.smoothing import LaterRows, engine_of
 from obsynth.data.sources import Data, chunks
 from obsynth.data.stamps import Stamps
-from obsynth.data.start import engine_of
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.monitors.online import OnlineMonitor
 from obsynth.files.outputs import check_output, require_distinct

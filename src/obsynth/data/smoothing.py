@@ -9,17 +9,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from obsynth.data.linear_log import DataObserver
 from obsynth.data.log_estimator import Engine, Row
 from obsynth.data.signals import TIME, Signals
 from obsynth.data.sources import chunks
 from obsynth.data.stamps import Stamps
-from obsynth.data.start import engine_of
 from obsynth.data.step_log import SteppingEngine
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray, read_only
-from obsynth.observers.dae.observer import DAEObserver
-from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.estimates import Estimates
+from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.robustness import with_outliers
 from obsynth.observers.smoothing.chain import Smoothed, deviations_in
 from obsynth.observers.smoothing.keeping import (
@@ -34,6 +34,20 @@ from obsynth.results.design import ObserverDesign
 
 #: Rows of a log that are read at a time.
 CHUNK_ROWS = 10_000
+
+
+def engine_of(
+    design: ObserverDesign, *, gap: float | None = None, warm_up: float | None = None, outliers: str | None = None
+) -> Engine:
+    """Return a running design, at its start; ``outliers`` takes the place of what the design says of them."""
+    if isinstance(design.observer, LinearObserver):
+        if outliers not in (None, "none"):
+            raise SpecError("outliers is for recursive and nonlinear designs, which know how far a sample may be from "
+                            "its prediction.", path="outliers")  # fmt: skip
+        return DataObserver(design, gap=gap, warm_up=warm_up)
+    if gap is not None:
+        raise SpecError("gap is for continuous-time designs: a sampled one knows which rows are missing.", path="gap")
+    return SteppingEngine(design, warm_up=warm_up, outliers=outliers)
 
 
 class Entry(NamedTuple):
@@ -68,10 +82,7 @@ class LaterRows:
             )
         self.engine, self.lag = engine, lag
         self.keeping = KeepingObserver(engine.observer)
-        engine.observer = self.keeping
-        state = engine.running.state
-        engine.running = engine.started()
-        engine.running.state = state
+        engine.observer = self.keeping  # type: ignore[assignment]
         self.waiting: list[_Waiting] = []
 
     def take(self, entry: Entry) -> Iterator[tuple[Entry, Any, Smoothed]]:
@@ -119,7 +130,7 @@ def smooth(
     time_column: str | None = None,
     scales: Mapping[str, float] | None = None,
     outliers: str | None = None,
-) -> Any:
+) -> Estimates:
     r"""Estimate each sample of a record from those after it as well.
 
     A filter knows the past; a log is mostly read afterwards.  With ``x_k = m_k + F_k c_k``, where ``F_k F_k'`` is the
@@ -151,7 +162,7 @@ def smooth(
 
     Returns
     -------
-    RecursiveEstimates or DAEEstimates
+    Estimates
         One row per sample (of a log: per row of it, with the operating point added back).  States, parameters and their
         deviations are smoothed; innovations and what belongs to them are the filter's.
 
@@ -186,7 +197,7 @@ def smooth(
     """
     require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
     waited = checked_lag(lag)
-    if not isinstance(design.observer, (RecursiveObserver, DAEObserver)):
+    if isinstance(design.observer, LinearObserver):
         # The same refusal as on logs.
         LaterRows(engine_of(design), waited)
     if _is_log(data):
@@ -213,7 +224,7 @@ def _is_log(data: Any) -> bool:
     return isinstance(data, str) or hasattr(data, "__fspath__") or hasattr(data, "readline") or hasattr(data, "columns")
 
 
-def _smoothed_log(engine: Any, data: Any, lag: int | None, signals: Signals) -> Any:
+def _smoothed_log(engine: Any, data: Any, lag: int | None, signals: Signals) -> Estimates:
     later, observer = LaterRows(engine, lag), engine.observer.observer
     found: list[tuple[Entry, Any, Smoothed]] = []
     count = 0
@@ -226,7 +237,5 @@ def _smoothed_log(engine: Any, data: Any, lag: int | None, signals: Signals) -> 
     known = smoothed_estimates(observer, [row for _, row, _ in found], [sample for _, _, sample in found])
     point = signals.estimates_point(engine)
     nx, nq = len(engine.state_names), len(engine.fault_names)
-    kind = "faults" if hasattr(known, "faults") else "parameters"
-    moved: dict[str, Any] = {"states": read_only(known.states + point[:nx]),
-                             kind: read_only(known.parameters + point[nx : nx + nq])}  # fmt: skip
-    return replace(known, **moved)
+    return replace(known, states=read_only(known.states + point[:nx]),
+                   faults=read_only(known.faults + point[nx : nx + nq]))  # fmt: skip

@@ -8,17 +8,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.estimates import Estimates
 
 State = TypeVar("State")
 Row = TypeVar("Row", covariant=True)
-Found = TypeVar("Found", covariant=True)
 Kept = TypeVar("Kept", bound=tuple[Any, ...])
 
 #: Marks an array whose columns are contiguous: sums are rounded in another order there.
 BY_COLUMNS = "by columns"
 
 
-class Observer(Protocol[State, Row, Found]):
+class Observer(Protocol[State, Row]):
     """An observer: values alone, so that one serves any number of runs; a state is a tuple of plain arrays.
 
     `advance` is `step` without checks of the sample, and returns the row of numbers that the estimates are made of.
@@ -32,12 +32,56 @@ class Observer(Protocol[State, Row, Found]):
         """Return the state after a sample, and what is known at it."""
         ...
 
-    def step(self, state: State, y: ArrayLike, u: ArrayLike = ()) -> tuple[State, Found]:
+    def step(self, state: State, y: ArrayLike, u: ArrayLike = ()) -> tuple[State, Estimates]:
         """Check a sample; return the state after it, and the estimates at it."""
         ...
 
 
-class RunningObserver(Generic[State, Row, Found]):
+class ParameterRow(Protocol):
+    """What an observer with deviations knows at one sample."""
+
+    @property
+    def x(self) -> FloatArray:
+        """The states ``(nx,)``."""
+        ...
+
+    @property
+    def theta(self) -> FloatArray:
+        """The parameters ``(nq,)``."""
+        ...
+
+    @property
+    def state_deviations(self) -> FloatArray:
+        """Standard deviations of `x` ``(nx,)``."""
+        ...
+
+    @property
+    def parameter_covariance(self) -> FloatArray:
+        """Covariance of `theta` ``(nq, nq)``."""
+        ...
+
+    @property
+    def gap(self) -> FloatArray:
+        """The innovation at the parameters estimated one sample before ``(m,)``."""
+        ...
+
+    @property
+    def whitened(self) -> FloatArray:
+        """The innovation of the model without parameters, whitened ``(m,)``."""
+        ...
+
+    @property
+    def regressor(self) -> FloatArray:
+        """Its regressor ``(m, nq)``."""
+        ...
+
+    @property
+    def is_finite(self) -> bool:
+        """Whether no number has overflown."""
+        ...
+
+
+class RunningObserver(Generic[State, Row]):
     """An observer with its state: `step` takes y(k) and u(k) and returns the estimates at k.
 
     Parameters
@@ -48,11 +92,11 @@ class RunningObserver(Generic[State, Row, Found]):
         Where to begin; ``observer.init()`` by default.
     """
 
-    def __init__(self, observer: Observer[State, Row, Found], state: State | None = None) -> None:
+    def __init__(self, observer: Observer[State, Row], state: State | None = None) -> None:
         self.observer = observer
         self.state = observer.init() if state is None else state
 
-    def step(self, y: ArrayLike, u: ArrayLike = ()) -> Found:
+    def step(self, y: ArrayLike, u: ArrayLike = ()) -> Estimates:
         """Take one sample and return the estimates at it.
 
         Parameters

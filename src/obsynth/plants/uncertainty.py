@@ -120,6 +120,16 @@ class Uncertainty:
         """
         return float(values[text]) if text in values else float(self._parsed[text](values))
 
+    def parsed(self, text: str) -> Expression:
+        """Return the expression of an entry that is not a name alone.
+
+        Parameters
+        ----------
+        text : str
+            The entry.
+        """
+        return self._parsed[text]
+
     def filled(self, matrices: Mapping[str, FloatArray], values: Mapping[str, float]) -> dict[str, FloatArray]:
         """Return matrices with every entry at values of the constants.
 

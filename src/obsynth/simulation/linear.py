@@ -12,7 +12,7 @@ samples.  All arrays of runs are ``(steps, runs, signals)``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,35 +20,11 @@ from numpy.typing import ArrayLike
 
 from obsynth.analysis.transformations import StateRecovery, discretise, eliminate_algebraic_states
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
+from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.holds import first_order_hold
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.simulation.scenario_signals import Drive
-
-
-@dataclass(frozen=True, eq=False)
-class Trajectory:
-    """What a plant did, one row per sample; arrays are read-only.
-
-    Fields: states, outputs: ``(steps, nx)`` and ``(steps, ny)``; inputs, faults, disturbances, noise: ``(steps, nu)``,
-    ``(steps, nf)``, ``(steps, nd)``, ``(steps, nw)``: what drove it; time: ``(steps,)``, seconds; starts at zero;
-    inconsistency: Norm of the change that the given initial state needed to satisfy the algebraic equations at k = 0;
-    only rounding for a consistent one.
-    """
-
-    states: FloatArray
-    outputs: FloatArray
-    inputs: FloatArray
-    faults: FloatArray
-    disturbances: FloatArray
-    noise: FloatArray
-    time: FloatArray
-    inconsistency: float
-
-    def __post_init__(self) -> None:
-        """Make the arrays private and read-only."""
-        for field in fields(self)[:-1]:
-            object.__setattr__(self, field.name, read_only(getattr(self, field.name)))
+from obsynth.simulation.trajectory import Trajectory
 
 
 def simulate_plant(

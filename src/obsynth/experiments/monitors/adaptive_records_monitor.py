@@ -16,7 +16,7 @@ from obsynth.experiments.monitors.adaptive_record import thresholds_of_records
 from obsynth.experiments.monitors.adaptive_rule import AdaptivePlan, record_columns
 from obsynth.experiments.monitors.monitor import Detection, Monitor
 from obsynth.numerics.arrays import FloatArray
-from obsynth.observers.linear.observer import Estimates
+from obsynth.observers.estimates import Estimates
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario
 from obsynth.simulation.scenario_signals import resolve

@@ -11,11 +11,12 @@ from numpy.typing import ArrayLike
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.compiled_library import DAELibrary
-from obsynth.observers.dae.estimates import DAEEstimates, DAERow, GatheredRows
+from obsynth.observers.dae.estimates import DAERow, GatheredRows, require_regular
 from obsynth.observers.dae.records import run_record
 from obsynth.observers.dae.settings import DAESettings
 from obsynth.observers.dae.step_graph import ObserverGraph
 from obsynth.observers.dae.steps import DAEState, Steps
+from obsynth.observers.estimates import Estimates
 from obsynth.observers.recursive.records import measured_record
 from obsynth.observers.running import RunningObserver
 from obsynth.plants.dae.checks import checked_inputs, require_known
@@ -90,7 +91,26 @@ class DAEObserver(DAESettings):
         """
         return self.steps.advance(state, y, u)
 
-    def step(self, state: DAEState, y: ArrayLike, u: ArrayLike = ()) -> tuple[DAEState, DAEEstimates]:
+    def accept(self, state: DAEState, y: FloatArray, u: FloatArray) -> tuple[DAEState, DAERow]:
+        """Return the same as `advance`, unless the step is singular to working precision.
+
+        Parameters
+        ----------
+        state : DAEState
+            Before the sample.
+        y, u : FloatArray
+            ``(ny,)``, NaN for what is missing, and ``(nu,)``.
+
+        Raises
+        ------
+        SolverError
+            The step has no solution, or more than one.
+        """
+        after, row = self.steps.advance(state, y, u)
+        require_regular(self, row, row.conditions)
+        return after, row
+
+    def step(self, state: DAEState, y: ArrayLike, u: ArrayLike = ()) -> tuple[DAEState, Estimates]:
         """Return the state after a sample, and the estimates at it.
 
         Parameters
@@ -117,24 +137,12 @@ class DAEObserver(DAESettings):
         if inputs.shape != (self.model.nu,):
             raise SpecError(f"u must be {self.model.nu} finite number(s) at k = {state.k}.", path="u")
         require_known(self.model, inputs[None], state.k)
-        after, row = self.advance(state, outputs, inputs)
-        return after, self.estimates(after, row)
-
-    def estimates(self, state: DAEState, row: DAERow) -> DAEEstimates:
-        """Return the estimates at one sample.
-
-        Parameters
-        ----------
-        state : DAEState
-            After the sample.
-        row : DAERow
-            What was said at it.
-        """
+        after, row = self.accept(state, outputs, inputs)
         found = GatheredRows(self)
-        found.add_regular(row)
-        return found.estimates(np.array(state.informations))
+        found.add(row)
+        return after, found.estimates(np.array(after.informations))
 
-    def start(self) -> RunningObserver[DAEState, DAERow, DAEEstimates]:
+    def start(self) -> RunningObserver[DAEState, DAERow]:
         """Return a running observer, at k = 0."""
         return RunningObserver(self)
 
@@ -157,7 +165,7 @@ class DAEObserver(DAESettings):
     def run(
         self, y: ArrayLike, u: ArrayLike | None = None, *, compiled: bool | None = None,
         progress: bool | Callable[[int], None] | None = None,
-    ) -> DAEEstimates:  # fmt: skip
+    ) -> Estimates:  # fmt: skip
         """Run over a whole record.
 
         Parameters
@@ -176,7 +184,7 @@ class DAEObserver(DAESettings):
 
         Returns
         -------
-        DAEEstimates
+        Estimates
             One row per sample.
 
         Raises

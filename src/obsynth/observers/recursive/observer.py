@@ -9,8 +9,9 @@ from numpy.typing import ArrayLike
 
 from obsynth.numerics.arguments import real_array, real_vector
 from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.estimates import Estimates
 from obsynth.observers.recursive.compiled_run import run_record
-from obsynth.observers.recursive.estimates import RecursiveEstimates
+from obsynth.observers.recursive.estimates import recursive_estimates
 from obsynth.observers.recursive.records import measured_record, require_horizon, whole_record
 from obsynth.observers.recursive.recursion import RawEstimate, Recursion, RecursiveState
 from obsynth.observers.recursive.settings import RecursiveSettings
@@ -67,7 +68,25 @@ class RecursiveObserver(RecursiveSettings):
         """
         return self.recursion.advance(state, y, u)
 
-    def step(self, state: RecursiveState, y: ArrayLike, u: ArrayLike = ()) -> tuple[RecursiveState, RecursiveEstimates]:
+    def accept(self, state: RecursiveState, y: FloatArray, u: FloatArray) -> tuple[RecursiveState, RawEstimate]:
+        """Return the same as `advance`, unless the plant is not known for so long.
+
+        Parameters
+        ----------
+        state : RecursiveState
+            Before the sample.
+        y, u : FloatArray
+            ``(ny,)``, NaN for what is missing, and ``(nu,)``.
+
+        Raises
+        ------
+        SpecError
+            The horizon is passed.
+        """
+        require_horizon(self.plant.horizon, state.k + 1, early=self.early_constraints)
+        return self.recursion.advance(state, y, u)
+
+    def step(self, state: RecursiveState, y: ArrayLike, u: ArrayLike = ()) -> tuple[RecursiveState, Estimates]:
         """Return the state after a sample, which keeps u(k) for the next, and the estimates at it.
 
         Parameters
@@ -88,15 +107,14 @@ class RecursiveObserver(RecursiveSettings):
         """
         outputs = measured_record(np.atleast_2d(real_array(y, "y")), self.plant.ny)[0]
         inputs = real_vector(u, self.plant.nu, "u")
-        require_horizon(self.plant.horizon, state.k + 1, early=self.early_constraints)
-        after, row = self.advance(state, outputs, inputs)
-        return after, RecursiveEstimates.of(self, [row], window=after.regressors)
+        after, row = self.accept(state, outputs, inputs)
+        return after, recursive_estimates(self, [row], window=after.regressors)
 
-    def start(self) -> RunningObserver[RecursiveState, RawEstimate, RecursiveEstimates]:
+    def start(self) -> RunningObserver[RecursiveState, RawEstimate]:
         """Return a running observer, at k = 0."""
         return RunningObserver(self)
 
-    def run(self, y: ArrayLike, u: ArrayLike | None = None, *, compiled: bool | None = None) -> RecursiveEstimates:
+    def run(self, y: ArrayLike, u: ArrayLike | None = None, *, compiled: bool | None = None) -> Estimates:
         """Run over a whole record.
 
         Parameters
@@ -112,7 +130,7 @@ class RecursiveObserver(RecursiveSettings):
 
         Returns
         -------
-        RecursiveEstimates
+        Estimates
             One row per sample.
 
         Raises

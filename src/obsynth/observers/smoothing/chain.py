@@ -10,7 +10,7 @@ import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.square_root_smoothing import Gaussian, WayBack, nothing_later, stepped_back
-from obsynth.observers.recursive.estimates import UNDETERMINED_SHARE
+from obsynth.observers.recursive.recursion import UNDETERMINED_SHARE
 
 
 class Lesson(NamedTuple):
@@ -95,10 +95,8 @@ class LaterLessons:
         packed: FloatArray = np.asarray(np.linalg.qr(stacked, mode="r"))
         triangle = packed[:nq, :nq]
         sums = np.hstack((lesson.triangle.T @ (lesson.triangle @ lesson.spread), self.noise))
-        return (
-            np.linalg.solve(triangle, packed[:nq, nq]),
-            np.linalg.solve(triangle, np.linalg.solve(triangle.T, sums)),
-        )
+        theta: FloatArray = np.asarray(np.linalg.solve(triangle, packed[:nq, nq]))
+        return theta, np.asarray(np.linalg.solve(triangle, np.linalg.solve(triangle.T, sums)))
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,10 +12,10 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.dae.estimates import GatheredRows
 from obsynth.observers.dae.observer import DAEObserver
-from obsynth.observers.recursive.estimates import RecursiveEstimates
+from obsynth.observers.estimates import Estimates
+from obsynth.observers.recursive.estimates import recursive_estimates
 from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.observers.recursive.records import measured_record, require_horizon, whole_record
-from obsynth.observers.running import RunningObserver
+from obsynth.observers.recursive.records import measured_record, whole_record
 from obsynth.observers.smoothing.chain import Links, Node, Smoothed, all_smoothed, deviations_in, smoothed_from
 from obsynth.observers.smoothing.dae_links import dae_links
 from obsynth.observers.smoothing.recursive_links import recursive_links
@@ -88,42 +88,33 @@ class KeepingObserver:
         self.chain = Chain()
         return self.observer.init()
 
-    def advance(self, state: Any, y: FloatArray, u: FloatArray) -> tuple[Any, Any]:
+    def accept(self, state: Any, y: FloatArray, u: FloatArray) -> tuple[Any, Any]:
         """Take a sample as the observer does, and keep it."""
-        after, row = self.observer.advance(state, y, u)
+        after, row = self.observer.accept(state, y, u)
         self.chain.add(self.links, state, after, row, u)
         return after, row
 
-    def start(self) -> RunningObserver[Any, Any, Any]:
-        """Return a running observer, at k = 0."""
-        return RunningObserver(self)
 
-
-def filtered_estimates(observer: SmoothedObserver, rows: list[Any]) -> Any:
-    """Return what an observer said at its rows."""
-    if isinstance(observer, RecursiveObserver):
-        return RecursiveEstimates.of(observer, rows)
-    found = GatheredRows(observer)
-    for row in rows:
-        found.add_regular(row)
-    return found.estimates()
-
-
-def smoothed_estimates(observer: SmoothedObserver, rows: list[Any], found: list[Smoothed]) -> Any:
+def smoothed_estimates(observer: SmoothedObserver, rows: list[Any], found: list[Smoothed]) -> Estimates:
     """Return the estimates of smoothed samples; innovations and what belongs to them are those of the observer."""
-    known = filtered_estimates(observer, rows)
+    if isinstance(observer, RecursiveObserver):
+        known = recursive_estimates(observer, rows)
+    else:
+        gathered = GatheredRows(observer)
+        for row in rows:
+            gathered.add(row)
+        known = gathered.estimates()
     nx = len(observer.state_names)
-    parameters = np.array([parameters_of(sample, nx)[0] for sample in found]).reshape(len(found), -1)
-    spreads = [parameters_of(sample, nx)[1] for sample in found]
-    covariances = np.array([spread @ spread.T for spread in spreads]).reshape(known.parameter_covariances.shape)
-    names = {field.name for field in fields(known)}
-    kind = "faults" if "faults" in names else "parameters"
-    changed = {
-        "states": np.array([sample.x[:nx] for sample in found]),
-        "state_deviations": np.array([deviations_in(sample.factor, sample.diffuse)[:nx] for sample in found]),
-        kind: parameters, ("fault" if kind == "faults" else "parameter") + "_covariances": covariances,
-    }  # fmt: skip
-    return replace(known, **{name: read_only(value) for name, value in changed.items()})
+    parameters = [parameters_of(sample, nx) for sample in found]
+    deviations = [deviations_in(sample.factor, sample.diffuse)[:nx] for sample in found]
+    spreads = np.array([spread @ spread.T for _, spread in parameters]).reshape(known.fault_covariances.shape)
+    return replace(
+        known,
+        states=read_only(np.array([sample.x[:nx] for sample in found]).reshape(known.states.shape)),
+        state_deviations=read_only(np.array(deviations).reshape(known.states.shape)),
+        faults=read_only(np.array([theta for theta, _ in parameters]).reshape(known.faults.shape)),
+        fault_covariances=read_only(spreads),
+    )
 
 
 def parameters_of(sample: Smoothed, nx: int) -> tuple[FloatArray, FloatArray]:
@@ -143,19 +134,20 @@ def checked_lag(lag: Any) -> int | None:
     return int(lag)
 
 
-def smoothed_record(observer: SmoothedObserver, y: ArrayLike, u: ArrayLike | None, lag: int | None) -> Any:
+def smoothed_record(observer: SmoothedObserver, y: ArrayLike, u: ArrayLike | None, lag: int | None) -> Estimates:
     """Return smoothed estimates of a whole record of arrays.
 
     Shapes: ``y (samples, ny)``, ``u (samples, nu)``.
     """
     if isinstance(observer, RecursiveObserver):
         outputs, inputs = whole_record(y, u, observer.plant.ny, observer.plant.nu)
-        require_horizon(observer.plant.horizon, len(outputs), early=observer.early_constraints)
     else:
         outputs = measured_record(y, observer.model.ny)
         inputs = checked_inputs(observer.model, u, len(outputs))
+    if not len(outputs):
+        return observer.run(outputs, inputs)
     kept = KeepingObserver(observer)
     state = kept.init()
     for k in range(len(outputs)):
-        state, _ = kept.advance(state, outputs[k], inputs[k])
+        state, _ = kept.accept(state, outputs[k], inputs[k])
     return smoothed_estimates(observer, kept.chain.rows, all_smoothed(kept.links, kept.chain.nodes, lag))
