@@ -13,11 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.analysis.transformations import StateRecovery
-from obsynth.data.log_estimator import DECIDING, Engine, Row, delayed
+from obsynth.analysis.transformations.recovery import StateRecovery
+from obsynth.data.log_estimator import DECIDING, Engine, Entry, Later, Row, delayed
 from obsynth.data.recovered import LATE, RecoveredStates
 from obsynth.data.signals import TIME, Signals
-from obsynth.data.smoothing import Entry, LaterRows
 from obsynth.errors import SpecError
 from obsynth.experiments.monitors.online import OnlineMonitor
 from obsynth.numerics.arguments import is_finite_number
@@ -81,7 +80,7 @@ class Job:
 
     def __init__(
         self, engine: Engine, signals: Signals, recovery: StateRecovery | None, thresholds: Mapping[str, float],
-        monitor: OnlineMonitor | None, recovered: str | Sequence[str] | None = None, later: LaterRows | None = None,
+        monitor: OnlineMonitor | None, recovered: str | Sequence[str] | None = None, later: Later | None = None,
     ) -> None:  # fmt: skip
         self.engine, self.signals, self.monitor, self.later = engine, signals, monitor, later
         self.recovered = RecoveredStates.of(recovery, engine, recovered)

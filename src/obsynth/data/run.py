@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any, TextIO
 import numpy as np
 
 from obsynth.data.job import Job
-from obsynth.data.log_estimator import Engine
+from obsynth.data.linear_log import engine_of
+from obsynth.data.log_estimator import Engine, Later
 from obsynth.data.saved_state import digest_of_gains, resume_state, save_state
 from obsynth.data.signals import TIME, Signals
 from obsynth.data.sinks import FrameSink, Sink, TextSink, file_sink
-from obsynth.data.smoothing import LaterRows, engine_of
 from obsynth.data.sources import Data, chunks
 from obsynth.data.stamps import Stamps
 from obsynth.errors import ObsynthError, SpecError
@@ -25,7 +25,6 @@ from obsynth.files.outputs import check_output, require_distinct
 from obsynth.files.signals import HeldSignals, ending_signals
 from obsynth.numerics.arguments import require_kind, require_mapping, truth
 from obsynth.numerics.arrays import FloatArray
-from obsynth.observers.smoothing.keeping import checked_lag
 from obsynth.results.design import ObserverDesign
 
 if TYPE_CHECKING:
@@ -244,21 +243,20 @@ def run_on_data(
     )  # fmt: skip
 
 
-def _later_rows(
-    engine: Engine, data: Data, *, smooth: bool, lag: int | None, state: str | Path | None
-) -> LaterRows | None:
+def _later_rows(engine: Engine, data: Data, *, smooth: bool, lag: int | None, state: str | Path | None) -> Later | None:
     """Return where rows wait for those after them, if they do."""
-    waited = checked_lag(lag)
-    if not truth(smooth, "smooth") and waited is None:
+    if not truth(smooth, "smooth") and lag is None:
         return None
-    if smooth and waited is not None:
+    if smooth and lag is not None:
         raise SpecError("smooth takes the whole record, and lag some samples of it: give one of them.", path="lag")
     if smooth and hasattr(data, "readline"):
         raise SpecError("A stream has no end to smooth from: give a lag, or the log as a file.", path="smooth")
     if smooth and state is not None:
         raise SpecError("smooth takes the whole record, and a saved state goes on with a part of it: give a lag, or "
                         "leave the state out.", path="smooth")  # fmt: skip
-    return LaterRows(engine, waited)
+    from obsynth.data.smoothing import LaterRows
+
+    return LaterRows(engine, lag)
 
 
 def _kept(rows: Iterator[FloatArray], kept: list[FloatArray] | None) -> Iterator[FloatArray]:

@@ -9,15 +9,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.data.linear_log import DataObserver
-from obsynth.data.log_estimator import Engine, Row
+from obsynth.data.linear_log import engine_of
+from obsynth.data.log_estimator import Engine, Entry
 from obsynth.data.signals import TIME, Signals
 from obsynth.data.sources import chunks
 from obsynth.data.stamps import Stamps
 from obsynth.data.step_log import SteppingEngine
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import require_kind
-from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.arrays import read_only
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.robustness import with_outliers
@@ -34,31 +34,6 @@ from obsynth.results.design import ObserverDesign
 
 #: Rows of a log that are read at a time.
 CHUNK_ROWS = 10_000
-
-
-def engine_of(
-    design: ObserverDesign, *, gap: float | None = None, warm_up: float | None = None, outliers: str | None = None
-) -> Engine:
-    """Return a running design, at its start; ``outliers`` takes the place of what the design says of them."""
-    if isinstance(design.observer, LinearObserver):
-        if outliers not in (None, "none"):
-            raise SpecError("outliers is for recursive and nonlinear designs, which know how far a sample may be from "
-                            "its prediction.", path="outliers")  # fmt: skip
-        return DataObserver(design, gap=gap, warm_up=warm_up)
-    if gap is not None:
-        raise SpecError("gap is for continuous-time designs: a sampled one knows which rows are missing.", path="gap")
-    return SteppingEngine(design, warm_up=warm_up, outliers=outliers)
-
-
-class Entry(NamedTuple):
-    """A row of a log.
-
-    Fields: time: In seconds; deviations: ``(nu + ny,)`` as read; row: Of the filter, and in time smoothed.
-    """
-
-    time: float
-    deviations: FloatArray
-    row: Row
 
 
 class _Waiting(NamedTuple):
@@ -80,7 +55,7 @@ class LaterRows:
                 "of an earlier one: design a descriptor-kalman, adaptive-observer or dae-adaptive-observer.",
                 path="smooth",
             )
-        self.engine, self.lag = engine, lag
+        self.engine, self.lag = engine, checked_lag(lag)
         self.keeping = KeepingObserver(engine.observer)
         engine.observer = self.keeping  # type: ignore[assignment]
         self.waiting: list[_Waiting] = []

@@ -55,9 +55,9 @@ def require_known(given: Iterable[Any], known: Iterable[str], *, what: str, kind
     wrong = [name for name in given if name not in listed]
     if not wrong:
         return
-    told = [f"{name!r}, which is no {kind} of the plant.{suggestion(str(name), listed)}" for name in wrong]
+    told = [f"{what} names {name!r}, which is no {kind} of the plant.{suggestion(str(name), listed)}" for name in wrong]
     if len(wrong) == 1:
-        raise SpecError(f"{what} names {told[0]}", path=what)
+        raise SpecError(told[0], path=what)
     raise SpecError(f"{what} names {len(wrong)} that are no {kind} of the plant:", path=what, problems=told)
 
 
