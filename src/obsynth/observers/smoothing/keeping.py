@@ -13,9 +13,9 @@ from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.dae.estimates import GatheredRows
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.estimates import Estimates
+from obsynth.observers.records import measured_record, whole_record
 from obsynth.observers.recursive.estimates import recursive_estimates
 from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.observers.recursive.records import measured_record, whole_record
 from obsynth.observers.smoothing.chain import Links, Node, Smoothed, all_smoothed, deviations_in, smoothed_from
 from obsynth.observers.smoothing.dae_links import dae_links
 from obsynth.observers.smoothing.recursive_links import recursive_links
