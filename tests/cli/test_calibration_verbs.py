@@ -125,3 +125,20 @@ def test_logs_that_cannot_be_used_have_a_code_in_the_json(folder, tmp_path, caps
     arguments = ["--data", str(tmp_path / "log.csv"), "--rows", ":", "--json", "--quiet"]
     assert main(["calibrate", "--system", str(folder / "spec.yaml"), *arguments]) in (2, 3)
     assert json.loads(capsys.readouterr().out)["code"] == code
+
+
+def test_the_report_on_a_log_says_whether_it_agrees(folder, capsys):
+    gains, page = folder / "report.gains.json", folder / "report.html"
+    assert main(["design", "--system", str(folder / "spec.yaml"), "--output", str(gains), "--quiet"]) == 0
+    columns = ["--map", "u1=u1_held", "--map", "u3=u3_held", "--data", str(folder / "log.csv")]
+    shown = []
+    for rows in (["--rows", "0:56"], []):
+        arguments = ["report", "--gains", str(gains), *columns, *rows, "--out", str(page), "--force"]
+        assert main(arguments) == 0
+        text = page.read_text(encoding="utf-8")
+        shown.append(text[text.index('id="does-your-data-agree"') :].partition("</section>")[0])
+    assert "The log agrees" in shown[0]
+    assert "NIS" in shown[0]
+    assert shown[0].count("<img") == 1
+    assert "does not agree" in shown[1]
+    assert "not free of faults" in shown[1]
