@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.analysis.transformations import StateRecovery
+from obsynth.analysis.transformations.recovery import StateRecovery
 from obsynth.data.log_estimator import DECIDING, Engine, Row, delayed
 from obsynth.data.recovered import LATE, RecoveredStates
 from obsynth.data.signals import TIME, Signals

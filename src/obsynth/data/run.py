@@ -12,18 +12,20 @@ from typing import TYPE_CHECKING, Any, TextIO
 import numpy as np
 
 from obsynth.data.job import Job
+from obsynth.data.linear_log import DataObserver
+from obsynth.data.log_estimator import Engine
 from obsynth.data.saved_state import digest_of_gains, resume_state, save_state
 from obsynth.data.signals import TIME, Signals
 from obsynth.data.sinks import FrameSink, Sink, TextSink, file_sink
 from obsynth.data.sources import Data, chunks
 from obsynth.data.stamps import Stamps
-from obsynth.data.start import engine_of
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.monitors.online import OnlineMonitor
 from obsynth.files.outputs import check_output, require_distinct
 from obsynth.files.signals import HeldSignals, ending_signals
 from obsynth.numerics.arguments import require_kind, require_mapping
 from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.linear.observer import LinearObserver
 from obsynth.results.design import ObserverDesign
 
 if TYPE_CHECKING:
@@ -206,7 +208,7 @@ def run_on_data(
     if time_column is not None:
         require_kind(time_column, str, "time_column", "the name of a column")
         columns = {**(columns or {}), TIME: time_column}
-    engine = engine_of(design, gap=gap, warm_up=warm_up, outliers=outliers)
+    engine = _engine_of(design, gap=gap, warm_up=warm_up, outliers=outliers)
     stamps = Stamps()
     # The monitor is not used up: a second run may begin with it.
     watched = None if monitor is None else copy.deepcopy(monitor)
@@ -231,6 +233,23 @@ def run_on_data(
         (*engine.notes, *job.first.warnings()), digest, table, _measured(kept, job.signals, stamps), stamps,
         dict(thresholds or {}),
     )  # fmt: skip
+
+
+def _engine_of(
+    design: ObserverDesign, *, gap: float | None = None, warm_up: float | None = None, outliers: str | None = None
+) -> Engine:
+    """Return a running design, at its start; ``outliers`` takes the place of what the design says of them."""
+    if isinstance(design.observer, LinearObserver):
+        if outliers not in (None, "none"):
+            raise SpecError("outliers is for recursive and nonlinear designs, which know how far a sample may be from "
+                            "its prediction.", path="outliers")  # fmt: skip
+        return DataObserver(design, gap=gap, warm_up=warm_up)
+    if gap is not None:
+        raise SpecError("gap is for continuous-time designs: a sampled one knows which rows are missing.", path="gap")
+    # What most logs do not need is loaded only where it is used: a run starts in a fraction of a second.
+    from obsynth.data.step_log import SteppingEngine
+
+    return SteppingEngine(design, warm_up=warm_up, outliers=outliers)
 
 
 def _kept(rows: Iterator[FloatArray], kept: list[FloatArray] | None) -> Iterator[FloatArray]:

@@ -66,6 +66,37 @@ class DAERow:
         return np.where(self.seen, self.part("innovation"), np.nan)
 
     @property
+    def gap(self) -> FloatArray:
+        """The same, under the name that every observer of parameters has for it: parameters are those before."""
+        return self.innovation
+
+    @property
+    def whitened(self) -> FloatArray:
+        """An innovation of the same length in units of its covariance ``(degrees,)``, of one sample; to first order.
+
+        Only its length counts for decisions.
+        """
+        white = np.zeros(self.degrees)
+        white[:1] = np.sqrt(max(float(self.nis), 0.0))
+        return white
+
+    @property
+    def regressor(self) -> FloatArray:
+        """Regressor of `whitened` ``(degrees, 0)``: there is none."""
+        return np.zeros((self.degrees, 0))
+
+    @property
+    def state_deviations(self) -> FloatArray:
+        """Standard deviations of `x` ``(nx,)``."""
+        return np.asarray(np.sqrt(np.maximum(np.einsum("...ii->...i", self.covariance), 0.0)))
+
+    @property
+    def is_finite(self) -> bool:
+        """Whether no number has overflown."""
+        arrays = (self.x, self.theta, self.state_deviations, self.parameter_covariance)
+        return all(bool(np.isfinite(array).all()) for array in arrays)
+
+    @property
     def nis(self) -> FloatArray:
         """Square of the innovation in units of its covariance, a number."""
         return self.part("nis")[..., 0]
@@ -120,9 +151,7 @@ class GatheredRows:
     def add_regular(self, rows: DAERow) -> None:
         """Keep some rows, unless the matrix of (7) was singular to working precision in one of them."""
         self.add(rows)
-        conditions = self.parts[-1]["conditions"]
-        if len(conditions) and conditions.max() > SINGULAR_CONDITION:
-            raise _singular(self.observer, rows.several, int(np.argmax(conditions > SINGULAR_CONDITION)))
+        require_regular(self.observer, rows, self.parts[-1]["conditions"])
 
     def estimates(self, informations: FloatArray | None = None) -> Estimates:
         """Return what was gathered.
@@ -138,10 +167,17 @@ class GatheredRows:
         return named_estimates(self.observer, **whole, projection=self.projection, received=received)
 
 
-def _singular(observer: DAESettings, rows: DAERow, i: int) -> SolverError:
+def require_regular(observer: DAESettings, rows: DAERow, conditions: FloatArray) -> None:
+    """Raise `SolverError` where the matrix of (7) was singular to working precision.
+
+    Shapes: ``conditions (samples,)``.
+    """
+    if not len(conditions) or conditions.max() <= SINGULAR_CONDITION:
+        return
+    rows, i = rows.several, int(np.argmax(conditions > SINGULAR_CONDITION))
     equations, states = involved(observer.model, rows.part("scaled")[i])
-    k, condition = rows.k + i, float(rows.conditions[i])
-    return SolverError(
+    k, condition = rows.k + i, float(conditions[i])
+    raise SolverError(
         f"The matrix of (7), dF/dx' / dt + dF/dx, is singular at k = {k} (condition {condition:.3g}): the equations "
         f"{', '.join(map(repr, equations))} do not determine {', '.join(map(repr, states))} there.",
         record={"k": k, "condition": condition},
@@ -150,9 +186,8 @@ def _singular(observer: DAESettings, rows: DAERow, i: int) -> SolverError:
 
 def _columns(rows: DAERow) -> dict[str, FloatArray]:
     """Return what the estimates keep of some samples."""
-    variances = np.einsum("kii->ki", rows.part("covariance"))
     return {
-        "states": rows.x, "state_deviations": np.sqrt(np.maximum(variances, 0.0)),
+        "states": rows.x, "state_deviations": rows.state_deviations,
         "faults": rows.theta, "fault_covariances": rows.parameter_covariance,
         "innovations": rows.innovation, "innovation_covariances": rows.part("expected"), "nis": rows.nis,
         "nis_degrees": rows.seen.sum(axis=1).astype(np.float64), "residuals": rows.part("residual"),

@@ -23,7 +23,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.covariances import covariance_factor
 from obsynth.numerics.least_squares_step import DEPENDENT_COLUMN, SUSPECT_PARITY
 from obsynth.observers.estimates import Estimates, named_estimates
-from obsynth.observers.recursive.estimates import deviations_of, received_in, recursive_estimates
+from obsynth.observers.recursive.estimates import received_in, recursive_estimates
 from obsynth.observers.recursive.recursion import RawEstimate, Recursion, RecursiveState
 from obsynth.observers.recursive.settings import RecursiveSettings
 from obsynth.observers.recursive.step_model import PlantSteps, StepMatrices, StepModel, stacked_noise
@@ -186,8 +186,8 @@ class _Record:
 
     def note(self, k: int, row: RawEstimate) -> None:
         """Keep one sample of a running observer."""
-        self.states[k], self.deviations[k] = row.x, deviations_of(row)
-        self.parameters[k], self.covariances[k] = row.parameters.theta, row.parameters.spread @ row.parameters.spread.T
+        self.states[k], self.deviations[k] = row.x, row.state_deviations
+        self.parameters[k], self.covariances[k] = row.theta, row.parameter_covariance
         self.innovations[k, : len(row.innovation)], self.degrees[k] = row.innovation, len(row.innovation)
 
     def estimates(self, observer: RecursiveSettings, y: FloatArray) -> Estimates:

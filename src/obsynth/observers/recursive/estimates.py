@@ -3,20 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.estimates import Estimates, named_estimates
-
-if TYPE_CHECKING:
-    from obsynth.observers.recursive.recursion import RawEstimate
-    from obsynth.observers.recursive.settings import RecursiveSettings
-
-#: Share of a diffuse direction below which a state is held to be determined: rounding of an orthonormal basis.
-UNDETERMINED_SHARE = 1e-8
+from obsynth.observers.recursive.recursion import RawEstimate
+from obsynth.observers.recursive.settings import RecursiveSettings
 
 
 def recursive_estimates(
@@ -38,13 +32,12 @@ def recursive_estimates(
         innovations[i, : len(row.innovation)] = row.innovation
         if len(row.regressor):
             padded[i, : len(row.regressor)] = row.regressor
-    spreads = np.array([row.parameters.spread @ row.parameters.spread.T for row in rows])
     return named_estimates(
         observer,
         states=np.array([row.x for row in rows]).reshape(len(rows), nx),
-        state_deviations=np.array([deviations_of(row) for row in rows]).reshape(len(rows), nx),
-        faults=np.array([row.parameters.theta for row in rows]).reshape(len(rows), nq),
-        fault_covariances=spreads.reshape(len(rows), nq, nq),
+        state_deviations=np.array([row.state_deviations for row in rows]).reshape(len(rows), nx),
+        faults=np.array([row.theta for row in rows]).reshape(len(rows), nq),
+        fault_covariances=np.array([row.parameter_covariance for row in rows]).reshape(len(rows), nq, nq),
         innovations=innovations,
         regressors=padded,
         nis=np.array([row.nis for row in rows]),
@@ -59,13 +52,6 @@ def received_in(y: FloatArray) -> NDArray[np.bool_]:
     received = ~np.isnan(y)
     received.setflags(write=False)
     return received
-
-
-def deviations_of(row: RawEstimate) -> FloatArray:
-    """Return standard deviations ``(nx,)`` of the states; infinite where one is undetermined."""
-    deviations = np.sqrt(np.einsum("ij,ij->i", row.factor, row.factor))
-    open_states = (np.abs(row.diffuse) > UNDETERMINED_SHARE).any(axis=1)
-    return np.where(open_states, np.inf, deviations)
 
 
 def excitation_levels(regressors: Sequence[FloatArray], window: int) -> FloatArray:
