@@ -117,6 +117,7 @@ def add_data_verbs(verbs: Any) -> None:
     report.add_argument("--out", type=Path, required=True, metavar="FILE", help="the page (HTML)")
     report.add_argument("--system", type=Path, metavar="SPEC", help="show the design on the scenario of this spec")
     _add_data(report, required=False, what="show the design on this log as well: text, Parquet, TDMS or MDF file")
+    report.add_argument("--rows", metavar="A:B", help="rows without faults, which are to agree (default: all)")
     _add_data_options(report)
     add_force(report)
     add_json(report)
