@@ -19,6 +19,7 @@ from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.pencils import FiniteZeros, pencil_structure
 from obsynth.numerics.ranks import RankDecision, decide_rank
 from obsynth.numerics.scaling import equilibrate_pencil
+from obsynth.numerics.threads import on_one_thread_if_small
 from obsynth.plants.descriptor import DescriptorSystem
 
 
@@ -63,6 +64,7 @@ class Structure:
 
 # Conditions, synthesis and verification ask for the same plant's; plants never change.
 @lru_cache(maxsize=4)
+@on_one_thread_if_small
 def analyse_structure(plant: DescriptorSystem | Transformation) -> Structure:
     """Analyse regularity, index, stability and observability of ``plant``.
 

@@ -228,8 +228,8 @@ def _judged_residuals(watched: Monitor, bench: Bench, runs: Runs) -> FloatArray:
     """Return ``(3, runs)``: whether an alarm is false, when a fault is found, and whether another one is blamed."""
     observer = cast(LinearBench, bench).observer
     rows = observer.fault_rows if watched.watches_estimates else observer.residual_rows
-    passed = watched.passed_in(runs, rows)
-    begin = len(passed) if bench.onset is None else bench.onset
+    begin = len(runs.rows) if bench.onset is None else bench.onset
+    passed = watched.passed_in(runs, rows, onset=begin)
     judged = np.full((3, passed.shape[1]), np.nan)
     judged[0] = passed[:begin].any(axis=0)
     for run in np.flatnonzero(passed[begin:].any(axis=0)):

@@ -19,6 +19,7 @@ from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import decide_rank
 from obsynth.numerics.spectra import abscissa, response
+from obsynth.numerics.threads import on_one_thread_if_small
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.balls import Enclosed, block
@@ -63,6 +64,7 @@ class DetectionFilter:
         return self.fault_sensitivity / self.disturbance_gain
 
 
+@on_one_thread_if_small
 def detection_filter(
     plant: DescriptorSystem | Transformation, *, band: Sequence[float] = (0.0, 1e3)
 ) -> DetectionFilter:

@@ -15,9 +15,9 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.least_squares_step import least_squares_step, rank_revealing_step
 from obsynth.numerics.recursive_least_squares import update
 from obsynth.observers.estimates import Estimates, named_estimates
+from obsynth.observers.records import require_horizon
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.recursive.parameter_steps import posterior_residual
-from obsynth.observers.recursive.records import require_horizon
 from obsynth.observers.recursive.step_model import EarlyConstraintSteps, StepMatrices, require_in_range
 
 
