@@ -23,7 +23,7 @@ from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.monitors.online import OnlineMonitor
 from obsynth.files.outputs import check_output, require_distinct
 from obsynth.files.signals import HeldSignals, ending_signals
-from obsynth.numerics.arguments import require_kind, require_mapping, truth
+from obsynth.numerics.arguments import is_whole, require_kind, require_mapping, truth
 from obsynth.numerics.arrays import FloatArray
 from obsynth.results.design import ObserverDesign
 
@@ -204,7 +204,7 @@ def run_on_data(
         require_kind(state, (str, Path), "state", "the name of a file")
     if out is not None and not hasattr(out, "write"):
         require_kind(out, (str, Path), "out", "the name of a file, or a text stream")
-    if isinstance(chunk_rows, bool) or not isinstance(chunk_rows, int) or chunk_rows < 1:
+    if not is_whole(chunk_rows) or chunk_rows < 1:
         raise SpecError(f"chunk_rows is {chunk_rows!r}: give a whole number, 1 or more.", path="chunk_rows")
     require_distinct({
         "state": state, "data": data if isinstance(data, str | Path) else None,
