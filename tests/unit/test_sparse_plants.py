@@ -270,3 +270,25 @@ class TestNumerics:
         factor = SparseFactor(sp.csr_array(matrix))
         assert factor.singular
         assert set(np.argsort(-factor.null_vectors().columns)[:2]) == {5, 7}
+
+
+class TestRounding:
+    """Entries that are only rounding: by random signs, as by the rows of the inverse."""
+
+    def test_signs_and_rows_of_the_inverse_agree(self, monkeypatch):
+        rng = np.random.default_rng(5)
+        size, share = 400, 1e-6
+        links = sp.diags_array([rng.uniform(0.2, 0.5, size - 1), rng.uniform(0.2, 0.5, size - 1)], offsets=[-1, 1])
+        factor = SparseFactor(sp.csr_array(links + 1.5 * sp.eye_array(size)))
+        solution = rng.normal(size=(size, 2)) * np.logspace(0, -9, size)[:, None]
+        terms = factor.size_of_terms(solution, np.arange(size))
+        truth = np.abs(solution) <= share * terms
+        assert 0 < truth.sum() < truth.size
+        suspicious = rng.random(solution.shape) < 0.9
+        exact_rows = []
+        found = SparseFactor.size_of_terms
+        monkeypatch.setattr(
+            SparseFactor, "size_of_terms", lambda self, x, rows: (exact_rows.append(len(rows)), found(self, x, rows))[1]
+        )
+        np.testing.assert_array_equal(factor.only_rounding(solution, suspicious, share), truth & suspicious)
+        assert sum(exact_rows) < size // 2

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,6 +21,9 @@ CHUNK = 256
 SCALING_SWEEPS = 3
 #: Steps of inverse iteration for the smallest singular value: the gap to the next decides, and few are needed.
 INVERSE_STEPS = 6
+#: Random signs by which sums of absolute values are estimated, and the safety factor beside the root of their number.
+SIGN_SAMPLES = 6
+SIGN_SAFETY = 4.0
 #: Relative size of what is added to the diagonal of a factor that SuperLU calls singular, to find its null vectors.
 PERTURBATION = 1e-14
 
@@ -168,6 +172,33 @@ class SparseFactor:
             units[wanted[part], np.arange(units.shape[1])] = 1.0
             found[part] = np.abs(self._lu.solve(units, trans="T")).T @ terms
         return self.columns[wanted][:, None] * found
+
+
+    def only_rounding(self, solution: FloatArray, suspicious: Any, share: float) -> Any:
+        """Return which suspicious entries ``(size, count)`` are below ``share`` of the sum of terms they come from.
+
+        The terms are `size_of_terms`.  Their sum has a root-mean-square estimate by random signs, which settles most
+        entries with few solves, however many rows there are; the others are computed exactly.
+        """
+        rows, columns = np.flatnonzero(suspicious.any(axis=1)), np.flatnonzero(suspicious.any(axis=0))
+        found = np.zeros(suspicious.shape, dtype=bool)
+        sizes = np.abs(solution)
+        if SIGN_SAMPLES * len(columns) < len(rows):
+            terms = abs(self.matrix) @ (sizes[:, columns] / self.columns[:, None])
+            signs = np.random.default_rng(0).choice([-1.0, 1.0], (SIGN_SAMPLES, self.size, 1))
+            drawn = np.hstack([terms * sign for sign in signs])
+            solved = np.abs(self.columns[:, None] * self._lu.solve(drawn)).reshape(self.size, SIGN_SAMPLES, -1)
+            # Any signs give a lower bound of the sum; the root mean square is at least its share of one per root.
+            above = SIGN_SAFETY * math.sqrt(self.size) * np.sqrt(np.mean(solved**2, axis=1))
+            doubtful = sizes[:, columns] <= share * above
+            certain = sizes[:, columns] <= share * np.max(solved, axis=1)
+            found[:, columns] = certain & suspicious[:, columns]
+            rows = np.flatnonzero((doubtful & ~certain & suspicious[:, columns]).any(axis=1))
+        if rows.size:
+            part = np.ix_(rows, columns)
+            small = sizes[part] <= share * self.size_of_terms(solution[:, columns], rows)
+            found[part] |= small & suspicious[part]
+        return found
 
 
 def _chunks(count: int) -> Iterator[slice]:

@@ -137,11 +137,6 @@ def without_rounding(factor: SparseFactor, solution: FloatArray) -> FloatArray:
     # No sum of terms is larger than the condition number times the largest unknown.
     most = CANCELLATION_TOLERANCE * factor.condition * np.max(sizes, axis=0, initial=0.0)
     suspicious = (sizes > 0.0) & (sizes <= most)
-    rows, columns = np.flatnonzero(suspicious.any(axis=1)), np.flatnonzero(suspicious.any(axis=0))
-    if not rows.size:
+    if not suspicious.any():
         return solution
-    found = solution.copy()
-    part = np.ix_(rows, columns)
-    terms = factor.size_of_terms(solution[:, columns], rows)
-    found[part] = np.where(np.abs(solution[part]) > CANCELLATION_TOLERANCE * terms, solution[part], 0.0)
-    return found
+    return np.where(factor.only_rounding(solution, suspicious, CANCELLATION_TOLERANCE), 0.0, solution)
