@@ -280,7 +280,7 @@ class TestRounding:
         size, share = 400, 1e-6
         links = sp.diags_array([rng.uniform(0.2, 0.5, size - 1), rng.uniform(0.2, 0.5, size - 1)], offsets=[-1, 1])
         factor = SparseFactor(sp.csr_array(links + 1.5 * sp.eye_array(size)))
-        solution = rng.normal(size=(size, 2)) * np.logspace(0, -9, size)[:, None]
+        solution = rng.normal(size=(size, 2)) * 10.0 ** rng.uniform(-9, 0, (size, 2))
         terms = factor.size_of_terms(solution, np.arange(size))
         truth = np.abs(solution) <= share * terms
         assert 0 < truth.sum() < truth.size

@@ -173,7 +173,6 @@ class SparseFactor:
             found[part] = np.abs(self._lu.solve(units, trans="T")).T @ terms
         return self.columns[wanted][:, None] * found
 
-
     def only_rounding(self, solution: FloatArray, suspicious: Any, share: float) -> Any:
         """Return which suspicious entries ``(size, count)`` are below ``share`` of the sum of terms they come from.
 

@@ -226,9 +226,7 @@ def _from_coordinates(tokens: list[str], size: tuple[int, int, int], field: str,
     rows, columns, stored = size
     width = 2 if field == "pattern" else 3
     _require_count(len(tokens), width * stored)
-    positions = [
-        np.array(_all_whole(tokens[k::width], "an index"), dtype=np.int64) - 1 for k in (0, 1)
-    ]
+    positions = [np.array(_all_whole(tokens[k::width], "an index"), dtype=np.int64) - 1 for k in (0, 1)]
     for position, limit in zip(positions, (rows, columns), strict=True):
         if np.any(position < 0) or np.any(position >= limit):
             raise ValueError("an index is outside the matrix")
