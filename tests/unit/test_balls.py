@@ -5,6 +5,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
+from obsynth.proofs import exponentials
 from obsynth.proofs.balls import UNDERFLOW, UNIT_ROUNDOFF, Ball, block, gamma, rounded_up
 
 #: Every double is a whole multiple of 1 / UNITS.
@@ -175,3 +176,28 @@ def test_overflow_claims_nothing():
     for result in (huge @ huge, (huge @ huge) @ Ball.exact(np.zeros((2, 2))), Ball.exact(np.full((1, 1), 1.7e308))):
         doubled = result + result
         assert not np.any(np.isfinite(doubled.midpoint) & np.isfinite(doubled.radius))
+
+
+class TestExponentialsOfManyStates:
+    """By squaring in double precision, in units that balance the matrix: the balls hold what python-flint says."""
+
+    @pytest.mark.parametrize("time", [0.05, 3.0])
+    def test_holds_what_more_digits_say(self, time, monkeypatch):
+        n, rng = exponentials.MANY_STATES + 1, np.random.default_rng(7)
+        units = 10.0 ** rng.uniform(-3, 3, n)
+        a = units[:, None] * (rng.normal(size=(n, n)) / np.sqrt(n) - 1.5 * np.eye(n)) / units
+        b = units[:, None] * rng.normal(size=(n, 2))
+        fast = exponentials.exponential(a, time), exponentials.energy(a, b, time)
+        monkeypatch.setattr(exponentials, "MANY_STATES", n)
+        sharp = exponentials.exponential(a, time), exponentials.energy(a, b, time)
+        for found, known in zip(fast, sharp, strict=True):
+            assert np.all(np.abs(found.midpoint - known.midpoint) <= found.radius + known.radius)
+            assert np.max(found.radius) > np.max(known.radius)
+        assert np.max(fast[0].radius) <= 1e-5 * np.max(np.abs(fast[0].midpoint))
+
+    def test_what_double_precision_does_not_tell_is_left_to_more_digits(self):
+        n = exponentials.MANY_STATES + 1
+        a = np.diag(np.ones(n - 1), 1) * 40.0 - 60.0 * np.eye(n)
+        a[-1, 0] = -40.0
+        found = exponentials.exponential(a, 2.0)
+        assert np.max(found.radius) <= 1e-12 * np.max(np.abs(found.midpoint))

@@ -33,9 +33,9 @@ LEVEL_FACTORS = (1.0, 1.5)
 #: Above so many states the higher level, which makes gains up to a quarter smaller, would cost up to half of the time.
 MOST_STATES_FOR_LEVELS = 200
 WEIGHT_STEPS = 4
-#: A disturbance that does less than this share of what it does to the starting filter is decoupled; the level at which
-#: such a filter is looked for in turn, relative to the same; a point without meaning; and the share of rows xi that counts as
-#: nothing.
+#: A disturbance that does less than this share of what it does to the starting filter is decoupled; the levels at which
+#: such a filter is looked for in turn, relative to the same; a point without meaning; and the share of rows xi that
+#: counts as nothing.
 DECOUPLED_GAIN = 1e-7
 DECOUPLING_LEVELS = (1e-4, 1e-2)
 GENERIC_POINT = 1.3247
@@ -104,7 +104,7 @@ def search_central_filter(
 
 
 def _decoupling_filter(problem: GainProblem, gain: float) -> tuple[Injection, float] | None:
-    """Return a filter that no disturbance reaches, and its gain, from one solution or two; ``None`` where there is none.
+    """Return a filter that no disturbance reaches, and its gain, from a solution or two; ``None`` where there is none.
 
     It exists only if what xi shows follows from the measurements at almost every point, whatever the disturbance does.
     """
