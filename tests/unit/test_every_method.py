@@ -18,7 +18,8 @@ import pytest
 import obsynth
 from obsynth.methods.registry import REGISTRY, method_spec
 from obsynth.observers.dae.observer import DAEObserver
-from obsynth.observers.linear.observer import Estimates, LinearObserver
+from obsynth.observers.estimates import Estimates
+from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
 
 SAMPLES = 24

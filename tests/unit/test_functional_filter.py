@@ -140,6 +140,42 @@ def test_index_two_and_algebraic_rows_are_proved_with_t0() -> None:
     assert found.report.passed
 
 
+@pytest.mark.parametrize("dt", [0.0, 1.0])
+def test_exact_equations_need_no_noise(dt: float) -> None:
+    # Index 2: x1 = 0 is exact, so x2 = -f, and y = x2 + v is the fault with the noise of one sensor: a walk of q in
+    # noise of r has the least error of all filters in closed form.
+    plant = obsynth.DescriptorSystem(
+        [[1, 0], [0, 0]], [[0, 1], [1, 0]], None, [[0, 1]], Bf=[[1], [0]], Dw=[[0.1]], dt=dt
+    )
+    found = obsynth.functional_filter(plant, fault_rate=0.1)
+    assert found.report.passed
+    error = found.certificate.matrices["deviations"][0, 1]
+    if dt:
+        assert found.observer.order == 2
+    else:
+        assert error == pytest.approx(0.1, rel=1e-3)
+
+
+@pytest.mark.parametrize("dt", [0.0, 1.0])
+def test_exact_equations_with_inputs_and_noise(dt: float) -> None:
+    e, a = np.diag([1.0, 1, 0]), [[-1.0, 1, 0], [-1, -1, 1], [1, 1, 0]]
+    plant = obsynth.DescriptorSystem(
+        e, a, [[0.0], [0], [-1]], [[0, 0, 1], [1, 0, 0]], Bf=[[1], [0], [0]], Dw=0.1 * np.eye(2), dt=dt
+    )
+    assert obsynth.functional_filter(plant).report.passed
+
+
+@pytest.mark.parametrize("dt", [0.0, 1.0])
+def test_an_empty_equation_is_left_out(dt: float) -> None:
+    # sE - A is not regular: the third equation is 0 = 0, and x3 is free; the fault shows all the same.
+    plant = obsynth.DescriptorSystem(
+        np.diag([1.0, 1, 0]), [[-0.2, 0, 0.2], [0, -0.4, 0], [0, 0, 0]], None, [[1, 0, 0], [0, 1, 0]],
+        Bf=[[0], [1], [0]], Dw=0.1 * np.eye(2), dt=dt,
+    )  # fmt: skip
+    assert obsynth.functional_filter(plant).report.passed
+    assert obsynth.functional_filter(plant, residuals="detect").report.passed
+
+
 @pytest.mark.parametrize(
     ("options", "text"),
     [

@@ -232,7 +232,5 @@ def run_verify(options: argparse.Namespace) -> int:
             "passed": report.passed, "report": report.as_dict(),
         })  # fmt: skip
     else:
-        from obsynth.report import design_report
-
-        design_report(design.replace(report=report), console=stdout_console(), file=options.gains)
+        _print_design(design.replace(report=report), options.gains, verbose=options.verbose)
     return 0 if report.passed else VerificationError.exit_code

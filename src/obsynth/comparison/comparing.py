@@ -25,6 +25,7 @@ from obsynth.numerics.arguments import (
     require_kind,
 )
 from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.threads import on_one_thread_if_small
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.profiles import Sine, Step
@@ -35,6 +36,7 @@ RUNS, SAMPLES, SETTLING_TIMES, MOST_STEPS = 20, 40, 8, 6000
 SEED = 7
 
 
+@on_one_thread_if_small
 def compare(
     plant: DescriptorSystem,
     *,

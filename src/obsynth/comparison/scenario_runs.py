@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.holds import driven
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.simulation.scenario import Scenario
@@ -63,25 +64,17 @@ def drawn_runs(
 
 def estimates(observer: LinearObserver, u: FloatArray, outputs: FloatArray) -> FloatArray:
     """Return fault estimates ``(runs, steps, faults)`` of an observer at rest on outputs ``(runs, steps, ny)``."""
-    z = np.zeros((len(outputs), observer.order))
-    rows = observer.fault_rows
-    known = u @ observer.Bu.T, u @ observer.Du[rows].T
-    found = np.empty((*outputs.shape[:2], len(observer.fault_names)))
+    rows, y = observer.fault_rows, outputs.swapaxes(0, 1)
+    z = driven(observer.Az, np.zeros(observer.order), y @ observer.By.T + (u @ observer.Bu.T)[:, None])
     with np.errstate(over="ignore", invalid="ignore"):
-        for k in range(outputs.shape[1]):
-            y = outputs[:, k]
-            found[:, k] = z @ observer.Cz[rows].T + y @ observer.Dy[rows].T + known[1][k]
-            z = z @ observer.Az.T + y @ observer.By.T + known[0][k]
-    return found
+        found = z @ observer.Cz[rows].T + y @ observer.Dy[rows].T + (u @ observer.Du[rows].T)[:, None]
+    return np.ascontiguousarray(found.swapaxes(0, 1))
 
 
 def _outputs(plant: DescriptorSystem, u: FloatArray, d: FloatArray, f: FloatArray, w: FloatArray) -> FloatArray:
     into = u @ plant.B.T + d @ plant.Bd.T + f @ plant.Bf.T + w @ plant.Bw.T
     direct = u @ plant.D.T + d @ plant.Dd.T + f @ plant.Df.T + w @ plant.Dw.T
-    x, states = np.zeros(plant.nx), np.empty((len(u), plant.nx))
-    for k in range(len(u)):
-        states[k] = x
-        x = plant.A @ x + into[k]
+    states = driven(plant.A, np.zeros(plant.nx), into)
     return np.asarray(states @ plant.C.T + direct)
 
 

@@ -15,6 +15,7 @@ from obsynth.analysis.diagnosis.sensor_search import GOALS, SensorSearch, Task, 
 from obsynth.errors import ObsynthError, PreconditionError, SpecError
 from obsynth.methods.functional_filter.public import functional_filter
 from obsynth.numerics.arguments import is_finite_number, require_kind
+from obsynth.numerics.threads import on_one_thread_if_small
 from obsynth.plants.descriptor import DescriptorSystem
 
 #: So many sets are returned at most by default, and so many of them designed for.
@@ -58,7 +59,7 @@ class SensorSets:
     may_be_lost : tuple of str
         Outputs of the plant that may fail, one at a time, without losing the goal (with no sensor added).
     notes : tuple of str
-        What was searched.
+        What was searched; where no set is small enough, one that does it.
     """
 
     goal: str
@@ -107,6 +108,7 @@ class SensorSets:
         return f"<table><tr>{head}</tr>{body}</table>{texts}"
 
 
+@on_one_thread_if_small
 def sensor_sets(
     plant: DescriptorSystem,
     *,
@@ -195,8 +197,11 @@ def sensor_sets(
     notes = [_note(search, exact, bound, most, len(found))]
     if not found:
         one = search.greedy_set(wanted)
-        found = [] if one is None else [one]
-        exact = False
+        if one is not None and largest is not None and len(one) > largest:
+            # More than asked for: said, not given.
+            notes.append(f"One of {len(one)} does: {', '.join(sensors[i].name for i in one)}.")
+        else:
+            found, exact = ([], exact) if one is None else ([one], False)
     report_stage("designing for each set")
     ranked = _ranked(search, found, costs, noise is not None and goal.startswith("estimate"))
     kept = tuple(name for i, name in enumerate(plant.output_names) if _kept_without(search, wanted, i))
@@ -241,6 +246,8 @@ def _require_positive(given: Mapping[str, Any], names: Sequence[str], what: str,
 
 
 def _note(search: SensorSearch, exact: bool, bound: int, most: int, count: int) -> str:
+    if exact and not count:
+        return f"No set of at most {bound} of {len(search.sensors)} candidates does it: all were tried."
     if exact:
         return f"All inclusion-minimal sets of at most {bound} of {len(search.sensors)} candidates."
     if count >= most:

@@ -12,17 +12,18 @@ from typing import TYPE_CHECKING, Any, TextIO
 import numpy as np
 
 from obsynth.data.job import Job
+from obsynth.data.linear_log import engine_of
+from obsynth.data.log_estimator import Engine, Later
 from obsynth.data.saved_state import digest_of_gains, resume_state, save_state
 from obsynth.data.signals import TIME, Signals
 from obsynth.data.sinks import FrameSink, Sink, TextSink, file_sink
 from obsynth.data.sources import Data, chunks
 from obsynth.data.stamps import Stamps
-from obsynth.data.start import engine_of
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.monitors.online import OnlineMonitor
 from obsynth.files.outputs import check_output, require_distinct
 from obsynth.files.signals import HeldSignals, ending_signals
-from obsynth.numerics.arguments import require_kind, require_mapping
+from obsynth.numerics.arguments import require_kind, require_mapping, truth
 from obsynth.numerics.arrays import FloatArray
 from obsynth.results.design import ObserverDesign
 
@@ -103,6 +104,8 @@ def run_on_data(
     gap: float | None = None,
     warm_up: float | None = None,
     outliers: str | None = None,
+    smooth: bool = False,
+    lag: int | None = None,
     recovered: str | Sequence[str] | None = None,
     state: str | Path | None = None,
     chunk_rows: int = CHUNK_ROWS,
@@ -148,6 +151,12 @@ def run_on_data(
     outliers : {"gate", "huber", "none"}, optional
         Recursive and nonlinear designs: what is done with a sample that its prediction excludes; by default what the
         design says, and a gate of six deviations where it says nothing.
+    smooth : bool, optional
+        Recursive and nonlinear designs: estimates from the whole log, as `obsynth.smooth` makes them, instead of those
+        of the filter.  Residuals, outliers, monitors and statuses stay those of the filter.  All rows are written at
+        the end, and the log is held in memory.
+    lag : int, optional
+        The same with the ``lag`` samples after each row; each row is written, with its own time, when they are there.
     recovered : {"all", "none"} or list of str, optional
         Which states of the plant as written, before its algebraic states were eliminated, stand beside the estimates;
         by default all of up to 300, and none of more.
@@ -210,7 +219,8 @@ def run_on_data(
     stamps = Stamps()
     # The monitor is not used up: a second run may begin with it.
     watched = None if monitor is None else copy.deepcopy(monitor)
-    job = Job(engine, Signals.of(engine, columns, scales), design.recovery, thresholds or {}, watched, recovered)
+    later = _later_rows(engine, data, smooth=smooth, lag=lag, state=state)
+    job = Job(engine, Signals.of(engine, columns, scales), design.recovery, thresholds or {}, watched, recovered, later)
     digest = digest_of_gains(design)
     if state is not None and Path(state).exists():
         resume_state(Path(state), job, digest)
@@ -231,6 +241,22 @@ def run_on_data(
         (*engine.notes, *job.first.warnings()), digest, table, _measured(kept, job.signals, stamps), stamps,
         dict(thresholds or {}),
     )  # fmt: skip
+
+
+def _later_rows(engine: Engine, data: Data, *, smooth: bool, lag: int | None, state: str | Path | None) -> Later | None:
+    """Return where rows wait for those after them, if they do."""
+    if not truth(smooth, "smooth") and lag is None:
+        return None
+    if smooth and lag is not None:
+        raise SpecError("smooth takes the whole record, and lag some samples of it: give one of them.", path="lag")
+    if smooth and hasattr(data, "readline"):
+        raise SpecError("A stream has no end to smooth from: give a lag, or the log as a file.", path="smooth")
+    if smooth and state is not None:
+        raise SpecError("smooth takes the whole record, and a saved state goes on with a part of it: give a lag, or "
+                        "leave the state out.", path="smooth")  # fmt: skip
+    from obsynth.data.smoothing import LaterRows
+
+    return LaterRows(engine, lag)
 
 
 def _kept(rows: Iterator[FloatArray], kept: list[FloatArray] | None) -> Iterator[FloatArray]:
@@ -258,6 +284,7 @@ def _run_rows(job: Job, rows: Iterator[FloatArray], sink: Sink, progress: Callab
         sink.write(job.take(chunk))
         if progress is not None:
             progress(job.rows)
+    sink.write(job.finish())
 
 
 def _run_stream(
@@ -283,6 +310,7 @@ def _run_stream(
         finally:
             if is_whole and job.rows:
                 save()
+                sink.write(job.finish())
 
 
 @contextmanager

@@ -22,7 +22,8 @@ def read_only(array: FloatArray) -> FloatArray:
 
 def unmasked(value: Any) -> Any:
     """Return masked numbers with NaN for what lies under the mask, and anything else as it is."""
-    if not np.ma.isMaskedArray(value) or value.dtype.kind not in "fiu":
+    # Asked first, since numpy loads its masked arrays when they are named.
+    if not hasattr(value, "mask") or not np.ma.isMaskedArray(value) or value.dtype.kind not in "fiu":
         return value
     return np.where(np.ma.getmaskarray(value), np.nan, np.ma.getdata(value))
 

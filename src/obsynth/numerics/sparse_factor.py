@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -21,11 +20,10 @@ CHUNK = 256
 SCALING_SWEEPS = 3
 #: Steps of inverse iteration for the smallest singular value: the gap to the next decides, and few are needed.
 INVERSE_STEPS = 6
-#: Random signs by which sums of absolute values are estimated, and the safety factor beside the root of their number.
-SIGN_SAMPLES = 6
-SIGN_SAFETY = 4.0
 #: Relative size of what is added to the diagonal of a factor that SuperLU calls singular, to find its null vectors.
 PERTURBATION = 1e-14
+#: Samples of the usual size of terms, and how far their mean may be off.
+SAMPLES, SAMPLED = 8, 8.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,15 +153,7 @@ class SparseFactor:
         return np.asarray(self.rows[:, None] * unknown)
 
     def size_of_terms(self, solution: FloatArray, places: Any) -> FloatArray:
-        """Return chosen rows of ``|matrix^-1| (|matrix| |solution|)``: rounding is judged beside it.
-
-        Parameters
-        ----------
-        solution : FloatArray
-            ``(size, count)``.
-        places : array of int
-            Rows.
-        """
+        """Return chosen rows of ``|matrix^-1| (|matrix| |solution|)``: rounding is judged beside it."""
         wanted = np.asarray(places, dtype=np.int64)
         terms = abs(self.matrix) @ (np.abs(solution) / self.columns[:, None])
         found = np.zeros((len(wanted), solution.shape[1]))
@@ -173,31 +163,16 @@ class SparseFactor:
             found[part] = np.abs(self._lu.solve(units, trans="T")).T @ terms
         return self.columns[wanted][:, None] * found
 
-    def only_rounding(self, solution: FloatArray, suspicious: Any, share: float) -> Any:
-        """Return which suspicious entries ``(size, count)`` are below ``share`` of the sum of terms they come from.
+    def usual_size_of_terms(self, solution: FloatArray) -> FloatArray:
+        """Return an estimate of `size_of_terms` of all rows with sums of squares for sums: terms of random signs.
 
-        The terms are `size_of_terms`.  Their sum has a root-mean-square estimate by random signs, which settles most
-        entries with few solves, however many rows there are; the others are computed exactly.
+        The sum itself lies between it and its product with the root of ``size``; eight samples are within a factor of
+        `SAMPLED` of the truth.
         """
-        rows, columns = np.flatnonzero(suspicious.any(axis=1)), np.flatnonzero(suspicious.any(axis=0))
-        found = np.zeros(suspicious.shape, dtype=bool)
-        sizes = np.abs(solution)
-        if SIGN_SAMPLES * len(columns) < len(rows):
-            terms = abs(self.matrix) @ (sizes[:, columns] / self.columns[:, None])
-            signs = np.random.default_rng(0).choice([-1.0, 1.0], (SIGN_SAMPLES, self.size, 1))
-            drawn = np.hstack([terms * sign for sign in signs])
-            solved = np.abs(self.columns[:, None] * self._lu.solve(drawn)).reshape(self.size, SIGN_SAMPLES, -1)
-            # Any signs give a lower bound of the sum; the root mean square is at least its share of one per root.
-            above = SIGN_SAFETY * math.sqrt(self.size) * np.sqrt(np.mean(solved**2, axis=1))
-            doubtful = sizes[:, columns] <= share * above
-            certain = sizes[:, columns] <= share * np.max(solved, axis=1)
-            found[:, columns] = certain & suspicious[:, columns]
-            rows = np.flatnonzero((doubtful & ~certain & suspicious[:, columns]).any(axis=1))
-        if rows.size:
-            part = np.ix_(rows, columns)
-            small = sizes[part] <= share * self.size_of_terms(solution[:, columns], rows)
-            found[part] |= small & suspicious[part]
-        return found
+        terms = abs(self.matrix) @ (np.abs(solution) / self.columns[:, None])
+        signs = np.random.default_rng(2).choice((-1.0, 1.0), (SAMPLES, *terms.shape))
+        squares = [self._lu.solve(part * terms) ** 2 for part in signs]
+        return np.asarray(self.columns[:, None] * np.sqrt(np.mean(squares, axis=0)))
 
 
 def _chunks(count: int) -> Iterator[slice]:

@@ -40,7 +40,8 @@ class Problems:
         try:
             return make()
         except SpecError as error:
-            self._note(str(error), error.path)
+            for problem in error.problems or (str(error),):
+                self._note(problem, error.path)
             return None
 
     def shaped(self, value: FloatArray | None, name: str, shape: tuple[int, int]) -> FloatArray:

@@ -9,7 +9,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from obsynth.analysis.transformations import StateRecovery
+from obsynth.analysis.transformations.recovery import StateRecovery
 from obsynth.analysis.transformations.recovery_operator import RecoveryOperator
 from obsynth.errors import SpecError
 from obsynth.files.inputs import input_file, json_data, read_json
@@ -31,6 +31,7 @@ from obsynth.results.gain_set_writing import (
     gain_set_digest,
     place_of,
     save,
+    types_of,
 )
 from obsynth.results.plain_data import digest_of, plain, restored
 from obsynth.results.plant_source import PlantSource
@@ -148,7 +149,7 @@ def _recovery_from(**data: Any) -> StateRecovery:
 def _design_from(data: dict[str, Any]) -> ObserverDesign:
     if not isinstance(data.get("kind"), (str, type(None))) or data.get("kind") not in KINDS:
         raise SpecError(f"A design of the kind {data['kind']!r} is unknown to this obsynth.", path="kind")
-    plant, observer = KINDS[data.get("kind")]
+    plant, observer = types_of(data.get("kind"))
     recovery = data["recovery"]
     return ObserverDesign(
         name=data["name"],

@@ -69,11 +69,11 @@ def checked_spec(document: Mapping[str, Any], source: Path) -> tuple[SpecDocumen
     if identifier == AUTO and isinstance(raw_options, dict) and checked is not None:
         problems.raise_if_any()
         return checked, _options_of_any(raw_options, source)
-    if isinstance(identifier, str) and identifier not in REGISTRY:
+    if isinstance(identifier, str) and identifier not in (*REGISTRY, AUTO):
         close = _suggestion(identifier, list(REGISTRY))
         known = ", ".join(sorted([*REGISTRY, AUTO]))
         problems.add("method.id", f"unknown method {identifier!r}; the known methods are: {known}.{close}")
-    elif isinstance(identifier, str) and isinstance(raw_options, dict):
+    elif isinstance(identifier, str) and identifier != AUTO and isinstance(raw_options, dict):
         options = _validated(options_schema(identifier), raw_options, problems, prefix="method.options")
     problems.raise_if_any()
     if checked is None or options is None:

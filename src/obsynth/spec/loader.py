@@ -16,9 +16,9 @@ from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.simulation.failures import KINDS
-from obsynth.simulation.parameter_scenario_signals import check_recursive
 from obsynth.simulation.profiles import Profile
 from obsynth.simulation.scenario import Scenario
+from obsynth.simulation.scenario_signals import check_parameters
 from obsynth.spec.checking import DocumentProblems, checked_plant, checked_spec
 from obsynth.spec.documents import read_yaml
 from obsynth.spec.plants import built_plant, linearised, read_value, transformed
@@ -52,7 +52,7 @@ def built_scenario(
             scenario.check_names(plant)
             scenario.step_of(plant)
         else:
-            check_recursive(plant, scenario)
+            check_parameters(plant, scenario)
     except SpecError as error:
         problems.add(f"scenario.{error.path}", str(error))
         problems.raise_if_any()
@@ -124,17 +124,24 @@ class Spec:
 
 def load_model(path: str | Path) -> tuple[DAEModel, Spec | None]:
     """Return the nonlinear plant of a spec, with the spec, or of a file that holds a plant alone."""
+    plant, spec = load_plant(path)
+    if not isinstance(plant, DAEModel):
+        raise SpecError(f"{path} holds no nonlinear plant (kind: dae).", path=str(path))
+    return plant, spec
+
+
+def load_plant(
+    path: str | Path,
+) -> tuple[DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel, Spec | None]:
+    """Return the plant of a spec as it was written, with the spec, or that of a file that holds a plant alone."""
     source = Path(path)
     document = read_yaml(source)
-    if "method" in document or "plant" in document:
-        spec = load_spec(source)
-        model = spec.model
-    else:
-        spec, found = None, built_plant(checked_plant(document, source), source, "")
-        model = found if isinstance(found, DAEModel) else None
-    if model is None:
-        raise SpecError(f"{source} holds no nonlinear plant (kind: dae).", path=str(source))
-    return model, spec
+    if "method" not in document and "plant" not in document:
+        return built_plant(checked_plant(document, source), source, ""), None
+    spec = load_spec(source)
+    if spec.model is not None:
+        return spec.model, spec
+    return spec.plant if spec.transformation is None else spec.transformation.source, spec
 
 
 def load_spec(path: str | Path) -> Spec:

@@ -159,11 +159,12 @@ def _reason(error: BaseException) -> str:
 SPARSE_FROM = 300
 
 
-#: Longer indices are damage.
-MOST_DIGITS = 15
-
 #: A sparse matrix needs memory for each row and column as well: this many entries' worth, generously.
 ENTRIES_PER_LINE = 1000
+
+
+#: Whole numbers with more digits are damage.
+MOST_DIGITS = 15
 
 
 def read_matrix_market(path: Path, *, maximum_entries: int, keep_sparse: bool = False) -> Any:
@@ -172,10 +173,7 @@ def read_matrix_market(path: Path, *, maximum_entries: int, keep_sparse: bool = 
         layout, field, symmetry = _checked_header(stream.readline(200))
         lines = (line for line in stream if line.strip() and not line.startswith("%"))
         size = next(lines, "").split()
-        rest = stream.read()
-        if "%" in rest:
-            rest = "\n".join(line for line in rest.split("\n") if not line.startswith("%"))
-        tokens = rest.split()
+        tokens = [token for line in lines for token in line.split()]
     counts = [_whole(token, "the sizes") for token in size]
     if len(counts) != (3 if layout == "coordinate" else 2) or min(counts) < 0:
         raise ValueError("the line with the sizes is damaged")
@@ -226,7 +224,7 @@ def _from_coordinates(tokens: list[str], size: tuple[int, int, int], field: str,
     rows, columns, stored = size
     width = 2 if field == "pattern" else 3
     _require_count(len(tokens), width * stored)
-    positions = [np.array(_all_whole(tokens[k::width], "an index"), dtype=np.int64) - 1 for k in (0, 1)]
+    positions = [_indices(tokens[k::width]) - 1 for k in (0, 1)]
     for position, limit in zip(positions, (rows, columns), strict=True):
         if np.any(position < 0) or np.any(position >= limit):
             raise ValueError("an index is outside the matrix")
@@ -264,10 +262,10 @@ def _numbers(tokens: list[str]) -> FloatArray:
     return np.fromiter(map(float, tokens), dtype=np.float64, count=len(tokens))
 
 
-def _all_whole(tokens: list[str], what: str) -> list[int]:
-    if all(map(str.isdecimal, tokens)) and max(map(len, tokens), default=0) <= MOST_DIGITS:
-        return list(map(int, tokens))
-    return [_whole(token, what) for token in tokens]
+def _indices(tokens: list[str]) -> Any:
+    if not all(map(str.isdecimal, tokens)) or max(map(len, tokens), default=0) > MOST_DIGITS:
+        return np.array([_whole(token, "an index") for token in tokens], dtype=np.int64)
+    return np.fromiter(map(int, tokens), dtype=np.int64, count=len(tokens))
 
 
 def _whole(token: str, what: str) -> int:

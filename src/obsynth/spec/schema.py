@@ -240,7 +240,7 @@ class CalibrateSection(Section):
     columns: dict[Text, Text] | None = None
     scales: dict[Text, float] | None = None
     dt: Positive | None = None
-    unknown: dict[Text, Range] = Field(min_length=1)
+    unknown: dict[Text, Range] = Field(default_factory=dict)
     priors: dict[Text, Range] | None = None
     noisy: Names | None = None
     Q: dict[Text, Positive] | None = None

@@ -12,6 +12,7 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import ComplexArray, FloatArray, read_only
 from obsynth.numerics.ranks import CLEAR_GAP, RankDecision
+from obsynth.numerics.threads import on_one_thread_if_small
 from obsynth.plants.descriptor import DescriptorSystem
 
 #: Entries of unit rows below this are rounding of the orthogonal transformations that made them.
@@ -109,6 +110,7 @@ class DecoupledPlant:
         )  # fmt: skip
 
 
+@on_one_thread_if_small
 def decouple(
     plant: DescriptorSystem, *, without: Sequence[str] = (), faults: Sequence[str] | None = None
 ) -> DecoupledPlant:

@@ -15,7 +15,7 @@ from obsynth.analysis.diagnosis.verdicts import Diagnosis, FaultDiagnosis
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_finite_number, require_kind
 from obsynth.numerics.pencils import pencil_structure
-from obsynth.numerics.threads import one_thread_if_small
+from obsynth.numerics.threads import on_one_thread_if_small
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.exosystems import Exosystem, exosystem
 from obsynth.plants.fault_models import stated_eigenvalues
@@ -24,6 +24,7 @@ from obsynth.plants.fault_models import stated_eigenvalues
 MOST_ZEROS = 4
 
 
+@on_one_thread_if_small
 def diagnose(
     plant: DescriptorSystem,
     *,
@@ -73,17 +74,16 @@ def diagnose(
     model = exosystem(fault_model, plant.fault_names, plant.dt)
     report_stage = progress or (lambda _: None)
     exactly = decided_exactly(plant)
-    with one_thread_if_small(plant.nx):
-        report_stage("asking what shows each fault")
-        shown = [Question(plant, (), i, exactly) for i in range(plant.nf)]
-        free = [Question(plant, _others(plant, i), i, exactly) for i in range(plant.nf)]
-        faults = tuple(
-            _verdict(plant, own, alone, frequencies, model_points(model, i), suggest=suggest)
-            for i, (own, alone) in enumerate(zip(shown, free, strict=True))
-        )
-        report_stage("telling faults from each other")
-        weak, strong, pairs = _isolability(plant, shown, exactly)
-        bank = residual_bank(plant, exactly)
+    report_stage("asking what shows each fault")
+    shown = [Question(plant, (), i, exactly) for i in range(plant.nf)]
+    free = [Question(plant, _others(plant, i), i, exactly) for i in range(plant.nf)]
+    faults = tuple(
+        _verdict(plant, own, alone, frequencies, model_points(model, i), suggest=suggest)
+        for i, (own, alone) in enumerate(zip(shown, free, strict=True))
+    )
+    report_stage("telling faults from each other")
+    weak, strong, pairs = _isolability(plant, shown, exactly)
+    bank = residual_bank(plant, exactly)
     return Diagnosis(
         faults, weak, strong, bank, plant.disturbance_names, "; ".join(dict.fromkeys(model.descriptions)), exactly,
         _warnings(plant, [*shown, *free, *pairs]),

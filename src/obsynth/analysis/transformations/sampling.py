@@ -15,11 +15,13 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, SLOW_ZERO_RADIUS
 from obsynth.numerics.scaling import power_of_two_below
 from obsynth.numerics.sparse import dense
+from obsynth.numerics.threads import on_one_thread_if_small
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.origin import note_source, with_origin
 from obsynth.plants.uncertainty import SAMPLED
 
 
+@on_one_thread_if_small
 def discretise(plant: DescriptorSystem | Transformation, sample_time: float) -> Transformation:
     """Sample a continuous plant with a zero-order hold.
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.experiments.batch_simulation import Bench, make_bench
+from obsynth.experiments.batch_simulation import LinearBench, make_bench
 from obsynth.experiments.monitors.adaptive_monitor import EXACT, tolerances_of
 from obsynth.experiments.monitors.monitor import KINDS, Monitor, statement_of
 from obsynth.experiments.monitors.residual_model import ResidualModel, residual_model, watches_estimates
@@ -202,7 +202,7 @@ def _statistical(
     return threshold
 
 
-def _floor(bench: Bench, scenario: Scenario, rows: slice) -> float:
+def _floor(bench: LinearBench, scenario: Scenario, rows: slice) -> float:
     """Return what rounding may add to the norm of the residual, from the size of what it is made of."""
     runs = bench.run([scenario.seed])
     size = (

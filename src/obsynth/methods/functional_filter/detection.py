@@ -18,6 +18,7 @@ from obsynth.numerics.arguments import is_finite_number, require_kind
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import decide_rank
 from obsynth.numerics.spectra import abscissa, response
+from obsynth.numerics.threads import on_one_thread_if_small
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.balls import Enclosed, block
@@ -62,6 +63,7 @@ class DetectionFilter:
         return self.fault_sensitivity / self.disturbance_gain
 
 
+@on_one_thread_if_small
 def detection_filter(plant: DescriptorSystem, *, band: Sequence[float] = (0.0, 1e3)) -> DetectionFilter:
     """Design the residual filter of largest H-minus over H-infinity.
 

@@ -9,8 +9,9 @@ import numpy as np
 from obsynth.errors import SolverError, SpecError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.compiled_library import DAELibrary
-from obsynth.observers.dae.estimates import DAEEstimates, DAERow, GatheredRows
+from obsynth.observers.dae.estimates import DAERow, GatheredRows
 from obsynth.observers.dae.steps import DAEState, Steps
+from obsynth.observers.estimates import Estimates
 from obsynth.observers.progress import shown_progress
 from obsynth.plants.dae.functions import Compiled, take_samples
 
@@ -21,7 +22,7 @@ SAMPLES_PER_CALL = 10_000
 def run_record(
     steps: Steps, y: FloatArray, u: FloatArray, *, compiled: bool | None, library: DAELibrary | None,
     progress: bool | Callable[[int], None] | None,
-) -> DAEEstimates:  # fmt: skip
+) -> Estimates:  # fmt: skip
     """Run over a whole record.
 
     Shapes: ``y (samples, ny)``, ``u (samples, nu)``.

@@ -12,6 +12,7 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arguments import Count, ForgettingFactor, Positive, checked_value
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.covariances import covariance_factor, is_definite
+from obsynth.observers.estimates import Undelayed
 from obsynth.observers.outliers import Outliers, checked_limit
 from obsynth.plants.dae.checks import finite_vector, step_length
 from obsynth.plants.dae.model import DAEModel
@@ -28,7 +29,7 @@ _DEFINITE = ("R", "initial_parameter_covariance")
 
 
 @dataclass(frozen=True, eq=False)
-class DAESettings:
+class DAESettings(Undelayed):
     """The fields of `obsynth.DAEObserver`, which is these with its steps."""
 
     model: DAEModel
