@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from obsynth.analysis.transformations.recovery import Transformation, linear_plant
 from obsynth.comparison.result import ComparedMethod, Comparison, FaultComparison
 from obsynth.comparison.scenario_runs import DrawnRuns, alarms, drawn_runs, estimates, rms
 from obsynth.errors import SpecError
@@ -38,7 +39,7 @@ SEED = 7
 
 @on_one_thread_if_small
 def compare(
-    plant: DescriptorSystem,
+    plant: DescriptorSystem | Transformation,
     *,
     scenario: Scenario | None = None,
     options: Mapping[str, Mapping[str, Any]] | None = None,
@@ -59,7 +60,7 @@ def compare(
 
     Parameters
     ----------
-    plant : DescriptorSystem
+    plant : DescriptorSystem or Transformation
         Either time, with faults.  A continuous one is sampled: methods are designed for the samples where they can be.
     scenario : Scenario, optional
         What happens; by default each fault in turn is a step, while every unknown input is a sinusoid.
@@ -98,7 +99,7 @@ def compare(
     ----------
     Ours: see `Comparison` for what each number means.
     """
-    require_kind(plant, DescriptorSystem, "plant", "an obsynth.DescriptorSystem")
+    plant = linear_plant(plant)
     if plant.nf == 0:
         raise SpecError("The plant has no faults: there is nothing to compare estimates of.", path="plant")
     checked_value(tolerance, "tolerance", NonNegative)
