@@ -72,7 +72,8 @@ def calibrate(
         CSV or Parquet file, or columns by name: ``time`` in seconds, every input and every output; NaN where an output
         is missing.
     unknown : mapping of str to (low, high)
-        Constants and parameters that are to be found, with finite bounds around their nominal values.
+        Constants and parameters that are to be found, with finite bounds around their nominal values; none (``{}``)
+        to find the noise alone.
     priors : mapping of str to (mean, deviation), optional
         What is known of them besides, as normal distributions.
     noisy : list of str, optional

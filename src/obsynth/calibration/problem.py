@@ -89,8 +89,6 @@ def calibration_problem(
     initial_state: Any, initial_covariance: Any, integration: str, substeps: int,
 ) -> Problem:  # fmt: skip
     """Return the problem, or say what is wrong with what is asked."""
-    if not unknown:
-        raise SpecError("unknown is empty: name the constants that are to be found, with their bounds.", path="unknown")
     if not isinstance(substeps, (int, np.integer)) or isinstance(substeps, bool) or substeps < 1:
         raise SpecError(f"substeps is {substeps!r}: give a whole number, at least 1.", path="substeps")
     if not log.samples > 1:
@@ -113,6 +111,9 @@ def calibration_problem(
         np.where(held, quanta**2 / 12.0, 0.0), (LEAST_NOISE * np.where(largest > 0.0, largest, 1.0)) ** 2
     )
     variances = int(np.isnan(known_Q).sum() + np.isnan(known_R).sum())
+    if not names and not variances:
+        raise SpecError("unknown is empty, and Q and R are known: nothing is to be found. Name constants with their "
+                        "bounds, or leave variances out.", path="unknown")  # fmt: skip
     needed, seen = VALUES_PER_UNKNOWN * (len(names) + variances), int(np.isfinite(log.y).sum())
     if seen < needed:
         raise bad_log("too-short", f"The log is too short: {seen} measured values for {len(names)} constants and "
@@ -147,7 +148,7 @@ def _bounds(unknown: Mapping[str, Sequence[float]], values: Mapping[str, float])
             raise SpecError(f"The nominal value of {name!r}, {values[name]:g}, is outside its bounds [{pair[0]:g}, "
                             f"{pair[1]:g}]: move one of them.", path=f"unknown.{name}")  # fmt: skip
         rows.append([float(pair[0]), float(pair[1])])
-    low, high = np.array(rows).T
+    low, high = np.array(rows).reshape(len(rows), 2).T
     return low, high
 
 

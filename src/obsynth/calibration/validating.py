@@ -175,7 +175,7 @@ def validate(
         A step of a nonlinear plant has no solution along the log.
     """
     require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
-    if isinstance(design.observer, LinearObserver):
+    if not states_innovations(design):
         raise SpecError(
             f"The method {design.method} states no covariance of its residual, which a log could contradict: validate "
             "a recursive or nonlinear design, or run the log with a monitor.", path="design",
@@ -206,6 +206,11 @@ def validate(
         read_only(record.deviations), read_only(np.array(found.y)), read_only(found.y - record.innovations),
         record.estimates, _described(found),
     )  # fmt: skip
+
+
+def states_innovations(design: ObserverDesign) -> bool:
+    """Whether a design predicts its outputs with a covariance, which a log could contradict."""
+    return not isinstance(design.observer, LinearObserver)
 
 
 def _described(log: Log) -> dict[str, object]:

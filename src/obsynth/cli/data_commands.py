@@ -51,7 +51,7 @@ def run_run(options: argparse.Namespace) -> int:
             columns=dict(options.map), time_column=options.time_column, scales=numbers_of(options.scale),
             thresholds=numbers_of(options.threshold), monitor=watched, gap=options.gap, warm_up=options.warm_up,
             recovered=_recovered(options.recovered),
-            outliers=options.outliers,
+            outliers=options.outliers, smooth=options.smooth, lag=options.lag,
             state=options.state, progress=progress,
         )  # fmt: skip
     for text in found.warnings:
@@ -122,7 +122,7 @@ def run_report(options: argparse.Namespace) -> int:
         run, watched = run_in_memory(design, options)
     file = html_report(
         design, options.out, report=report, gains_file=options.gains.name, scenario=scenario, system_file=system,
-        run=run, data_file=options.data, statement="" if watched is None else watched.statement,
+        run=run, data_file=options.data, statement="" if watched is None else watched.statement, rows=options.rows,
     )  # fmt: skip
     if options.json:
         print_json({"command": "report", "gains": str(options.gains), "file": str(file), "passed": report.passed})

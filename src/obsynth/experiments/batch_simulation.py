@@ -10,7 +10,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.holds import first_order_hold
+from obsynth.numerics.holds import driven, first_order_hold
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.observer import LinearObserver
@@ -137,12 +137,8 @@ class LinearBench(Bench):
         Shapes: ``outputs (steps, runs, ny)``, ``inputs (steps, runs, nu)``.
         """
         system = self.observer
-        drive = inputs @ system.Bu.T + outputs @ system.By.T
-        z = np.empty((*outputs.shape[:2], system.order))
-        z[0] = self.observer_start - np.concatenate([inputs[0], outputs[0]], axis=1) @ self.observer_ramp.T
-        turned = np.ascontiguousarray(system.Az.T)
-        for k in range(len(drive) - 1):
-            z[k + 1] = z[k] @ turned + drive[k]
+        start = self.observer_start - np.concatenate([inputs[0], outputs[0]], axis=1) @ self.observer_ramp.T
+        z = driven(system.Az, start, inputs @ system.Bu.T + outputs @ system.By.T)
         return np.asarray(z @ system.Cz.T + inputs @ system.Du.T + outputs @ system.Dy.T)
 
 

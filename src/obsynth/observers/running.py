@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.numerics.arrays import FloatArray
-from obsynth.observers.estimates import Estimates
+from obsynth.observers.estimates import Estimates, Undelayed
 
 State = TypeVar("State")
 Row = TypeVar("Row", covariant=True)
+Known = TypeVar("Known")
 Kept = TypeVar("Kept", bound=tuple[Any, ...])
 
 #: Marks an array whose columns are contiguous: sums are rounded in another order there.
@@ -79,6 +81,107 @@ class ParameterRow(Protocol):
     def is_finite(self) -> bool:
         """Whether no number has overflown."""
         ...
+
+
+class Steps(Protocol[State, Row]):
+    """The steps of an observer: what follows from it alone, made once for all runs."""
+
+    first: State
+
+    def advance(self, state: State, y: FloatArray, u: FloatArray) -> tuple[State, Row]:
+        """Return the state after a sample, and what is known at it."""
+        ...
+
+
+class StepObserver(Undelayed, Generic[State, Known]):
+    """An observer of states and parameters, which takes missing samples itself and states deviations."""
+
+    @property
+    @abstractmethod
+    def _steps(self) -> Steps[State, Known]:
+        """What follows from the observer alone."""
+
+    @abstractmethod
+    def _allow(self, state: State) -> None:
+        """Raise where no sample can follow."""
+
+    @abstractmethod
+    def _trust(self, row: Known) -> None:
+        """Raise where a step cannot be trusted."""
+
+    @abstractmethod
+    def _sample(self, state: State, y: ArrayLike, u: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Return a sample, checked."""
+
+    @abstractmethod
+    def _estimates(self, state: State, row: Known) -> Estimates:
+        """Return the estimates of one sample."""
+
+    def init(self) -> State:
+        """Return the state before the first sample, k = 0."""
+        return self._steps.first
+
+    def advance(self, state: State, y: FloatArray, u: FloatArray) -> tuple[State, Known]:
+        """Return the next state and what is known at a sample, without checking it.
+
+        Parameters
+        ----------
+        state : NamedTuple
+            Before the sample.
+        y, u : FloatArray
+            ``(ny,)``, NaN for what is missing, and ``(nu,)``.
+        """
+        return self._steps.advance(state, y, u)
+
+    def accept(self, state: State, y: FloatArray, u: FloatArray) -> tuple[State, Known]:
+        """Return the same as `advance`, where the step is one that can be trusted.
+
+        Parameters
+        ----------
+        state : NamedTuple
+            Before the sample.
+        y, u : FloatArray
+            ``(ny,)``, NaN for what is missing, and ``(nu,)``.
+
+        Raises
+        ------
+        SpecError
+            The horizon of a time-varying plant is passed.
+        SolverError
+            The step of a nonlinear plant has no solution, or more than one.
+        """
+        self._allow(state)
+        after, row = self._steps.advance(state, y, u)
+        self._trust(row)
+        return after, row
+
+    def step(self, state: State, y: ArrayLike, u: ArrayLike = ()) -> tuple[State, Estimates]:
+        """Return the state after a sample, and the estimates at it.
+
+        Parameters
+        ----------
+        state : NamedTuple
+            Before the sample; it is not changed.
+        y : array_like
+            Outputs ``(ny,)``; NaN marks a missing one.  A recursive observer does not use y(0).
+        u : array_like, optional
+            Known inputs ``(nu,)`` at this sample; of a nonlinear plant, during the step that ends at it.
+
+        Raises
+        ------
+        SpecError
+            A sample has the wrong length, an input is not finite, or the horizon is passed.
+        PreconditionError
+            Rank H_k is lost at this k although no sample is missing (recursive observers).
+        SolverError
+            The step has no solution; k, iteration and worst equation are named (nonlinear observers).
+        """
+        after, row = self.accept(state, *self._sample(state, y, u))
+        return after, self._estimates(after, row)
+
+    def start(self) -> RunningObserver[State, Known]:
+        """Return a running observer, at k = 0."""
+        return RunningObserver(self)
 
 
 class RunningObserver(Generic[State, Row]):

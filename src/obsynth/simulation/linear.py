@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from obsynth.analysis.transformations import StateRecovery, discretise, eliminate_algebraic_states
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arrays import FloatArray, as_matrix
-from obsynth.numerics.holds import first_order_hold
+from obsynth.numerics.holds import driven, first_order_hold
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.simulation.scenario_signals import Drive
 from obsynth.simulation.trajectory import Trajectory
@@ -55,7 +55,8 @@ def simulate_plant(
     elimination = eliminate_algebraic_states(plant)
     reduced, recovery = elimination.plant, elimination.recovery
     drive = _sum_of(signals, {"u": reduced.B, "f": reduced.Bf, "d": reduced.Bd, "w": reduced.Bw})
-    dynamic = _recursion(reduced.A, dynamic_part(plant, recovery, start), drive)
+    dynamic = driven(reduced.A, dynamic_part(plant, recovery, start), drive)
+    _require_finite(dynamic, "simulate fewer steps", "steps")
     states = dynamic @ recovery.from_state.T + _sum_of(
         signals,
         {
@@ -110,21 +111,14 @@ def dynamic_part(plant: DescriptorSystem, recovery: StateRecovery, state: FloatA
     return np.asarray(np.linalg.solve(r, q.T @ (plant.E @ state / sizes)))
 
 
-def _recursion(a: FloatArray, start: FloatArray, drive: FloatArray) -> FloatArray:
-    """Return x(0), x(1), ... of ``x+ = a x + drive``."""
-    states = np.empty_like(drive)
-    states[0] = start
-    with np.errstate(over="ignore", invalid="ignore"):
-        for k in range(len(drive) - 1):
-            states[k + 1] = a @ states[k] + drive[k]
-    finite = np.all(np.isfinite(states), axis=1)
-    if not np.all(finite):
+def _require_finite(states: FloatArray, advice: str, path: str) -> None:
+    """Raise `SpecError` where states ``(steps, ...)`` overflow."""
+    finite = np.isfinite(states).reshape(len(states), -1).all(axis=1)
+    if not finite.all():
         raise SpecError(
-            f"The states outgrow double precision at sample {int(np.argmin(finite))}: the plant is unstable; "
-            "simulate fewer steps.",
-            path="steps",
+            f"The states outgrow double precision at sample {int(np.argmin(finite))}: the plant is unstable; {advice}.",
+            path=path,
         )
-    return states
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,18 +148,8 @@ class Stepper:
         runs, nw)``.
         """
         drive = signals @ self.held.T + differences @ self.ramped.T + noise @ self.noisy.T
-        x = np.empty_like(drive)
-        x[0] = self.start
-        turned = np.ascontiguousarray(self.transition.T)
-        with np.errstate(over="ignore", invalid="ignore"):
-            for k in range(len(drive) - 1):
-                x[k + 1] = x[k] @ turned + drive[k]
-        finite = np.isfinite(x).all(axis=(1, 2))
-        if not finite.all():
-            raise SpecError(
-                f"The states outgrow double precision at sample {int(np.argmin(finite))}: the plant is unstable; "
-                "shorten the horizon, or set stabilise.", path="horizon",
-            )  # fmt: skip
+        x = driven(self.transition, self.start, drive)
+        _require_finite(x, "shorten the horizon, or set stabilise", "horizon")
 
         def seen(parts: tuple[FloatArray, FloatArray, FloatArray]) -> FloatArray:
             return np.asarray(x @ parts[0].T + signals @ parts[1].T + noise @ parts[2].T)
@@ -182,7 +166,7 @@ def make_stepper(plant: DescriptorSystem, drive: Drive, *, initial_state: FloatA
     elimination = eliminate_algebraic_states(plant)
     reduced, recovery = elimination.plant, elimination.recovery
     start = dynamic_part(plant, recovery, initial_state)
-    gain = _stabilising(reduced) if stabilise else None
+    gain = stabilising_feedback(reduced) if stabilise else None
     closing = np.zeros((reduced.nu, reduced.nx)) if gain is None else gain
     a = reduced.A - reduced.B @ closing
     inputs = np.hstack([reduced.B, reduced.Bf, reduced.Bd])
@@ -217,7 +201,7 @@ def _sampled_noise(
     return sampled.Bw, sampled.Dw, np.zeros((len(recovery.names), sampled.nw))
 
 
-def _stabilising(plant: DescriptorSystem) -> FloatArray:
+def stabilising_feedback(plant: DescriptorSystem) -> FloatArray:
     """Return the linear-quadratic state feedback with unit weights of a plant with ``E = I``."""
     from scipy.linalg import solve_continuous_are, solve_discrete_are
 

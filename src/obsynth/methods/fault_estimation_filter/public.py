@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from numpy.typing import ArrayLike
 
-from obsynth.analysis.transformations.recovery import plant_and_recovery
+from obsynth.analysis.transformations.recovery import Transformation, plant_and_recovery
 from obsynth.errors import SpecError
 from obsynth.methods.designing import design, draft_of
 from obsynth.methods.verifying import verify
@@ -16,7 +16,7 @@ from obsynth.simulation.scenario import Scenario
 
 
 def fault_estimation_filter(
-    plant: DescriptorSystem,
+    plant: DescriptorSystem | Transformation,
     *,
     gamma: float | None = None,
     gamma_search: str = "direct",
@@ -39,7 +39,7 @@ def fault_estimation_filter(
 
     Parameters
     ----------
-    plant : DescriptorSystem
+    plant : DescriptorSystem or Transformation
         Discrete time (``dt > 0``), ``E (nx, nx)``, ``C (ny, nx)``, ``Bf (nx, nf)``, ``Bd (nx, nd)``; feedthrough
         ``D, Df, Dd`` and noise ``Bw, Dw`` allowed.
     gamma : float, optional, dimensionless
@@ -134,7 +134,7 @@ def fault_estimation_filter(
 
 
 def fault_estimation_filter_from_gains(
-    plant: DescriptorSystem,
+    plant: DescriptorSystem | Transformation,
     *,
     T: ArrayLike,
     N: ArrayLike,
@@ -148,7 +148,7 @@ def fault_estimation_filter_from_gains(
 
     Parameters
     ----------
-    plant : DescriptorSystem
+    plant : DescriptorSystem or Transformation
         As for `fault_estimation_filter`.
     T, N, L, W : array_like
         ``(nx, nx)``, ``(nx, ny)``, ``(nx, ny)``, ``(nf, ny)`` of eq. (23).
@@ -180,11 +180,11 @@ def fault_estimation_filter_from_gains(
     """
     from obsynth.methods.fault_estimation_filter.given_gains import synthesis_from_gains
 
-    plant, recovery = plant_and_recovery(plant)
-    if plant.nd and gamma is None:
+    own, recovery = plant_and_recovery(plant)
+    if own.nd and gamma is None:
         raise SpecError(
             "gamma is needed: the plant has disturbances, and a gain set claims a bound on them.", path="gamma"
         )
-    found = synthesis_from_gains(plant, T=T, N=N, L=L, W=W, gamma=gamma, indexes=indexes)
-    draft = draft_of(plant, "fault-estimation-filter", found, name=name, recovery=recovery)
+    found = synthesis_from_gains(own, T=T, N=N, L=L, W=W, gamma=gamma, indexes=indexes)
+    draft = draft_of(own, "fault-estimation-filter", found, name=name, recovery=recovery)
     return draft.replace(report=verify(draft))

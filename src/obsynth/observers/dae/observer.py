@@ -17,12 +17,12 @@ from obsynth.observers.dae.settings import DAESettings
 from obsynth.observers.dae.step_graph import ObserverGraph
 from obsynth.observers.dae.steps import DAEState, Steps
 from obsynth.observers.estimates import Estimates
-from obsynth.observers.recursive.records import measured_record
-from obsynth.observers.running import RunningObserver
+from obsynth.observers.records import measured_record
+from obsynth.observers.running import StepObserver
 from obsynth.plants.dae.checks import checked_inputs, require_known
 
 
-class DAEObserver(DAESettings):
+class DAEObserver(DAESettings, StepObserver[DAEState, DAERow]):
     """An observer: what `start` and `run` need, and nothing that depends on data.
 
     Parameters
@@ -75,60 +75,17 @@ class DAEObserver(DAESettings):
         """What follows from the observer alone, made when it is first needed."""
         return Steps(self)
 
-    def init(self) -> DAEState:
-        """Return the state before the first sample, k = 0."""
-        return self.steps.first
+    @property
+    def _steps(self) -> Steps:
+        return self.steps
 
-    def advance(self, state: DAEState, y: FloatArray, u: FloatArray) -> tuple[DAEState, DAERow]:
-        """Return the next state and what is said at a sample, without checking it.
+    def _allow(self, state: DAEState) -> None:
+        """Raise nothing: a model has no horizon."""
 
-        Parameters
-        ----------
-        state : DAEState
-            Before the sample.
-        y, u : FloatArray
-            ``(ny,)``, NaN for what is missing, and ``(nu,)``.
-        """
-        return self.steps.advance(state, y, u)
-
-    def accept(self, state: DAEState, y: FloatArray, u: FloatArray) -> tuple[DAEState, DAERow]:
-        """Return the same as `advance`, unless the step is singular to working precision.
-
-        Parameters
-        ----------
-        state : DAEState
-            Before the sample.
-        y, u : FloatArray
-            ``(ny,)``, NaN for what is missing, and ``(nu,)``.
-
-        Raises
-        ------
-        SolverError
-            The step has no solution, or more than one.
-        """
-        after, row = self.steps.advance(state, y, u)
+    def _trust(self, row: DAERow) -> None:
         require_regular(self, row, row.conditions)
-        return after, row
 
-    def step(self, state: DAEState, y: ArrayLike, u: ArrayLike = ()) -> tuple[DAEState, Estimates]:
-        """Return the state after a sample, and the estimates at it.
-
-        Parameters
-        ----------
-        state : DAEState
-            Before the sample; it is not changed.
-        y : array_like
-            Outputs ``(ny,)``; NaN marks a missing one.
-        u : array_like, optional
-            Known inputs ``(nu,)`` during the step that ends at this sample.
-
-        Raises
-        ------
-        SpecError
-            A sample has the wrong length, or an input is not finite.
-        SolverError
-            The step has no solution; k, iteration and worst equation are named.
-        """
+    def _sample(self, state: DAEState, y: ArrayLike, u: ArrayLike) -> tuple[FloatArray, FloatArray]:
         outputs = measured_record(np.atleast_2d(np.asarray(y)), self.model.ny)[0]
         try:
             inputs = np.atleast_1d(np.asarray(u, dtype=np.float64))
@@ -137,14 +94,12 @@ class DAEObserver(DAESettings):
         if inputs.shape != (self.model.nu,):
             raise SpecError(f"u must be {self.model.nu} finite number(s) at k = {state.k}.", path="u")
         require_known(self.model, inputs[None], state.k)
-        after, row = self.accept(state, outputs, inputs)
+        return outputs, inputs
+
+    def _estimates(self, state: DAEState, row: DAERow) -> Estimates:
         found = GatheredRows(self)
         found.add(row)
-        return after, found.estimates(np.array(after.informations))
-
-    def start(self) -> RunningObserver[DAEState, DAERow]:
-        """Return a running observer, at k = 0."""
-        return RunningObserver(self)
+        return found.estimates(np.array(state.informations))
 
     @property
     def graph(self) -> ObserverGraph:

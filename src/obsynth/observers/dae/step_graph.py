@@ -92,11 +92,13 @@ def _predicted(observer: DAESettings, before: Arrays, x: Any, local: tuple[Any, 
     P, K, H, L, spread = (before[name] for name in ("P", "K", "H", "L", "spread"))
     added = noise @ ca.DM(observer.Q) @ noise.T
     kept = ca.DM.eye(observer.model.nx) - K @ H
-    after = {**before, "x": x, "F": F, "G": G, "kept": F @ kept, "scaled": scaled}
+    after = {**before, "x": x, "F": F, "G": G, "noise": noise, "kept": F @ kept, "scaled": scaled}
     if observer.form == "augmented-kalman":
+        # The parameters of a sample act in the step that leads there.
+        spread = spread + ca.DM(observer.random_walk)
         through = F @ before["cross"] @ G.T
         P = F @ P @ F.T + through + through.T + G @ spread @ G.T + added
-        after["cross"], after["spread"] = F @ before["cross"] + G @ spread, spread + ca.DM(observer.random_walk)
+        after["cross"], after["spread"] = F @ before["cross"] + G @ spread, spread
     else:
         P = F @ (kept @ P @ kept.T + K @ ca.DM(observer.R) @ K.T) @ F.T + added
     after["P"] = 0.5 * (P + P.T)

@@ -13,7 +13,13 @@ from numpy.typing import ArrayLike
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.observers.estimates import Estimates
-from obsynth.observers.linear.checking import NAME_FIELDS, checked_record, checked_sample, is_delay, require_names
+from obsynth.observers.records import (
+    NAME_FIELDS,
+    checked_sample,
+    is_delay,
+    require_names,
+    whole_record,
+)
 from obsynth.observers.running import RunningObserver
 
 
@@ -215,11 +221,7 @@ class LinearObserver:
         SpecError
             Shapes do not fit, or a sample is not finite.
         """
-        outputs = checked_record(y, len(self.output_names), "y")
-        known = np.zeros((len(outputs), 0)) if u is None and not self.input_names else u
-        inputs = checked_record(known, len(self.input_names), "u")
-        if len(inputs) != len(outputs):
-            raise SpecError(f"u has {len(inputs)} samples and y has {len(outputs)}: give the same number.", path="u")
+        outputs, inputs = whole_record(y, u, len(self.output_names), len(self.input_names), complete=True)
         state = self.init(initial_state)
         rows = np.empty((len(outputs), self.Cz.shape[0]))
         for k in range(len(outputs)):
