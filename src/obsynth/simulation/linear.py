@@ -167,7 +167,7 @@ def make_stepper(plant: DescriptorSystem, drive: Drive, *, initial_state: FloatA
     elimination = eliminate_algebraic_states(plant)
     reduced, recovery = elimination.plant, elimination.recovery
     start = dynamic_part(plant, recovery, initial_state)
-    gain = _stabilising(reduced) if stabilise else None
+    gain = stabilising_feedback(reduced) if stabilise else None
     closing = np.zeros((reduced.nu, reduced.nx)) if gain is None else gain
     a = reduced.A - reduced.B @ closing
     inputs = np.hstack([reduced.B, reduced.Bf, reduced.Bd])
@@ -202,7 +202,7 @@ def _sampled_noise(
     return sampled.Bw, sampled.Dw, np.zeros((len(recovery.names), sampled.nw))
 
 
-def _stabilising(plant: DescriptorSystem) -> FloatArray:
+def stabilising_feedback(plant: DescriptorSystem) -> FloatArray:
     """Return the linear-quadratic state feedback with unit weights of a plant with ``E = I``."""
     from scipy.linalg import solve_continuous_are, solve_discrete_are
 
