@@ -10,7 +10,7 @@ Designs
     design, and one function for each method: fault_estimation_filter, pd_observer, ui_pi_observer, descriptor_kalman,
     adaptive_observer, dae_adaptive_observer; verify, load.
 On data
-    run_on_data, online_monitor, plotting.plot_data, html_report, export.
+    run_on_data, smooth, online_monitor, plotting.plot_data, html_report, export.
 In simulation
     Scenario, simulate, monitor, evaluate, decide; plotting.
 What is wrong
@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from obsynth.comparison.sensor_sets import SensorSet, SensorSets, sensor_sets
     from obsynth.data.alarm_proof import prove_alarm
     from obsynth.data.run import DataRun, run_on_data
+    from obsynth.data.smoothing import smooth
     from obsynth.errors import (
         InfeasibleError,
         ObsynthError,
@@ -256,6 +257,7 @@ _HOMES = {
     "SweepResult": "obsynth.sweeps.sweep",
     "sweep": "obsynth.sweeps.sweep",
     "sample_observer": "obsynth.observers.linear.sampling",
+    "smooth": "obsynth.data.smoothing",
     "simulate": "obsynth.experiments.simulation",
     "simulate_time_varying": "obsynth.simulation.time_varying",
     "steady_state_filter": "obsynth.methods.recursive.steady_filter",
@@ -389,6 +391,7 @@ __all__ = [
     "simulate",
     "simulate_dae",
     "simulate_time_varying",
+    "smooth",
     "steady_state_filter",
     "sweep",
     "ui_pi_observer",

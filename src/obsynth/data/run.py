@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, TextIO
 import numpy as np
 
 from obsynth.data.job import Job
-from obsynth.data.linear_log import DataObserver
-from obsynth.data.log_estimator import Engine
+from obsynth.data.linear_log import engine_of
+from obsynth.data.log_estimator import Engine, Later
 from obsynth.data.saved_state import digest_of_gains, resume_state, save_state
 from obsynth.data.signals import TIME, Signals
 from obsynth.data.sinks import FrameSink, Sink, TextSink, file_sink
@@ -23,9 +23,8 @@ from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.monitors.online import OnlineMonitor
 from obsynth.files.outputs import check_output, require_distinct
 from obsynth.files.signals import HeldSignals, ending_signals
-from obsynth.numerics.arguments import require_kind, require_mapping
+from obsynth.numerics.arguments import is_whole, require_kind, require_mapping, truth
 from obsynth.numerics.arrays import FloatArray
-from obsynth.observers.linear.observer import LinearObserver
 from obsynth.results.design import ObserverDesign
 
 if TYPE_CHECKING:
@@ -66,6 +65,8 @@ class DataRun:
         Whether the log has seconds, or dates and times: ``stamps.shown(time)`` is a time as the log writes it.
     thresholds : mapping of str to float
         Those that were given.
+    alarm_rows : mapping of str to int
+        Numbers of the rows of these alarms, from 1.
     """
 
     rows: int
@@ -80,11 +81,13 @@ class DataRun:
     measured: pd.DataFrame | None = field(default=None, repr=False)
     stamps: Stamps = field(default_factory=Stamps, repr=False)
     thresholds: Mapping[str, float] = field(default_factory=dict, repr=False)
+    alarm_rows: Mapping[str, int] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the summary as plain data, without the table."""
         return {
             "rows": self.rows, "statuses": dict(self.statuses), "alarms": dict(self.alarms),
+            "alarm_rows": dict(self.alarm_rows),
             "alarm_stamps": {name: self.stamps.shown(time) for name, time in self.alarms.items()},
             "isolated": self.isolated, "recovered": dict(self.recovered),
             "outliers": dict(self.outliers), "warnings": list(self.warnings),
@@ -105,6 +108,8 @@ def run_on_data(
     gap: float | None = None,
     warm_up: float | None = None,
     outliers: str | None = None,
+    smooth: bool = False,
+    lag: int | None = None,
     recovered: str | Sequence[str] | None = None,
     state: str | Path | None = None,
     chunk_rows: int = CHUNK_ROWS,
@@ -150,6 +155,12 @@ def run_on_data(
     outliers : {"gate", "huber", "none"}, optional
         Recursive and nonlinear designs: what is done with a sample that its prediction excludes; by default what the
         design says, and a gate of six deviations where it says nothing.
+    smooth : bool, optional
+        Recursive and nonlinear designs: estimates from the whole log, as `obsynth.smooth` makes them, instead of those
+        of the filter.  Residuals, outliers, monitors and statuses stay those of the filter.  All rows are written at
+        the end, and the log is held in memory.
+    lag : int, optional
+        The same with the ``lag`` samples after each row; each row is written, with its own time, when they are there.
     recovered : {"all", "none"} or list of str, optional
         Which states of the plant as written, before its algebraic states were eliminated, stand beside the estimates;
         by default all of up to 300, and none of more.
@@ -197,7 +208,7 @@ def run_on_data(
         require_kind(state, (str, Path), "state", "the name of a file")
     if out is not None and not hasattr(out, "write"):
         require_kind(out, (str, Path), "out", "the name of a file, or a text stream")
-    if isinstance(chunk_rows, bool) or not isinstance(chunk_rows, int) or chunk_rows < 1:
+    if not is_whole(chunk_rows) or chunk_rows < 1:
         raise SpecError(f"chunk_rows is {chunk_rows!r}: give a whole number, 1 or more.", path="chunk_rows")
     require_distinct({
         "state": state, "data": data if isinstance(data, str | Path) else None,
@@ -208,11 +219,12 @@ def run_on_data(
     if time_column is not None:
         require_kind(time_column, str, "time_column", "the name of a column")
         columns = {**(columns or {}), TIME: time_column}
-    engine = _engine_of(design, gap=gap, warm_up=warm_up, outliers=outliers)
+    engine = engine_of(design, gap=gap, warm_up=warm_up, outliers=outliers)
     stamps = Stamps()
     # The monitor is not used up: a second run may begin with it.
     watched = None if monitor is None else copy.deepcopy(monitor)
-    job = Job(engine, Signals.of(engine, columns, scales), design.recovery, thresholds or {}, watched, recovered)
+    later = _later_rows(engine, data, smooth=smooth, lag=lag, state=state)
+    job = Job(engine, Signals.of(engine, columns, scales), design.recovery, thresholds or {}, watched, recovered, later)
     digest = digest_of_gains(design)
     if state is not None and Path(state).exists():
         resume_state(Path(state), job, digest)
@@ -231,25 +243,24 @@ def run_on_data(
         job.rows, dict(job.statuses), dict(job.alarms), job.isolated, shown,
         dict(getattr(engine, "outliers", {})),
         (*engine.notes, *job.first.warnings()), digest, table, _measured(kept, job.signals, stamps), stamps,
-        dict(thresholds or {}),
+        dict(thresholds or {}), dict(job.alarm_rows),
     )  # fmt: skip
 
 
-def _engine_of(
-    design: ObserverDesign, *, gap: float | None = None, warm_up: float | None = None, outliers: str | None = None
-) -> Engine:
-    """Return a running design, at its start; ``outliers`` takes the place of what the design says of them."""
-    if isinstance(design.observer, LinearObserver):
-        if outliers not in (None, "none"):
-            raise SpecError("outliers is for recursive and nonlinear designs, which know how far a sample may be from "
-                            "its prediction.", path="outliers")  # fmt: skip
-        return DataObserver(design, gap=gap, warm_up=warm_up)
-    if gap is not None:
-        raise SpecError("gap is for continuous-time designs: a sampled one knows which rows are missing.", path="gap")
-    # What most logs do not need is loaded only where it is used: a run starts in a fraction of a second.
-    from obsynth.data.step_log import SteppingEngine
+def _later_rows(engine: Engine, data: Data, *, smooth: bool, lag: int | None, state: str | Path | None) -> Later | None:
+    """Return where rows wait for those after them, if they do."""
+    if not truth(smooth, "smooth") and lag is None:
+        return None
+    if smooth and lag is not None:
+        raise SpecError("smooth takes the whole record, and lag some samples of it: give one of them.", path="lag")
+    if smooth and hasattr(data, "readline"):
+        raise SpecError("A stream has no end to smooth from: give a lag, or the log as a file.", path="smooth")
+    if smooth and state is not None:
+        raise SpecError("smooth takes the whole record, and a saved state goes on with a part of it: give a lag, or "
+                        "leave the state out.", path="smooth")  # fmt: skip
+    from obsynth.data.smoothing import LaterRows
 
-    return SteppingEngine(design, warm_up=warm_up, outliers=outliers)
+    return LaterRows(engine, lag)
 
 
 def _kept(rows: Iterator[FloatArray], kept: list[FloatArray] | None) -> Iterator[FloatArray]:
@@ -277,6 +288,7 @@ def _run_rows(job: Job, rows: Iterator[FloatArray], sink: Sink, progress: Callab
         sink.write(job.take(chunk))
         if progress is not None:
             progress(job.rows)
+    sink.write(job.finish())
 
 
 def _run_stream(
@@ -302,6 +314,7 @@ def _run_stream(
         finally:
             if is_whole and job.rows:
                 save()
+                sink.write(job.finish())
 
 
 @contextmanager

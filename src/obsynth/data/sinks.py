@@ -94,6 +94,8 @@ class ParquetSink:
         """Write one row group."""
         import pyarrow as pa
 
+        if not rows:
+            return
         columns = [pa.array(list(cells), field.type) for cells, field in zip(zip(*rows, strict=True), self._schema,
                                                                              strict=True)]  # fmt: skip
         self._writer.write_table(pa.Table.from_arrays(columns, schema=self._schema))

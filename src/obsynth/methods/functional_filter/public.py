@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from obsynth.analysis.transformations.recovery import Transformation
 from obsynth.methods.designing import design
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
 
 
 def functional_filter(
-    plant: DescriptorSystem,
+    plant: DescriptorSystem | Transformation,
     *,
     faults: Sequence[str] | None = None,
     joint: bool = False,
@@ -33,7 +34,7 @@ def functional_filter(
 
     Parameters
     ----------
-    plant : DescriptorSystem
+    plant : DescriptorSystem or Transformation
         Either time, any index; ``C (ny, nx)``, ``Bf (nx, nf)``, ``Bd (nx, nd)``, ``D, Df, Dd`` allowed.
     faults : sequence of str, optional
         Faults to estimate, all by default.  The others are treated like unknown inputs: no estimate sees them.

@@ -12,6 +12,7 @@ import numpy as np
 
 from obsynth.analysis.transformations.equations_at_a_point import local_equations
 from obsynth.errors import SpecError
+from obsynth.numerics.arguments import is_number, real_number
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.plants.dae.checks import finite_vector, step_length
@@ -128,9 +129,10 @@ def _covariance(value: Any, names: Sequence[str], what: str, default: FloatArray
     if isinstance(value, Mapping):
         variances = np.zeros(len(names))
         for name, variance in value.items():
-            variances[index_of(name, names, what=what)] = _number(variance, f"{what}.{name}")
+            variances[index_of(name, names, what=what)] = real_number(variance, f"{what}.{name}")
         return np.diag(variances)
-    matrix = as_matrix(value, what) if np.size(value) else np.zeros((0, 0))
+    empty = isinstance(value, (list, tuple, np.ndarray)) and not np.asarray(value, dtype=object).size
+    matrix = np.zeros((0, 0)) if empty else as_matrix(value, what)
     return float(matrix[0, 0]) * np.eye(len(names)) if np.ndim(value) == 0 else matrix
 
 
@@ -140,13 +142,14 @@ def _vector(value: Any, names: Sequence[str], default: FloatArray, what: str) ->
     if isinstance(value, Mapping):
         vector = np.array(default)
         for name, entry in value.items():
-            vector[index_of(name, names, what=what)] = _number(entry, f"{what}.{name}")
+            vector[index_of(name, names, what=what)] = real_number(entry, f"{what}.{name}")
         return vector
     return finite_vector(value, names, default, what)
 
 
-def _number(value: Any, path: str) -> float:
-    if not isinstance(value, (int, float, np.number)) or isinstance(value, bool):
+def _bound(value: Any, path: str) -> float:
+    """Return a bound, which may be infinite."""
+    if not is_number(value):
         raise SpecError(f"{path} is {value!r}: give a number.", path=path)
     return float(value)
 
@@ -158,7 +161,7 @@ def _bounds(value: Any, names: Sequence[str]) -> FloatArray:
         for name, pair in value.items():
             if np.shape(pair) != (2,):
                 raise SpecError(f"bounds.{name} must be [lower, upper].", path=f"bounds.{name}")
-            found[index_of(name, names, what="bounds")] = [_number(bound, f"bounds.{name}") for bound in pair]
+            found[index_of(name, names, what="bounds")] = [_bound(bound, f"bounds.{name}") for bound in pair]
         return found
     if value is None:
         return found

@@ -92,10 +92,10 @@ def _predicted(observer: DAESettings, before: Arrays, x: Any, local: tuple[Any, 
     P, K, H, L, spread = (before[name] for name in ("P", "K", "H", "L", "spread"))
     added = noise @ ca.DM(observer.Q) @ noise.T
     kept = ca.DM.eye(observer.model.nx) - K @ H
-    after = {**before, "x": x, "F": F, "G": G, "kept": F @ kept, "scaled": scaled}
+    after = {**before, "x": x, "F": F, "G": G, "noise": noise, "kept": F @ kept, "scaled": scaled}
     carried = F @ (kept @ before["Upsilon"] - K @ L)
     if observer.form != "forgetting":
-        # The parameters that act in this step have walked already.
+        # The parameters of a sample act in the step that leads there: they have walked already.
         after["spread"] = walked = spread + ca.DM(observer.random_walk)
     if observer.form == "augmented-kalman":
         through = F @ before["cross"] @ G.T
