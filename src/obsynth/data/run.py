@@ -23,7 +23,7 @@ from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.monitors.online import OnlineMonitor
 from obsynth.files.outputs import check_output, require_distinct
 from obsynth.files.signals import HeldSignals, ending_signals
-from obsynth.numerics.arguments import require_kind, require_mapping, truth
+from obsynth.numerics.arguments import is_whole, require_kind, require_mapping, truth
 from obsynth.numerics.arrays import FloatArray
 from obsynth.results.design import ObserverDesign
 
@@ -65,6 +65,8 @@ class DataRun:
         Whether the log has seconds, or dates and times: ``stamps.shown(time)`` is a time as the log writes it.
     thresholds : mapping of str to float
         Those that were given.
+    alarm_rows : mapping of str to int
+        Numbers of the rows of these alarms, from 1.
     """
 
     rows: int
@@ -79,11 +81,13 @@ class DataRun:
     measured: pd.DataFrame | None = field(default=None, repr=False)
     stamps: Stamps = field(default_factory=Stamps, repr=False)
     thresholds: Mapping[str, float] = field(default_factory=dict, repr=False)
+    alarm_rows: Mapping[str, int] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the summary as plain data, without the table."""
         return {
             "rows": self.rows, "statuses": dict(self.statuses), "alarms": dict(self.alarms),
+            "alarm_rows": dict(self.alarm_rows),
             "alarm_stamps": {name: self.stamps.shown(time) for name, time in self.alarms.items()},
             "isolated": self.isolated, "recovered": dict(self.recovered),
             "outliers": dict(self.outliers), "warnings": list(self.warnings),
@@ -204,7 +208,7 @@ def run_on_data(
         require_kind(state, (str, Path), "state", "the name of a file")
     if out is not None and not hasattr(out, "write"):
         require_kind(out, (str, Path), "out", "the name of a file, or a text stream")
-    if isinstance(chunk_rows, bool) or not isinstance(chunk_rows, int) or chunk_rows < 1:
+    if not is_whole(chunk_rows) or chunk_rows < 1:
         raise SpecError(f"chunk_rows is {chunk_rows!r}: give a whole number, 1 or more.", path="chunk_rows")
     require_distinct({
         "state": state, "data": data if isinstance(data, str | Path) else None,
@@ -239,7 +243,7 @@ def run_on_data(
         job.rows, dict(job.statuses), dict(job.alarms), job.isolated, shown,
         dict(getattr(engine, "outliers", {})),
         (*engine.notes, *job.first.warnings()), digest, table, _measured(kept, job.signals, stamps), stamps,
-        dict(thresholds or {}),
+        dict(thresholds or {}), dict(job.alarm_rows),
     )  # fmt: skip
 
 
