@@ -58,7 +58,7 @@ DEFAULT_PARAMETER_SHARE = 0.1
 OPTIONS = (
     "dt", "Q", "R", "form", "forgetting", "guard", "weight", "integration", "random_walk", "initial_state",
     "initial_covariance", "initial_parameters", "initial_parameter_covariance", "bounds", "largest_move", "window",
-    "outliers", "outlier_limit",
+    "outliers", "outlier_limit", "reset",
 )  # fmt: skip
 
 
@@ -83,11 +83,18 @@ def dae_observer_from_options(model: DAEModel, options: Mapping[str, Any]) -> DA
             _default_parameter_variances(model, options["initial_parameter_covariance"]),
         ),
         random_walk=_covariance(options["random_walk"], parameters, "random_walk", np.zeros(model.nq)),
-        lower=bounds[:, 0], upper=bounds[:, 1], form=options["form"], forgetting=options["forgetting"],
+        lower=bounds[:, 0], upper=bounds[:, 1], form=_form(options), forgetting=options["forgetting"],
         guard=options["guard"], weight=options["weight"], integration=_integration(model, options),
         largest_move=options["largest_move"], window=options["window"],
         outliers=options.get("outliers", "none"), outlier_limit=options.get("outlier_limit"),
+        reset=options.get("reset", 0.0),
     )  # fmt: skip
+
+
+def _form(options: Mapping[str, Any]) -> str:
+    """Return the form that is asked for; by itself that of parameters that walk where a walk is stated."""
+    walks = options["random_walk"] is not None
+    return ("random-walk" if walks else "forgetting") if options["form"] == "auto" else str(options["form"])
 
 
 def _integration(model: DAEModel, options: Mapping[str, Any]) -> str:
