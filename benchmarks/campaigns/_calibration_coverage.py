@@ -9,6 +9,8 @@ four true constants or does not.  Its table tells shares and no wrong cases, so 
 from __future__ import annotations
 
 import argparse
+import json
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +19,8 @@ from obsynth.calibration.innovations_fit import guarded_maximum
 from obsynth.calibration.intervals import deviance_root, quantile
 from obsynth.calibration.logs import Log
 from obsynth.calibration.maximum import Objective
-from obsynth.calibration.problem import calibration_problem
+from obsynth.calibration.plants import NonlinearPlant
+from obsynth.calibration.problem import Problem, calibration_problem
 from obsynth.calibration.simulation_error import simulation_fits
 from obsynth.plants.dae.model import DAEModel
 from obsynth.simulation.dae import simulate_dae
@@ -57,13 +60,21 @@ def simulated(model: DAEModel, rows: int, seed: int, quantum: float) -> Log:
     return Log(np.arange(float(rows)), u, y, 1.0, model.input_names, model.output_names, (0, rows))
 
 
-def root_at_truth(rows: int, seed: int, quantum: float = 0.0) -> float:
-    """Return the largest root of the profile deviance at a true constant: a box with that root just holds them all."""
+@lru_cache(maxsize=4)
+def asked(rows: int, quantum: float) -> tuple[DAEModel, Problem]:
+    """Return the plant and what is asked of its logs: the same functions serve them all."""
     model = plant(rows)
     problem = calibration_problem(
-        model, simulated(model, rows, seed, quantum), unknown=BOUNDS, priors=None, noisy=None, Q=None, R=None,
-        initial_state=None, initial_covariance=SPREAD**2, integration="backward-euler", substeps=1,
+        NonlinearPlant(model), simulated(model, rows, SEED, quantum), unknown=BOUNDS, priors=None, noisy=None,
+        Q=None, R=None, initial_state=None, initial_covariance=SPREAD**2, integration="backward-euler", substeps=1,
     )  # fmt: skip
+    return model, problem
+
+
+def root_at_truth(rows: int, seed: int, quantum: float = 0.0) -> float:
+    """Return the largest root of the profile deviance at a true constant: a box with that root just holds them all."""
+    model, problem = asked(rows, quantum)
+    problem = problem.with_log(simulated(model, rows, seed, quantum))
     fits = simulation_fits(problem, 1, 0, lambda text: None)
     objective = Objective(problem, fits[0])
     maximum, _ = guarded_maximum(objective, fits, lambda text: None)
@@ -81,8 +92,18 @@ def main() -> None:
     parser.add_argument("--rows", type=int, default=56)
     parser.add_argument("--runs", type=int, default=1000)
     parser.add_argument("--quantum", type=float, default=0.0)
+    parser.add_argument("--journal", type=Path, help="where roots are kept, so that an ended run goes on")
     options = parser.parse_args()
-    found = np.array([root_at_truth(options.rows, SEED + run, options.quantum) for run in range(options.runs)])
+    roots = {}
+    if options.journal is not None and options.journal.exists():
+        roots = dict(json.loads(line) for line in options.journal.read_text(encoding="utf-8").splitlines())
+    for seed in range(SEED, SEED + options.runs):
+        if seed not in roots:
+            roots[seed] = root_at_truth(options.rows, seed, options.quantum)
+            if options.journal is not None:
+                with options.journal.open("a", encoding="utf-8") as stream:
+                    stream.write(json.dumps([seed, roots[seed]]) + "\n")
+    found = np.array([roots[seed] for seed in range(SEED, SEED + options.runs)])
     share = float(np.mean(found <= limit(options.rows)))
     error = np.sqrt(share * (1.0 - share) / len(found))
     print(f"{options.rows} rows: {len(found)} logs, {share:.3f} +- {error:.3f} hold the truth")

@@ -10,7 +10,7 @@ Designs
     design, and one function for each method: fault_estimation_filter, pd_observer, ui_pi_observer, descriptor_kalman,
     adaptive_observer, dae_adaptive_observer; verify, load.
 On data
-    run_on_data, online_monitor, plotting.plot_data, html_report, export.
+    run_on_data, smooth, online_monitor, plotting.plot_data, html_report, export.
 In simulation
     Scenario, simulate, monitor, evaluate, decide; plotting.
 What is wrong
@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from obsynth.comparison.sensor_sets import SensorSet, SensorSets, sensor_sets
     from obsynth.data.alarm_proof import prove_alarm
     from obsynth.data.run import DataRun, run_on_data
+    from obsynth.data.smoothing import smooth
     from obsynth.errors import (
         InfeasibleError,
         ObsynthError,
@@ -57,9 +58,8 @@ if TYPE_CHECKING:
     from obsynth.experiments.monitors.online_monitor import online_monitor
     from obsynth.experiments.monitors.residual_monitor import monitor
     from obsynth.experiments.monte_carlo import Evaluation, evaluate
-    from obsynth.experiments.parameter_monte_carlo import ParameterMonitor
-    from obsynth.experiments.parameter_simulation import RecursiveSimulation
     from obsynth.experiments.simulation import Simulation, simulate
+    from obsynth.experiments.simulation import Simulation as RecursiveSimulation
     from obsynth.exporting.files import export
     from obsynth.importing.andes import from_andes
     from obsynth.importing.fmu import from_fmu
@@ -90,14 +90,15 @@ if TYPE_CHECKING:
     from obsynth.methods.verifying import verify
     from obsynth.observers.alarms import Alarm, Decision
     from obsynth.observers.batches import run_batch
-    from obsynth.observers.dae.batch import DAEBatchEstimates
-    from obsynth.observers.dae.estimates import DAEEstimates
     from obsynth.observers.dae.observer import DAEObserver
-    from obsynth.observers.decisions import decide
-    from obsynth.observers.linear.observer import Estimates, LinearObserver
+    from obsynth.observers.decisions import ParameterMonitor, decide
+    from obsynth.observers.estimates import Estimates
+    from obsynth.observers.estimates import Estimates as BatchEstimates
+    from obsynth.observers.estimates import Estimates as DAEBatchEstimates
+    from obsynth.observers.estimates import Estimates as DAEEstimates
+    from obsynth.observers.estimates import Estimates as RecursiveEstimates
+    from obsynth.observers.linear.observer import LinearObserver
     from obsynth.observers.linear.sampling import sample_observer
-    from obsynth.observers.recursive.estimates import RecursiveEstimates
-    from obsynth.observers.recursive.gain_schedule import BatchEstimates
     from obsynth.observers.recursive.observer import RecursiveObserver
     from obsynth.observers.recursive.settings import Adaptation
     from obsynth.observers.running import RunningObserver
@@ -115,11 +116,13 @@ if TYPE_CHECKING:
     from obsynth.results.design import Certificate, ObserverDesign
     from obsynth.results.gain_sets import load
     from obsynth.results.report import Check, VerificationReport
-    from obsynth.simulation.dae import DAETrajectory, simulate_dae
+    from obsynth.simulation.dae import simulate_dae
     from obsynth.simulation.failures import Gaussian, LostEffectiveness, Stuck, Uniform
     from obsynth.simulation.profiles import Drift, Intermittent, Ramp, Sine, Step
     from obsynth.simulation.scenario import Scenario
     from obsynth.simulation.time_varying import simulate_time_varying
+    from obsynth.simulation.trajectory import Trajectory
+    from obsynth.simulation.trajectory import Trajectory as DAETrajectory
     from obsynth.spec.loader import Spec, load_spec
     from obsynth.tolerances.robustness import Robustness, robustness
 
@@ -153,7 +156,8 @@ _HOMES = {
     "FaultDiagnosis": "obsynth.analysis.diagnosis.verdicts",
     "StructuredResidual": "obsynth.analysis.diagnosis.banks",
     "dae_adaptive_observer": "obsynth.methods.dae_adaptive_observer.public",
-    "DAETrajectory": "obsynth.simulation.dae",
+    "DAETrajectory": "obsynth.simulation.trajectory:Trajectory",
+    "Trajectory": "obsynth.simulation.trajectory",
     "Constant": "obsynth.plants.constants",
     "ConstantsBox": "obsynth.plants.constants",
     "Robustness": "obsynth.tolerances.robustness",
@@ -164,8 +168,8 @@ _HOMES = {
     "verify_alarm": "obsynth.experiments.alarm_proofs.certificate",
     "uncertain_system": "obsynth.plants.uncertain_system",
     "simulate_dae": "obsynth.simulation.dae",
-    "DAEBatchEstimates": "obsynth.observers.dae.batch",
-    "DAEEstimates": "obsynth.observers.dae.estimates",
+    "DAEBatchEstimates": "obsynth.observers.estimates:Estimates",
+    "DAEEstimates": "obsynth.observers.estimates:Estimates",
     "RunningDAEObserver": "obsynth.observers.running:RunningObserver",
     "DAEObserver": "obsynth.observers.dae.observer",
     "Identifiability": "obsynth.analysis.identifiability",
@@ -173,7 +177,7 @@ _HOMES = {
     "DAEModel": "obsynth.plants.dae.model",
     "Adaptation": "obsynth.observers.recursive.settings",
     "Alarm": "obsynth.observers.alarms",
-    "BatchEstimates": "obsynth.observers.recursive.gain_schedule",
+    "BatchEstimates": "obsynth.observers.estimates:Estimates",
     "Certificate": "obsynth.results.design",
     "Check": "obsynth.results.report",
     "DataRun": "obsynth.data.run",
@@ -182,7 +186,7 @@ _HOMES = {
     "DescriptorSystem": "obsynth.plants.descriptor",
     "Detection": "obsynth.experiments.monitors.monitor",
     "Drift": "obsynth.simulation.profiles",
-    "Estimates": "obsynth.observers.linear.observer",
+    "Estimates": "obsynth.observers.estimates",
     "Evaluation": "obsynth.experiments.monte_carlo",
     "FaultModel": "obsynth.plants.fault_models",
     "Gaussian": "obsynth.simulation.failures",
@@ -195,12 +199,12 @@ _HOMES = {
     "ObserverDesign": "obsynth.results.design",
     "OnlineMonitor": "obsynth.experiments.monitors.online",
     "ObsynthError": "obsynth.errors",
-    "ParameterMonitor": "obsynth.experiments.parameter_monte_carlo",
+    "ParameterMonitor": "obsynth.observers.decisions",
     "PreconditionError": "obsynth.errors",
     "Ramp": "obsynth.simulation.profiles",
-    "RecursiveEstimates": "obsynth.observers.recursive.estimates",
+    "RecursiveEstimates": "obsynth.observers.estimates:Estimates",
     "RecursiveObserver": "obsynth.observers.recursive.observer",
-    "RecursiveSimulation": "obsynth.experiments.parameter_simulation",
+    "RecursiveSimulation": "obsynth.experiments.simulation:Simulation",
     "RunningObserver": "obsynth.observers.running",
     "RunningRecursiveObserver": "obsynth.observers.running:RunningObserver",
     "Scenario": "obsynth.simulation.scenario",
@@ -253,6 +257,7 @@ _HOMES = {
     "SweepResult": "obsynth.sweeps.sweep",
     "sweep": "obsynth.sweeps.sweep",
     "sample_observer": "obsynth.observers.linear.sampling",
+    "smooth": "obsynth.data.smoothing",
     "simulate": "obsynth.experiments.simulation",
     "simulate_time_varying": "obsynth.simulation.time_varying",
     "steady_state_filter": "obsynth.methods.recursive.steady_filter",
@@ -330,6 +335,7 @@ __all__ = [
     "Sweep",
     "SweepResult",
     "TimeVaryingDescriptorSystem",
+    "Trajectory",
     "Uncertainty",
     "Uniform",
     "Validation",
@@ -385,6 +391,7 @@ __all__ = [
     "simulate",
     "simulate_dae",
     "simulate_time_varying",
+    "smooth",
     "steady_state_filter",
     "sweep",
     "ui_pi_observer",

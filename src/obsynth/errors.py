@@ -104,8 +104,8 @@ class PreconditionError(ObsynthError):
         """Return the error as plain data, for ``--json``."""
         mode = None if self.mode is None else [complex(self.mode).real, complex(self.mode).imag]
         return {
-            **super().as_dict(), "condition": self.condition, "mode": mode, "signals": list(self.signals),
-            "add": [list(names) for names in self.add],
+            **super().as_dict(), "condition": self.condition, "code": self.code, "mode": mode,
+            "signals": list(self.signals), "add": [list(names) for names in self.add],
         }  # fmt: skip
 
 

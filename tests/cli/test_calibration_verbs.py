@@ -103,3 +103,42 @@ def test_validate_says_yes_and_no_by_its_exit_code(folder, capsys):
 def test_what_is_wrong_has_an_exit_code(folder, monkeypatch, arguments, code):
     monkeypatch.chdir(folder)
     assert main(arguments) == code
+
+
+@pytest.mark.parametrize(
+    ("change", "code"),
+    [
+        (lambda log: log.iloc[:10], "too-short"),
+        (lambda log: log.assign(v2=1000.0 * log.v2), "explains-nothing"),
+        (lambda log: log.assign(v1=log.v1 / 1000.0, v2=log.v2 / 1000.0, v3=log.v3 / 1000.0), "explains-nothing"),
+        (lambda log: log.assign(time=log.time + 0.3 * np.sin(9.0 * np.arange(56))), "irregular"),
+        (lambda log: log.assign(u1=np.where(np.arange(56) == 20, np.nan, log.u1)), "nan"),
+        (lambda log: log.assign(v1=0.5, v2=0.5, v3=0.5, u1=0.0, u3=0.0), "not-exciting"),
+        (lambda log: log.assign(v1=np.sin(0.3 * np.arange(56)), v2=1.0 - log.v2, v3=np.cos(np.arange(56))),
+         "explains-nothing"),
+    ],
+)  # fmt: skip
+def test_logs_that_cannot_be_used_have_a_code_in_the_json(folder, tmp_path, capsys, change, code):
+    import pandas as pd
+
+    change(pd.read_csv(folder / "log.csv").iloc[:56]).to_csv(tmp_path / "log.csv", index=False)
+    arguments = ["--data", str(tmp_path / "log.csv"), "--rows", ":", "--json", "--quiet"]
+    assert main(["calibrate", "--system", str(folder / "spec.yaml"), *arguments]) in (2, 3)
+    assert json.loads(capsys.readouterr().out)["code"] == code
+
+
+def test_the_report_on_a_log_says_whether_it_agrees(folder, capsys):
+    gains, page = folder / "report.gains.json", folder / "report.html"
+    assert main(["design", "--system", str(folder / "spec.yaml"), "--output", str(gains), "--quiet"]) == 0
+    columns = ["--map", "u1=u1_held", "--map", "u3=u3_held", "--data", str(folder / "log.csv")]
+    shown = []
+    for rows in (["--rows", "0:56"], []):
+        arguments = ["report", "--gains", str(gains), *columns, *rows, "--out", str(page), "--force"]
+        assert main(arguments) == 0
+        text = page.read_text(encoding="utf-8")
+        shown.append(text[text.index('id="does-your-data-agree"') :].partition("</section>")[0])
+    assert "The log agrees" in shown[0]
+    assert "NIS" in shown[0]
+    assert shown[0].count("<img") == 1
+    assert "does not agree" in shown[1]
+    assert "not free of faults" in shown[1]

@@ -161,7 +161,9 @@ class TestDesign:
 
 class TestWidths:
     @pytest.mark.parametrize("width", [72, 80, 120, 200])
-    @pytest.mark.parametrize("arguments", [["verify"], ["check", "-v", "--system", str(SMIB)]], ids=["verify", "check"])
+    @pytest.mark.parametrize(
+        "arguments", [["verify", "-v"], ["check", "-v", "--system", str(SMIB)]], ids=["verify", "check"]
+    )
     def test_everything_fits_and_no_verdict_is_cut(
         self,
         width: int,
@@ -173,7 +175,7 @@ class TestWidths:
         monkeypatch.setenv("COLUMNS", str(width))
         # A path stays in one piece, so it is given by its name alone.
         monkeypatch.chdir(wang_gains.parent)
-        given = [*arguments, wang_gains.name] if arguments == ["verify"] else arguments
+        given = [*arguments, wang_gains.name] if arguments[0] == "verify" else arguments
         assert main(given) == 0
         lines = capsys.readouterr().out.splitlines()
         assert max(len(line) for line in lines) <= width
@@ -228,7 +230,11 @@ class TestCheck:
 class TestVerify:
     def test_holds(self, wang_gains: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert main(["verify", str(wang_gains)]) == 0
-        assert "Verified: all" in capsys.readouterr().out
+        printed = capsys.readouterr().out
+        assert "Verified: all" in printed.splitlines()[0]
+        assert len(printed.splitlines()) <= 20
+        assert main(["verify", str(wang_gains), "-v"]) == 0
+        assert "H-infinity norm" in capsys.readouterr().out
 
     def test_json(self, wang_gains: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert main(["verify", str(wang_gains), "--json"]) == 0

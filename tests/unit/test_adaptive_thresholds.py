@@ -11,6 +11,7 @@ from uncertain_plants import drive, wang
 
 import obsynth
 from obsynth.errors import PreconditionError, SpecError
+from obsynth.experiments.batch_simulation import make_bench
 from obsynth.experiments.monitors.adaptive_monitor import adaptive_plan
 from obsynth.experiments.monitors.adaptive_record import thresholds_of_records
 from obsynth.experiments.monitors.adaptive_rule import AdaptiveState, adaptive_step, record_columns
@@ -208,3 +209,25 @@ def test_plants_are_drawn_from_the_box() -> None:
         obsynth.evaluate(exact, quiet, runs=2, plants=2)
     with pytest.raises(SpecError, match="follows inputs and outputs"):
         adaptive.watch(obsynth.simulate(design, quiet).estimates)
+
+
+@pytest.mark.parametrize("size", [0.05, 0.3, 1.0])
+def test_what_an_evaluation_counts_does_not_depend_on_what_is_left_out(design, size: float) -> None:
+    plant, _ = design.linear
+    steps, onset = 90, 45
+    scenario = obsynth.Scenario(
+        horizon=(steps - 0.5) * plant.dt, noise=1.0,
+        inputs={name: obsynth.Sine(amplitude=1.0, frequency=2.0) for name in plant.input_names},
+        faults={plant.fault_names[0]: obsynth.Step(size=size, start=onset * plant.dt)},
+        disturbances={name: obsynth.Uniform(low=-0.1, high=0.1) for name in plant.disturbance_names},
+    )  # fmt: skip
+    watched = obsynth.monitor(design, scenario, constants=plant, noise_bound=1.0)
+    box = plant.uncertainty.box
+    for q in drawn_points(len(box.names), 6, 3):
+        bench = make_bench(design.replace(plant=plant_at(plant, box.values(q))), scenario)
+        runs = bench.run(range(20))
+        some = watched.passed_in(runs, design.observer.residual_rows, onset=onset)
+        whole = watched.passed_in(runs, design.observer.residual_rows)
+        assert np.array_equal(some[:onset].any(axis=0), whole[:onset].any(axis=0))
+        assert np.array_equal(some[onset:].any(axis=0), whole[onset:].any(axis=0))
+        assert np.array_equal(np.argmax(some[onset:], axis=0), np.argmax(whole[onset:], axis=0))

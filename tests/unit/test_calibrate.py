@@ -54,8 +54,9 @@ def test_what_was_found_reads_as_a_table_and_as_data(measured):
     assert measured.box.constants()["b1"]["nominal"] == measured.nominal["b1"]
 
 
-def test_a_leak_inside_the_rows_is_found(measured):
-    found = calibrate(tanks(), LOG, BOUNDS, rows="0:100", initial_covariance=1e-4, input_delay=1, starts=1)
+@pytest.mark.parametrize("end", [70, 80, 100])
+def test_a_leak_inside_the_rows_is_found(end):
+    found = calibrate(tanks(), LOG, BOUNDS, rows=f"0:{end}", initial_covariance=1e-4, input_delay=1, starts=1)
     assert found.change in range(55, 60)
     assert any("not of one piece" in sentence for sentence in found.verdict)
 
@@ -166,10 +167,21 @@ def test_logs_that_cannot_be_used_are_refused_with_a_code(change, code):
     assert caught.value.as_dict()["message"]
 
 
+def test_one_sensor_in_other_units_is_refused_by_name():
+    import pandas as pd
+
+    log = pd.read_csv(LOG)
+    log["v2"] *= 1000.0
+    with pytest.raises(PreconditionError, match="factor of 1000") as caught:
+        calibrate(tanks(), log, BOUNDS, rows="0:56", initial_covariance=1e-4, starts=1)
+    assert caught.value.as_dict()["code"] == "explains-nothing"
+    assert caught.value.signals == ("v2",)
+
+
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        ({"unknown": {}}, "empty"),
+        ({"unknown": {}, "noisy": [], "R": {"y": 1e-4}}, "nothing is to be found"),
         ({"unknown": {"Tau": (1, 2)}}, "Tau"),
         ({"unknown": {"T": (4, 9)}}, "outside its bounds"),
         ({"unknown": {"T": (9, 4)}}, "low, high"),

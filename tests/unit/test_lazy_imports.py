@@ -89,7 +89,22 @@ def test_a_run_of_a_linear_gain_set_loads_nothing_heavy(tmp_path):
     plant = obsynth.DescriptorSystem(None, [[0.5]], C=[[1.0]], Bf=[[1.0]], dt=1.0)
     obsynth.fault_estimation_filter(plant).save(tmp_path / "gains.json")
     (tmp_path / "log.csv").write_text("time;y1\n0;0,5\n1;0,25\n")
-    heavy = ("pandas", "scipy", "matplotlib", "casadi", "cvxpy", "clarabel", "control", "numba", "rich", "pydantic")
+    heavy = (
+        "pandas",
+        "scipy",
+        "matplotlib",
+        "casadi",
+        "cvxpy",
+        "clarabel",
+        "control",
+        "numba",
+        "rich",
+        "pydantic",
+        "obsynth.observers.recursive",
+        "obsynth.observers.dae",
+        "obsynth.analysis.structure",
+        "obsynth.proofs",
+    )
     code = (
         "import sys\nfrom obsynth.cli.main import main\n"
         "code = main(['run', '--gains', 'gains.json', '--data', 'log.csv', '--out', 'out.csv', '--quiet'])\n"

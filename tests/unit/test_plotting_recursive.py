@@ -89,8 +89,8 @@ def test_a_wide_band_at_the_start_does_not_hide_what_moves(run) -> None:
     steps = len(found.parameters)
     fading = np.where(np.arange(steps) < 3, 1.0, 1e-6)
     quiet = replace(
-        found, parameters=np.tile([0.1, 0.2], (steps, 1)) + 0.01 * np.sin(np.arange(steps))[:, None],
-        parameter_covariances=fading[:, None, None] * np.eye(2),
+        found, faults=np.tile([0.1, 0.2], (steps, 1)) + 0.01 * np.sin(np.arange(steps))[:, None],
+        fault_covariances=fading[:, None, None] * np.eye(2),
     )  # fmt: skip
     for panel, centre in zip(plot_parameters(quiet), (0.1, 0.2), strict=True):
         low, high = panel.get_ylim()

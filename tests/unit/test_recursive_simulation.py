@@ -12,8 +12,8 @@ import pytest
 import obsynth
 from obsynth.cli.main import main
 from obsynth.errors import SpecError
-from obsynth.experiments.parameter_batch_simulation import make_recursive_bench
-from obsynth.experiments.parameter_simulation import RecursiveSimulation
+from obsynth.experiments.benches import bench_of
+from obsynth.experiments.simulation import Simulation
 from obsynth.spec import load_spec
 
 DESIGNS = Path(__file__).parents[2] / "designs"
@@ -56,7 +56,7 @@ def test_a_time_varying_plant_obeys_its_equations(shifted) -> None:
         sensors={"y2": obsynth.Step(size=5, start=40)},
     )  # fmt: skip
     found = obsynth.simulate(shifted, scenario)
-    assert isinstance(found, RecursiveSimulation)
+    assert isinstance(found, Simulation)
     assert len(found.time) == 101
     np.testing.assert_array_equal(found.time[:3], [0.0, 0.5, 1.0])
     # Parameters are the observer's first ones and what the scenario adds.
@@ -85,7 +85,7 @@ def test_the_observer_beside_it_is_that_of_run(varying) -> None:
 def test_runs_at_once_are_runs_one_by_one(varying, shifted) -> None:
     cases = ((varying[0], varying[1].replace(horizon=80)), (shifted, obsynth.Scenario(horizon=40, noise=1)))
     for design, scenario in cases:
-        bench = make_recursive_bench(design, scenario)
+        bench = bench_of(design, scenario)
         together = bench.run(range(5))
         for seed, found in enumerate(together.estimates):
             alone = bench.run([seed])
@@ -98,13 +98,13 @@ def test_runs_at_once_are_runs_one_by_one(varying, shifted) -> None:
 
 def test_noise_is_as_large_as_the_design_states(shifted) -> None:
     """Sensors of 0.1, equations of 0.01: from what the plant does with it."""
-    bench = make_recursive_bench(shifted, obsynth.Scenario(horizon=100, noise=2.0))
+    bench = bench_of(shifted, obsynth.Scenario(horizon=100, noise=2.0))
     noisy = bench.run(range(40))
     sensed = (noisy.outputs - noisy.states)[1:]
     assert np.std(sensed) == pytest.approx(2.0 * 0.1, rel=0.03)
-    steps = noisy.states[1:, :, 1] - 0.6 * noisy.states[:-1, :, 1] - noisy.parameters[:-1, None, 1]
+    steps = noisy.states[1:, :, 1] - 0.6 * noisy.states[:-1, :, 1] - noisy.faults[:-1, :, 1]
     assert np.std(steps) == pytest.approx(2.0 * 0.01, rel=0.03)
-    quiet = make_recursive_bench(shifted, obsynth.Scenario(horizon=10, sensor_noise={"y1": 0.5})).run(range(200))
+    quiet = bench_of(shifted, obsynth.Scenario(horizon=10, sensor_noise={"y1": 0.5})).run(range(200))
     assert np.std((quiet.outputs - quiet.states)[1:, :, 0]) == pytest.approx(0.5, rel=0.05)
     assert not (quiet.outputs - quiet.states)[1:, :, 1].any()
 
@@ -115,7 +115,7 @@ def test_a_resetting_observer_is_run_on_each_record() -> None:
     )
     design = obsynth.adaptive_observer(plant, Q=1e-4, R=1e-2, forgetting=0.98, reset=1e-4)
     scenario = obsynth.Scenario(horizon=80, noise=1, faults={"leak": obsynth.Step(size=2, start=40)})
-    bench = make_recursive_bench(design, scenario)
+    bench = bench_of(design, scenario)
     both = bench.run([3, 4]).estimates
     np.testing.assert_array_equal(both[1].parameters, bench.run([4]).estimates[0].parameters)
     assert obsynth.evaluate(design, scenario, runs=3).runs == 3
@@ -249,6 +249,6 @@ def test_monitors_go_with_their_designs(shifted, varying) -> None:
 
 def test_benches_travel_to_other_processes(varying, nonlinear) -> None:
     for design, scenario in (varying, nonlinear):
-        bench = make_recursive_bench(design, scenario.replace(horizon=20 * design.observer.dt, faults={}))
+        bench = bench_of(design, scenario.replace(horizon=20 * design.observer.dt, faults={}))
         there = pickle.loads(pickle.dumps(bench))
         np.testing.assert_array_equal(there.run([5]).outputs, bench.run([5]).outputs)

@@ -107,6 +107,35 @@ def test_rank_answers_agree_with_the_decoupled_plant() -> None:
         assert asked.visible == (strength > 0.0)
 
 
+def test_rank_answers_on_a_network_agree_with_the_decoupled_plant() -> None:
+    # Kundur's 196 variables: 80 random pairs of all 19,110.
+    plant = load_spec(DESIGNS / "kundur" / "spec_fault_filter.yaml").transformation.source.dense()
+    bare = plant.replace(
+        C=np.zeros((0, plant.nx)), D=None, Dd=None, Df=None, Dw=None, output_names=[], units={}, scales={},
+        operating_point={},
+    )  # fmt: skip
+    sensors = state_sensors(bare)
+    pairs = np.array(list(combinations(range(len(sensors)), 2)))
+    responses = SensorResponses.of(bare, sensors)
+    assert responses is not None
+    shown = responses.shows(pairs, 0, ())
+    assert np.count_nonzero(shown) == 14240
+    assert not np.any((shown > 0.0) & (shown < 1e-4))
+    for number in np.random.default_rng(80).choice(len(pairs), 80, replace=False):
+        chosen = with_sensors(bare, [sensors[i] for i in pairs[number]])
+        assert Question(chosen, (), 0, False).visible == (shown[number] > 0.0)
+
+
+def test_no_set_of_the_size_asked_for() -> None:
+    rows = {"a": np.poly([1, 2]), "b": np.poly([2, 3]), "c": np.poly([1, 3])}
+    a = np.array([[-3.0, -3.0, -1.0], [1, 0, 0], [0, 1, 0]])
+    plant = obsynth.DescriptorSystem(None, a, None, np.zeros((0, 3)), Bf=[[1], [0], [0]])
+    found = obsynth.sensor_sets(plant, goal="estimate", candidates=rows, largest=2)
+    assert found.sets == ()
+    assert found.exact
+    assert found.notes == ("No set of at most 2 of 3 candidates does it: all were tried.", "One of 3 does: a, b, c.")
+
+
 def test_which_sensors_may_fail() -> None:
     found = obsynth.sensor_sets(load_spec(DESIGNS / "motor" / "spec.yaml").plant)
     assert found.sets[0].sensors == ()

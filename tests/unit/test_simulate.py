@@ -341,3 +341,39 @@ def test_an_output_may_have_the_name_of_an_input() -> None:
     assert list(table)[:4] == ["time", "level", "y[level]", "x[x1]"]
     np.testing.assert_array_equal(table["level"], 2.0)
     np.testing.assert_allclose(table["y[level]"], [0.0, 2.0, 3.0, 3.5])
+
+
+def test_a_plant_of_any_kind_is_simulated_alone(wang) -> None:
+    """One `simulate`: the kind of the plant decides; the signals are given, not a scenario."""
+    plant = wang[0].linear[0]
+    found = obsynth.simulate(plant, steps=4, f=np.ones((4, plant.nf)))
+    np.testing.assert_allclose(found.states[1:] @ plant.E.T, found.states[:-1] @ plant.A.T + plant.Bf.sum(1), atol=1e-9)
+    varying = obsynth.TimeVaryingDescriptorSystem(None, [["0.5 + 0 * k"]], C=[[1.0]], Phi=[[1.0]], dt=2.0)
+    found = obsynth.simulate(varying, samples=3, parameters=[1.0])
+    np.testing.assert_allclose(found.states[:, 0], [0.0, 1.0, 1.5])
+    np.testing.assert_allclose(found.time, [0.0, 2.0, 4.0])
+    tank = obsynth.DAEModel(
+        {"tank": "der(level) = -leak * level"}, {"gauge": "level"}, states={"level": 1.0}, inputs={},
+        parameters={"leak": 0.5},
+    )  # fmt: skip
+    found = obsynth.simulate(tank, u=np.zeros((3, 0)), dt=0.1)
+    np.testing.assert_allclose(found.outputs[:, 0], np.exp(-0.05 * np.arange(3)), rtol=1e-6)
+    with pytest.raises(SpecError, match=r"an obsynth\.Scenario"):
+        obsynth.simulate(wang[0])
+    with pytest.raises(SpecError, match="steps: the signals of a design are its scenario's"):
+        obsynth.simulate(*wang, steps=3)
+
+
+def test_estimates_are_of_one_kind() -> None:
+    kinds = {obsynth.RecursiveEstimates, obsynth.DAEEstimates, obsynth.BatchEstimates, obsynth.DAEBatchEstimates}
+    assert kinds == {obsynth.Estimates}
+    assert obsynth.RecursiveSimulation is obsynth.Simulation
+    assert obsynth.DAETrajectory is obsynth.Trajectory
+    design = obsynth.fault_estimation_filter(
+        obsynth.DescriptorSystem(None, [[0.5]], [[1.0]], [[1.0]], Bf=[[1.0]], dt=1.0)
+    )
+    found = design.observer.run(np.zeros((3, 1)), np.zeros((3, 1)))
+    assert not found.has_deviations
+    assert np.isnan(found.state_deviations).all()
+    assert found.fault_deviations.shape == found.parameters.shape == (3, 1)
+    assert found.nis.size == 0

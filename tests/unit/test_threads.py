@@ -5,15 +5,17 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
-import scipy.linalg  # noqa: F401 - its BLAS must be loaded to be seen
+import scipy.linalg
 import threadpoolctl
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import obsynth
+from obsynth.analysis.structure import analyse_structure
 from obsynth.methods import designing
 from obsynth.methods.pd_observer import synthesis as method
 from obsynth.methods.pd_observer.options import PdOptions
@@ -122,6 +124,39 @@ def test_a_design_runs_on_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     made = obsynth.design(PLANT, "pd-observer", progress=lambda _: seen.append(blas_threads()))
     assert made.report.passed
     assert len(seen) >= 3
+    assert all(found == {1} for found in seen)
+    assert blas_threads() == {2}
+
+
+KUNDUR = Path(__file__).parents[2] / "designs" / "kundur" / "spec_fault_filter.yaml"
+ENTRIES: dict[str, Callable[[obsynth.DescriptorSystem], object]] = {
+    "load_spec": lambda _: obsynth.load_spec(KUNDUR),
+    "analyse_structure": lambda plant: analyse_structure.__wrapped__(plant),
+    "diagnose": obsynth.diagnose,
+    "decouple": obsynth.decouple,
+    "sensor_sets": obsynth.sensor_sets,
+    "compare": lambda plant: obsynth.compare(plant, runs=1, methods=["functional-filter"]),
+    "discretise": lambda plant: obsynth.discretise(plant, 0.1),
+}
+
+
+@pytest.mark.parametrize("entry", ENTRIES)
+def test_every_entry_runs_on_one_thread(entry: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = []
+    for home, name in ((np.linalg, "svd"), (np.linalg, "solve"), (scipy.linalg, "expm"), (scipy.linalg, "svd")):
+        right = getattr(home, name)
+
+        def watched(*arguments: object, right: Callable[..., object] = right, **options: object) -> object:
+            seen.append(blas_threads())
+            return right(*arguments, **options)
+
+        monkeypatch.setattr(home, name, watched)
+    plant = obsynth.DescriptorSystem(
+        np.diag([1.0, 1, 0]), [[-0.5, 1, 0], [0, -1, 0], [1, 0, -1]], None, [[1.0, 0, 0.5]], Bf=[[0.0], [1], [0]],
+        Dw=[[0.1]],
+    )  # fmt: skip
+    ENTRIES[entry](plant)
+    assert seen
     assert all(found == {1} for found in seen)
     assert blas_threads() == {2}
 

@@ -5,7 +5,7 @@ Questions about a plant that may not be what was meant; nothing is refused becau
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from types import MappingProxyType
@@ -13,11 +13,13 @@ from types import MappingProxyType
 import numpy as np
 
 from obsynth.analysis.existence.verdicts import hidden_modes
+from obsynth.analysis.transformations.recovery import Transformation, linear_plant
 from obsynth.analysis.zeros import are_outside
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.pencils import FiniteZeros, pencil_structure
 from obsynth.numerics.ranks import RankDecision, decide_rank
 from obsynth.numerics.scaling import equilibrate_pencil
+from obsynth.numerics.threads import on_one_thread_if_small
 from obsynth.plants.descriptor import DescriptorSystem
 
 
@@ -62,12 +64,13 @@ class Structure:
 
 # Conditions, synthesis and verification ask for the same plant's; plants never change.
 @lru_cache(maxsize=4)
-def analyse_structure(plant: DescriptorSystem) -> Structure:
+@on_one_thread_if_small
+def analyse_structure(plant: DescriptorSystem | Transformation) -> Structure:
     """Analyse regularity, index, stability and observability of ``plant``.
 
     Parameters
     ----------
-    plant : DescriptorSystem
+    plant : DescriptorSystem or Transformation
         ``E, A (nx, nx)``, ``C (ny, nx)``, either time.
 
     Returns
@@ -83,7 +86,7 @@ def analyse_structure(plant: DescriptorSystem) -> Structure:
     ----------
     .. [Dai1989] L. Dai, "Singular Control Systems", 1989, chapters 1 and 2.
     """
-    plant = plant.dense()
+    plant = linear_plant(plant).dense()
     E, A, C = plant.E, plant.A, plant.C
     pencil = pencil_structure(E, A)
     poles = FiniteZeros(pencil.finite_eigenvalues, pencil.normal_rank, pencil.decisions)
@@ -143,12 +146,54 @@ _FAR = 3.0
 
 #: Larger plants are not asked: their eigenvalues would take too long for a question.
 _MOST_STATES = 200
+#: Signals that a question lists.
+_MOST_NAMES = 5
 
 
 def questions(plant: DescriptorSystem) -> tuple[str, ...]:
-    """Return what to ask about a linear plant: matrices of continuous time with a dt, or the other way round."""
+    """Return what to ask about a linear plant: half an operating point, or matrices of another time than ``dt``."""
     if plant.nx > _MOST_STATES:
+        return _half_a_point(plant)
+    return (*_half_a_point(plant), *_other_time(plant))
+
+
+def _half_a_point(plant: DescriptorSystem) -> tuple[str, ...]:
+    """Ask about measured signals that the operating point leaves out, and say where the plant rests."""
+    point, measured = plant.operating_point, (*plant.input_names, *plant.output_names)
+    missing = [name for name in measured if name not in point]
+    if not missing or not any(point.values()):
         return ()
+    listed = ", ".join(missing[:_MOST_NAMES]) + (
+        f" and {len(missing) - _MOST_NAMES} more" if len(missing) > _MOST_NAMES else ""
+    )
+    told = _rest(plant, missing)
+    return (
+        f"operating_point has {', '.join(list(point)[:_MOST_NAMES])}, but not {listed}: what a log holds of these is "
+        f"taken as a deviation. Give their values at that point as well{told}.",
+    )
+
+
+def _rest(plant: DescriptorSystem, missing: Sequence[str]) -> str:
+    """Return in words where the missing outputs are at rest, if the equations hold for absolute values."""
+    names = [name for name in missing if name in plant.output_names]
+    if not names or plant.nx > _MOST_STATES:
+        return ""
+    plain, point = plant.dense(), plant.operating_point
+    known = np.array([point.get(name, 0.0) for name in plant.input_names])
+    unknown = np.array([point.get(name, 0.0) for name in plant.disturbance_names])
+    matrix = plain.A - plain.E if plant.is_discrete else plain.A
+    drive = plain.B @ known + plain.Bd @ unknown
+    state, _, rank, _ = np.linalg.lstsq(matrix, -drive, rcond=None)
+    if rank < plant.nx:
+        return ""
+    values = plain.C @ state + plain.D @ known + plain.Dd @ unknown
+    found = dict(zip(plant.output_names, values, strict=True))
+    told = ", ".join(f"{name} {found[name]:.5g}" for name in names[:_MOST_NAMES])
+    return f" (if the equations hold for absolute values, the plant rests there at {told})"
+
+
+def _other_time(plant: DescriptorSystem) -> tuple[str, ...]:
+    """Ask about eigenvalues that are those of a plant in the other kind of time."""
     plain = plant.dense()
     values = np.asarray(pencil_structure(plain.E, plain.A).finite_eigenvalues)
     values = values[np.isfinite(values)]

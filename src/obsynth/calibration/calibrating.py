@@ -9,21 +9,27 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.calibration.innovations_fit import Timing, chosen_timing, innovations_fit
+from obsynth.calibration.linear_plants import EXACT, LinearPlant, plant_as_written
 from obsynth.calibration.logs import LogData, read_log
+from obsynth.calibration.plants import NonlinearPlant
 from obsynth.calibration.problem import Problem, calibration_problem, require_variation
 from obsynth.calibration.reporting import IntegrationError, integration_error, reported
 from obsynth.calibration.result import Calibration
 from obsynth.calibration.simulation_error import Fit, SimulationError, simulation_fits
 from obsynth.errors import SolverError, SpecError
-from obsynth.numerics.arguments import require_kind
+from obsynth.numerics.arguments import is_whole
 from obsynth.plants.dae.model import DAEModel
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 
 METHODS = ("innovations", "simulation")
 INTEGRATIONS = ("auto", "backward-euler", "radau")
+#: Two sample times are the same within this share.
+SAME_TIME = 1e-6
 
 
 def calibrate(
-    model: DAEModel,
+    model: DAEModel | DescriptorSystem | TimeVaryingDescriptorSystem,
     log: LogData,
     unknown: Mapping[str, Sequence[float]],
     *,
@@ -46,7 +52,7 @@ def calibrate(
     seed: int = 0,
     progress: Callable[[str], object] | None = None,
 ) -> Calibration:
-    r"""Fit constants and noise covariances of a nonlinear plant to a log of rows without faults.
+    r"""Fit constants and noise covariances of a plant to a log of rows without faults.
 
     The start is a least-squares fit of simulations.  Then the likelihood of the innovations is made greatest,
 
@@ -58,13 +64,17 @@ def calibrate(
 
     Parameters
     ----------
-    model : DAEModel
-        ``nx`` states, ``nu`` inputs, ``ny`` outputs.
+    model : DAEModel, DescriptorSystem or TimeVaryingDescriptorSystem
+        ``nx`` states, ``nu`` inputs, ``ny`` outputs.  Linear plants hold their constants in entries that are
+        expressions (`obsynth.uncertain_system`, or texts of a time-varying plant); constant faults and parameters may
+        be unknown too.  Their signals are deviations from the operating point, of which logs know nothing; ``k`` is
+        the row of the log.
     log : path, pandas.DataFrame or mapping
         CSV or Parquet file, or columns by name: ``time`` in seconds, every input and every output; NaN where an output
         is missing.
     unknown : mapping of str to (low, high)
-        Constants and parameters that are to be found, with finite bounds around their nominal values.
+        Constants and parameters that are to be found, with finite bounds around their nominal values; none (``{}``)
+        to find the noise alone.
     priors : mapping of str to (mean, deviation), optional
         What is known of them besides, as normal distributions.
     noisy : list of str, optional
@@ -72,9 +82,10 @@ def calibrate(
     R, Q : mapping of str to float, optional
         Variances that are known, by sensor and by noisy equation; the others are found.
     initial_state : array_like or mapping, optional
-        ``(nx,)``, or values by name; nominal values by default.
+        ``(nx,)``, or values by name; by default nominal values, of linear plants zero.
     initial_covariance : array_like or mapping, optional
-        ``(nx, nx)``, one variance, or variances by name; deviations of 10 % of the nominal sizes by default.
+        ``(nx, nx)``, one variance, or variances by name.  By default deviations are 10 % of the nominal
+        sizes; of linear plants, what alone would make outputs as large as they are.
     rows : str, slice or pair, optional
         ``"a:b"``: the rows that are free of faults, as Python counts; all by default.
     columns : mapping of str to str, optional
@@ -84,12 +95,14 @@ def calibrate(
     dt : float, optional
         Seconds between rows; the median of the stamps by default.
     input_delay : int or "auto", optional
-        Rows by which the log's inputs act later than the convention says, ``u(k)`` during the step that ends at k.
-        ``"auto"`` takes 1 where the likelihood is clearly better: a log that writes what is sent at k.
+        Rows by which the log's inputs act later than the convention says: ``u(k)`` during the step that ends at k, of
+        linear plants during the one that begins there.  ``"auto"`` takes 1 where the likelihood is clearly better: a
+        log that writes what is sent at k.
     method : {"innovations", "simulation"}, optional
         The second one stops at the fit of simulations, whose boxes are too small where its residuals are not white.
     integration : {"auto", "backward-euler", "radau"}, optional
-        ``"auto"`` takes backward Euler unless its error of one step exceeds a quarter of a sensor's deviation.
+        ``"auto"`` takes backward Euler unless its error of one step exceeds a quarter of a sensor's deviation; for
+        linear plants in continuous time Radau.  Discrete plants are stepped as they are.
     substeps : int, optional
         Steps in a sample.
     level : float, optional
@@ -113,7 +126,8 @@ def calibrate(
         ``too-short``).
     PreconditionError
         ``not-exciting``: nothing moves.  ``explains-nothing``: the model cannot follow the log, for example as units
-        are off by 1000.  ``cannot-simulate``: it has no solution along the log's inputs.
+        are off by 1000.  ``cannot-simulate``: it has no solution along the log's inputs.  ``undetermined-step``: a
+        step of a linear plant does not determine its state.
 
     References
     ----------
@@ -122,42 +136,75 @@ def calibrate(
        Psychometrika 78, 2013: the weight that keeps variances from zero, which we give only to those that the log
        cannot tell from it.
     """
-    require_kind(model, DAEModel, "model", "a DAEModel")
     _check_options(method, integration, level, starts, input_delay)
     note = progress or (lambda text: None)
-    whole = read_log(log, model.input_names, model.output_names, rows=rows, columns=columns, scales=scales, dt=dt)
+    model = require_plant(model)
+    factors = dict(getattr(model, "scales", {})) | dict(scales or {})
+    whole = read_log(log, model.input_names, model.output_names, rows=rows, columns=columns, scales=factors,
+                     dt=_sample_time(model, dt, substeps))  # fmt: skip
     digest = whole.digest
     whole = whole.shifted(input_delay) if isinstance(input_delay, int) else whole
+    plant = NonlinearPlant(model) if isinstance(model, DAEModel) else LinearPlant(model, whole)
     problem = calibration_problem(
-        model, whole, unknown=unknown, priors=priors, noisy=noisy, Q=Q, R=R, initial_state=initial_state,
-        initial_covariance=initial_covariance, substeps=substeps,
-        integration="backward-euler" if integration == "auto" else integration,
+        plant, whole, unknown=unknown, priors=priors, noisy=noisy, Q=Q, R=R, initial_state=initial_state,
+        initial_covariance=initial_covariance, substeps=substeps, integration=_first_integration(plant, integration),
     )  # fmt: skip
     require_variation(problem)
     fits = simulation_fits(problem, starts, seed, note)
     error = None
-    if integration == "auto":
+    if integration == "auto" and isinstance(plant, NonlinearPlant):
         error = _step_error(problem, fits[0])
         if error is not None and error.matters:
             note("integrating by Radau")
             problem = problem.integrated("radau", substeps)
             fits = simulation_fits(problem, starts, seed, note)
     timing = Timing(input_delay if isinstance(input_delay, int) else 0, {})
-    if method == "innovations" and input_delay == "auto" and model.nu:
+    if method == "innovations" and input_delay == "auto" and model.input_names:
         problem, fits, timing = chosen_timing(problem, fits, seed, note)
     fit = innovations_fit(problem, fits, level, note) if method == "innovations" else None
     return reported(problem, fits[0], fit, level=level, timing=timing, error=error, digest=digest)
 
 
+def require_plant(given: Any) -> DAEModel | DescriptorSystem | TimeVaryingDescriptorSystem:
+    """Return a plant as written; of a transformation its source."""
+    plant = plant_as_written(given)
+    if not isinstance(plant, (DAEModel, DescriptorSystem, TimeVaryingDescriptorSystem)):
+        raise SpecError(f"model is {type(given).__name__}: give a DAEModel, a DescriptorSystem or a "
+                        "TimeVaryingDescriptorSystem.", path="model")  # fmt: skip
+    return plant
+
+
+def _sample_time(model: Any, dt: float | None, substeps: int) -> float | None:
+    """Return the time between rows: that of a discrete plant is its own."""
+    own = 0.0 if isinstance(model, DAEModel) else float(model.dt)
+    if not own:
+        return dt
+    if dt is not None and abs(dt - own) > SAME_TIME * own:
+        raise SpecError(f"dt is {dt:g} s, but a step of this plant takes {own:g} s: leave dt out.", path="dt")
+    if substeps != 1:
+        raise SpecError("substeps divides the steps of continuous plants, and this one is discrete: leave it out.",
+                        path="substeps")  # fmt: skip
+    return own
+
+
+def _first_integration(plant: NonlinearPlant | LinearPlant, asked: str) -> str:
+    if isinstance(plant, NonlinearPlant):
+        return "backward-euler" if asked == "auto" else asked
+    if plant.integrations == (EXACT,):
+        return EXACT
+    return "radau" if asked == "auto" else asked
+
+
 def _step_error(problem: Problem, fit: Fit) -> IntegrationError | None:
     """Return what backward Euler errs along the best simulation; nothing where it cannot be told."""
-    error = SimulationError(problem)
-    states = error.states(fit)
-    theta = np.array(problem.model.nominal_parameters)
-    for name, value in zip(problem.unknown, fit.t, strict=True):
-        theta[problem.model.parameter_names.index(name)] = value
+    states, plant = SimulationError(problem).states(fit), problem.plant
+    if not isinstance(plant, NonlinearPlant):
+        return None
+    theta = np.array(plant.theta(problem.unknown, fit.t), dtype=np.float64)
     try:
-        return integration_error(problem.model, states, problem.u, theta, fit.deviations, problem.log.dt)
+        return integration_error(
+            plant.promoted(problem.unknown), states, problem.u, theta, fit.deviations, problem.log.dt
+        )
     except SolverError:
         # Where Radau has no solution there is nothing to choose.
         return None
@@ -170,7 +217,7 @@ def _check_options(method: Any, integration: Any, level: Any, starts: Any, input
         raise SpecError(f"integration is {integration!r}: use one of {', '.join(INTEGRATIONS)}.", path="integration")
     if not isinstance(level, (int, float)) or not 0.0 < level < 1.0:
         raise SpecError(f"level is {level!r}: give a probability, such as 0.95.", path="level")
-    if not isinstance(starts, int) or isinstance(starts, bool) or starts < 1:
+    if not is_whole(starts) or starts < 1:
         raise SpecError(f"starts is {starts!r}: give a whole number, at least 1.", path="starts")
-    if input_delay != "auto" and (not isinstance(input_delay, int) or isinstance(input_delay, bool)):
+    if input_delay != "auto" and (not is_whole(input_delay)):
         raise SpecError(f"input_delay is {input_delay!r}: give whole rows, or 'auto'.", path="input_delay")

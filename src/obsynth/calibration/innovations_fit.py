@@ -98,8 +98,9 @@ def innovations_fit(problem: Problem, fits: list[Fit], level: float, note: Calla
     variances = int((objective.is_q | objective.is_r).sum())
     root = quantile(level, objective.nt, problem.log.samples, variances)
     note("boxes by profile likelihood")
-    sides = profile_box(objective, maximum, root)
-    Q, R = objective.noise(maximum.z)
+    sides = profile_box(objective, maximum, root, found)
+    # Variances are kept from zero for the sake of the boxes; where the log tells them from it, it says them itself.
+    Q, R = objective.noise(maximum.likeliest)
     limited, limits = _limits(objective, maximum)
     Q, R = np.where(limited[: len(Q)], limits[: len(Q)], Q), np.where(limited[len(Q) :], limits[len(Q) :], R)
     whitened, e, spread = objective.likelihood.innovations(objective.full(maximum.z))

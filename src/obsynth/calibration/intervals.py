@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from obsynth.calibration.maximum import Maximum, Objective, at_bounds, descent
+from obsynth.calibration.maximum import Maximum, Objective, at_bounds, descent, polished
 from obsynth.numerics.arrays import FloatArray
 
 #: A direction whose deviation exceeds this share of the bounds' width is not determined by the log.
@@ -24,6 +24,10 @@ LIMIT_ROOT = 1.645
 #: A profile ends when its root is within this share of what is sought.
 PROFILE_TOLERANCE = 0.02
 MOST_PROFILE_STEPS = 12
+#: Along a valley: longest step in widths of the bounds, Newton's steps at each, and the gain in nats that ends them.
+VALLEY_STEP, VALLEY_NEWTON_STEPS, VALLEY_TOLERANCE = 0.0625, 8, 1e-3
+#: The share of that step at which an end is told.
+LEAST_VALLEY_STEP = 0.0625
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,11 +93,15 @@ class Side:
     is_open: bool
 
 
-def profile_box(objective: Objective, maximum: Maximum, root: float) -> list[tuple[Side, Side]]:
+def profile_box(
+    objective: Objective, maximum: Maximum, root: float, said: Information
+) -> list[tuple[Side, Side]]:  # fmt: skip
     """Return both ends of each constant's box, in its own units."""
-    found = []
+    found, names = [], objective.problem.unknown
     for i, width in enumerate(objective.problem.widths):
-        sides = [_side(objective, maximum, i, sign, root) for sign in (-1.0, 1.0)]
+        weak = any(names[i] in direction for direction in said.undetermined)
+        side = _side_along_valley if weak else _side
+        sides = [side(objective, maximum, i, sign, root) for sign in (-1.0, 1.0)]
         found.append((Side(sides[0].value * width, sides[0].is_open), Side(sides[1].value * width, sides[1].is_open)))
     return found
 
@@ -186,3 +194,31 @@ def _side(objective: Objective, maximum: Maximum, i: int, sign: float, target: f
             share = (target - reached_inner) / max(reached - reached_inner, 1e-12)
             return Side(inner + share * (outer - inner), False)
     return Side(outer, False)
+
+
+def _side_along_valley(objective: Objective, maximum: Maximum, i: int, sign: float, target: float) -> Side:
+    """Return the end of a constant that the log hardly determines: along a valley that bends, in short steps.
+
+    The others are led on from the last two places, and set right by Newton's steps at each.
+    """
+    others = [j for j in range(len(maximum.z)) if j != i]
+    place, rest = float(maximum.z[i]), maximum.z[others].copy()
+    end = float(objective.low[i] if sign < 0 else objective.high[i])
+    inner = maximum.hessian[np.ix_(others, others)]
+    slope = -np.linalg.lstsq(inner, maximum.hessian[others, i], rcond=LEAST_INFORMATION)[0]
+    step, reached = VALLEY_STEP, 0.0
+    while abs(end - place) > 1e-9:
+        new = place + sign * min(step, abs(end - place))
+        z = np.empty(len(maximum.z))
+        z[others], z[i] = rest + slope * (new - place), new
+        z = np.clip(z, objective.low, objective.high)
+        least, z, _ = polished(objective, z, fixed=i, most=VALLEY_NEWTON_STEPS, tolerance=VALLEY_TOLERANCE)
+        found = math.sqrt(max(2.0 * (least - maximum.value), 0.0))
+        if found >= target:
+            if step <= LEAST_VALLEY_STEP * VALLEY_STEP:
+                share = (target - reached) / max(found - reached, 1e-12)
+                return Side(place + share * (new - place), False)
+            step *= 0.25
+            continue
+        slope, place, rest, reached = (z[others] - rest) / (new - place), new, z[others].copy(), found
+    return Side(end, True)

@@ -89,11 +89,11 @@ def _whole(
     return ca.Function("likelihood", [v], [total, ca.densify(gradient), ca.densify(rows)])
 
 
-def _update(graphs: SampleGraphs, x: Any, P: Any, t: Any, log_r: Any, y: Any, seen: Any) -> tuple[Any, Any]:
+def _update(graphs: SampleGraphs, x: Any, P: Any, u: Any, t: Any, log_r: Any, y: Any, seen: Any) -> tuple[Any, Any]:
     """Return the state and covariance after a measurement, packed; and its row: value, whitened, e, variances."""
     import casadi as ca
 
-    predicted, H, _ = graphs.outputs(x, t)
+    predicted, H, _ = graphs.outputs(x, u, t)
     H = ca.densify(H) * ca.repmat(seen, 1, graphs.nx)
     e = seen * (y - predicted)
     S = H @ P @ H.T + ca.diag(seen * ca.exp(log_r) + (1.0 - seen))
@@ -133,10 +133,10 @@ def _symbols(graphs: SampleGraphs, noisy: Sequence[int]) -> tuple[Any, ...]:
 def _first(graphs: SampleGraphs, noisy: Sequence[int]) -> Any:
     import casadi as ca
 
-    packed, data, v, _, y, seen, t, _, log_r = _symbols(graphs, noisy)
+    packed, data, v, u, y, seen, t, _, log_r = _symbols(graphs, noisy)
     nx = graphs.nx
     x, P = packed[:nx], ca.reshape(packed[nx:], nx, nx)
-    after, row = _update(graphs, x, P, t, log_r, y, seen)
+    after, row = _update(graphs, x, P, u, t, log_r, y, seen)
     return ca.Function("first", [packed, data, v], [ca.densify(after), ca.densify(ca.vertcat(row, 0.0))])
 
 
@@ -151,7 +151,7 @@ def _later(graphs: SampleGraphs, noisy: Sequence[int]) -> Any:
     x, F, _, way = graphs.local(packed[:nx], u, t, tc, numbers)
     added = way[:, list(noisy)]
     P = F @ P @ F.T + added @ ca.diag(ca.exp(log_q)) @ added.T if noisy else F @ P @ F.T
-    after, row = _update(graphs, x, P, t, log_r, y, seen)
+    after, row = _update(graphs, x, P, u, t, log_r, y, seen)
     return ca.Function("later", [packed, data, v, tc, numbers], [ca.densify(after), ca.densify(row)])
 
 

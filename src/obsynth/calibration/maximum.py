@@ -29,7 +29,14 @@ CONSTANT_SCALE, VARIANCE_SCALE = 0.01, 1.0
 SAME_MINIMUM = 1e-3
 SEARCH_TOLERANCE = 1e-6
 MOST_SEARCH_STEPS = 150
-DIFFERENCE = 1e-4
+#: Newton steps at the end: how many, what is added to curvatures until one helps, how far one goes (in widths
+#: of the bounds, and as a logarithm of a variance), the least curvature that is seen, the gain in nats that ends them.
+MOST_NEWTON_STEPS, NEWTON_DAMPINGS = 12, (0.0, 1e1, 1e3, 1e5, 1e7)
+NEWTON_REACH, LEAST_CURVATURE, NEWTON_TOLERANCE = (0.1, 2.0), 0.1, 1e-6
+#: Steps along directions of high curvature alone, and what a value is rounded by.
+ACROSS_STEPS, STEEP, VALUE_ROUNDING = 4, 1e3, 1e-13
+#: Differences of the gradient: the longest, as a share of a deviation, and the shortest.
+DIFFERENCE, DIFFERENCE_SHARE, LEAST_DIFFERENCE = 1e-4, 0.03, 1e-6
 #: A variance counts as indistinguishable from zero if making it smaller by this logarithm costs fewer nats than this.
 COLLAPSE, COLLAPSE_NATS = 3.0, 0.05
 #: Where variances that must not collapse begin, as logarithms of factors of their first guess.
@@ -127,7 +134,7 @@ def _process_noise(problem: Problem, fit: Fit) -> FloatArray:
     g, p = problem.graphs, problem
     stages = g.solve(p.x0, p.u[0], fit.t)[0]
     way = np.array(g.local(p.x0, p.u[0], fit.t, fit.t, g.sensitivities(p.x0, p.u[0], fit.t, stages))[3])
-    moved = (np.abs(way) / p.model.state_scales[:, None]).max(axis=0)[p.noisy_equations]
+    moved = (np.abs(way) / p.plant.state_scales[:, None]).max(axis=0)[p.noisy_equations]
     moved = np.where(np.isfinite(moved) & (moved > 0.0), moved, 1.0)
     return np.asarray(2.0 * np.log(FIRST_PROCESS_NOISE / moved))
 
@@ -156,8 +163,6 @@ def descent(
 
 def greatest_likelihood(objective: Objective, fits: Sequence[Fit], note: Callable[[str], object]) -> Maximum:
     """Return the best of several searches, polished."""
-    from scipy.optimize import minimize
-
     starts: list[float] = []
     best, value = None, np.inf
     for i, fit in enumerate(fits):
@@ -174,13 +179,60 @@ def greatest_likelihood(objective: Objective, fits: Sequence[Fit], note: Callabl
     if best is None or value >= IMPOSSIBLE:
         raise refused("cannot-simulate", "The filter has no finite likelihood from any start: check units, bounds and "
                       "the initial covariance.", signals=list(objective.problem.unknown))  # fmt: skip
-    found = minimize(
-        objective, best, jac=True, method="L-BFGS-B", bounds=np.column_stack([objective.low, objective.high]),
-        options={"maxiter": 100, "maxcor": 30, "ftol": 1e-14, "gtol": 1e-7},
-    )  # fmt: skip
-    if found.fun < value:
-        best, value = np.asarray(found.x), float(found.fun)
-    return Maximum(best, value, hessian(objective, best), tuple(starts), best)
+    value, best, curvature = polished(objective, best)
+    return Maximum(best, value, curvature, tuple(starts), best)
+
+
+def polished(
+    objective: Objective, z: FloatArray, *, fixed: int | None = None, most: int = MOST_NEWTON_STEPS,
+    tolerance: float = NEWTON_TOLERANCE,
+) -> tuple[float, FloatArray, FloatArray]:  # fmt: skip
+    """Return value, place and Hessian after Newton steps: a quiet log makes valleys that other searches end beside.
+
+    One variable may be fixed; the Hessian is then that of a place nearby.
+    """
+    value, gradient = objective(z)
+    curvature = hessian(objective, z)
+    for _ in range(most):
+        before = value
+        for damping in NEWTON_DAMPINGS:
+            trial = _newton_step(objective, z, gradient, curvature, damping, fixed)
+            found, slope = objective(trial)
+            if found < value:
+                z, value, gradient = trial, found, slope
+                break
+        if before - value < tolerance:
+            break
+        curvature = hessian(objective, z, curvature)
+    # What is left across steep walls tilts the bottom of a bent valley, and with it what the valley leaves open.
+    for _ in range(ACROSS_STEPS):
+        trial = _newton_step(objective, z, gradient, curvature, 0.0, fixed, least=STEEP)
+        found, slope = objective(trial)
+        if not found < value + VALUE_ROUNDING * abs(value):
+            break
+        z, value, gradient = trial, found, slope
+    return value, z, hessian(objective, z, curvature) if fixed is None else curvature
+
+
+def _newton_step(
+    objective: Objective, z: FloatArray, gradient: FloatArray, curvature: FloatArray, damping: float,
+    fixed: int | None, *, least: float = 0.0,
+) -> FloatArray:  # fmt: skip
+    """Return where a damped step leads within the bounds, along directions of more than the least curvature."""
+    room = AT_BOUND * (1.0 + np.abs(z))
+    held = ((z - objective.low <= room) & (gradient > 0.0)) | ((objective.high - z <= room) & (gradient < 0.0))
+    if fixed is not None:
+        held[fixed] = True
+    free = np.flatnonzero(~held)
+    if not free.size:
+        return z
+    reach = np.where(objective.is_q | objective.is_r, NEWTON_REACH[1], NEWTON_REACH[0])[free]
+    values, vectors = np.linalg.eigh(curvature[np.ix_(free, free)])
+    lengths = -(vectors.T @ gradient[free]) / (np.maximum(np.abs(values), LEAST_CURVATURE) + damping)
+    longest = 1.0 / np.abs(vectors / reach[:, None]).max(axis=0)
+    step = np.zeros(len(z))
+    step[free] = vectors @ np.where(np.abs(values) > least, np.clip(lengths, -longest, longest), 0.0)
+    return np.asarray(np.clip(z + step, objective.low, objective.high))
 
 
 def collapsed(objective: Objective, maximum: Maximum) -> BoolArray:
@@ -212,17 +264,22 @@ def without_collapse(objective: Objective, maximum: Maximum, note: Callable[[str
             reached, z = descent(objective, start, objective.low, objective.high, objective.scale)
             if reached < value:
                 best, value = z, reached
-        maximum = Maximum(best, value, hessian(objective, best), maximum.starts, maximum.likeliest)
+        value, best, curvature = polished(objective, best)
+        maximum = Maximum(best, value, curvature, maximum.starts, maximum.likeliest)
     return maximum
 
 
-def hessian(both: Objective, z: FloatArray) -> FloatArray:
-    """Return second derivatives by central differences of the exact gradient."""
+def hessian(both: Objective, z: FloatArray, near: FloatArray | None = None) -> FloatArray:
+    """Return second derivatives by central differences of the exact gradient, in steps that suit those nearby."""
+    steps = np.full(len(z), DIFFERENCE)
+    if near is not None:
+        steeper = np.sqrt(np.maximum(np.diag(near), 1.0))
+        steps = np.clip(DIFFERENCE_SHARE / steeper, LEAST_DIFFERENCE, DIFFERENCE)
     rows = []
     for i in range(len(z)):
         step = np.zeros(len(z))
-        step[i] = DIFFERENCE
-        rows.append((both(z + step)[1] - both(z - step)[1]) / (2.0 * DIFFERENCE))
+        step[i] = steps[i]
+        rows.append((both(z + step)[1] - both(z - step)[1]) / (2.0 * steps[i]))
     found = np.array(rows)
     return np.asarray(0.5 * (found + found.T))
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from obsynth.calibration.result import Calibration
@@ -67,13 +69,19 @@ def validation_figure(found: Validation) -> Figure:
     """Return measured and predicted signals, innovations in their band, and each estimate with its own."""
     import matplotlib.pyplot as plt
 
-    names, time = list(found.sensors), found.log["rows"][0] + np.arange(len(found.innovations))
-    count = 2 * len(names) + len(found.estimates)
+    count = 2 * len(found.sensors) + len(found.estimates)
     figure, panels = plt.subplots(
         count, 1, layout="constrained", squeeze=False, sharex=True, figsize=(7.5, 0.6 + 1.5 * count)
     )
+    draw_validation(found, list(panels[:, 0]))
+    return figure
+
+
+def draw_validation(found: Validation, panels: Sequence[Axes]) -> None:
+    """Draw signal and innovation of each sensor, then each estimate, on a panel each."""
+    names, time = list(found.sensors), found.log["rows"][0] + np.arange(len(found.innovations))
     for i, name in enumerate(names):
-        signals, said = panels[2 * i, 0], panels[2 * i + 1, 0]
+        signals, said = panels[2 * i], panels[2 * i + 1]
         signals.plot(time, found.measured[:, i], color="0.7", linewidth=3.0, label="measured")
         signals.plot(time, found.predicted[:, i], color="black", linewidth=1.0, linestyle="--", label="predicted")
         signals.set_ylabel(name)
@@ -82,15 +90,14 @@ def validation_figure(found: Validation) -> Figure:
         said.fill_between(time, -band, band, color="tab:blue", alpha=0.15, linewidth=0.0)
         said.plot(time, found.innovations[:, i], color="black", linewidth=0.8, marker=".", markersize=3)
         said.set_ylabel(f"innovation\nof {name}")
-    for panel, (name, columns) in zip(panels[2 * len(names) :, 0], found.estimates.items(), strict=True):
+    for panel, (name, columns) in zip(panels[2 * len(names) :], found.estimates.items(), strict=True):
         value, band = columns[:, 0], BAND * columns[:, 1]
         panel.fill_between(time, value - band, value + band, color="tab:blue", alpha=0.25, linewidth=0.0)
         panel.plot(time, value, color="black", linewidth=1.1)
         panel.set_ylabel(name)
-    for panel in panels[:, 0]:
+    for panel in panels:
         panel.grid(True, color="0.9", linewidth=0.6)
-    panels[-1, 0].set_xlabel("row of the log")
-    return figure
+    panels[-1].set_xlabel("row of the log")
 
 
 def validity_figure(found: Validity) -> Figure:

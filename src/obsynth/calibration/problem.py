@@ -9,28 +9,31 @@ from typing import Any
 import numpy as np
 
 from obsynth.calibration.logs import Log, bad_log, quantum, refused, repeats
-from obsynth.calibration.step_graphs import SampleGraphs, promoted, sample_graphs
+from obsynth.calibration.plants import CalibrationPlant
+from obsynth.calibration.step_graphs import SampleGraphs, sample_graphs
 from obsynth.errors import SpecError
+from obsynth.numerics.arguments import is_number, is_whole
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.covariances import covariance_factor
 from obsynth.plants.dae.checks import finite_vector
-from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.names import index_of
 
 #: Measured values for each unknown constant and variance that are needed at least.
 VALUES_PER_UNKNOWN = 5
-#: Deviation of an initial state that is not stated, as a share of its nominal size.
-DEFAULT_STATE_SHARE = 0.1
 #: Least deviation of a sensor, as a share of its largest value: rounding.
 LEAST_NOISE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """A promoted model with its log; arrays by unknown ``(nt,)``, by sensor ``(ny,)``, by noisy equation."""
+    """A plant with its log; arrays by unknown ``(nt,)``, by sensor ``(ny,)``, by noisy equation.
 
-    model: DAEModel
+    ``u (n, ns)``: the signals that the plant takes of each row.
+    """
+
+    plant: CalibrationPlant
     log: Log
+    u: FloatArray
     unknown: tuple[str, ...]
     nominal: FloatArray
     low: FloatArray
@@ -47,11 +50,6 @@ class Problem:
     graphs: SampleGraphs
     integration: str
     substeps: int
-
-    @property
-    def u(self) -> FloatArray:
-        """Inputs ``(n, nu)``."""
-        return self.log.u
 
     @property
     def y(self) -> FloatArray:
@@ -71,40 +69,39 @@ class Problem:
     @property
     def noisy_equations(self) -> list[int]:
         """Numbers of the noisy equations."""
-        return [self.model.equation_names.index(name) for name in self.noisy]
+        return [self.plant.equation_names.index(name) for name in self.noisy]
 
     def integrated(self, integration: str, substeps: int) -> Problem:
         """Return the same problem with other steps."""
         graphs = sample_graphs(
-            self.model, self.unknown, self.log.dt, integration=integration, substeps=substeps, samples=self.log.samples
+            self.plant, self.unknown, self.log.dt, integration=integration, substeps=substeps, samples=self.log.samples
         )
         return Problem(**{**vars(self), "graphs": graphs, "integration": integration, "substeps": substeps})
 
     def with_log(self, log: Log) -> Problem:
         """Return the same problem with another log of the same signals."""
-        return Problem(**{**vars(self), "log": log})
+        return Problem(**{**vars(self), "log": log, "u": self.plant.signals(log)})
 
 
 def calibration_problem(
-    model: DAEModel, log: Log, *, unknown: Mapping[str, Sequence[float]], priors: Mapping[str, Sequence[float]] | None,
+    plant: CalibrationPlant, log: Log, *, unknown: Mapping[str, Sequence[float]],
+    priors: Mapping[str, Sequence[float]] | None,
     noisy: Sequence[str] | None, Q: Mapping[str, float | None] | None, R: Mapping[str, float | None] | None,
     initial_state: Any, initial_covariance: Any, integration: str, substeps: int,
 ) -> Problem:  # fmt: skip
     """Return the problem, or say what is wrong with what is asked."""
-    if not unknown:
-        raise SpecError("unknown is empty: name the constants that are to be found, with their bounds.", path="unknown")
-    if not isinstance(substeps, (int, np.integer)) or isinstance(substeps, bool) or substeps < 1:
+    if not is_whole(substeps) or substeps < 1:
         raise SpecError(f"substeps is {substeps!r}: give a whole number, at least 1.", path="substeps")
     if not log.samples > 1:
         raise bad_log("too-short", f"The log has {log.samples} row(s): a calibration needs more.")
     names = tuple(unknown)
-    values = {**model.constants, **model.parameters}
     for name in names:
-        index_of(name, list(values), what="unknown")
+        index_of(name, list(plant.values), what="unknown")
+    values = _started(unknown, plant)
     low, high = _bounds(unknown, values)
-    equations = tuple(model.equation_names if noisy is None else noisy)
+    equations = tuple(plant.equation_names if noisy is None else noisy)
     for name in equations:
-        index_of(name, model.equation_names, what="noisy")
+        index_of(name, plant.equation_names, what="noisy")
     means, weights = _priors(priors, names, values)
     known_Q = _variances(Q, equations, "Q")
     known_R = _variances(R, log.output_names, "R")
@@ -115,18 +112,31 @@ def calibration_problem(
         np.where(held, quanta**2 / 12.0, 0.0), (LEAST_NOISE * np.where(largest > 0.0, largest, 1.0)) ** 2
     )
     variances = int(np.isnan(known_Q).sum() + np.isnan(known_R).sum())
+    if not names and not variances:
+        raise SpecError("unknown is empty, and Q and R are known: nothing is to be found. Name constants with their "
+                        "bounds, or leave variances out.", path="unknown")  # fmt: skip
     needed, seen = VALUES_PER_UNKNOWN * (len(names) + variances), int(np.isfinite(log.y).sum())
     if seen < needed:
         raise bad_log("too-short", f"The log is too short: {seen} measured values for {len(names)} constants and "
                       f"{variances} variances; at least {needed} are needed. Take more rows, fewer unknowns, or state "
                       "Q and R.")  # fmt: skip
-    whole = promoted(model, names)
-    x0 = initial_state_of(model, initial_state)
-    graphs = sample_graphs(whole, names, log.dt, integration=integration, substeps=substeps, samples=log.samples)
+    x0 = initial_state_of(plant, initial_state)
+    graphs = sample_graphs(plant, names, log.dt, integration=integration, substeps=substeps, samples=log.samples)
     return Problem(
-        whole, log, names, np.array([values[name] for name in names]), low, high, means, weights, equations, known_Q,
-        known_R, x0, _covariance(model, initial_covariance), quanta, floors, graphs, integration, int(substeps),
+        plant, log, plant.signals(log), names, np.array([values[name] for name in names]), low, high, means, weights,
+        equations, known_Q,
+        known_R, x0, _covariance(plant, initial_covariance), quanta, floors, graphs, integration, int(substeps),
     )  # fmt: skip
+
+
+def _started(unknown: Mapping[str, Sequence[float]], plant: CalibrationPlant) -> dict[str, float]:
+    """Return nominal values; the middle of its bounds for what has none within them and none that is stated."""
+    values = dict(plant.values)
+    for name in plant.unstated.intersection(unknown):
+        pair = unknown[name]
+        if np.shape(pair) == (2,) and not pair[0] <= values[name] <= pair[1]:
+            values[name] = 0.5 * (float(pair[0]) + float(pair[1]))
+    return values
 
 
 def _bounds(unknown: Mapping[str, Sequence[float]], values: Mapping[str, float]) -> tuple[FloatArray, FloatArray]:
@@ -139,7 +149,7 @@ def _bounds(unknown: Mapping[str, Sequence[float]], values: Mapping[str, float])
             raise SpecError(f"The nominal value of {name!r}, {values[name]:g}, is outside its bounds [{pair[0]:g}, "
                             f"{pair[1]:g}]: move one of them.", path=f"unknown.{name}")  # fmt: skip
         rows.append([float(pair[0]), float(pair[1])])
-    low, high = np.array(rows).T
+    low, high = np.array(rows).reshape(len(rows), 2).T
     return low, high
 
 
@@ -164,39 +174,38 @@ def _variances(given: Mapping[str, float | None] | None, names: Sequence[str], w
         i = index_of(name, names, what=what)
         if value is None:
             continue
-        if not isinstance(value, (int, float, np.number)) or isinstance(value, bool) or not value > 0.0:
+        if not is_number(value) or not value > 0.0:
             raise SpecError(f"{what}.{name} is {value!r}: give a positive variance, or leave it out to have it found.",
                             path=f"{what}.{name}")  # fmt: skip
         found[i] = float(value)
     return found
 
 
-def initial_state_of(model: DAEModel, value: Any) -> FloatArray:
+def initial_state_of(plant: CalibrationPlant, value: Any) -> FloatArray:
     """Return a state ``(nx,)`` from an array or from values by name; nominal where nothing is said."""
     if not isinstance(value, Mapping):
-        return finite_vector(value, model.state_names, model.nominal_state, "initial_state")
-    x = np.array(model.nominal_state)
+        return finite_vector(value, plant.state_names, plant.nominal_state, "initial_state")
+    x = np.array(plant.nominal_state)
     for name, entry in value.items():
-        x[index_of(name, model.state_names, what="initial_state")] = float(entry)
-    return finite_vector(x, model.state_names, x, "initial_state")
+        x[index_of(name, plant.state_names, what="initial_state")] = float(entry)
+    return finite_vector(x, plant.state_names, x, "initial_state")
 
 
-def _covariance(model: DAEModel, value: Any) -> FloatArray:
-    default = (DEFAULT_STATE_SHARE * model.state_scales) ** 2
+def _covariance(plant: CalibrationPlant, value: Any) -> FloatArray:
+    default, nx = plant.state_deviations**2, len(plant.state_names)
     if value is None:
         return np.diag(default)
     if isinstance(value, Mapping):
         variances = np.array(default)
         for name, entry in value.items():
-            variances[index_of(name, model.state_names, what="initial_covariance")] = float(entry)
+            variances[index_of(name, plant.state_names, what="initial_covariance")] = float(entry)
         matrix = np.diag(variances)
     elif np.ndim(value) == 0:
-        matrix = float(value) * np.eye(model.nx)
+        matrix = float(value) * np.eye(nx)
     else:
         matrix = as_matrix(value, "initial_covariance")
-    if matrix.shape != (model.nx, model.nx):
-        raise SpecError(f"initial_covariance is {matrix.shape}, but {(model.nx, model.nx)} is needed.",
-                        path="initial_covariance")  # fmt: skip
+    if matrix.shape != (nx, nx):
+        raise SpecError(f"initial_covariance is {matrix.shape}, but {(nx, nx)} is needed.", path="initial_covariance")
     covariance_factor(matrix, "initial_covariance")
     return matrix
 

@@ -99,7 +99,8 @@ def reported(
                                           (*found.limited_Q, *found.limited_R), strict=True) if weak]  # fmt: skip
     row = None if change is None else problem.log.rows[0] + change
     at_end = tuple(name for name, there in zip(names, found.at_bounds, strict=True) if there)
-    verdict = [*problem.log.notes, *_fitted(problem, box, found, at_end, correlation, limited, Q, R),
+    verdict = [*problem.log.notes, *problem.plant.notes,
+               *_fitted(problem, box, found, at_end, correlation, limited, Q, R),
                *_checked(nis, colours, row, fit is None), *_told(problem, R, timing, error)]  # fmt: skip
     return Calibration(
         nominal, read_only(covariance), read_only(correlation), box, found.information.undetermined, Q, R,
@@ -109,7 +110,7 @@ def reported(
         read_only(whitened), read_only(problem.y - found.innovations), read_only(np.sqrt(found.variances)),
         {"source": problem.log.source, "rows": list(problem.log.rows), "digest": digest,
          "samples": problem.log.samples, "dt": problem.log.dt},
-        {name: problem.model.units.get(name, "1") for name in names}, problem.output_names,
+        {name: problem.plant.units.get(name, "1") for name in names}, problem.output_names,
     )  # fmt: skip
 
 

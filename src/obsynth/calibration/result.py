@@ -184,6 +184,8 @@ class Calibration:
         rows = f"rows {self.log['rows'][0]}:{self.log['rows'][1]}"
         lines = [f"Calibration of {len(self.nominal)} constants from {self.log['source'] or 'a log'}, {rows} ("
                  f"{100 * self.box.level:g} % box, all at once)"]  # fmt: skip
+        if not self.nominal:
+            lines = [f"Calibration of the noise from {self.log['source'] or 'a log'}, {rows}"]
         width = max((len(name) for name in self.nominal), default=0)
         marks = set(self.box.open_sides)
         for name, value in self.nominal.items():

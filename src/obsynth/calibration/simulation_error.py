@@ -10,6 +10,7 @@ import numpy as np
 
 from obsynth.calibration.likelihood import LARGEST_RESIDUAL
 from obsynth.calibration.logs import refused
+from obsynth.calibration.plants import NonlinearPlant
 from obsynth.calibration.problem import Problem
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.dae.functions import Compiled
@@ -26,6 +27,10 @@ UNEXPLAINED = 0.9
 UNEXPLAINED_AT_REST = 5.0
 #: A signal moves if its deviation is this many times its roughness from sample to sample.
 MOVING = 3.0
+#: Without inputs, outputs that move by more than this multiple of what the states' sizes make are of other units.
+OUTSIZED = 10.0
+#: A sensor that the best fit does not explain, and whose level is so many times another, is in other units.
+OTHER_LEVEL = 30.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,6 +138,7 @@ def simulation_fits(
         )  # fmt: skip
     fits.sort(key=lambda fit: fit.cost)
     _require_explained(problem, fits[0].deviations)
+    _require_levels(problem, fits[0], error)
     return fits
 
 
@@ -145,7 +151,7 @@ def _require_explained(problem: Problem, left: FloatArray) -> None:
         roughness = np.nan_to_num(np.nanstd(np.diff(y, axis=0), axis=0)) / np.sqrt(2.0)
     moves = deviations > MOVING * np.maximum(roughness, np.sqrt(problem.floors))
     bad = np.where(moves, share > UNEXPLAINED, share > UNEXPLAINED_AT_REST)
-    if bad.any() and (bad[moves].all() if moves.any() else True):
+    if bad.any() and (bad[moves].all() if moves.any() else True) and not _moved_by_noise(problem, deviations):
         names = [name for name, wrong in zip(problem.output_names, bad, strict=True) if wrong]
         told = ", ".join(f"{name}: {100 * part:.3g} %" for name, part in zip(problem.output_names, share, strict=True))
         raise refused(
@@ -153,6 +159,35 @@ def _require_explained(problem: Problem, left: FloatArray) -> None:
             f"({told} of their deviations). Check units and scales (a factor of 1000?), the sample time, and the "
             "bounds.", signals=names,
         )  # fmt: skip
+
+
+def _require_levels(problem: Problem, fit: Fit, error: SimulationError) -> None:
+    """Refuse a single sensor in other units: the best fit leaves nearly all of it, on another level altogether."""
+    if not isinstance(problem.plant, NonlinearPlant):
+        # Deviations from an operating point have no level.
+        return
+    y = problem.y
+    simulated = error.simulated(np.concatenate([fit.t, fit.x0]) / error.scale)[0]
+    levels = np.sqrt(np.nanmean(simulated**2, axis=0)) / np.maximum(np.sqrt(np.nanmean(y**2, axis=0)), 1e-300)
+    far = (levels > OTHER_LEVEL) | (levels < 1.0 / OTHER_LEVEL)
+    far &= fit.deviations > UNEXPLAINED * np.nanstd(y, axis=0)
+    if far.any():
+        names = [name for name, wrong in zip(problem.output_names, far, strict=True) if wrong]
+        told = ", ".join(f"{problem.output_names[i]}: {1.0 / levels[i]:.3g} times what the model says"
+                         for i in np.flatnonzero(far))  # fmt: skip
+        raise refused(
+            "explains-nothing", f"The model cannot follow the log: {told}. Check units and scales (a factor of "
+            "1000?).", signals=names,
+        )  # fmt: skip
+
+
+def _moved_by_noise(problem: Problem, deviations: FloatArray) -> bool:
+    """Whether no input moves, and outputs move by no more than the plant's size: noise may be all that moves it."""
+    if np.std(problem.log.u, axis=0).any():
+        return False
+    H = np.array(problem.graphs.outputs(problem.x0, problem.u[0], problem.nominal)[1])
+    sizes = np.abs(H) @ np.maximum(problem.plant.state_scales, problem.plant.state_deviations)
+    return bool((deviations <= OUTSIZED * sizes).all())
 
 
 def _simulated(problem: Problem) -> Any:
@@ -163,18 +198,18 @@ def _simulated(problem: Problem) -> Any:
     nx, ny, nt, size = g.nx, g.ny, g.nt, g.nt + g.nx
     packed, u, t = ca.MX.sym("packed", nx + nx * size), ca.MX.sym("u", g.nu), ca.MX.sym("t", nt)
 
-    def row(x: Any, S: Any, t: Any, left: Any) -> Any:
-        y, H, L = g.outputs(x, t)
+    def row(x: Any, S: Any, u: Any, t: Any, left: Any) -> Any:
+        y, H, L = g.outputs(x, u, t)
         return ca.vertcat(y, ca.vec(H @ S + ca.horzcat(L, ca.MX.zeros(ny, nx))), left)
 
     x, S = packed[:nx], ca.reshape(packed[nx:], nx, size)
     stages, left = g.solve(x, u, t)
     after, F, G, _ = g.fast(x, u, t, t, g.sensitivities(x, u, t, stages))
     S = F @ S + ca.horzcat(G, ca.MX.zeros(nx, nx))
-    one = ca.Function("one", [packed, u, t], [ca.vertcat(after, ca.vec(S)), row(after, S, t, left)])
+    one = ca.Function("one", [packed, u, t], [ca.vertcat(after, ca.vec(S)), row(after, S, u, t, left)])
     v = ca.MX.sym("v", size)
     first = ca.DM(np.hstack([np.zeros((nx, nt)), np.eye(nx)]))
-    rows = row(v[nt:], ca.MX(first), v[:nt], ca.MX(0.0))
+    rows = row(v[nt:], ca.MX(first), ca.DM(problem.u[0]), v[:nt], ca.MX(0.0))
     if n > 1:
         begin = ca.vertcat(v[nt:], ca.vec(first))
         _, later = one.mapaccum(n - 1)(begin, ca.DM(problem.u[1:].T), ca.repmat(v[:nt], 1, n - 1))

@@ -17,13 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.errors import SpecError
+from obsynth.calibration.plants import CalibrationPlant
+from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.symbolic_solve import largest_entries
 from obsynth.observers.dae.compiled_library import compiler
-from obsynth.plants.dae.functions import DAEFunctions
-from obsynth.plants.dae.model import DAEModel
-from obsynth.plants.dae.symbols import symbols_of
-from obsynth.plants.names import index_of
 
 #: Optimisation costs more than it gains on straight code of thousands of lines.
 FLAGS = ("-std=c99", "-O1", "-ffp-contract=off", "-shared", "-fPIC")
@@ -64,12 +61,12 @@ COMPILED_OPERATIONS = 2_000_000
 
 @dataclass(frozen=True, eq=False)
 class SampleGraphs:
-    """The functions of one sample; ``t (nt,)`` are the unknown constants.
+    """The functions of one sample; ``u (nu,)`` are the signals, ``t (nt,)`` the unknown constants.
 
     solve : from x, u, t to the stages of all substeps and the scaled residual that is left.
     sensitivities : from x, u, t, stages to what `local` takes as numbers: stages and their derivatives.
     local : from x, u, t and those numbers (with x itself) to the state after, F, G by t, and the noise's way.
-    outputs : from x, t to y, H and L by t.
+    outputs : from x, u, t to y, H and L by t.
     fast : `local`, to be evaluated and not to be differentiated; in_c : whether functions are machine code.
     """
 
@@ -87,31 +84,14 @@ class SampleGraphs:
     made: dict[Any, Any] = field(default_factory=dict, repr=False)
 
 
-def promoted(model: DAEModel, names: Sequence[str]) -> DAEModel:
-    """Return a model whose named constants are parameters, before those it has."""
-    for name in names:
-        index_of(name, [*model.parameter_names, *model.constants], what="unknown")
-    new = [name for name in names if name in model.constants]
-    if not new:
-        return model
-    if not model.is_data:
-        raise SpecError(f"{new[0]!r} is a constant of Python functions, which only texts can give up: make it a "
-                        "parameter.", path=f"unknown.{new[0]}")  # fmt: skip
-    return model.replace(
-        constants={name: value for name, value in model.constants.items() if name not in new},
-        parameters={**{name: model.constants[name] for name in new}, **model.parameters},
-        units={**dict.fromkeys(new, "1"), **model.units},
-    )
-
-
 def sample_graphs(
-    model: DAEModel, unknown: Sequence[str], dt: float, *, integration: str, substeps: int, samples: int = 1
+    plant: CalibrationPlant, unknown: Sequence[str], dt: float, *, integration: str, substeps: int, samples: int = 1
 ) -> SampleGraphs:
-    """Return the functions of one sample of ``dt`` seconds of a promoted model, in C where there are many."""
+    """Return the functions of one sample of ``dt`` seconds, in C where there are many."""
     import casadi as ca
 
-    base = _Substep(model, unknown, dt / substeps, integration)
-    nx, nu, nt, n = model.nx, model.nu, len(unknown), base.size
+    base = _Substep(plant, unknown, dt / substeps, integration)
+    nx, nu, nt, n = len(plant.state_scales), len(plant.nominal_signals), len(unknown), base.size
     x, u, t = ca.MX.sym("x", nx), ca.MX.sym("u", nu), ca.MX.sym("t", nt)
     stages: list[Any] = []
     state, left = x, ca.MX(0.0)
@@ -127,17 +107,14 @@ def sample_graphs(
         state = X[n - nx :]
     packed = ca.vertcat(*numbers)
     sensitivities = ca.Function("sensitivities", [x, u, t, Z], [packed])
-    symbols = symbols_of(model)
-    theta, H = symbols.theta, ca.jacobian(symbols.outputs, symbols.x)
-    L = ca.jacobian(symbols.outputs, symbols.theta)[:, base.columns]
-    full = ca.Function("h", [symbols.x, theta], [ca.densify(part) for part in (symbols.outputs, H, L)])
-    xs, ts = ca.SX.sym("x", nx), ca.SX.sym("t", nt)
-    outputs = ca.Function("outputs", [xs, ts], list(full(xs, base.theta(ts))))
+    outputs = plant.outputs(unknown)
     local = _local(base, substeps, nx, nu, nt)
     fast, in_c = local, 8 * samples * local.n_instructions() > COMPILED_OPERATIONS
     if in_c:
         solve, sensitivities, fast = compiled([solve, sensitivities, local])
-    return SampleGraphs(solve, sensitivities, local, outputs, fast, nx, nu, model.ny, nt, packed.shape[0], in_c)
+    return SampleGraphs(
+        solve, sensitivities, local, outputs, fast, nx, nu, outputs.size1_out(0), nt, packed.shape[0], in_c
+    )
 
 
 def _local(base: _Substep, substeps: int, nx: int, nu: int, nt: int) -> Any:
@@ -166,19 +143,19 @@ def _local(base: _Substep, substeps: int, nx: int, nu: int, nt: int) -> Any:
 class _Substep:
     """One implicit step: its Newton iteration and its derivatives, by elimination in an order that is fixed."""
 
-    def __init__(self, model: DAEModel, unknown: Sequence[str], dt: float, integration: str) -> None:
+    def __init__(self, plant: CalibrationPlant, unknown: Sequence[str], dt: float, integration: str) -> None:
         import casadi as ca
 
-        self.model, functions = model, DAEFunctions(model, integration)
-        self.stages, self.size = functions.stages, functions.stages * model.nx
-        self.columns = [model.parameter_names.index(name) for name in unknown]
-        self.functions, self.dt = functions, dt
-        X, x = ca.SX.sym("X", self.size), ca.SX.sym("x", model.nx)
-        u, t = ca.SX.sym("u", model.nu), ca.SX.sym("t", len(unknown))
-        sizes = ca.DM(np.tile(model.state_scales, self.stages))
+        self.nx, self.dt = len(plant.state_scales), dt
+        self.stages, self.function = plant.step(unknown, integration)
+        self.size = self.stages * self.nx
+        X, x = ca.SX.sym("X", self.size), ca.SX.sym("x", self.nx)
+        u, t = ca.SX.sym("u", len(plant.nominal_signals)), ca.SX.sym("t", len(unknown))
+        sizes = ca.DM(np.tile(plant.state_scales, self.stages))
         equations = self._equations(X, x, u, t)
         J = ca.jacobian(equations, X)
-        self.order = _pivots(ca.Function("J", [X, x, u, t], [ca.densify(J)]), model, self.stages, self.columns)
+        values = np.array([plant.values[name] for name in unknown])
+        self.order = _pivots(ca.Function("J", [X, x, u, t], [ca.densify(J)]), plant, self.stages, values)
         step = eliminated(J, -equations, self.order)
         weights = 1.0 / ca.fmax(largest_entries(ca.densify(J) @ ca.diag(sizes)), 1e-300)
         left = ca.mmax(ca.fabs(weights * equations)) if self.size > 1 else ca.fabs(weights * equations)
@@ -207,24 +184,15 @@ class _Substep:
         after, rest = choice(unsolved, X, *before)
         return ca.Function("solution", start, [after, ca.if_else(unsolved, rest, left)])
 
-    def theta(self, t: Any) -> Any:
-        """Return all parameters: the unknown, and nominal values for the rest."""
-        import casadi as ca
-
-        entries = [ca.SX(value) for value in self.model.nominal_parameters]
-        for i, column in enumerate(self.columns):
-            entries[column] = t[i]
-        return ca.vertcat(*entries) if entries else ca.SX(0, 1)
-
     def _equations(self, X: Any, x: Any, u: Any, t: Any) -> Any:
-        return self.functions.residual_function(X, x, u, self.theta(t), self.dt)[0]
+        return self.function(X, x, u, t, self.dt)
 
     def symbolic(self, X: Any, x: Any, u: Any, t: Any) -> tuple[Any, Any, Any]:
         """Return the derivatives of the stages by x and by t, and of the state after by what is added."""
         import casadi as ca
 
         Xs, xs, us, ts = (ca.SX.sym(name, part.numel()) for name, part in zip("Xxut", (X, x, u, t), strict=True))
-        equations, nx, nt = self._equations(Xs, xs, us, ts), self.model.nx, ts.numel()
+        equations, nx, nt = self._equations(Xs, xs, us, ts), self.nx, ts.numel()
         right = ca.horzcat(-ca.jacobian(equations, xs), -ca.jacobian(equations, ts),
                            ca.repmat(ca.SX.eye(nx), self.stages, 1))  # fmt: skip
         found = eliminated(ca.jacobian(equations, Xs), right, self.order)
@@ -232,13 +200,13 @@ class _Substep:
         return found[:, :nx], found[:, nx : nx + nt], found[self.size - nx :, nx + nt :]
 
 
-def _pivots(jacobian: Any, model: DAEModel, stages: int, columns: Sequence[int]) -> list[int]:
+def _pivots(jacobian: Any, plant: CalibrationPlant, stages: int, values: FloatArray) -> list[int]:
     """Return the order of rows in which elimination goes at the nominal point."""
     from scipy.linalg import lu_factor
 
-    x = model.nominal_state
-    J = np.array(jacobian(np.tile(x, stages), x, model.nominal_input, model.nominal_parameters[list(columns)]))
-    J = np.nan_to_num(J * np.tile(model.state_scales, stages))
+    x = plant.nominal_state
+    J = np.array(jacobian(np.tile(x, stages), x, plant.nominal_signals, values))
+    J = np.nan_to_num(J * np.tile(plant.state_scales, stages))
     peaks = np.abs(J).max(axis=1)
     _, exchanges = lu_factor(J / np.where(peaks > 0.0, peaks, 1.0)[:, None], check_finite=False)
     order = list(range(len(J)))

@@ -15,6 +15,7 @@ import numpy as np
 from obsynth.calibration.diagnostics import SIGNIFICANT, change_of_mean, consistency, consistency_of, whiteness
 from obsynth.calibration.logs import Log, LogData, quantum, read_log
 from obsynth.calibration.maximum import Objective, greatest_likelihood
+from obsynth.calibration.plants import NonlinearPlant
 from obsynth.calibration.problem import Problem
 from obsynth.calibration.simulation_error import Fit
 from obsynth.calibration.step_graphs import sample_graphs
@@ -104,10 +105,11 @@ def noise_ratios(observer: DAEObserver, log: Log) -> Mapping[str, float]:
     names = (*noisy, *model.output_names)
     designed = np.concatenate([designed_Q[designed_Q > 0.0], designed_R])
     nothing, free_Q = np.zeros(0), np.full(len(noisy), np.nan)
-    graphs = sample_graphs(held, (), log.dt, integration=observer.integration, substeps=1, samples=log.samples)
+    plant = NonlinearPlant(held)
+    graphs = sample_graphs(plant, (), log.dt, integration=observer.integration, substeps=1, samples=log.samples)
     quanta = np.array([quantum(column) for column in log.y.T])
     problem = Problem(
-        held, log, (), nothing, nothing, nothing, nothing, nothing, noisy, free_Q, np.full(model.ny, np.nan),
+        plant, log, log.u, (), nothing, nothing, nothing, nothing, nothing, noisy, free_Q, np.full(model.ny, np.nan),
         np.array(observer.initial_state), np.array(observer.initial_covariance), quanta, 1e-6 * designed_R, graphs,
         observer.integration, 1,
     )  # fmt: skip
@@ -173,7 +175,7 @@ def validate(
         A step of a nonlinear plant has no solution along the log.
     """
     require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
-    if isinstance(design.observer, LinearObserver):
+    if not states_innovations(design):
         raise SpecError(
             f"The method {design.method} states no covariance of its residual, which a log could contradict: validate "
             "a recursive or nonlinear design, or run the log with a monitor.", path="design",
@@ -204,6 +206,11 @@ def validate(
         read_only(record.deviations), read_only(np.array(found.y)), read_only(found.y - record.innovations),
         record.estimates, _described(found),
     )  # fmt: skip
+
+
+def states_innovations(design: ObserverDesign) -> bool:
+    """Whether a design predicts its outputs with a covariance, which a log could contradict."""
+    return not isinstance(design.observer, LinearObserver)
 
 
 def _described(log: Log) -> dict[str, object]:

@@ -14,11 +14,10 @@ from obsynth.files.inputs import protect
 from obsynth.files.outputs import FileKind, write_atomically
 
 if TYPE_CHECKING:
-    from obsynth.plants.dae.model import DAEModel
     from obsynth.spec.loader import Spec
 
 _LINEARISE = "Linearise the nonlinear plant of a spec: exact matrices at rest, or the reason why it never rests."
-_CALIBRATE = "Fit constants and noise of a nonlinear plant to a log of rows without faults, with boxes and a verdict."
+_CALIBRATE = "Fit constants and noise of a plant to a log of rows without faults, with boxes and a verdict."
 _VALIDATE = "Ask whether a recorded log without faults agrees with a design."
 #: Written by ``linearise`` and ``calibrate``.
 PLANT = FileKind("a plant that obsynth has linearised", rb"\A# Linearised by obsynth")
@@ -157,18 +156,18 @@ def run_linearise(options: argparse.Namespace) -> int:
 def run_calibrate(options: argparse.Namespace) -> int:
     """Run ``calibrate``: spec and log in, constants with their box and a verdict out."""
     from obsynth.calibration.calibrating import calibrate
-    from obsynth.spec.loader import load_model
+    from obsynth.spec.loader import load_plant
 
     with progress(quiet=options.quiet) as report_stage:
         report_stage(f"reading {options.system}")
-        model, spec = load_model(options.system)
-        asked = _asked(model, spec, options)
+        plant, spec = load_plant(options.system)
+        asked = _asked(spec, options)
         log, digest = asked.pop("log"), asked.pop("digest", None)
         if log is None:
             raise SpecError("There is no log: give --data, or calibrate.log in the spec.", path="calibrate.log")
         protect(log)
         target = None if options.out is None else output_file(options.out, CALIBRATION, options)
-        found = calibrate(model, log, progress=report_stage, **asked)
+        found = calibrate(plant, log, progress=report_stage, **asked)
         if digest is not None and digest != found.box.digest:
             raise SpecError(
                 f"The log {log} is not the one that the spec names: its digest is {found.box.digest}, and "
@@ -191,7 +190,7 @@ def run_calibrate(options: argparse.Namespace) -> int:
     return 0
 
 
-def _asked(model: DAEModel, spec: Spec | None, options: argparse.Namespace) -> dict[str, Any]:
+def _asked(spec: Spec | None, options: argparse.Namespace) -> dict[str, Any]:
     """Return the arguments of `calibrate`: of the spec, those of its nonlinear method, and of the command line."""
     asked: dict[str, Any] = {"log": None}
     if spec is not None:

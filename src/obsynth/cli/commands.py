@@ -53,7 +53,7 @@ def _print_design(design: ObserverDesign, file: Path, *, verbose: bool) -> None:
     """Print the answer first; every claim and check if asked for, and what fails in any case."""
     from obsynth.report import design_report
     from obsynth.report.summary import print_summary, summary
-    from obsynth.report.verification import checks_table
+    from obsynth.results.checks_table import checks_table
 
     console = stdout_console()
     if verbose:
@@ -62,8 +62,8 @@ def _print_design(design: ObserverDesign, file: Path, *, verbose: bool) -> None:
     print_summary(summary(design, file=file, everything=verbose), console=console)
     if not verbose and "delta_scan" in design.solver:
         from obsynth.report.designs import delta_scan_table
-        from obsynth.report.layout import print_section
         from obsynth.results.delta_scan import DeltaScan
+        from obsynth.results.layout import print_section
 
         console.print()
         scan = DeltaScan.from_dict(design.solver["delta_scan"])
@@ -90,8 +90,9 @@ def designed(spec: Spec, report_stage: Any) -> ObserverDesign:
 
     recovery = None if spec.transformation is None else spec.transformation.recovery
     found = design(
-        spec.plant, spec.method, name=spec.name, recovery=recovery, progress=report_stage, **dict(spec.options)
-    )
+        spec.plant, spec.method, name=spec.name, recovery=recovery, progress=report_stage, scenario=spec.scenario,
+        **dict(spec.options),
+    )  # fmt: skip
     noted = () if spec.transformation is None else spec.transformation.notes
     return found.replace(notes=(*noted, *found.notes)) if noted else found
 
@@ -205,7 +206,7 @@ def _is_alarm(path: Path) -> bool:
 def _verify_alarm(options: argparse.Namespace) -> int:
     """Recheck the certificate of an alarm without a solver."""
     from obsynth.experiments.alarm_proofs.certificate import verify_alarm
-    from obsynth.report.verification import verification_report
+    from obsynth.results.checks_table import verification_report
 
     report = verify_alarm(options.gains)
     if options.json:
@@ -232,7 +233,5 @@ def run_verify(options: argparse.Namespace) -> int:
             "passed": report.passed, "report": report.as_dict(),
         })  # fmt: skip
     else:
-        from obsynth.report import design_report
-
-        design_report(design.replace(report=report), console=stdout_console(), file=options.gains)
+        _print_design(design.replace(report=report), options.gains, verbose=options.verbose)
     return 0 if report.passed else VerificationError.exit_code

@@ -58,6 +58,15 @@ def add_data_verbs(verbs: Any) -> None:
         help="recursive and nonlinear designs: leave out samples that their prediction excludes (default), pull them "
         "to its limit, or take them as they are",
     )  # fmt: skip
+    later = run.add_mutually_exclusive_group()
+    later.add_argument(
+        "--smooth", action="store_true",
+        help="recursive and nonlinear designs: estimates from the whole log, not only from what came before",
+    )  # fmt: skip
+    later.add_argument(
+        "--lag", type=int, metavar="N",
+        help="the same from the N samples after each row: rows are written N samples late, with their own time",
+    )  # fmt: skip
     run.add_argument(
         "--recovered", action="append", metavar="NAME",
         help="a state of the plant as written to recover (or all, or none; default: all of up to 300)",
@@ -65,6 +74,10 @@ def add_data_verbs(verbs: Any) -> None:
     run.add_argument(
         "--state", type=Path, metavar="FILE", help="go on from this saved state if it exists, and save the new one"
     )
+    run.add_argument(
+        "--prove", type=Path, metavar="FILE",
+        help="with --monitor pointwise: prove the first alarm, and write the certificate that 'verify' rechecks",
+    )  # fmt: skip
     add_json(run)
     add_force(run)
     add_quiet(run, "no progress and no summary")
@@ -108,6 +121,7 @@ def add_data_verbs(verbs: Any) -> None:
     report.add_argument("--out", type=Path, required=True, metavar="FILE", help="the page (HTML)")
     report.add_argument("--system", type=Path, metavar="SPEC", help="show the design on the scenario of this spec")
     _add_data(report, required=False, what="show the design on this log as well: text, Parquet, TDMS or MDF file")
+    report.add_argument("--rows", metavar="A:B", help="rows without faults, which are to agree (default: all)")
     _add_data_options(report)
     add_force(report)
     add_json(report)

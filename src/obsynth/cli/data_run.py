@@ -122,7 +122,12 @@ def summary_of_run(found: DataRun, watched: OnlineMonitor | None) -> str:
     if found.recovered:
         kinds = Counter(found.recovered.values())
         told = ", ".join(f"{count} {kind.replace('needs', 'with')}" for kind, count in kinds.items())
-        lines.append(f"{len(found.recovered)} states as written recovered: {told}.")
+        count = len(found.recovered)
+        lines.append(f"Of the plant as written, {count} more state{'s are' if count > 1 else ' is'} estimated: {told}.")
+    quiet = not found.alarms and (watched is not None or found.thresholds)
+    if quiet and 2 * sum(found.statuses.get(status, 0) for status in ("warm-up", "recovering")) > found.rows:
+        lines.append("More than half of the rows raise no alarm, as they are warm-up: it lasts until the slowest mode "
+                     "of the observer is forgotten, or as long as --warm-up says.")  # fmt: skip
     if found.outliers:
         told = ", ".join(f"{count} of {name}" for name, count in found.outliers.items())
         lines.append(f"{sum(found.outliers.values())} outliers: {told}.")
@@ -132,9 +137,6 @@ def summary_of_run(found: DataRun, watched: OnlineMonitor | None) -> str:
     if watched is not None:
         if watched.kind not in found.alarms:
             lines.append(f"No alarm by {watched.kind}.")
-            if 2 * sum(found.statuses.get(status, 0) for status in ("warm-up", "recovering")) > found.rows:
-                lines.append("More than half of the rows raise none, as they are warm-up: it lasts until the slowest "
-                             "mode of the observer is forgotten, or as long as --warm-up says.")  # fmt: skip
         lines.append(f"The {watched.kind} threshold: {watched.statement}.")
     return "\n".join(lines)
 

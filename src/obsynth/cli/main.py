@@ -13,6 +13,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from importlib import import_module
 from pathlib import Path
 
 from obsynth import __version__
@@ -140,6 +141,7 @@ def _parser() -> argparse.ArgumentParser:
         "--printed-digits", type=_digits, metavar="N",
         help="judge the gains as numbers that were printed with N decimals",
     )  # fmt: skip
+    add_verbose(verify, "every claim and every check")
     add_json(verify)
     verify.set_defaults(verb="verify")
 
@@ -186,34 +188,21 @@ def _digits(text: str) -> int:
     return digits
 
 
-def _verb(name: str) -> Callable[[argparse.Namespace], int]:
-    from obsynth.cli import (
-        calibration,
-        commands,
-        data_commands,
-        prove_alarm,
-        scenarios,
-        simulate,
-        sweep,
-    )
+#: Verb -> module of `obsynth.cli` and function; only the one that is asked for is loaded.
+_VERBS = {
+    "design": "commands:run_design", "check": "commands:run_check", "verify": "commands:run_verify",
+    "simulate": "simulate:run_simulate", "compare": "scenarios:run_compare", "evaluate": "scenarios:run_evaluate",
+    "sweep": "sweep:run_sweep", "run": "data_commands:run_run", "export": "data_commands:run_export",
+    "plot": "data_commands:run_plot", "report": "data_commands:run_report", "linearise": "calibration:run_linearise",
+    "calibrate": "calibration:run_calibrate", "validate": "calibration:run_validate",
+    "prove-alarm": "prove_alarm:run_prove_alarm",
+}  # fmt: skip
 
-    return {
-        "design": commands.run_design,
-        "check": commands.run_check,
-        "verify": commands.run_verify,
-        "simulate": simulate.run_simulate,
-        "compare": scenarios.run_compare,
-        "evaluate": scenarios.run_evaluate,
-        "sweep": sweep.run_sweep,
-        "run": data_commands.run_run,
-        "export": data_commands.run_export,
-        "plot": data_commands.run_plot,
-        "report": data_commands.run_report,
-        "linearise": calibration.run_linearise,
-        "calibrate": calibration.run_calibrate,
-        "validate": calibration.run_validate,
-        "prove-alarm": prove_alarm.run_prove_alarm,
-    }[name]
+
+def _verb(name: str) -> Callable[[argparse.Namespace], int]:
+    module, _, function = _VERBS[name].partition(":")
+    found: Callable[[argparse.Namespace], int] = getattr(import_module(f"obsynth.cli.{module}"), function)
+    return found
 
 
 def _run(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> int:

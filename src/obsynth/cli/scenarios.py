@@ -18,7 +18,7 @@ from obsynth.errors import PreconditionError, SpecError
 
 if TYPE_CHECKING:
     from obsynth.experiments.monitors.monitor import Monitor
-    from obsynth.experiments.parameter_monte_carlo import ParameterMonitor
+    from obsynth.observers.decisions import ParameterMonitor
     from obsynth.plants.descriptor import DescriptorSystem
     from obsynth.spec import Spec
 
@@ -63,7 +63,7 @@ def run_evaluate(options: argparse.Namespace) -> int:
         report_stage("running")
         from obsynth.experiments.monitors.residual_monitor import monitor
         from obsynth.experiments.monte_carlo import evaluate
-        from obsynth.experiments.parameter_monte_carlo import ParameterMonitor
+        from obsynth.observers.decisions import ParameterMonitor
         from obsynth.observers.linear.observer import LinearObserver
 
         watched: Monitor | ParameterMonitor | None = None

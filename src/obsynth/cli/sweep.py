@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
-from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import contextmanager
-from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from obsynth.cli.arguments import add_force, add_json, add_quiet, output_file
 from obsynth.cli.output import print_json, progress, stdout_console
 from obsynth.errors import SpecError
 from obsynth.files.outputs import FileKind, write_together
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
 
 _SWEEP = "Design and verify for every combination of specs and values; what fails is a row of the table."
 _HELP = """\
@@ -102,6 +103,9 @@ def chosen_executor(jobs: int, cluster: str | None) -> Iterator[Executor | None]
     if jobs == 1:
         yield None
         return
+    from concurrent.futures import ProcessPoolExecutor
+    from multiprocessing import get_context
+
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as executor:
         try:
             yield executor

@@ -12,9 +12,11 @@ import numpy as np
 from obsynth.analysis.diagnosis.additions import Sensor, state_sensors
 from obsynth.analysis.diagnosis.decoupled import fault_numbers
 from obsynth.analysis.diagnosis.sensor_search import GOALS, SensorSearch, Task, reached
+from obsynth.analysis.transformations.recovery import Transformation, linear_plant
 from obsynth.errors import ObsynthError, PreconditionError, SpecError
 from obsynth.methods.functional_filter.public import functional_filter
-from obsynth.numerics.arguments import is_finite_number, require_kind
+from obsynth.numerics.arguments import is_finite_number
+from obsynth.numerics.threads import on_one_thread_if_small
 from obsynth.plants.descriptor import DescriptorSystem
 
 #: So many sets are returned at most by default, and so many of them designed for.
@@ -58,7 +60,7 @@ class SensorSets:
     may_be_lost : tuple of str
         Outputs of the plant that may fail, one at a time, without losing the goal (with no sensor added).
     notes : tuple of str
-        What was searched.
+        What was searched; where no set is small enough, one that does it.
     """
 
     goal: str
@@ -107,8 +109,9 @@ class SensorSets:
         return f"<table><tr>{head}</tr>{body}</table>{texts}"
 
 
+@on_one_thread_if_small
 def sensor_sets(
-    plant: DescriptorSystem,
+    plant: DescriptorSystem | Transformation,
     *,
     goal: str = "estimate",
     faults: Sequence[str] | None = None,
@@ -128,7 +131,7 @@ def sensor_sets(
 
     Parameters
     ----------
-    plant : DescriptorSystem
+    plant : DescriptorSystem or Transformation
         Either time; its outputs are there already.
     goal : {"detect", "isolate", "estimate-step", "estimate"}, optional
         What every fault asked for must be: shown free of the unknown inputs; told from each other fault as well;
@@ -170,7 +173,7 @@ def sensor_sets(
     .. [Krysander] M. Krysander, E. Frisk, "Sensor placement for fault diagnosis", IEEE Trans. SMC-A 38, 2008: the
        question, on structure alone.  Here the numbers decide, zeros included.
     """
-    require_kind(plant, DescriptorSystem, "plant", "an obsynth.DescriptorSystem")
+    plant = linear_plant(plant)
     report_stage = progress or (lambda _: None)
     chosen = tuple(range(plant.nf)) if faults is None else tuple(fault_numbers(plant, faults, "faults"))
     if goal not in GOALS:
@@ -195,8 +198,11 @@ def sensor_sets(
     notes = [_note(search, exact, bound, most, len(found))]
     if not found:
         one = search.greedy_set(wanted)
-        found = [] if one is None else [one]
-        exact = False
+        if one is not None and largest is not None and len(one) > largest:
+            # More than asked for: said, not given.
+            notes.append(f"One of {len(one)} does: {', '.join(sensors[i].name for i in one)}.")
+        else:
+            found, exact = ([], exact) if one is None else ([one], False)
     report_stage("designing for each set")
     ranked = _ranked(search, found, costs, noise is not None and goal.startswith("estimate"))
     kept = tuple(name for i, name in enumerate(plant.output_names) if _kept_without(search, wanted, i))
@@ -241,6 +247,8 @@ def _require_positive(given: Mapping[str, Any], names: Sequence[str], what: str,
 
 
 def _note(search: SensorSearch, exact: bool, bound: int, most: int, count: int) -> str:
+    if exact and not count:
+        return f"No set of at most {bound} of {len(search.sensors)} candidates does it: all were tried."
     if exact:
         return f"All inclusion-minimal sets of at most {bound} of {len(search.sensors)} candidates."
     if count >= most:

@@ -12,7 +12,6 @@ from typing import TypeAlias
 
 import numpy as np
 
-from obsynth.analysis.transformations import eliminate_algebraic_states
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.holds import first_order_hold
@@ -32,6 +31,10 @@ class GapModel:
     @classmethod
     def of(cls, plant: DescriptorSystem) -> GapModel | None:
         """Return the gap_model of a plant; ``None`` where the plant cannot be propagated (index 2 or more)."""
+        if np.array_equal(plant.E, np.eye(plant.nx)):
+            return cls(plant, np.eye(plant.nx))
+        from obsynth.analysis.transformations import eliminate_algebraic_states
+
         try:
             done = eliminate_algebraic_states(plant)
         except PreconditionError:

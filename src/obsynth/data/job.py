@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.analysis.transformations import StateRecovery
-from obsynth.data.log_estimator import DECIDING, Engine, Row, delayed
+from obsynth.analysis.transformations.recovery import StateRecovery
+from obsynth.data.log_estimator import DECIDING, Engine, Entry, Later, Row, delayed
 from obsynth.data.recovered import LATE, RecoveredStates
 from obsynth.data.signals import TIME, Signals
 from obsynth.errors import SpecError
@@ -74,14 +74,15 @@ class Job:
     """Rows of data to rows of output.
 
     Fields: engine: What is run; signals: Which columns it reads; recovery: The way back to the states of the plant as
-    written; thresholds: Level by column; monitor: What watches residuals or parameters.
+    written; thresholds: Level by column; monitor: What watches residuals or parameters; later: Where rows wait
+    for those after them.
     """
 
     def __init__(
         self, engine: Engine, signals: Signals, recovery: StateRecovery | None, thresholds: Mapping[str, float],
-        monitor: OnlineMonitor | None, recovered: str | Sequence[str] | None = None,
+        monitor: OnlineMonitor | None, recovered: str | Sequence[str] | None = None, later: Later | None = None,
     ) -> None:  # fmt: skip
-        self.engine, self.signals, self.monitor = engine, signals, monitor
+        self.engine, self.signals, self.monitor, self.later = engine, signals, monitor, later
         self.recovered = RecoveredStates.of(recovery, engine, recovered)
         extra = () if self.recovered is None else self.recovered.columns
         names = (*engine.columns, *extra)
@@ -118,6 +119,7 @@ class Job:
         #: The file of the state that the first rows go on from: only they show whether its parts fit together.
         self.resumed_from: Path | None = None
         self.statuses, self.alarms, self.isolated = Counter[str](), dict[str, float](), ""
+        self.alarm_rows = dict[str, int]()
 
     def take(self, chunk: FloatArray) -> list[list[Any]]:
         """Take rows ``[time, u, y]`` as read; return rows of output.
@@ -134,13 +136,29 @@ class Job:
         return found
 
     def _taken(self, chunk: FloatArray) -> list[list[Any]]:
-        times: list[float] = chunk[:, 0].tolist()
-        nu = len(self.engine.input_names)
-        found, estimates = [], []
-        for time, deviations in zip(times, self.signals.scale * chunk[:, 1:] - self.signals.offset, strict=True):
-            row = self.engine.step(time, deviations, self.rows + 1)
+        entries: list[Entry] = []
+        scaled = self.signals.scale * chunk[:, 1:] - self.signals.offset
+        for time, deviations in zip(chunk[:, 0].tolist(), scaled, strict=True):
+            entry = Entry(time, deviations, self.engine.step(time, deviations, self.rows + 1))
             self.rows += 1
             self.first.take(time, deviations)
+            if self.later is None:
+                entries.append(entry)
+            else:
+                entries.extend(ready for ready, *_ in self.later.take(entry))
+        return self._shown(entries)
+
+    def finish(self) -> list[list[Any]]:
+        """Return the rows of output that waited for what does not come any more."""
+        return [] if self.later is None else self._shown([ready for ready, *_ in self.later.flush()])
+
+    def _shown(self, entries: Sequence[Entry]) -> list[list[Any]]:
+        if not entries:
+            return []
+        times = [entry.time for entry in entries]
+        nu = len(self.engine.input_names)
+        found, estimates = [], []
+        for _, deviations, row in entries:
             values = row.values
             if self.recovered is not None:
                 values = np.concatenate([values, self.recovered.take(row, deviations[:nu])])
@@ -153,16 +171,18 @@ class Job:
             for time, row, cells in zip(times, found, shown, strict=True)
         ]
         if self._levels or self.monitor is not None:
-            for time, row, values, cells in zip(times, found, estimates, rows, strict=True):
-                cells.extend(self._decided(time, row, values))
+            first = self.rows - len(rows) + 1
+            for number, (time, row, values, cells) in enumerate(zip(times, found, estimates, rows, strict=True), first):
+                cells.extend(self._decided(time, row, values, number))
         return rows
 
-    def _decided(self, time: float, row: Row, values: FloatArray) -> list[Any]:
+    def _decided(self, time: float, row: Row, values: FloatArray, number: int) -> list[Any]:
         """Return statistic and threshold, if there is a monitor, and what alarms there are."""
         deciding = row.status in DECIDING
         names = [name for name, i, level in self._levels if deciding and np.abs(values[i]) > level]
         for name in names:
             self.alarms.setdefault(name, time)
+            self.alarm_rows.setdefault(name, number)
         cells: list[Any] = []
         if self.monitor is not None:
             seen = self.monitor.see(
@@ -174,6 +194,7 @@ class Job:
             if seen.alarm:
                 if self.monitor.kind not in self.alarms:
                     self.alarms[self.monitor.kind], self.isolated = time, seen.fault
+                    self.alarm_rows[self.monitor.kind] = number
                 names.append(f"{self.monitor.kind}: {seen.fault}" if seen.fault else self.monitor.kind)
         return [*cells, "; ".join(names)]
 

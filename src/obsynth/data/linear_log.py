@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from obsynth.data.gap_model import GapModel, KeptHolds
-from obsynth.data.log_estimator import GAP, LONGEST_BRIDGE, OK, RECOVERING, WARM_UP, Row, estimate_columns
+from obsynth.data.log_estimator import GAP, LONGEST_BRIDGE, OK, RECOVERING, WARM_UP, Engine, Row, estimate_columns
 from obsynth.data.signals import LinearSignalNames
 from obsynth.data.stamps import Clock
 from obsynth.errors import ObsynthError, SpecError
@@ -18,6 +18,7 @@ from obsynth.experiments.monitors.online import LinearSample
 from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.holds import first_order_hold
+from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.linear.warm_up import checked_warm_up, transient
 from obsynth.results.design import ObserverDesign
 
@@ -211,3 +212,20 @@ class DataObserver(LinearSignalNames):
         self.measured = data["measured"]
         self.inputs.clear()
         self.inputs.extend(data["inputs"])
+
+
+def engine_of(
+    design: ObserverDesign, *, gap: float | None = None, warm_up: float | None = None, outliers: str | None = None
+) -> Engine:
+    """Return a running design, at its start; ``outliers`` takes the place of what the design says of them."""
+    if isinstance(design.observer, LinearObserver):
+        if outliers not in (None, "none"):
+            raise SpecError("outliers is for recursive and nonlinear designs, which know how far a sample may be from "
+                            "its prediction.", path="outliers")  # fmt: skip
+        return DataObserver(design, gap=gap, warm_up=warm_up)
+    if gap is not None:
+        raise SpecError("gap is for continuous-time designs: a sampled one knows which rows are missing.", path="gap")
+    # What most logs do not need is loaded only where it is used: a run starts in a fraction of a second.
+    from obsynth.data.step_log import SteppingEngine
+
+    return SteppingEngine(design, warm_up=warm_up, outliers=outliers)

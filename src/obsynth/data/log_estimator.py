@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple, Protocol
 
 from obsynth.experiments.monitors.online import Evidence, LinearSample
@@ -29,6 +29,29 @@ class Row(NamedTuple):
     values: FloatArray
     skipped: int = 0
     evidence: Evidence | LinearSample | None = None
+
+
+class Entry(NamedTuple):
+    """A row of a log.
+
+    Fields: time: In seconds; deviations: ``(nu + ny,)`` as read; row: Of the filter, and in time smoothed.
+    """
+
+    time: float
+    deviations: FloatArray
+    row: Row
+
+
+class Later(Protocol):
+    """Rows that wait for those after them: what leaves is an entry, what the observer said of it, and more."""
+
+    def take(self, entry: Entry) -> Iterable[tuple[Entry, Any, Any]]:
+        """Take a row after its step; return those that need not wait any more."""
+        ...
+
+    def flush(self) -> Iterable[tuple[Entry, Any, Any]]:
+        """Return the rows that wait."""
+        ...
 
 
 class Engine(Protocol):

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.analysis.transformations import StateRecovery
+from obsynth.analysis.transformations.recovery import StateRecovery
 from obsynth.data.log_estimator import Engine, Row
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.names import index_of

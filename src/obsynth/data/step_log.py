@@ -1,91 +1,108 @@
-"""What observers with a step of their own have in common on a log: time stamps, held inputs, status, saved state."""
+"""Observers that take missing outputs themselves, on a log: time stamps, held inputs, status, saved state."""
 
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 import numpy as np
 
 from obsynth.data.log_estimator import GAP, LONGEST_BRIDGE, OK, PARTIAL, RECOVERING, WARM_UP, Row, estimate_columns
 from obsynth.data.stamps import Clock
-from obsynth.errors import ObsynthError, SpecError
+from obsynth.errors import ObsynthError, PreconditionError, SolverError, SpecError
 from obsynth.experiments.monitors.online import Evidence
 from obsynth.numerics.arrays import FloatArray
-from obsynth.observers.robustness import Robust, with_outliers
-from obsynth.observers.running import RunningObserver, state_as_data, state_from_data
-
-Found = TypeVar("Found")
-
-
-def without_outliers(observer: Robust, outliers: str | None) -> Robust:
-    """Return an observer for logs: with a gate, unless it or ``outliers`` says otherwise."""
-    wanted = outliers or ("gate" if observer.outliers == "none" else observer.outliers)
-    if wanted == observer.outliers:
-        return observer
-    return with_outliers(observer, wanted)
+from obsynth.observers.dae.observer import DAEObserver
+from obsynth.observers.linear.warm_up import checked_warm_up
+from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.robustness import with_outliers
+from obsynth.observers.running import ParameterRow, state_as_data, state_from_data
+from obsynth.results.design import ObserverDesign
 
 
-class SteppingEngine(ABC, Generic[Found]):
-    """An observer that takes missing outputs itself; the first row is k = 0.
+class SteppingEngine:
+    """A running observer with deviations on measured data; the first row is k = 0.
 
-    Fields: signals: Inputs, outputs, states, faults or parameters, residuals; dt: Seconds between samples; warm_up:
-    Seconds that are marked after a start, and after rows with unknown inputs; may_restart: Whether the observer may
-    start again after a very long gap.
+    Signals of a nonlinear plant are absolute values, as its model's.
+
+    Fields: design: Recursive or nonlinear; warm_up: Seconds that are marked after a start, and after rows with unknown
+    inputs, none by default: the covariances of the start say how uncertain the estimates are; outliers: What is done
+    with them, by default what the observer says, or a gate.
     """
 
-    #: Whether the outputs of the first row are used.
-    uses_first_outputs = True
-
-    def __init__(self, signals: tuple[tuple[str, ...], ...], *, dt: float, warm_up: float, may_restart: bool) -> None:
-        self.input_names, self.output_names, self.state_names, self.fault_names, residuals = signals
-        self.columns = estimate_columns(self.state_names, self.fault_names, residuals, deviations=True)
-        self.state_delays, self.fault_delays = (0,) * len(self.state_names), (0,) * len(self.fault_names)
-        self.dt, self.warm_up, self.may_restart = dt, warm_up, may_restart
+    def __init__(self, design: ObserverDesign, *, warm_up: float | None = None, outliers: str | None = None) -> None:
+        self.observer, plant = _with_gate(design.observer, outliers), design.plant
+        self.input_names, self.output_names = plant.input_names, plant.output_names
+        self.state_names, self.fault_names = self.observer.state_names, self.observer.fault_names
+        self.state_delays, self.fault_delays = self.observer.state_delays, self.observer.fault_delays
         self.point: Mapping[str, float] = {}
         self.scales: Mapping[str, float] = {}
+        self.is_recursive, self.may_restart = isinstance(self.observer, RecursiveObserver), True
+        residuals: tuple[str, ...] = plant.output_names
+        if isinstance(self.observer, RecursiveObserver):
+            plant, Q, R = self.observer.plant, self.observer.Q, self.observer.R
+            self.point, self.scales = plant.operating_point, plant.scales
+            # H_k has as many directions beside the state as there are parity innovations.
+            residuals = tuple(f"innovation {i + 1}" for i in range(plant.ne + plant.ny - plant.nx))
+            constant = plant.is_time_invariant and Q.is_constant and R.is_constant
+            self.may_restart = constant and plant.horizon is None
+        self.columns = estimate_columns(self.state_names, self.fault_names, residuals, deviations=True)
+        self.directions = len(residuals)
+        self.dt, self.warm_up = self.observer.dt, checked_warm_up(warm_up, 0.0)
         self.notes: tuple[str, ...] = ()
-        self.clock = Clock(dt, None)
-        self.running: RunningObserver[Any, Any, Any] = self.started()
+        self.clock = Clock(self.dt, None)
+        self.state: Any = self.observer.init()
         self.u: FloatArray | None = None
         self.settled_at, self.phase = math.inf, WARM_UP
 
     @property
     def outliers(self) -> dict[str, int]:
         """How many samples of each output were outliers, since the observer last started."""
-        counts = self.running.state.refused[1]
+        counts = self.state.refused[1]
         return {name: int(count) for name, count in zip(self.output_names, counts, strict=True) if count}
 
-    @abstractmethod
-    def started(self) -> RunningObserver[Any, Any, Any]:
-        """Return the running observer, at k = 0."""
+    def _first_inputs(self, values: FloatArray, row: int) -> FloatArray:
+        """Return what stands for inputs that are not known in the first row; a nonlinear plant must know them."""
+        if self.is_recursive:
+            return np.zeros_like(values)
+        if not np.isfinite(values).all():
+            raise SpecError(
+                f"Row {row}: an input is missing before it was ever known, and a nonlinear model has no zero to begin "
+                "with: begin with a row in which all inputs are known.", path=f"row {row}",
+            )  # fmt: skip
+        return values
 
-    @abstractmethod
-    def values(self, found: Found) -> FloatArray:
-        """Return a row of estimates."""
-
-    @abstractmethod
-    def evidence(self, found: Found) -> Evidence:
-        """Return what the sample says, for decisions."""
-
-    @abstractmethod
-    def taken(self, y: FloatArray, u: FloatArray, row: int) -> Found | Exception | None:
+    def _taken(self, y: FloatArray, u: FloatArray, row: int) -> ParameterRow | SolverError | None:
         """Take one sample, or return why the sample cannot be taken; `None` if numbers are not finite."""
+        try:
+            self.state, found = self.observer.accept(self.state, y, u)
+        except SolverError as error:
+            return SolverError(f"Row {row}: {error}")
+        except SpecError as error:
+            raise SpecError(f"Row {row}: {error}", path=f"row {row}") from error
+        except PreconditionError as error:
+            raise PreconditionError(f"Row {row}: {error}", condition=error.condition) from error
+        except (np.linalg.LinAlgError, ValueError):
+            return None
+        return found if found.is_finite else None
 
-    def first_inputs(self, values: FloatArray, row: int) -> FloatArray:
-        """Return what stands for inputs that are not known in the first row."""
-        return np.zeros_like(values)
+    def _values(self, found: ParameterRow) -> FloatArray:
+        """Return a row: estimates, standard deviations, innovation at the parameters of one sample before."""
+        residual = np.full(self.directions, np.nan)
+        # The correction of the start by early constraints has no more directions, but may have fewer.
+        residual[: min(len(found.gap), self.directions)] = found.gap[: self.directions]
+        deviations = np.sqrt(np.diag(found.parameter_covariance))
+        return np.concatenate([found.x, found.theta, found.state_deviations, deviations, residual])
 
     def step(self, time: float, values: FloatArray, row: int) -> Row:
         """Take one row of data."""
-        before, stamps = self.running.state, (self.clock.last, self.clock.longest)
+        before, stamps = self.state, (self.clock.last, self.clock.longest)
         try:
             return self._step(time, values, row)
         except ObsynthError:
             # A row that is refused leaves nothing behind: a run may go on after it.
-            self.running.state = before
+            self.state = before
             self.clock.last, self.clock.longest = stamps
             raise
 
@@ -93,10 +110,10 @@ class SteppingEngine(ABC, Generic[Found]):
         _, missing = self.clock.advance(time, row)
         nu, fresh = len(self.input_names), self.u is None
         known = np.isfinite(values)
-        held = self.first_inputs(values[:nu], row) if self.u is None else self.u
+        held = self._first_inputs(values[:nu], row) if self.u is None else self.u
         u, y = np.where(known[:nu], values[:nu], held), np.where(known[nu:], values[nu:], np.nan)
         if missing > LONGEST_BRIDGE and self.may_restart:
-            self.running, fresh = self.started(), True
+            self.state, fresh = self.observer.init(), True
         else:
             fresh = self._bridged(missing, held, row) or fresh
         found, spoiled, restarted = self._found(y, u, row, may_restart=self.may_restart and not fresh)
@@ -109,16 +126,15 @@ class SteppingEngine(ABC, Generic[Found]):
             self.phase = WARM_UP if self.phase == WARM_UP else RECOVERING
         # A filter that begins with y(1) does not miss y(0).
         heard = known[nu:] & ~self._refused()
-        if fresh and not self.uses_first_outputs:
+        if fresh and self.is_recursive:
             heard = np.ones_like(heard)
         status = self._status(time, known[:nu], heard, spoiled=spoiled)
-        return Row(status, self.values(found), missing, self.evidence(found))
+        evidence = Evidence(found.theta, found.parameter_covariance, found.whitened, found.regressor)
+        return Row(status, self._values(found), missing, evidence)
 
     def _refused(self) -> np.ndarray:
         """Return which outputs of the last sample were left out as outliers, as truth values."""
-        state = self.running.state
-        gated = getattr(self.running.observer, "outliers", "none") == "gate"
-        return np.asarray(state.refused[0] > 0.0) & gated
+        return np.asarray(self.state.refused[0] > 0.0) & (self.observer.outliers == "gate")
 
     def _bridged(self, missing: int, held: FloatArray, row: int) -> bool:
         """Take samples without outputs; return whether the observer had to start again."""
@@ -128,11 +144,11 @@ class SteppingEngine(ABC, Generic[Found]):
             except ObsynthError:
                 if not self.may_restart:
                     raise
-                self.running = self.started()
+                self.state = self.observer.init()
                 return True
         return False
 
-    def _found(self, y: FloatArray, u: FloatArray, row: int, *, may_restart: bool) -> tuple[Found, bool, bool]:
+    def _found(self, y: FloatArray, u: FloatArray, row: int, *, may_restart: bool) -> tuple[ParameterRow, bool, bool]:
         """Take one sample; return also whether its outputs were left out, and whether the observer started again."""
         found = self._safe(y, u, row)
         if found is not None:
@@ -143,7 +159,7 @@ class SteppingEngine(ABC, Generic[Found]):
             # An outlier may have led where the model cannot go on.
             if not may_restart:
                 raise
-        self.running = self.started()
+        self.state = self.observer.init()
         found = self._safe(y, u, row)
         return (self._required(u, row), True, True) if found is None else (found, False, True)
 
@@ -155,21 +171,21 @@ class SteppingEngine(ABC, Generic[Found]):
         self.phase = OK
         return OK if outputs.all() else PARTIAL
 
-    def _safe(self, y: FloatArray, u: FloatArray, row: int) -> Found | None:
+    def _safe(self, y: FloatArray, u: FloatArray, row: int) -> ParameterRow | None:
         """Take one sample, or none of it: what overflows leaves the state as it was."""
-        before = self.running.state
+        before = self.state
         with np.errstate(all="ignore"):
-            found = self.taken(y, u, row)
-        if found is None or isinstance(found, Exception):
-            self.running.state = before
+            found = self._taken(y, u, row)
+        if found is None or isinstance(found, SolverError):
+            self.state = before
             return None
         return found
 
-    def _required(self, u: FloatArray, row: int) -> Found:
+    def _required(self, u: FloatArray, row: int) -> ParameterRow:
         """Take one sample without outputs."""
         with np.errstate(all="ignore"):
-            found = self.taken(np.full(len(self.output_names), np.nan), u, row)
-        if isinstance(found, Exception):
+            found = self._taken(np.full(len(self.output_names), np.nan), u, row)
+        if isinstance(found, SolverError):
             raise found
         if found is None:
             raise SpecError(
@@ -181,7 +197,7 @@ class SteppingEngine(ABC, Generic[Found]):
     def as_dict(self) -> dict[str, Any]:
         """Return the state that goes from row to row, as data."""
         return {
-            "last": self.clock.last, "longest": self.clock.longest, "observer": state_as_data(self.running.state),
+            "last": self.clock.last, "longest": self.clock.longest, "observer": state_as_data(self.state),
             "u": self.u, "settled_at": self.settled_at, "phase": self.phase, "warm_up": self.warm_up,
         }  # fmt: skip
 
@@ -190,5 +206,13 @@ class SteppingEngine(ABC, Generic[Found]):
         if data["warm_up"] != self.warm_up:
             raise SpecError("The saved state is of a run with another warm-up: use the same option.", path="state")
         self.clock.last, self.clock.longest = data["last"], data["longest"]
-        self.running.state = state_from_data(self.running.state, data["observer"])
+        self.state = state_from_data(self.state, data["observer"])
         self.u, self.settled_at, self.phase = data["u"], data["settled_at"], data["phase"]
+
+
+def _with_gate(observer: Any, outliers: str | None) -> RecursiveObserver | DAEObserver:
+    """Return an observer for logs: with a gate, unless it or ``outliers`` says otherwise."""
+    wanted = outliers or ("gate" if observer.outliers == "none" else observer.outliers)
+    found: RecursiveObserver | DAEObserver
+    found = observer if wanted == observer.outliers else with_outliers(observer, wanted)
+    return found

@@ -1,7 +1,8 @@
-"""Plant, scenario and observer side by side, in plain arrays: a bench that many seeds run on at once."""
+"""A design and a scenario side by side, ready to run: plant, signals and observer, once for each of many seeds."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -9,21 +10,32 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.holds import first_order_hold
+from obsynth.numerics.holds import driven, first_order_hold
+from obsynth.observers.dae.observer import DAEObserver
+from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.linear.sampling import sample_observer
+from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.plants.names import index_of
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.linear import Stepper, make_stepper
 from obsynth.simulation.scenario import Scenario
 from obsynth.simulation.scenario_signals import Drive, resolve
+
+#: Warm-up ends when the effect of an error at the start has shrunk to this share of its largest, for good.
+WARM_UP_SHARE = 0.01
+#: An initial state that is off by less than this, relative to its size, is off by rounding only.
+CONSISTENCY_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class Runs:
     """What happened in several runs, ``(steps, runs, signals)`` each.
 
-    Fields: states, outputs, inputs, faults, disturbances: Of the plant; outputs as measured; rows: What the observer
-    says: state estimates, fault estimates, residuals.
+    Fields: states, outputs, inputs, faults, disturbances: Of the plant; outputs as measured (those of a time-varying
+    plant begin with y(1)); faults are the parameters of a plant that has some; rows: What the observer says: state
+    estimates, fault estimates, residuals; observer: Which; kept: The estimates of each run, of an observer that says
+    more than the rows.
     """
 
     states: FloatArray
@@ -32,23 +44,78 @@ class Runs:
     faults: FloatArray
     disturbances: FloatArray
     rows: FloatArray
+    observer: LinearObserver | RecursiveObserver | DAEObserver
+    kept: tuple[Estimates, ...] = ()
+
+    @property
+    def estimates(self) -> tuple[Estimates, ...]:
+        """What the observer says, one per run."""
+        if not isinstance(self.observer, LinearObserver):
+            return self.kept
+        return tuple(Estimates.split(self.observer, self.rows[:, run]) for run in range(self.rows.shape[1]))
 
 
 @dataclass(frozen=True, eq=False)
-class Bench:
-    """A design and a scenario, ready to run; it can be sent to another process.
+class Bench(ABC):
+    """A design and a scenario, ready to run; it can be sent to another process, with a model that is data.
 
-    Fields: drive: Signals; stepper: Plant; observer: In discrete time; a continuous one sampled by a first-order hold;
-    observer_start: ``z(0)``; observer_ramp: ``(nz, nu + ny)``: what a first sample adds to the state that a sampled
-    observer keeps; initial_state: ``(nx,)``, as asked for; sizes: ``nu, nf, nd``.
+    Fields: drive: Signals; observer: In discrete time; initial_state: ``(nx,)``, as asked for; fault_signals: Where the
+    faults are among the signals; estimated: Which of the true faults are estimated; notes: What a reader of a
+    simulation must know.
     """
 
     drive: Drive
-    stepper: Stepper
+    observer: LinearObserver | RecursiveObserver | DAEObserver
+    initial_state: FloatArray
+    fault_signals: slice
+    estimated: tuple[int, ...]
+    notes: tuple[str, ...]
+
+    @abstractmethod
+    def run(self, seeds: Sequence[int]) -> Runs:
+        """Run the plant and the observer, once for each seed."""
+
+    @property
+    def onset(self) -> int | None:
+        """First sample at which a fault acts, or a faulty sensor; `None` if there is none."""
+        return self.drive.first_fault(self.fault_signals)
+
+    def warm_ups(self) -> tuple[int | None, int | None]:
+        """Return the samples at which the start no longer shows in the estimates of states, and of faults.
+
+        They are zero for observers that state deviations, which say from the start what is known.
+        """
+        observer, steps = self.observer, self.drive.steps
+        if not isinstance(observer, LinearObserver):
+            return 0, 0
+        ends: list[int | None] = []
+        for rows, delays in (
+            (observer.state_rows, observer.state_delays),
+            (observer.fault_rows, observer.fault_delays),
+        ):
+            shown, sizes = observer.Cz[rows], np.zeros(steps)
+            for k in range(steps):
+                sizes[k] = np.linalg.norm(shown)
+                shown = shown @ observer.Az
+            late = np.flatnonzero(sizes > WARM_UP_SHARE * np.max(sizes))
+            end = int(late[-1]) + 1 if late.size else 0
+            end = max(end, *delays, 0)
+            ends.append(end if end < steps else None)
+        return ends[0], ends[1]
+
+
+@dataclass(frozen=True, eq=False)
+class LinearBench(Bench):
+    """A linear design and a scenario.
+
+    Fields: stepper: Plant; observer_start: ``z(0)``; observer_ramp: ``(nz, nu + ny)``: what a first sample adds to the
+    state that a sampled observer keeps; sizes: ``nu, nf, nd``.
+    """
+
     observer: LinearObserver
+    stepper: Stepper
     observer_start: FloatArray
     observer_ramp: FloatArray
-    initial_state: FloatArray
     sizes: tuple[int, int, int]
 
     def run(self, seeds: Sequence[int]) -> Runs:
@@ -61,7 +128,8 @@ class Bench:
         if fed.shape[2]:
             inputs = inputs + fed
         outputs = self.drive.measured(clean + sensor_noise)
-        return Runs(states, outputs, inputs, faults, disturbances, self.observed(outputs, inputs))
+        rows = self.observed(outputs, inputs)
+        return Runs(states, outputs, inputs, faults, disturbances, rows, self.observer)
 
     def observed(self, outputs: FloatArray, inputs: FloatArray) -> FloatArray:
         """Return what the observer says to records, ``(steps, runs, nx + nf + nr)``.
@@ -69,16 +137,12 @@ class Bench:
         Shapes: ``outputs (steps, runs, ny)``, ``inputs (steps, runs, nu)``.
         """
         system = self.observer
-        drive = inputs @ system.Bu.T + outputs @ system.By.T
-        z = np.empty((*outputs.shape[:2], system.order))
-        z[0] = self.observer_start - np.concatenate([inputs[0], outputs[0]], axis=1) @ self.observer_ramp.T
-        turned = np.ascontiguousarray(system.Az.T)
-        for k in range(len(drive) - 1):
-            z[k + 1] = z[k] @ turned + drive[k]
+        start = self.observer_start - np.concatenate([inputs[0], outputs[0]], axis=1) @ self.observer_ramp.T
+        z = driven(system.Az, start, inputs @ system.Bu.T + outputs @ system.By.T)
         return np.asarray(z @ system.Cz.T + inputs @ system.Du.T + outputs @ system.Dy.T)
 
 
-def make_bench(design: ObserverDesign, scenario: Scenario) -> Bench:
+def make_bench(design: ObserverDesign, scenario: Scenario) -> LinearBench:
     """Return the bench of a linear design and a scenario."""
     plant, observer = design.linear
     drive = resolve(plant, scenario)
@@ -92,4 +156,19 @@ def make_bench(design: ObserverDesign, scenario: Scenario) -> Bench:
         ramp = first_order_hold(observer.Az, np.hstack([observer.Bu, observer.By]), drive.dt)[2]
         observer = sample_observer(observer, drive.dt)
     begin = np.zeros(observer.order) if given is None else np.array(given)
-    return Bench(drive, stepper, observer, begin, ramp, start, (plant.nu, plant.nf, plant.nd))
+    notes = []
+    if not plant.is_discrete:
+        notes.append(
+            "Between samples the plant is exact for signals that are constant or linear there; its observer is sampled "
+            "by a first-order hold."
+        )
+    if stepper.feedback is not None:
+        notes.append(
+            "A stabilising state feedback (linear-quadratic, unit weights) was added for this simulation; the inputs "
+            "include it."
+        )
+    return LinearBench(
+        drive, observer, start, slice(plant.nu, plant.nu + plant.nf),
+        tuple(index_of(name, plant.fault_names, what="The plant") for name in observer.fault_names), tuple(notes),
+        stepper, begin, ramp, (plant.nu, plant.nf, plant.nd),
+    )  # fmt: skip

@@ -1,20 +1,18 @@
-"""What simulations of every kind have in common: signals as named columns of a table, and what is said of the start."""
+"""Signals of a simulation as named columns of a table, and how large errors are."""
 
 from __future__ import annotations
 
 import io
-from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
 
 from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.files.tables import TableWriter
-from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.arrays import FloatArray
 
-#: A table that `SignalTable.write_csv` has written: signals of the plant beside time, and no status of rows.
+#: A table that `Simulation.write_csv` has written: signals of the plant beside time, and no status of rows.
 SIGNALS = FileKind("a table of simulated signals", rb"\Atime,(?!status,)[^\n]*x(hat)?\[")
 
 
@@ -39,31 +37,6 @@ def write_columns(table: Mapping[str, FloatArray], path: str | Path) -> Path:
     text = io.StringIO()
     TableWriter(text, table).write(zip(*(column.tolist() for column in table.values()), strict=True))
     return write_atomically(path, text.getvalue())
-
-
-@dataclass(frozen=True, eq=False)
-class SignalTable(ABC):
-    """Signals of a simulation, one row per sample; arrays are read-only."""
-
-    def __post_init__(self) -> None:
-        for field in fields(self):
-            if isinstance(getattr(self, field.name), np.ndarray):
-                object.__setattr__(self, field.name, read_only(getattr(self, field.name)))
-
-    @abstractmethod
-    def columns(self) -> dict[str, FloatArray]:
-        """Return every column by name, ``(steps,)`` each."""
-
-    def write_csv(self, path: str | Path) -> Path:
-        """Write `columns` as comma-separated text, atomically, floats with all their digits."""
-        return write_columns(self.columns(), path)
-
-
-def projected_note(change: float) -> str:
-    """Return what to say of an initial state that was moved by ``change`` (norm)."""
-    return (
-        f"The initial state did not satisfy the algebraic equations: it was projected, a change of {change:.3g} (norm)."
-    )
 
 
 def root_mean_square(errors: FloatArray) -> float:

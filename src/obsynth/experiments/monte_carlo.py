@@ -6,21 +6,22 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, as_completed
 from dataclasses import asdict, dataclass
 from types import MappingProxyType
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.experiments.batch_simulation import Bench, Runs, make_bench
+from obsynth.experiments.batch_simulation import Bench, LinearBench, Runs, make_bench
+from obsynth.experiments.benches import bench_of
 from obsynth.experiments.intervals import Interval, mean, share
 from obsynth.experiments.monitors.monitor import Monitor
-from obsynth.experiments.parameter_batch_simulation import make_recursive_bench
-from obsynth.experiments.parameter_monte_carlo import ParameterMonitor, RecursiveTask, recursive_tasks
 from obsynth.experiments.progress import Progress, shown_progress
-from obsynth.experiments.simulation import aligned_errors, warm_up_ends
-from obsynth.numerics.arguments import is_finite_number, require_kind
+from obsynth.experiments.simulation import aligned_errors
+from obsynth.numerics.arguments import is_finite_number, is_whole, require_kind
 from obsynth.numerics.arrays import FloatArray
-from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.decisions import ParameterMonitor
+from obsynth.observers.estimates import Estimates
+from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario
 from obsynth.tolerances.exact_plant import drawn_points, plant_at
@@ -78,13 +79,29 @@ class _Task:
     """What a worker needs; plain data and arrays."""
 
     bench: Bench
-    watched: Monitor | None
-    onset: int | None
+    watched: Monitor | ParameterMonitor | None
     warm_ups: tuple[int, int]
     seeds: tuple[int, ...]
 
     def __call__(self) -> dict[str, FloatArray]:
-        return _trial(self)
+        """Return what counts of a batch of runs, one row per run; NaN for what did not happen."""
+        runs, observer = self.bench.run(self.seeds), self.bench.observer
+        found, nx = dict[str, FloatArray](), len(observer.state_names)
+        for name, rows, truth, delays, warm_up in (
+            ("states", slice(0, nx), runs.states, observer.state_delays, self.warm_ups[0]),
+            ("faults", slice(nx, nx + len(observer.fault_names)), runs.faults[:, :, list(self.bench.estimated)],
+             observer.fault_delays, self.warm_ups[1]),
+        ):  # fmt: skip
+            errors = aligned_errors(runs.rows[:, :, rows], truth, delays)[max(warm_up, *delays, 0) :]
+            # A record no longer than the delays has no error to speak of.
+            found[name] = np.sqrt(np.mean(errors**2, axis=0)) if len(errors) else np.full(errors.shape[1:], np.nan)
+        judged = np.full((3, len(self.seeds)), np.nan)
+        if isinstance(self.watched, Monitor):
+            judged = _judged_residuals(self.watched, self.bench, runs)
+        elif self.watched is not None:
+            decided = [_judged_parameters(self.watched, self.bench, estimates) for estimates in runs.estimates]
+            judged = np.array(decided).T
+        return {**found, "false": judged[0], "found": judged[1], "wrong": judged[2]}
 
 
 def evaluate(
@@ -135,51 +152,45 @@ def evaluate(
     """
     require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
     require_kind(scenario, Scenario, "scenario", "an obsynth.Scenario")
-    if isinstance(runs, bool) or not isinstance(runs, int) or runs < 1:
+    if not is_whole(runs) or runs < 1:
         raise SpecError(f"runs is {runs!r}: give a whole number, 1 or more.", path="runs")
     if not (is_finite_number(confidence) and 0.0 < confidence < 1.0):
         raise SpecError(f"confidence is {confidence!r}: give a number between 0 and 1.", path="confidence")
-    if plants is not None and (isinstance(plants, bool) or not isinstance(plants, int) or plants < 1):
+    if plants is not None and (not is_whole(plants) or plants < 1):
         raise SpecError(f"plants is {plants!r}: give a whole number, 1 or more.", path="plants")
     runs = runs if plants is None else max(runs, plants)
     seeds = range(scenario.seed, scenario.seed + runs)
-    tasks: Sequence[_Task] | Sequence[RecursiveTask]
-    if isinstance(design.observer, LinearObserver):
-        tasks, onset, dt = _linear_tasks(design, scenario, monitor, seeds, plants)
-    elif plants is not None:
-        raise SpecError("plants are drawn for linear designs of a plant with tolerances.", path="plants")
-    else:
-        bench = make_recursive_bench(design, scenario)
-        onset, dt = bench.onset, bench.drive.dt
-        tasks = recursive_tasks(bench, monitor, seeds, max(1, BATCH_SAMPLES // bench.drive.steps))
-    with shown_progress(progress) as told:
-        parts = _done(tasks, executor, told, runs)
-    return _summed(parts, design, onset, dt, watched=monitor is not None, level=confidence)
-
-
-def _linear_tasks(
-    design: ObserverDesign,
-    scenario: Scenario,
-    monitor: Monitor | ParameterMonitor | None,
-    seeds: Sequence[int],
-    plants: int | None = None,
-) -> tuple[list[_Task], int | None, float]:
-    """Return batches of runs, the first sample at which something is wrong, and the seconds between samples."""
-    if isinstance(monitor, ParameterMonitor):
-        raise SpecError("This design is linear: give monitor=obsynth.monitor(design, scenario).", path="monitor")
-    bench = make_bench(design, scenario)
-    nu, nf, _ = bench.sizes
-    onset = bench.drive.first_fault(slice(nu, nu + nf))
-    states, faults = (end or 0 for end in warm_up_ends(bench))
-    size = max(1, BATCH_SAMPLES // bench.drive.steps)
+    bench = bench_of(design, scenario)
+    _require_fit(bench, monitor, plants)
     benches = [bench] if plants is None else _drawn_benches(design, scenario, plants)
-    share = -(-len(seeds) // len(benches))
+    share, size = -(-len(seeds) // len(benches)), max(1, BATCH_SAMPLES // bench.drive.steps)
+    # The first row of a plant with parameters is what was known before: no sample has been used.
+    states, faults = ((end or 0) if isinstance(bench, LinearBench) else 1 for end in bench.warm_ups())
     tasks = [
-        _Task(one, monitor, onset, (states, faults), tuple(seeds[i : min(i + size, (number + 1) * share)]))
+        _Task(one, monitor, (states, faults), tuple(seeds[i : min(i + size, (number + 1) * share)]))
         for number, one in enumerate(benches)
         for i in range(number * share, min((number + 1) * share, len(seeds)), size)
     ]
-    return tasks, onset, bench.drive.dt
+    with shown_progress(progress) as told:
+        parts = _done(tasks, executor, told, runs)
+    return _summed(parts, design, bench.onset, bench.drive.dt, watched=monitor is not None, level=confidence)
+
+
+def _require_fit(bench: Bench, monitor: Monitor | ParameterMonitor | None, plants: int | None) -> None:
+    """Raise `SpecError` where a monitor, or drawing plants, is not for such a design."""
+    if isinstance(bench, LinearBench):
+        if isinstance(monitor, ParameterMonitor):
+            raise SpecError("This design is linear: give monitor=obsynth.monitor(design, scenario).", path="monitor")
+        return
+    if plants is not None:
+        raise SpecError("plants are drawn for linear designs of a plant with tolerances.", path="plants")
+    if isinstance(monitor, Monitor):
+        raise SpecError("This design is recursive: give monitor=obsynth.ParameterMonitor(...).", path="monitor")
+    if monitor is not None and not isinstance(bench.observer, RecursiveObserver):
+        raise SpecError(
+            "Decisions are for time-varying plants: the innovations of a nonlinear one are only nearly white. Leave "
+            "monitor out, and read the errors.", path="monitor",
+        )  # fmt: skip
 
 
 def _drawn_benches(design: ObserverDesign, scenario: Scenario, plants: int) -> list[Bench]:
@@ -213,37 +224,36 @@ def _done(
     return {name: np.concatenate([part[name] for part in results]) for name in results[0]}
 
 
-def _trial(task: _Task) -> dict[str, FloatArray]:
-    """Return what counts of a batch of runs, one row per run; NaN for what did not happen."""
-    runs, observer = task.bench.run(task.seeds), task.bench.observer
-    found = {}
-    for name, rows, truth, delays, warm_up in (
-        ("states", observer.state_rows, runs.states, observer.state_delays, task.warm_ups[0]),
-        ("faults", observer.fault_rows, runs.faults, observer.fault_delays, task.warm_ups[1]),
-    ):
-        errors = aligned_errors(runs.rows[:, :, rows], truth, delays)[max(warm_up, *delays, 0) :]
-        # A record no longer than the delays has no error to speak of.
-        found[name] = np.sqrt(np.mean(errors**2, axis=0)) if len(errors) else np.full(errors.shape[1:], np.nan)
-    count = len(task.seeds)
-    false, found_at, wrong = np.full(count, np.nan), np.full(count, np.nan), np.full(count, np.nan)
-    if task.watched is not None:
-        watched = observer.fault_rows if task.watched.watches_estimates else observer.residual_rows
-        passed = task.watched.passed_in(runs, watched)
-        begin = len(passed) if task.onset is None else task.onset
-        false[:] = passed[:begin].any(axis=0)
-        for run in np.flatnonzero(passed[begin:].any(axis=0)):
-            k = begin + int(np.argmax(passed[begin:, run]))
-            found_at[run], wrong[run] = k, _blames_another(task.watched, runs, observer.fault_rows, int(run), k)
-    return {**found, "false": false, "found": found_at, "wrong": wrong}
+def _judged_residuals(watched: Monitor, bench: Bench, runs: Runs) -> FloatArray:
+    """Return ``(3, runs)``: whether an alarm is false, when a fault is found, and whether another one is blamed."""
+    observer = cast(LinearBench, bench).observer
+    rows = observer.fault_rows if watched.watches_estimates else observer.residual_rows
+    begin = len(runs.rows) if bench.onset is None else bench.onset
+    passed = watched.passed_in(runs, rows, onset=begin)
+    judged = np.full((3, passed.shape[1]), np.nan)
+    judged[0] = passed[:begin].any(axis=0)
+    for run in np.flatnonzero(passed[begin:].any(axis=0)):
+        k = begin + int(np.argmax(passed[begin:, run]))
+        end = min(k + watched.isolation_delay, len(passed) - 1) + 1
+        acted = np.any(runs.faults[:end, run, list(bench.estimated)] != 0.0, axis=0)
+        estimates = runs.rows[:, run, observer.fault_rows]
+        judged[1:, run] = k, float(not acted[watched.isolated(estimates, k)]) if acted.any() else np.nan
+    return judged
 
 
-def _blames_another(watched: Monitor, runs: Runs, rows: slice, run: int, k: int) -> float:
-    """Return 1 if the isolated fault has not acted until its comparison, else 0; NaN if none has."""
-    end = min(k + watched.isolation_delay, len(runs.faults) - 1)
-    acted = np.any(runs.faults[: end + 1, run] != 0.0, axis=0)
-    if not acted.any():
-        return float("nan")
-    return float(not acted[watched.isolated(runs.rows[:, run, rows], k)])
+def _judged_parameters(watched: ParameterMonitor, bench: Bench, estimates: Estimates) -> tuple[float, float, float]:
+    """Return the same of one run of an observer of parameters."""
+    decision = watched.watch(cast(RecursiveObserver, bench.observer), estimates)
+    passed = decision.values > decision.thresholds
+    begin = len(passed) if bench.onset is None else bench.onset
+    false, later = float(passed[:begin].any()), np.flatnonzero(passed[begin:])
+    if not later.size:
+        return false, float("nan"), float("nan")
+    k, alarm, names = begin + int(later[0]), decision.alarm, bench.observer.fault_names
+    acted = np.any(bench.drive.left[: k + 1, -len(names) :] != 0.0, axis=0)
+    if alarm is None or alarm.k != k or not alarm.parameter or not acted.any():
+        return false, float(k), float("nan")
+    return false, float(k), float(not acted[names.index(alarm.parameter)])
 
 
 def _summed(

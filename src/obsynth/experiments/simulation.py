@@ -2,30 +2,38 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, cast, overload
 
 import numpy as np
 
-from obsynth.experiments.batch_simulation import Bench, make_bench
-from obsynth.experiments.columns import SignalTable, named_columns, projected_note, root_mean_square
+from obsynth.analysis.transformations.recovery import Transformation, plant_and_recovery
+from obsynth.errors import SpecError
+from obsynth.experiments.batch_simulation import CONSISTENCY_TOLERANCE
+from obsynth.experiments.benches import bench_of
+from obsynth.experiments.columns import named_columns, root_mean_square, write_columns
 from obsynth.numerics.arguments import require_kind
-from obsynth.numerics.arrays import FloatArray
-from obsynth.observers.linear.observer import Estimates, LinearObserver
+from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.observers.estimates import Estimates
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.plants.dae.model import DAEModel
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.results.design import ObserverDesign
+from obsynth.simulation.dae import simulate_dae
+from obsynth.simulation.linear import simulate_plant
 from obsynth.simulation.scenario import Scenario
+from obsynth.simulation.time_varying import simulate_time_varying
+from obsynth.simulation.trajectory import Trajectory
 
-if TYPE_CHECKING:
-    from obsynth.experiments.parameter_simulation import RecursiveSimulation
-
-#: Warm-up ends when the effect of an error at the start has shrunk to this share of its largest, for good.
-WARM_UP_SHARE = 0.01
-#: An initial state that is off by less than this, relative to its size, is off by rounding only.
-CONSISTENCY_TOLERANCE = 1e-9
+#: Standard deviations on each side: 95 % of a normal variable.
+BAND_WIDTH = 1.96
 
 
 @dataclass(frozen=True, eq=False)
-class Simulation(SignalTable):
+class Simulation:
     """A plant and its observer over a scenario, one row per sample; arrays are read-only.
 
     Parameters
@@ -33,17 +41,20 @@ class Simulation(SignalTable):
     time : FloatArray
         ``(steps,)``, seconds.
     states, outputs, inputs, faults, disturbances : FloatArray
-        ``(steps, nx)``, ``(steps, ny)`` as measured, ``(steps, nu)`` with any feedback, ``(steps, nf)``,
-        ``(steps, nd)``.
+        ``(steps, nx)``, ``(steps, ny)`` as measured (the model of a time-varying plant begins with y(1): its first row
+        is NaN), ``(steps, nu)`` with any feedback, ``(steps, nf)``, ``(steps, nd)``.  The faults of a plant with
+        parameters are these: `parameters` is another name.
     estimates : Estimates
         At sample k, of the signals at k minus their delays.
     output_names, input_names, disturbance_names : tuple of str
         Names of those columns; states and faults are named as in ``estimates``.
+    fault_columns : tuple of int
+        Which of ``faults`` are estimated: all of them, or some, or none by a Kalman filter.
     inconsistency : float
         Norm of the change that the initial state needed to satisfy the algebraic equations.
     state_warm_up, fault_warm_up : int or None
         Sample from which an error at the start no longer shows in the estimates of states (faults); `None` if that is
-        not within the record.
+        not within the record.  Zero where the observer states deviations: they say from the start what it knows.
     notes : tuple of str
         What a reader must know: a feedback that was added, holds between samples, a projected start.
     """
@@ -58,68 +69,125 @@ class Simulation(SignalTable):
     output_names: tuple[str, ...]
     input_names: tuple[str, ...]
     disturbance_names: tuple[str, ...]
+    fault_columns: tuple[int, ...]
     inconsistency: float
     state_warm_up: int | None
     fault_warm_up: int | None
     notes: tuple[str, ...]
 
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            if isinstance(getattr(self, field.name), np.ndarray):
+                object.__setattr__(self, field.name, read_only(getattr(self, field.name)))
+
     @property
     def fault_errors(self) -> FloatArray:
         """Estimate less fault, aligned with the known delays, ``(steps, nf)``; NaN before the first."""
-        return aligned_errors(self.estimates.faults, self.faults, self.estimates.fault_delays)
+        truth = self.faults[:, list(self.fault_columns)]
+        return aligned_errors(self.estimates.faults, truth, self.estimates.fault_delays)
 
     @property
     def state_errors(self) -> FloatArray:
         """Estimate less state, aligned with the known delays, ``(steps, nx)``; NaN before the first."""
         return aligned_errors(self.estimates.states, self.states, self.estimates.state_delays)
 
+    @property
+    def parameters(self) -> FloatArray:
+        """The parameters of a plant that has some, ``(steps, nq)``: the same as `faults`."""
+        return self.faults
+
+    @property
+    def parameter_columns(self) -> tuple[int, ...]:
+        """The same as `fault_columns`."""
+        return self.fault_columns
+
+    @property
+    def parameter_errors(self) -> FloatArray:
+        """The same as `fault_errors`, ``(steps, nq)``."""
+        return self.fault_errors
+
     def summary(self) -> dict[str, Any]:
-        """Return root mean square and largest errors after warm-up by signal, and when warm-up ended, as plain data."""
-        table: dict[str, Any] = {}
-        for kind, names, errors, warm_up in (
-            ("faults", self.estimates.fault_names, self.fault_errors, self.fault_warm_up),
-            ("states", self.estimates.state_names, self.state_errors, self.state_warm_up),
+        """Return root mean square and largest errors by signal, as plain data.
+
+        Those of an observer that states deviations are of the whole record, with the share of samples at which the
+        truth lies in the 95 % band of its estimate (``within_band``); those of others come after warm-up, with the time
+        at which that ended.
+        """
+        shown, table = self.estimates, dict[str, Any]()
+        for kind, names, errors, deviations, warm_up in (
+            ("faults", shown.fault_names, self.fault_errors, shown.fault_deviations, self.fault_warm_up),
+            ("states", shown.state_names, self.state_errors, shown.state_deviations, self.state_warm_up),
         ):
-            after = errors[warm_up:]
-            table[kind] = {
-                name: {"rmse": root_mean_square(after[:, i]), "largest": _largest(after[:, i])}
-                for i, name in enumerate(names)
-            }
-            table[f"{kind[:-1]}_warm_up"] = None if warm_up is None else float(self.time[warm_up])
+            table[kind] = {name: _sizes(errors[warm_up:, i]) for i, name in enumerate(names)}
+            if shown.has_deviations:
+                for i, row in enumerate(table[kind].values()):
+                    row["within_band"] = float(np.mean(np.abs(errors[:, i]) <= BAND_WIDTH * deviations[:, i]))
+            else:
+                table[f"{kind[:-1]}_warm_up"] = None if warm_up is None else float(self.time[warm_up])
         return {"samples": len(self.time), "inconsistency": self.inconsistency, **table, "notes": list(self.notes)}
 
     def columns(self) -> dict[str, FloatArray]:
         """Return every column by name: ``time``, inputs and outputs, ``x[..]``, ``f[..]``, ``d[..]``, and estimates.
 
-        An output with the name of an input is ``y[..]``.  Estimates ``xhat[..]``, ``fhat[..]`` and residuals ``r[..]``
-        stand where the observer gave them.
+        An output with the name of an input is ``y[..]``.  Estimates ``xhat[..]``, ``fhat[..]``, standard deviations
+        ``std xhat[..]``, ``std fhat[..]`` and residuals ``r[..]`` stand where the observer gave them.
         """
         shown = self.estimates
-        groups = (
+        x, f = shown.state_names, shown.fault_names
+        truth = (
             ("u[{}]", self.input_names, self.inputs), ("y[{}]", self.output_names, self.outputs),
-            ("x[{}]", shown.state_names, self.states), ("f[{}]", shown.fault_names, self.faults),
-            ("d[{}]", self.disturbance_names, self.disturbances), ("xhat[{}]", shown.state_names, shown.states),
-            ("fhat[{}]", shown.fault_names, shown.faults), ("r[{}]", shown.residual_names, shown.residuals),
+            ("x[{}]", x, self.states), ("f[{}]", f, self.faults[:, list(self.fault_columns)]),
+            ("d[{}]", self.disturbance_names, self.disturbances),
         )  # fmt: skip
-        return named_columns(self.time, groups)
+        states, faults = ("xhat[{}]", x, shown.states), ("fhat[{}]", f, shown.faults)
+        if not shown.has_deviations:
+            residuals = ("r[{}]", shown.residual_names, shown.residuals)
+            return named_columns(self.time, (*truth, states, faults, residuals))
+        spreads = ("std xhat[{}]", x, shown.state_deviations), ("std fhat[{}]", f, shown.fault_deviations)
+        return named_columns(self.time, (*truth, states, spreads[0], faults, spreads[1]))
+
+    def write_csv(self, path: str | Path) -> Path:
+        """Write `columns` as comma-separated text, atomically, floats with all their digits.
+
+        Parameters
+        ----------
+        path : path
+            Of the file.
+        """
+        return write_columns(self.columns(), path)
 
 
-def simulate(design: ObserverDesign, scenario: Scenario) -> Simulation | RecursiveSimulation:
-    """Simulate a design's plant over a scenario, with its observer beside it.
+@overload
+def simulate(design: ObserverDesign, scenario: Scenario) -> Simulation: ...
+@overload
+def simulate(
+    design: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel | Transformation, **signals: Any
+) -> Trajectory: ...
+def simulate(
+    design: ObserverDesign | DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel | Transformation,
+    scenario: Scenario | None = None,
+    **signals: Any,
+) -> Simulation | Trajectory:
+    """Simulate a design's plant over a scenario, with its observer beside it; or a plant alone, with given signals.
 
     Parameters
     ----------
-    design : ObserverDesign
-        Of any method; the plant of a linear one has index 0 or 1.
-    scenario : Scenario
-        What happens.  For a time-varying plant or a DAE, ``inputs`` and ``faults`` are added to the nominal inputs and
-        parameters, ``noise`` multiplies the deviations that the design states, and states without a value start where
-        the observer does (those of a DAE at their nominal values).
+    design : ObserverDesign, DescriptorSystem, TimeVaryingDescriptorSystem, DAEModel or Transformation
+        A design of any method, the plant of a linear one of index 0 or 1; or a plant.
+    scenario : Scenario, optional
+        What happens; for a design.  For a time-varying plant or a DAE, ``inputs`` and ``faults`` are added to the
+        nominal inputs and parameters, ``noise`` multiplies the deviations that the design states, and states without a
+        value start where the observer does (those of a DAE at their nominal values).
+    **signals
+        For a plant alone.  A discrete linear one: ``steps`` samples, with ``u (steps, nu)``, ``f (steps, nf)``,
+        ``d (steps, nd)``, ``w (steps, nw)`` and ``initial_state (nx,)``, zero by default.  A time-varying one: as
+        `simulate_time_varying`.  A DAE: as `simulate_dae`.
 
     Returns
     -------
-    Simulation or RecursiveSimulation
-        Signals, estimates, and how well they agree; the second for recursive designs, with standard deviations.
+    Simulation or Trajectory
+        Signals, estimates, and how well they agree, with standard deviations where the observer states them; or what
+        the plant alone did.
 
     Raises
     ------
@@ -140,45 +208,43 @@ def simulate(design: ObserverDesign, scenario: Scenario) -> Simulation | Recursi
     taken as linear between samples.  The continuous observer runs on the samples, by a first-order hold.  A DAE is
     integrated by Radau IIA (fifth order) with inputs that are constant during each step, whatever its observer uses.
     """
+    design, _ = plant_and_recovery(design)
+    for kind, plant_alone in _PLANTS.items():
+        if isinstance(design, kind) and scenario is None:
+            found: Trajectory = plant_alone(design, **signals)
+            return found
     require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
     require_kind(scenario, Scenario, "scenario", "an obsynth.Scenario")
-    if not isinstance(design.observer, LinearObserver):
-        from obsynth.experiments.parameter_simulation import simulate_recursive
+    if signals:
+        raise SpecError(f"{', '.join(signals)}: the signals of a design are its scenario's.", path=next(iter(signals)))
+    return _simulated(cast(ObserverDesign, design), cast(Scenario, scenario))
 
-        return simulate_recursive(design, scenario)
-    bench = make_bench(design, scenario)
+
+#: What simulates a plant alone.
+_PLANTS: dict[type, Callable[..., Trajectory]] = {
+    DescriptorSystem: simulate_plant, TimeVaryingDescriptorSystem: simulate_time_varying, DAEModel: simulate_dae,
+}  # fmt: skip
+
+
+def _simulated(design: ObserverDesign, scenario: Scenario) -> Simulation:
+    bench = bench_of(design, scenario)
     runs = bench.run([scenario.seed])
-    plant, _ = design.linear
-    warm_ups = warm_up_ends(bench)
-    inconsistency = float(np.linalg.norm(runs.states[0, 0] - bench.initial_state)) if scenario.initial_state else 0.0
+    plant, dt = design.plant, bench.drive.dt
+    state_warm_up, fault_warm_up = bench.warm_ups()
+    change, notes = float(np.linalg.norm(runs.states[0, 0] - bench.initial_state)), list(bench.notes)
+    if isinstance(design.observer, LinearObserver) and not scenario.initial_state:
+        # Nothing was asked for: the plant starts at rest, as its inputs let it.
+        change = 0.0
+    if change > CONSISTENCY_TOLERANCE * max(1.0, float(np.linalg.norm(bench.initial_state))):
+        notes.append("The initial state did not satisfy the algebraic equations: it was projected, a change of "
+                     f"{change:.3g} (norm).")  # fmt: skip
     return Simulation(
-        time=bench.drive.dt * np.arange(bench.drive.steps, dtype=np.float64),
-        states=runs.states[:, 0], outputs=runs.outputs[:, 0],
+        time=dt * np.arange(bench.drive.steps, dtype=np.float64), states=runs.states[:, 0], outputs=runs.outputs[:, 0],
         inputs=runs.inputs[:, 0], faults=runs.faults[:, 0], disturbances=runs.disturbances[:, 0],
-        estimates=Estimates.split(bench.observer, runs.rows[:, 0]), output_names=plant.output_names,
-        input_names=plant.input_names, disturbance_names=plant.disturbance_names, inconsistency=inconsistency,
-        state_warm_up=warm_ups[0], fault_warm_up=warm_ups[1],
-        notes=_notes(bench, inconsistency, continuous=not plant.is_discrete),
+        estimates=runs.estimates[0], output_names=plant.output_names, input_names=plant.input_names,
+        disturbance_names=getattr(plant, "disturbance_names", ()), fault_columns=bench.estimated,
+        inconsistency=change, state_warm_up=state_warm_up, fault_warm_up=fault_warm_up, notes=tuple(notes),
     )  # fmt: skip
-
-
-def warm_up_ends(bench: Bench) -> tuple[int | None, int | None]:
-    """Return the samples at which the start no longer shows in the estimates of states, and of faults."""
-    observer, steps = bench.observer, bench.drive.steps
-    ends: list[int | None] = []
-    for rows, delays in (
-        (observer.state_rows, observer.state_delays),
-        (observer.fault_rows, observer.fault_delays),
-    ):
-        shown, sizes = observer.Cz[rows], np.zeros(steps)
-        for k in range(steps):
-            sizes[k] = np.linalg.norm(shown)
-            shown = shown @ observer.Az
-        late = np.flatnonzero(sizes > WARM_UP_SHARE * np.max(sizes))
-        end = int(late[-1]) + 1 if late.size else 0
-        end = max(end, *delays, 0)
-        ends.append(end if end < steps else None)
-    return ends[0], ends[1]
 
 
 def aligned_errors(estimates: FloatArray, truth: FloatArray, delays: tuple[int, ...]) -> FloatArray:
@@ -192,23 +258,6 @@ def aligned_errors(estimates: FloatArray, truth: FloatArray, delays: tuple[int, 
     return errors
 
 
-def _largest(errors: FloatArray) -> float:
+def _sizes(errors: FloatArray) -> dict[str, float]:
     known = errors[~np.isnan(errors)]
-    return float(np.max(np.abs(known))) if known.size else float("nan")
-
-
-def _notes(bench: Bench, inconsistency: float, *, continuous: bool) -> tuple[str, ...]:
-    notes = []
-    if continuous:
-        notes.append(
-            "Between samples the plant is exact for signals that are constant or linear there; its observer is sampled "
-            "by a first-order hold."
-        )
-    if bench.stepper.feedback is not None:
-        notes.append(
-            "A stabilising state feedback (linear-quadratic, unit weights) was added for this simulation; the inputs "
-            "include it."
-        )
-    if inconsistency > CONSISTENCY_TOLERANCE * max(1.0, float(np.linalg.norm(bench.initial_state))):
-        notes.append(projected_note(inconsistency))
-    return tuple(notes)
+    return {"rmse": root_mean_square(errors), "largest": float(np.max(np.abs(known))) if known.size else float("nan")}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -12,7 +13,7 @@ from obsynth.numerics.arrays import FloatArray
 _REAL = ("Real", "Float64")
 
 
-class Instance:
+class Instance(ABC):
     """States, values and Jacobians of an FMU at one point; subclasses know the version of FMI."""
 
     def __init__(self, fmpy: Any, description: Any, folder: str) -> None:
@@ -31,21 +32,54 @@ class Instance:
         ]  # fmt: skip
         self.model = self._instantiate(folder)
 
+    #: Causalities of what may be set before the initialisation.
+    settable_first: tuple[str, ...] = ("parameter", "local", "output", "input")
+
+    @abstractmethod
+    def _kind(self) -> Any:
+        """Return the class of fmpy for this version."""
+
+    @abstractmethod
+    def _reals(self, references: Sequence[int]) -> Sequence[float]:
+        """Return values of real variables."""
+
+    @abstractmethod
+    def _set_reals(self, references: Sequence[int], values: Sequence[float]) -> None:
+        """Set real variables."""
+
+    @abstractmethod
+    def _discrete_states_change(self) -> bool:
+        """Update the discrete states once; return whether that has to be done again."""
+
     def _instantiate(self, folder: str) -> Any:
-        raise NotImplementedError
+        model = self._kind()(
+            guid=self.description.guid, unzipDirectory=folder, instanceName="linearised",
+            modelIdentifier=self.description.modelExchange.modelIdentifier,
+        )  # fmt: skip
+        model.instantiate()
+        return model
 
     def begin(self, at: Mapping[str, float]) -> None:
         """Initialise at the given values and enter continuous time."""
-        raise NotImplementedError
+        self._set(at, self.settable_first)
+        self.model.enterInitializationMode()
+        self._set(at, ("input",))
+        self.model.exitInitializationMode()
+        while self._discrete_states_change():
+            pass
+        self.model.enterContinuousTimeMode()
+        self._set(at, ("input",))
 
     def _get(self, references: Sequence[int]) -> FloatArray:
-        raise NotImplementedError
+        return np.array(self._reals(list(references)), dtype=np.float64) if references else np.zeros(0)
 
     def _set(self, at: Mapping[str, float], causalities: Sequence[str]) -> None:
-        raise NotImplementedError
+        for name, value in at.items():
+            if self.variables[name].causality in causalities:
+                self._set_reals([self.variables[name].valueReference], [float(value)])
 
     def _derivative(self, unknowns: Sequence[int], known: int) -> FloatArray:
-        raise NotImplementedError
+        return np.array(self.model.getDirectionalDerivative(list(unknowns), [known], [1.0]))
 
     def states(self) -> FloatArray:
         """Return the continuous states ``(nx,)``."""
@@ -53,7 +87,11 @@ class Instance:
 
     def set_states(self, states: FloatArray) -> None:
         """Set the continuous states ``(nx,)``."""
-        raise NotImplementedError
+        import ctypes
+
+        values = (ctypes.c_double * len(states))(*states)
+        if len(states):
+            self.model.setContinuousStates(values, len(states))
 
     def derivatives(self) -> FloatArray:
         """Return the derivatives of the states ``(nx,)``."""
@@ -90,90 +128,44 @@ class Instance:
 class InstanceOfFMI2(Instance):
     """FMI 2.0."""
 
-    def _instantiate(self, folder: str) -> Any:
+    def _kind(self) -> Any:
         from fmpy.fmi2 import FMU2Model
 
-        model = FMU2Model(
-            guid=self.description.guid, unzipDirectory=folder, instanceName="linearised",
-            modelIdentifier=self.description.modelExchange.modelIdentifier,
-        )  # fmt: skip
-        model.instantiate()
-        return model
+        return FMU2Model
 
     def begin(self, at: Mapping[str, float]) -> None:
         """Initialise at the given values and enter continuous time."""
         self.model.setupExperiment(startTime=0.0)
-        self._set(at, ("parameter", "local", "output", "input"))
-        self.model.enterInitializationMode()
-        self._set(at, ("input",))
-        self.model.exitInitializationMode()
-        while self.model.newDiscreteStates()[0]:
-            pass
-        self.model.enterContinuousTimeMode()
-        self._set(at, ("input",))
+        super().begin(at)
 
-    def _get(self, references: Sequence[int]) -> FloatArray:
-        return np.array(self.model.getReal(list(references)), dtype=np.float64) if references else np.zeros(0)
+    def _reals(self, references: Sequence[int]) -> Sequence[float]:
+        return list(self.model.getReal(references))
 
-    def _set(self, at: Mapping[str, float], causalities: Sequence[str]) -> None:
-        for name, value in at.items():
-            if self.variables[name].causality in causalities:
-                self.model.setReal([self.variables[name].valueReference], [float(value)])
+    def _set_reals(self, references: Sequence[int], values: Sequence[float]) -> None:
+        self.model.setReal(references, values)
 
-    def set_states(self, states: FloatArray) -> None:
-        """Set the continuous states ``(nx,)``."""
-        import ctypes
-
-        values = (ctypes.c_double * len(states))(*states)
-        if len(states):
-            self.model.setContinuousStates(values, len(states))
-
-    def _derivative(self, unknowns: Sequence[int], known: int) -> FloatArray:
-        return np.array(self.model.getDirectionalDerivative(list(unknowns), [known], [1.0]))
+    def _discrete_states_change(self) -> bool:
+        return bool(self.model.newDiscreteStates()[0])
 
 
 class InstanceOfFMI3(Instance):
     """FMI 3.0."""
 
-    def _instantiate(self, folder: str) -> Any:
+    settable_first = ("parameter", "structuralParameter", "local", "output", "input")
+
+    def _kind(self) -> Any:
         from fmpy.fmi3 import FMU3Model
 
-        model = FMU3Model(
-            guid=self.description.guid, unzipDirectory=folder, instanceName="linearised",
-            modelIdentifier=self.description.modelExchange.modelIdentifier,
-        )  # fmt: skip
-        model.instantiate()
-        return model
+        return FMU3Model
 
-    def begin(self, at: Mapping[str, float]) -> None:
-        """Initialise at the given values and enter continuous time."""
-        self._set(at, ("parameter", "structuralParameter", "local", "output", "input"))
-        self.model.enterInitializationMode()
-        self._set(at, ("input",))
-        self.model.exitInitializationMode()
-        while self.model.updateDiscreteStates()[0]:
-            pass
-        self.model.enterContinuousTimeMode()
-        self._set(at, ("input",))
+    def _reals(self, references: Sequence[int]) -> Sequence[float]:
+        return list(self.model.getFloat64(references))
 
-    def _get(self, references: Sequence[int]) -> FloatArray:
-        return np.array(self.model.getFloat64(list(references)), dtype=np.float64) if references else np.zeros(0)
+    def _set_reals(self, references: Sequence[int], values: Sequence[float]) -> None:
+        self.model.setFloat64(references, values)
 
-    def _set(self, at: Mapping[str, float], causalities: Sequence[str]) -> None:
-        for name, value in at.items():
-            if self.variables[name].causality in causalities:
-                self.model.setFloat64([self.variables[name].valueReference], [float(value)])
-
-    def set_states(self, states: FloatArray) -> None:
-        """Set the continuous states ``(nx,)``."""
-        import ctypes
-
-        values = (ctypes.c_double * len(states))(*states)
-        if len(states):
-            self.model.setContinuousStates(values, len(states))
-
-    def _derivative(self, unknowns: Sequence[int], known: int) -> FloatArray:
-        return np.array(self.model.getDirectionalDerivative(list(unknowns), [known], [1.0]))
+    def _discrete_states_change(self) -> bool:
+        return bool(self.model.updateDiscreteStates()[0])
 
 
 def instance_of(fmpy: Any, description: Any, folder: str) -> Instance:

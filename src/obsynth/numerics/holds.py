@@ -1,4 +1,4 @@
-"""Exact steps of ``x' = A x + B s`` for signals that are linear between samples."""
+"""Steps of linear systems: the recursion itself, and exact steps of ``x' = A x + B s`` for signals that are linear."""
 
 from __future__ import annotations
 
@@ -27,3 +27,16 @@ def first_order_hold(
     row = expm(chain)[:n]
     held, ramped = (scale[:, None] * block * sizes for block in (row[:, n : n + m], row[:, n + m :]))
     return scale[:, None] * row[:, :n] / scale, held, ramped
+
+
+def driven(a: FloatArray, start: FloatArray, drive: FloatArray) -> FloatArray:
+    """Return ``x(0), x(1), ...`` of ``x+ = a x + drive`` for one or many runs; infinite where the states overflow.
+
+    Shapes: ``drive (steps, ..., n)``.
+    """
+    x, turned = np.empty_like(drive), np.ascontiguousarray(a.T)
+    x[:1] = start
+    with np.errstate(over="ignore", invalid="ignore"):
+        for k in range(len(drive) - 1):
+            x[k + 1] = x[k] @ turned + drive[k]
+    return x

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import lru_cache
-from typing import TYPE_CHECKING
+from functools import lru_cache, wraps
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 if TYPE_CHECKING:
     from threadpoolctl import ThreadpoolController
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 #: Problems with fewer states than this run on one BLAS thread: two took more time wherever they were measured, up to
 #: twelve times as much at 100 states (``benchmarks/README.md``).
 STATES_WORTH_THREADS = 1000
+
+_Function = TypeVar("_Function", bound=Callable[..., Any])
 
 #: Held by the block that has set the number of threads.
 _SETTING = threading.Lock()
@@ -52,3 +54,16 @@ def one_thread_if_small(states: int) -> Iterator[None]:
             yield
     finally:
         _SETTING.release()
+
+
+def on_one_thread_if_small(function: _Function) -> _Function:
+    """Return a function of a plant or design, its first argument, that runs in `one_thread_if_small`."""
+
+    @wraps(function)
+    def limited(*arguments: Any, **options: Any) -> Any:
+        subject = arguments[0] if arguments else options.get("plant")
+        states = getattr(getattr(subject, "plant", subject), "nx", 0)
+        with one_thread_if_small(states if isinstance(states, int) else 0):
+            return function(*arguments, **options)
+
+    return cast(_Function, limited)

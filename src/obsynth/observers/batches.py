@@ -2,28 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, overload
+from typing import Any
 
 from numpy.typing import ArrayLike
 
-from obsynth.observers.dae.batch import DAEBatchEstimates, run_dae_batch
+from obsynth.observers.dae.batch import run_dae_batch
 from obsynth.observers.dae.observer import DAEObserver
+from obsynth.observers.estimates import Estimates
 from obsynth.observers.recursive import gain_schedule
-from obsynth.observers.recursive.gain_schedule import BatchEstimates
 from obsynth.observers.recursive.observer import RecursiveObserver
 
 
-@overload
-def run_batch(observer: RecursiveObserver, y: ArrayLike, u: ArrayLike | None = None) -> BatchEstimates: ...
-@overload
-def run_batch(
-    observer: DAEObserver, y: ArrayLike, u: ArrayLike | None = None, *, compiled: bool | None = None,
-    progress: bool | Callable[[int], None] | None = None,
-) -> DAEBatchEstimates: ...  # fmt: skip
 def run_batch(
     observer: RecursiveObserver | DAEObserver, y: ArrayLike, u: ArrayLike | None = None, **options: Any
-) -> BatchEstimates | DAEBatchEstimates:
+) -> Estimates:
     """Run many trials with one observer.
 
     The gains of a recursive observer do not depend on data, so that a step is one product for all trials.  An observer
@@ -44,8 +36,9 @@ def run_batch(
 
     Returns
     -------
-    BatchEstimates or DAEBatchEstimates
-        The same numbers as ``observer.run`` gives for each trial, up to rounding.
+    Estimates
+        With an axis of trials before the samples; the same numbers as ``observer.run`` gives for each trial, up to
+        rounding.  States, faults and innovations; of a DAE also covariances of the faults, NIS and residuals.
 
     Raises
     ------

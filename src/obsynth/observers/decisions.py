@@ -6,6 +6,8 @@ that a run of N samples raises a false alarm with at most about the stated proba
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -13,7 +15,7 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arguments import chosen, real_array, real_number, real_vector
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.alarms import Alarm, Decision, alone, quantile, tail
-from obsynth.observers.recursive.estimates import RecursiveEstimates
+from obsynth.observers.estimates import Estimates
 from obsynth.observers.recursive.likelihood_ratio import likelihood_ratio, pull_of_the_start
 from obsynth.observers.recursive.observer import RecursiveObserver
 
@@ -26,7 +28,7 @@ NIS_LOOKS = 1.0 / 2.0
 
 def decide(
     observer: RecursiveObserver,
-    estimates: RecursiveEstimates,
+    estimates: Estimates,
     *,
     statistic: str = "chi-square",
     nominal: ArrayLike | None = None,
@@ -39,7 +41,7 @@ def decide(
     ----------
     observer : RecursiveObserver
         That gave the estimates, with parameters (a filter without any knows the ``nis`` alone).
-    estimates : RecursiveEstimates
+    estimates : Estimates
         Of a whole run.
     statistic : {"chi-square", "cusum", "glr", "nis"}, optional
         ``chi-square`` on theta against its nominal value, with its honest covariance (default); ``cusum`` for small
@@ -98,8 +100,59 @@ def decide(
     return likelihood_ratio(observer, estimates, gaps, false_alarms)
 
 
+@dataclass(frozen=True)
+class ParameterMonitor:
+    """How decisions on parameters are made in every run: the options of `obsynth.decide`.
+
+    Parameters
+    ----------
+    statistic : {"chi-square", "cusum", "glr", "nis"}, optional
+        As for `obsynth.decide`.
+    nominal : tuple of float, optional
+        ``(nq,)``: nominal parameters; the observer's initial ones by default.
+    false_alarms : float, optional, dimensionless
+        Probability of a false alarm in a whole run.
+    change : float or tuple of float, optional
+        Change that ``cusum`` is tuned for, in parameter units.
+
+    Raises
+    ------
+    SpecError
+        The statistic is unknown.
+    """
+
+    statistic: str = "chi-square"
+    nominal: tuple[float, ...] | None = None
+    false_alarms: float = 0.01
+    change: float | tuple[float, ...] = 0.1
+
+    def __post_init__(self) -> None:
+        if self.statistic not in STATISTICS:
+            raise SpecError(f"statistic is {self.statistic!r}: use one of {', '.join(STATISTICS)}.", path="statistic")
+
+    def watch(self, observer: RecursiveObserver, estimates: Estimates) -> Decision:
+        """Return the decision on one run.
+
+        Parameters
+        ----------
+        observer : RecursiveObserver
+            That gave the estimates.
+        estimates : Estimates
+            Of a whole run.
+
+        Raises
+        ------
+        SpecError
+            As for `obsynth.decide`.
+        """
+        return decide(
+            observer, estimates, statistic=self.statistic, nominal=self.nominal, false_alarms=self.false_alarms,
+            change=self.change,
+        )  # fmt: skip
+
+
 def _chi_square(
-    observer: RecursiveObserver, estimates: RecursiveEstimates, nominal: FloatArray, false_alarms: float
+    observer: RecursiveObserver, estimates: Estimates, nominal: FloatArray, false_alarms: float
 ) -> Decision:
     gaps, nq = estimates.parameters - nominal, len(nominal)
     start = np.zeros(nq) if observer.adaptation is None else observer.adaptation.initial_parameters - nominal
@@ -131,7 +184,7 @@ def _inverses(covariances: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.pinv(covariances, hermitian=True))
 
 
-def _nis(estimates: RecursiveEstimates, gaps: FloatArray, false_alarms: float) -> Decision:
+def _nis(estimates: Estimates, gaps: FloatArray, false_alarms: float) -> Decision:
     squares = np.nansum(gaps**2, axis=1)
     samples = len(squares)
     window = np.ones(min(NIS_WINDOW, samples))
@@ -151,7 +204,7 @@ def _nis(estimates: RecursiveEstimates, gaps: FloatArray, false_alarms: float) -
     return Decision("nis", read_only(values), read_only(thresholds), alarm)
 
 
-def _cusum(estimates: RecursiveEstimates, gaps: FloatArray, change: FloatArray, false_alarms: float) -> Decision:
+def _cusum(estimates: Estimates, gaps: FloatArray, change: FloatArray, false_alarms: float) -> Decision:
     samples, nq = len(gaps), len(change)
     signs = np.concatenate([change, -change])
     regressors = np.nan_to_num(estimates.regressors)

@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.estimates import Estimates, Undelayed
 
 State = TypeVar("State")
 Row = TypeVar("Row", covariant=True)
-Found = TypeVar("Found", covariant=True)
+Known = TypeVar("Known")
 Kept = TypeVar("Kept", bound=tuple[Any, ...])
 
 #: Marks an array whose columns are contiguous: sums are rounded in another order there.
 BY_COLUMNS = "by columns"
 
 
-class Observer(Protocol[State, Row, Found]):
+class Observer(Protocol[State, Row]):
     """An observer: values alone, so that one serves any number of runs; a state is a tuple of plain arrays.
 
     `advance` is `step` without checks of the sample, and returns the row of numbers that the estimates are made of.
@@ -32,12 +34,157 @@ class Observer(Protocol[State, Row, Found]):
         """Return the state after a sample, and what is known at it."""
         ...
 
-    def step(self, state: State, y: ArrayLike, u: ArrayLike = ()) -> tuple[State, Found]:
+    def step(self, state: State, y: ArrayLike, u: ArrayLike = ()) -> tuple[State, Estimates]:
         """Check a sample; return the state after it, and the estimates at it."""
         ...
 
 
-class RunningObserver(Generic[State, Row, Found]):
+class ParameterRow(Protocol):
+    """What an observer with deviations knows at one sample."""
+
+    @property
+    def x(self) -> FloatArray:
+        """The states ``(nx,)``."""
+        ...
+
+    @property
+    def theta(self) -> FloatArray:
+        """The parameters ``(nq,)``."""
+        ...
+
+    @property
+    def state_deviations(self) -> FloatArray:
+        """Standard deviations of `x` ``(nx,)``."""
+        ...
+
+    @property
+    def parameter_covariance(self) -> FloatArray:
+        """Covariance of `theta` ``(nq, nq)``."""
+        ...
+
+    @property
+    def gap(self) -> FloatArray:
+        """The innovation at the parameters estimated one sample before ``(m,)``."""
+        ...
+
+    @property
+    def whitened(self) -> FloatArray:
+        """The innovation of the model without parameters, whitened ``(m,)``."""
+        ...
+
+    @property
+    def regressor(self) -> FloatArray:
+        """Its regressor ``(m, nq)``."""
+        ...
+
+    @property
+    def is_finite(self) -> bool:
+        """Whether no number has overflown."""
+        ...
+
+
+class Steps(Protocol[State, Row]):
+    """The steps of an observer: what follows from it alone, made once for all runs."""
+
+    first: State
+
+    def advance(self, state: State, y: FloatArray, u: FloatArray) -> tuple[State, Row]:
+        """Return the state after a sample, and what is known at it."""
+        ...
+
+
+class StepObserver(Undelayed, Generic[State, Known]):
+    """An observer of states and parameters, which takes missing samples itself and states deviations."""
+
+    @property
+    @abstractmethod
+    def _steps(self) -> Steps[State, Known]:
+        """What follows from the observer alone."""
+
+    @abstractmethod
+    def _allow(self, state: State) -> None:
+        """Raise where no sample can follow."""
+
+    @abstractmethod
+    def _trust(self, row: Known) -> None:
+        """Raise where a step cannot be trusted."""
+
+    @abstractmethod
+    def _sample(self, state: State, y: ArrayLike, u: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Return a sample, checked."""
+
+    @abstractmethod
+    def _estimates(self, state: State, row: Known) -> Estimates:
+        """Return the estimates of one sample."""
+
+    def init(self) -> State:
+        """Return the state before the first sample, k = 0."""
+        return self._steps.first
+
+    def advance(self, state: State, y: FloatArray, u: FloatArray) -> tuple[State, Known]:
+        """Return the next state and what is known at a sample, without checking it.
+
+        Parameters
+        ----------
+        state : NamedTuple
+            Before the sample.
+        y, u : FloatArray
+            ``(ny,)``, NaN for what is missing, and ``(nu,)``.
+        """
+        return self._steps.advance(state, y, u)
+
+    def accept(self, state: State, y: FloatArray, u: FloatArray) -> tuple[State, Known]:
+        """Return the same as `advance`, where the step is one that can be trusted.
+
+        Parameters
+        ----------
+        state : NamedTuple
+            Before the sample.
+        y, u : FloatArray
+            ``(ny,)``, NaN for what is missing, and ``(nu,)``.
+
+        Raises
+        ------
+        SpecError
+            The horizon of a time-varying plant is passed.
+        SolverError
+            The step of a nonlinear plant has no solution, or more than one.
+        """
+        self._allow(state)
+        after, row = self._steps.advance(state, y, u)
+        self._trust(row)
+        return after, row
+
+    def step(self, state: State, y: ArrayLike, u: ArrayLike = ()) -> tuple[State, Estimates]:
+        """Return the state after a sample, and the estimates at it.
+
+        Parameters
+        ----------
+        state : NamedTuple
+            Before the sample; it is not changed.
+        y : array_like
+            Outputs ``(ny,)``; NaN marks a missing one.  A recursive observer does not use y(0).
+        u : array_like, optional
+            Known inputs ``(nu,)`` at this sample; of a nonlinear plant, during the step that ends at it.
+
+        Raises
+        ------
+        SpecError
+            A sample has the wrong length, an input is not finite, or the horizon is passed.
+        PreconditionError
+            Rank H_k is lost at this k although no sample is missing (recursive observers).
+        SolverError
+            The step has no solution; k, iteration and worst equation are named (nonlinear observers).
+        """
+        after, row = self.accept(state, *self._sample(state, y, u))
+        return after, self._estimates(after, row)
+
+    def start(self) -> RunningObserver[State, Known]:
+        """Return a running observer, at k = 0."""
+        return RunningObserver(self)
+
+
+class RunningObserver(Generic[State, Row]):
     """An observer with its state: `step` takes y(k) and u(k) and returns the estimates at k.
 
     Parameters
@@ -48,11 +195,11 @@ class RunningObserver(Generic[State, Row, Found]):
         Where to begin; ``observer.init()`` by default.
     """
 
-    def __init__(self, observer: Observer[State, Row, Found], state: State | None = None) -> None:
+    def __init__(self, observer: Observer[State, Row], state: State | None = None) -> None:
         self.observer = observer
         self.state = observer.init() if state is None else state
 
-    def step(self, y: ArrayLike, u: ArrayLike = ()) -> Found:
+    def step(self, y: ArrayLike, u: ArrayLike = ()) -> Estimates:
         """Take one sample and return the estimates at it.
 
         Parameters

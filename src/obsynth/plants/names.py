@@ -26,7 +26,11 @@ def checked_names(names: Sequence[str] | None, count: int, *, prefix: str, what:
         raise SpecError(f"{what} must be a list of non-empty texts.", path=what)
     if len(given) != count:
         raise SpecError(f"{what} has {len(given)} names, but there are {count} such signals.", path=what)
-    unwritable = [name for name in given if any(unicodedata.category(sign) in _UNWRITABLE for sign in name)]
+    unwritable = [
+        name
+        for name in given
+        if not name.isprintable() and any(unicodedata.category(sign) in _UNWRITABLE for sign in name)
+    ]
     if unwritable:
         raise SpecError(f"{what} has the name {unwritable[0]!r}: use no line ends and no control characters.",
                         path=what)  # fmt: skip
@@ -55,9 +59,9 @@ def require_known(given: Iterable[Any], known: Iterable[str], *, what: str, kind
     wrong = [name for name in given if name not in listed]
     if not wrong:
         return
-    told = [f"{name!r}, which is no {kind} of the plant.{suggestion(str(name), listed)}" for name in wrong]
+    told = [f"{what} names {name!r}, which is no {kind} of the plant.{suggestion(str(name), listed)}" for name in wrong]
     if len(wrong) == 1:
-        raise SpecError(f"{what} names {told[0]}", path=what)
+        raise SpecError(told[0], path=what)
     raise SpecError(f"{what} names {len(wrong)} that are no {kind} of the plant:", path=what, problems=told)
 
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,8 +14,10 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.expressions import Expression, parse_expression
 from obsynth.plants.constants import ConstantsBox, constants_box
-from obsynth.proofs.affine import AffineMatrix
-from obsynth.proofs.affine_numbers import AffineNumber, affine_translation
+
+if TYPE_CHECKING:
+    from obsynth.proofs.affine import AffineMatrix
+    from obsynth.proofs.affine_numbers import AffineNumber
 
 #: Matrices that may hold constants.
 UNCERTAIN_MATRICES = ("E", "A", "B", "C", "D", "Bf", "Df", "Bd", "Dd")
@@ -120,6 +122,16 @@ class Uncertainty:
         """
         return float(values[text]) if text in values else float(self._parsed[text](values))
 
+    def parsed(self, text: str) -> Expression:
+        """Return the expression of an entry that is not a name alone.
+
+        Parameters
+        ----------
+        text : str
+            The entry.
+        """
+        return self._parsed[text]
+
     def filled(self, matrices: Mapping[str, FloatArray], values: Mapping[str, float]) -> dict[str, FloatArray]:
         """Return matrices with every entry at values of the constants.
 
@@ -151,6 +163,9 @@ class Uncertainty:
         PreconditionError
             An expression is not bounded on the box.
         """
+        from obsynth.proofs.affine import AffineMatrix
+        from obsynth.proofs.affine_numbers import AffineNumber, affine_translation
+
         unknowns = {name: i for i, name in enumerate(box.names)}
         count, numbers = len(unknowns), {}
         for name, item in box.constants.items():
@@ -175,6 +190,8 @@ class Uncertainty:
         return found
 
     def _number(self, text: str, numbers: Mapping[str, AffineNumber], translation: Any, count: int) -> AffineNumber:
+        from obsynth.proofs.affine_numbers import AffineNumber
+
         value = self._parsed[text].translated(numbers, translation)
         return value if isinstance(value, AffineNumber) else AffineNumber(float(value), np.zeros(count), 0.0)
 

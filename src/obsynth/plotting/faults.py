@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, as_matrix
-from obsynth.observers.linear.observer import Estimates
+from obsynth.observers.estimates import Estimates
 from obsynth.plotting.panels import (
     ESTIMATE_STYLE,
     MARK_STYLE,

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from obsynth.experiments.monitors.monitor import Detection
-from obsynth.experiments.parameter_simulation import RecursiveSimulation
 from obsynth.experiments.simulation import Simulation
+from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.alarms import Decision
 from obsynth.plotting.faults import plot_faults
 from obsynth.plotting.panels import MARK_STYLE, RESIDUAL_STYLE, THRESHOLD_STYLES, legend_above, new_panels, tidy
@@ -44,7 +44,7 @@ DECADES_BELOW = 3
 
 
 def plot_simulation(
-    simulation: Simulation | RecursiveSimulation,
+    simulation: Simulation,
     *,
     detections: Sequence[Detection | Decision] = (),
     units: Mapping[str, str] | None = None,
@@ -54,7 +54,7 @@ def plot_simulation(
 
     Parameters
     ----------
-    simulation : Simulation or RecursiveSimulation
+    simulation : Simulation
         From `obsynth.simulate`.
     detections : sequence of Detection or Decision, optional
         What monitors saw in it, from ``monitor.watch`` or `obsynth.decide`.
@@ -74,15 +74,13 @@ def plot_simulation(
         There are too few or too many axes.
     """
     dt = float(simulation.time[1]) if len(simulation.time) > 1 else 1.0
-    if isinstance(simulation, Simulation):
-        count = len(simulation.estimates.fault_names)
-        panels = new_panels(axes, count + len(detections))
-        _plot_linear(simulation, panels[:count], dt, units)
-    else:
-        count = len(simulation.estimates.parameter_names)
-        panels = new_panels(axes, count + len(detections))
-        true = simulation.parameters[:, list(simulation.parameter_columns)]
+    count = len(simulation.estimates.fault_names)
+    panels = new_panels(axes, count + len(detections))
+    true = simulation.faults[:, list(simulation.fault_columns)]
+    if simulation.estimates.has_deviations:
         plot_parameters(simulation.estimates, parameters=true, dt=dt, units=units, axes=panels[:count])
+    else:
+        _plot_linear(simulation, true, panels[:count], dt, units)
     for panel, detection in zip(panels[count:], detections, strict=True):
         if isinstance(detection, Decision):
             plot_decision(detection, dt=dt, axes=panel)
@@ -93,8 +91,10 @@ def plot_simulation(
     return panels
 
 
-def _plot_linear(simulation: Simulation, panels: list[Axes], dt: float, units: Mapping[str, str] | None) -> None:
-    plot_faults(simulation.estimates, faults=simulation.faults, dt=dt, units=units, axes=panels)
+def _plot_linear(
+    simulation: Simulation, true: FloatArray, panels: list[Axes], dt: float, units: Mapping[str, str] | None
+) -> None:
+    plot_faults(simulation.estimates, faults=true, dt=dt, units=units, axes=panels)
     for panel, estimate in zip(panels, simulation.estimates.faults.T, strict=True):
         if np.median(np.abs(np.diff(estimate))) > NOISY_SHARE * np.ptp(estimate):
             truth, band = panel.get_lines()

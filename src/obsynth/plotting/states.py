@@ -10,9 +10,7 @@ from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, as_matrix
-from obsynth.observers.dae.estimates import DAEEstimates
-from obsynth.observers.linear.observer import Estimates
-from obsynth.observers.recursive.estimates import RecursiveEstimates
+from obsynth.observers.estimates import Estimates
 from obsynth.plants.names import index_of
 from obsynth.plotting.panels import (
     BAND_STYLE,
@@ -33,7 +31,7 @@ ROOM_SHARE, USUAL_BANDS = 0.2, 3.0
 
 
 def plot_parameters(
-    estimates: RecursiveEstimates | DAEEstimates,
+    estimates: Estimates,
     *,
     parameters: ArrayLike | None = None,
     dt: float = 1.0,
@@ -44,7 +42,7 @@ def plot_parameters(
 
     Parameters
     ----------
-    estimates : RecursiveEstimates or DAEEstimates
+    estimates : Estimates
         From a run.
     parameters : array_like, optional
         True parameters ``(samples, nq)``; a single one may be ``(samples,)``.
@@ -73,7 +71,7 @@ def plot_parameters(
 
 
 def plot_states(
-    estimates: Estimates | RecursiveEstimates | DAEEstimates,
+    estimates: Estimates,
     *,
     states: ArrayLike | None = None,
     names: Sequence[str] | None = None,
@@ -85,7 +83,7 @@ def plot_states(
 
     Parameters
     ----------
-    estimates : Estimates, RecursiveEstimates or DAEEstimates
+    estimates : Estimates
         From a run.  Where a state is undetermined there is no band.
     states : array_like, optional
         True states ``(samples, nx)``, not delayed.
@@ -110,12 +108,9 @@ def plot_states(
     """
     known = estimates.state_names
     chosen = range(len(known)) if names is None else [index_of(name, known, what="The estimates") for name in names]
-    if isinstance(estimates, Estimates):
-        deviations, delays = None, estimates.state_delays
-    else:
-        deviations, delays = estimates.state_deviations, (0,) * len(known)
+    deviations = estimates.state_deviations if estimates.has_deviations else None
     true = _truth(states, estimates.states.shape)
-    return _panels(estimates.states, deviations, known, true, delays, dt, units, chosen, axes)
+    return _panels(estimates.states, deviations, known, true, estimates.state_delays, dt, units, chosen, axes)
 
 
 def _truth(given: ArrayLike | None, shape: tuple[int, ...]) -> FloatArray | None:

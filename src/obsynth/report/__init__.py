@@ -2,6 +2,6 @@
 
 from obsynth.report.designs import design_report
 from obsynth.report.plants import check_report
-from obsynth.report.verification import verification_report
+from obsynth.results.checks_table import verification_report
 
 __all__ = ["check_report", "design_report", "verification_report"]

@@ -20,10 +20,10 @@ from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
-from obsynth.report.layout import facts_table, headed_table, name_list, number, print_section
-from obsynth.report.verification import verification_report
+from obsynth.results.checks_table import verification_report
 from obsynth.results.delta_scan import DeltaScan
 from obsynth.results.design import ObserverDesign
+from obsynth.results.layout import facts_table, headed_table, name_list, number, print_section
 
 
 def tolerances_report(design: ObserverDesign, *, console: Console) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from html import escape
 from pathlib import Path
 
@@ -10,11 +10,12 @@ from obsynth.data.run import DataRun
 from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.methods.registry import REGISTRY, method_spec
 from obsynth.report.designs import delay_curves, fault_estimates_table, plant_facts, promises, recovered_states
+from obsynth.report.log_agreement import agreement_section
 from obsynth.report.page_style import STYLE
 from obsynth.report.page_tables import check_rows, copied_table, fact_rows, matrix_rows, value_text
 from obsynth.report.pictures import data_section, pictures_of
 from obsynth.report.summary import summary
-from obsynth.report.verification import verdict_line
+from obsynth.results.checks_table import verdict_line
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import gain_set_digest
 from obsynth.results.report import VerificationReport
@@ -31,7 +32,7 @@ MOST_ENTRIES = 900
 def html_report(
     design: ObserverDesign, path: str | Path, *, report: VerificationReport | None = None,
     gains_file: str | None = None, scenario: Scenario | None = None, system_file: str | None = None,
-    run: DataRun | None = None, data_file: str | None = None, statement: str = "",
+    run: DataRun | None = None, data_file: str | None = None, statement: str = "", rows: str | None = None,
 ) -> Path:  # fmt: skip
     """Write one HTML page about a design, complete in itself: it needs no network and no other file.
 
@@ -55,6 +56,9 @@ def html_report(
         Name of the log, for the same command.
     statement : str, optional
         What the monitor of that run promises.
+    rows : str, optional
+        ``"a:b"``: rows of that run without faults, for the question whether the log agrees with the design, asked of
+        recursive and nonlinear designs; all by default.
 
     Returns
     -------
@@ -69,19 +73,22 @@ def html_report(
         The plant cannot be simulated on the scenario.
     """
     shown = design.report if report is None else report
-    own = list(data_section(design, run, statement)) if run is not None else []
+    own = {}
+    if run is not None:
+        own = {"On your data": list(data_section(design, run, statement)),
+               "Does your data agree": list(agreement_section(design, run, rows))}  # fmt: skip
     return write_atomically(path, _page_text(design, shown, gains_file, scenario, system_file, own, data_file))
 
 
 def _page_text(
     design: ObserverDesign, report: VerificationReport, gains_file: str | None, scenario: Scenario | None,
-    system_file: str | None, own: Sequence[str], data_file: str | None,
+    system_file: str | None, own: Mapping[str, list[str]], data_file: str | None,
 ) -> str:  # fmt: skip
     digest = gain_set_digest(design)
     title = escape(f"{design.name}: {design.method}")
     state = "holds" if report.passed else "fails"
     sections = {
-        "On your data": list(own),
+        **own,
         "In short": list(_in_short(design.replace(report=report))),
         "Pictures": list(_pictures(design, scenario, report)),
         "What is promised": [*fact_rows(promises(design)), *_fault_estimates(design), *_recovered(design)],

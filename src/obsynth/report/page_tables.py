@@ -11,7 +11,7 @@ import numpy as np
 from rich.table import Table
 
 from obsynth.numerics.arrays import FloatArray
-from obsynth.report.layout import number, verdict
+from obsynth.results.layout import number, verdict
 from obsynth.results.report import Check, CheckKind, Status
 
 #: Prefix of a check's name -> heading of its group; the others are about the shipped observer.

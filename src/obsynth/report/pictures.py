@@ -9,7 +9,7 @@ import base64
 import io
 from collections.abc import Callable, Iterator, Sequence
 from html import escape
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from rich.text import Text
@@ -20,12 +20,10 @@ from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.demonstration import demonstration_scenario
 from obsynth.experiments.monitors.monitor import Detection
 from obsynth.experiments.monitors.residual_monitor import monitor
-from obsynth.experiments.parameter_simulation import RecursiveSimulation
 from obsynth.experiments.simulation import Simulation, simulate
 from obsynth.observers.alarms import Decision
 from obsynth.observers.decisions import decide
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.observers.recursive.estimates import RecursiveEstimates
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.plotting.data import panel_count, plot_data
 from obsynth.plotting.frequency import plot_gains
@@ -33,9 +31,9 @@ from obsynth.plotting.panels import names_as_they_are
 from obsynth.plotting.simulation import plot_simulation
 from obsynth.plotting.spectra import plot_poles
 from obsynth.plotting.states import plot_states
-from obsynth.report.layout import headed_table, number
 from obsynth.report.page_tables import copied_table, fact_rows
 from obsynth.results.design import ObserverDesign
+from obsynth.results.layout import headed_table, number
 from obsynth.simulation.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -113,7 +111,7 @@ def _at_work(design: ObserverDesign, scenario: Scenario | None) -> Iterator[Pict
         return
     if simulation is None or shown is None:
         return
-    linear = isinstance(simulation, Simulation)
+    linear = isinstance(design.observer, LinearObserver)
     what = "On the scenario" if given else "Each fault in turn" if linear else "Each parameter in turn"
     text = f"{what}: {_story(shown, given=given, linear=linear)}"
     faults, states = len(design.observer.fault_names), simulation.estimates.state_names
@@ -134,11 +132,9 @@ def _at_work(design: ObserverDesign, scenario: Scenario | None) -> Iterator[Pict
         ), wide=True)  # fmt: skip
 
 
-def _watched(
-    design: ObserverDesign, scenario: Scenario, simulation: Simulation | RecursiveSimulation
-) -> Iterator[Detection | Decision]:
+def _watched(design: ObserverDesign, scenario: Scenario, simulation: Simulation) -> Iterator[Detection | Decision]:
     """Yield what the first monitor sees that this design and this scenario have; nothing where they have none."""
-    if isinstance(simulation, Simulation):
+    if isinstance(design.observer, LinearObserver):
         for kind in ("pointwise", "chi-square"):
             try:
                 yield monitor(design, scenario, kind).watch(simulation.estimates)
@@ -146,8 +142,8 @@ def _watched(
                 # A signal without a bound, or without a covariance; a continuous design has neither threshold.
                 continue
             return
-    elif isinstance(simulation.estimates, RecursiveEstimates) and simulation.estimates.parameter_names:
-        yield decide(cast(RecursiveObserver, design.observer), simulation.estimates)
+    elif isinstance(design.observer, RecursiveObserver) and design.observer.fault_names:
+        yield decide(design.observer, simulation.estimates)
 
 
 def _story(scenario: Scenario, *, given: bool, linear: bool) -> str:

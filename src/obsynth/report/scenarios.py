@@ -19,10 +19,9 @@ from obsynth.comparison.result import Comparison
 from obsynth.experiments.intervals import Interval
 from obsynth.experiments.monitors.monitor import Monitor
 from obsynth.experiments.monte_carlo import Evaluation
-from obsynth.experiments.parameter_monte_carlo import ParameterMonitor
-from obsynth.experiments.parameter_simulation import RecursiveSimulation
 from obsynth.experiments.simulation import Simulation
-from obsynth.report.layout import headed_table, number, print_section
+from obsynth.observers.decisions import ParameterMonitor
+from obsynth.results.layout import headed_table, number, print_section
 
 #: Rows of a table; of a large plant the worst estimates are shown.
 SHOWN = 12
@@ -121,7 +120,7 @@ def comparison_report(found: Comparison, *, console: Console, file: Path | None 
 
 def simulation_report(
     name: str,
-    found: Simulation | RecursiveSimulation,
+    found: Simulation,
     *,
     console: Console,
     units: Mapping[str, str],
@@ -131,7 +130,7 @@ def simulation_report(
     summary = found.summary()
     console.print(Text(f"{name}: {summary['samples']} samples, {found.time[-1]:g} s", style="bold"))
     console.print()
-    linear = isinstance(found, Simulation)
+    linear = not found.estimates.has_deviations
     for kind, title in (
         ("faults", "Fault estimates" if linear else "Parameter estimates"),
         ("states", "State estimates"),
@@ -162,9 +161,9 @@ def simulation_report(
         console.print(Text(f"Written: {file}"))
 
 
-def _last_column(found: Simulation | RecursiveSimulation, kind: str) -> Iterator[str]:
+def _last_column(found: Simulation, kind: str) -> Iterator[str]:
     """Yield a heading, and a cell for each signal: delays of a linear observer, coverage of a recursive one."""
-    if isinstance(found, Simulation):
+    if not found.estimates.has_deviations:
         yield "delay (samples)"
         yield from map(str, found.estimates.fault_delays if kind == "faults" else found.estimates.state_delays)
     else:

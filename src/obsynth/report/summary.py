@@ -20,10 +20,10 @@ from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.plotting.frequency import FaultGains, fault_gains
-from obsynth.report.layout import number
-from obsynth.report.verification import verdict_line
-from obsynth.report.warnings import design_warnings
+from obsynth.report.warnings import Followed, design_warnings, followed_steps
+from obsynth.results.checks_table import verdict_line
 from obsynth.results.design import ObserverDesign
+from obsynth.results.layout import number
 
 #: Faults, warnings and notes that are listed; the others are counted.
 _MOST_FAULTS, _MOST_NOTES = 5, 1
@@ -100,16 +100,17 @@ class Summary:
 def summary(design: ObserverDesign, *, file: Path | None = None, everything: bool = False) -> Summary:
     """Return the summary of a design; with ``everything`` no fault and no note is left out."""
     gains = _gains_if_linear(design)
+    steps = followed_steps(design)
     headings, rows = _estimates(design, gains)
-    warnings = tuple(_warnings(design, gains))
+    warnings = tuple(_warnings(design, gains, steps))
     shown = len(rows) if everything else _MOST_FAULTS
     notes = design.notes if everything else design.notes[:_MOST_NOTES]
-    more = [f"{len(rows) - shown} more estimates" for _ in (1,) if len(rows) > shown]
-    more += [f"{len(design.notes) - len(notes)} more notes" for _ in (1,) if len(design.notes) > len(notes)]
+    hidden = ((len(rows) - shown, "more estimate"), (len(design.notes) - len(notes), "more note"))
+    more = _counted([(count, what) for count, what in hidden if count > 0])
     verdict = f"{design.name}: {verdict_line(design.report).plain}"
     return Summary(
-        verdict, design.report.passed, tuple(_facts(design)), headings, tuple(rows[:shown]),
-        f"{' and '.join(more)} with -v" if more else "", warnings, notes, "" if file is None else str(file),
+        verdict, design.report.passed, tuple(_facts(design, steps)), headings, tuple(rows[:shown]),
+        f"{more} with -v" if more else "", warnings, notes, "" if file is None else str(file),
     )  # fmt: skip
 
 
@@ -129,12 +130,13 @@ def design_html(design: ObserverDesign) -> str:
     return summary(design).html()
 
 
-def _facts(design: ObserverDesign) -> Iterator[tuple[str, str]]:
+def _facts(design: ObserverDesign, steps: Followed) -> Iterator[tuple[str, str]]:
     known = method_spec(design.method) if design.method in REGISTRY else None
     yield "method", design.method + (f": {known.summary}" if known else "")
     yield "plant", _plant(design.plant)
     yield from _promise(design)
     yield "slowest", _slowest(design)
+    yield from _speed(design, steps)
     yield "assumes", "; ".join(_assumptions(design))
 
 
@@ -174,6 +176,19 @@ def _slowest(design: ObserverDesign) -> str:
                 f"{design.observer.order}")  # fmt: skip
     factor = design.certificate.claims.get("contraction", math.nan)
     return f"errors shrink by {number(factor)} per step on average; observer of order {design.observer.order}"
+
+
+def _speed(design: ObserverDesign, steps: Followed) -> Iterator[tuple[str, str]]:
+    """Yield how soon the estimates show a step, where that is later than their delays say."""
+    if not steps.figures:
+        return
+    observer = design.linear[1]
+    late = dict(zip(observer.fault_names, observer.fault_delays, strict=True))
+    reached = [(name, found.most) for name, found in steps.figures.items() if found.reaches]
+    told = [f"{name} {number(most, digits=4)} s" for name, most in reached if most > (late[name] + 0.5) * observer.dt]
+    if told:
+        more = f" and {len(told) - _MOST_FAULTS} more" if len(told) > _MOST_FAULTS else ""
+        yield "step", f"90 % is shown after: {', '.join(told[:_MOST_FAULTS])}{more}"
 
 
 def _assumptions(design: ObserverDesign) -> Iterator[str]:
@@ -228,7 +243,7 @@ def _estimates(design: ObserverDesign, gains: FaultGains | None) -> tuple[tuple[
     return headings, rows
 
 
-def _warnings(design: ObserverDesign, gains: FaultGains | None) -> Iterator[str]:
+def _warnings(design: ObserverDesign, gains: FaultGains | None, steps: Followed) -> Iterator[str]:
     """Yield what a user should not overlook: leaks that look like faults, steps that are not followed."""
     if isinstance(design.plant, DescriptorSystem):
         yield from questions(design.plant)
@@ -248,7 +263,7 @@ def _warnings(design: ObserverDesign, gains: FaultGains | None) -> Iterator[str]
             share = number(100.0 * followed, digits=3)
             told.append(fault)
             yield f"the estimate of {fault} does not follow a step: in the end it shows {share} % of it."
-    yield from design_warnings(design, told=told)
+    yield from design_warnings(design, told=told, steps=steps)
     for check in design.report.checks:
         if check.name.startswith("limit at "):
             yield f"{check.name}: {check.claim}."

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
 
 from obsynth.analysis.diagnosis.columns import question
 from obsynth.analysis.diagnosis.diagnosing import rest_point
 from obsynth.errors import ObsynthError
 from obsynth.methods.choosing.automatic import SAMPLES
-from obsynth.methods.choosing.figures import fault_figures, on_the_clock
+from obsynth.methods.choosing.figures import FaultFigures, fault_figures, on_the_clock
 from obsynth.methods.functional_filter.rates import settling_time
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.linear.sampling import sample_observer
@@ -21,19 +22,54 @@ SETTLING_TIMES, MOST_STEPS = 30, 6000
 MOST_STATES = 80
 
 
+@dataclass(frozen=True)
+class Followed:
+    """Steps of the faults, followed for so many seconds: figures by fault, none where they could not be followed."""
+
+    figures: Mapping[str, FaultFigures]
+    seconds: float
+
+
+def followed_steps(design: ObserverDesign, horizon: float | None = None) -> Followed:
+    """Return what becomes of a unit step of each fault of a linear design; ``horizon`` in s."""
+    plant, observer = design.plant, design.observer
+    nothing = Followed({}, 0.0)
+    if not isinstance(plant, DescriptorSystem) or not isinstance(observer, LinearObserver):
+        return nothing
+    if not observer.fault_names or plant.nx > MOST_STATES or set(observer.fault_names) - set(plant.fault_names):
+        return nothing
+    if (observer.Bu.shape[1], observer.By.shape[1]) != (plant.nu, plant.ny):
+        return nothing
+    step = plant.dt if plant.dt > 0.0 else settling_time(plant) / SAMPLES
+    length = horizon if horizon is not None else SETTLING_TIMES * settling_time(plant)
+    steps = int(min(max(length / step, 20), MOST_STEPS))
+    try:
+        sampled = on_the_clock(plant, step)
+        clocked = observer if observer.dt > 0.0 else sample_observer(observer, step)
+    except ObsynthError:
+        return nothing
+    return Followed({found.fault: found for found in fault_figures(sampled, clocked, steps)}, steps * step)
+
+
 def design_warnings(
-    design: ObserverDesign, horizon: float | None = None, *, told: Collection[str] = ()
+    design: ObserverDesign, horizon: float | None = None, *, told: Collection[str] = (), steps: Followed | None = None
 ) -> tuple[str, ...]:
     """Return what a user should know before trusting the fault estimates; ``horizon`` in s, of the spec's scenario.
 
-    Of faults that are ``told`` of already, steps are not followed again.
+    Of faults that are ``told`` of already, no step is; ``steps``: from `followed_steps`, where they are known.
     """
     plant, observer = design.plant, design.observer
     if not isinstance(plant, DescriptorSystem) or not isinstance(observer, LinearObserver):
         return ()
     if not observer.fault_names or plant.nx > MOST_STATES or set(observer.fault_names) - set(plant.fault_names):
         return ()
-    return (*_undetectable(plant, observer), *_followed(plant, observer, horizon, told))
+    found = followed_steps(design, horizon) if steps is None else steps
+    missed = (
+        f"A unit step of {name} reads {figures.at_horizon:.3g} after {found.seconds:.3g} s: the estimate does not "
+        "reach it by then."
+        for name, figures in found.figures.items() if not figures.reaches and name not in told
+    )  # fmt: skip
+    return (*_undetectable(plant, observer), *missed)
 
 
 def _undetectable(plant: DescriptorSystem, observer: LinearObserver) -> Iterator[str]:
@@ -48,23 +84,3 @@ def _undetectable(plant: DescriptorSystem, observer: LinearObserver) -> Iterator
             f"{what} cannot be told from {unknown}: what the estimate shows may as well be that. See obsynth check for "
             "the sensors that would tell them apart."
         )
-
-
-def _followed(
-    plant: DescriptorSystem, observer: LinearObserver, horizon: float | None, told: Collection[str]
-) -> Iterator[str]:
-    """Yield steps that the estimates do not reach within the horizon."""
-    step = plant.dt if plant.dt > 0.0 else settling_time(plant) / SAMPLES
-    length = horizon if horizon is not None else SETTLING_TIMES * settling_time(plant)
-    steps = int(min(max(length / step, 20), MOST_STEPS))
-    try:
-        sampled = on_the_clock(plant, step)
-        clocked = observer if observer.dt > 0.0 else sample_observer(observer, step)
-    except ObsynthError:
-        return
-    for figures in fault_figures(sampled, clocked, steps):
-        if not figures.reaches and figures.fault not in told:
-            yield (
-                f"A unit step of {figures.fault} reads {figures.at_horizon:.3g} after {steps * step:.3g} s: the "
-                "estimate does not reach it by then."
-            )

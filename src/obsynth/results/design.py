@@ -9,21 +9,22 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from obsynth.analysis.transformations import StateRecovery
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, read_only
-from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.results.gain_set_writing import save
 from obsynth.results.plant_source import PlantSource
 from obsynth.results.report import VerificationReport
 
 if TYPE_CHECKING:
     import control
+
+    from obsynth.analysis.transformations.recovery import StateRecovery
+    from obsynth.observers.dae.observer import DAEObserver
+    from obsynth.observers.recursive.observer import RecursiveObserver
+    from obsynth.plants.dae.model import DAEModel
+    from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +78,8 @@ class ObserverDesign:
         The report of this very object.
     source : PlantSource, optional
         The plant as written, where algebraic states were eliminated or the plant was sampled: `verify` does it again.
+    file_digest : str, optional
+        The sha256 that the file had from which it was read, of whatever schema: states of earlier runs name it.
     """
 
     name: str
@@ -91,6 +94,7 @@ class ObserverDesign:
     recovery: StateRecovery | None = None
     report: VerificationReport = field(default_factory=VerificationReport)
     source: PlantSource | None = None
+    file_digest: str = field(default="", repr=False)
 
     def __post_init__(self) -> None:
         frozen = {name: read_only(matrix) for name, matrix in self.gains.items()}
@@ -120,6 +124,9 @@ class ObserverDesign:
         SpecError
             The design is a linear time-invariant one.
         """
+        from obsynth.observers.recursive.observer import RecursiveObserver
+        from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+
         if not isinstance(self.plant, TimeVaryingDescriptorSystem) or not isinstance(self.observer, RecursiveObserver):
             raise SpecError(f"Design {self.name!r} is no recursive observer.", path="observer")
         return self.plant, self.observer
@@ -133,6 +140,9 @@ class ObserverDesign:
         SpecError
             The design is for a linear plant.
         """
+        from obsynth.observers.dae.observer import DAEObserver
+        from obsynth.plants.dae.model import DAEModel
+
         if not isinstance(self.plant, DAEModel) or not isinstance(self.observer, DAEObserver):
             raise SpecError(f"Design {self.name!r} is no observer of a nonlinear plant.", path="observer")
         return self.plant, self.observer
@@ -157,7 +167,7 @@ class ObserverDesign:
         **changes
             Any field.
         """
-        return replace(self, **changes)
+        return replace(self, **{"file_digest": "", **changes})
 
     def save(self, path: str | Path) -> Path:
         """Write the gain set as one JSON document, atomically.
@@ -194,6 +204,7 @@ class ObserverDesign:
         import control
         import numpy as np
 
+        from obsynth.observers.recursive.observer import RecursiveObserver
         from obsynth.observers.recursive.steady_state import steady_observer
 
         observer = (

@@ -12,14 +12,10 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from obsynth.analysis.transformations import StateRecovery
+from obsynth.analysis.transformations.recovery import StateRecovery
 from obsynth.files.outputs import FileKind, write_atomically
-from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.results.binary_members import count_of_numbers, digest_of_both, packed, split
 from obsynth.results.plain_data import digest_of, plain
 
@@ -31,11 +27,8 @@ GAIN_SET = FileKind(
     rb'\A(PK\x03\x04[\s\S]{26}gain_set\.json)?\s*\{\s*"kind":\s*"obsynth gain set"',
     ending=".gains.json",
 )
-# Linear time-invariant designs have no tag.
-KINDS: dict[str | None, tuple[Any, Any]] = {
-    None: (DescriptorSystem, LinearObserver), "recursive": (TimeVaryingDescriptorSystem, RecursiveObserver),
-    "dae": (DAEModel, DAEObserver),
-}  # fmt: skip
+#: Tags of kinds of designs; linear time-invariant ones have none.
+KINDS = (None, "recursive", "dae")
 #: From so many numbers on, which are more than a megabyte as text, the arrays of a gain set are a binary member.
 MANY_NUMBERS = 50_000
 
@@ -65,10 +58,25 @@ def _body_of(design: Any) -> dict[str, Any]:
     }
 
 
+def types_of(kind: str | None) -> tuple[Any, Any]:
+    """Return the types of plant and observer of a kind; only those asked for are loaded."""
+    if kind == "recursive":
+        from obsynth.observers.recursive.observer import RecursiveObserver
+        from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+
+        return TimeVaryingDescriptorSystem, RecursiveObserver
+    if kind == "dae":
+        from obsynth.observers.dae.observer import DAEObserver
+        from obsynth.plants.dae.model import DAEModel
+
+        return DAEModel, DAEObserver
+    return DescriptorSystem, LinearObserver
+
+
 def _tag(design: Any) -> dict[str, str]:
     """Return the entry that tells of which kind plant and observer are."""
-    kinds = [kind for kind, (_, observer) in KINDS.items() if isinstance(design.observer, observer)]
-    return {"kind": kinds[0]} if kinds and kinds[0] is not None else {}
+    found = next((kind for kind in KINDS if isinstance(design.observer, types_of(kind)[1])), None)
+    return {} if found is None else {"kind": found}
 
 
 def gain_set_bytes(design: Any, *, spec: Path | None = None) -> bytes:

@@ -9,7 +9,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from obsynth.analysis.transformations import StateRecovery
+from obsynth.analysis.transformations.recovery import StateRecovery
 from obsynth.analysis.transformations.recovery_operator import RecoveryOperator
 from obsynth.errors import SpecError
 from obsynth.files.inputs import input_file, json_data, read_json
@@ -31,6 +31,7 @@ from obsynth.results.gain_set_writing import (
     gain_set_digest,
     place_of,
     save,
+    types_of,
 )
 from obsynth.results.plain_data import digest_of, plain, restored
 from obsynth.results.plant_source import PlantSource
@@ -130,7 +131,8 @@ def _design_of(document: Any, arrays: bytes | None, source: str) -> ObserverDesi
     if not intact:
         raise SpecError(f"{source} was changed after it was written: its digest does not match.", path=source)
     try:
-        return _design_from(checked_parts(restored(body if arrays is None else with_arrays(body, arrays))))
+        parts = checked_parts(restored(body if arrays is None else with_arrays(body, arrays)))
+        return _design_from(parts, document["sha256"])
     except (SpecError, AttributeError, LookupError, TypeError, ValueError, ArithmeticError, RecursionError) as error:
         raise SpecError(f"{source} is incomplete: {str(error).rstrip('.')}.", path=source) from error
 
@@ -145,10 +147,10 @@ def _recovery_from(**data: Any) -> StateRecovery:
     return StateRecovery.from_operator(names, operator, data["noise_kept"], data["operating_point"])
 
 
-def _design_from(data: dict[str, Any]) -> ObserverDesign:
+def _design_from(data: dict[str, Any], digest: str) -> ObserverDesign:
     if not isinstance(data.get("kind"), (str, type(None))) or data.get("kind") not in KINDS:
         raise SpecError(f"A design of the kind {data['kind']!r} is unknown to this obsynth.", path="kind")
-    plant, observer = KINDS[data.get("kind")]
+    plant, observer = types_of(data.get("kind"))
     recovery = data["recovery"]
     return ObserverDesign(
         name=data["name"],
@@ -163,4 +165,5 @@ def _design_from(data: dict[str, Any]) -> ObserverDesign:
         recovery=None if recovery is None else made("recovery", _recovery_from, **recovery),
         report=made("report", VerificationReport.from_dict, data["report"]),
         source=None if data.get("source") is None else made("source", PlantSource.from_dict, data["source"]),
+        file_digest=digest,
     )

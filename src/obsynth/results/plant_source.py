@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from obsynth.analysis.transformations import Transformation, discretise, eliminate_algebraic_states
 from obsynth.errors import ObsynthError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.origin import DECISIVE, origin_of, with_origin
+
+if TYPE_CHECKING:
+    from obsynth.analysis.transformations.recovery import Transformation
 
 #: Larger plants are not stored: their elimination is checked where it is done.
 MOST_STATES = 500
@@ -37,6 +39,8 @@ class PlantSource:
 
     def derived(self) -> Transformation:
         """Return the elimination, and the sampling where there was one, done again."""
+        from obsynth.analysis.transformations import discretise, eliminate_algebraic_states
+
         if self.sample_time is None:
             return eliminate_algebraic_states(self.plant)
         return discretise(self.plant, self.sample_time)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
-from importlib import import_module
 from typing import Any, Literal
 
 CheckKind = Literal["proved", "equality", "computed", "condition", "information"]
@@ -131,7 +130,9 @@ class VerificationReport:
 
     def __str__(self) -> str:
         """Return the table of the checks."""
-        return str(import_module("obsynth.report.verification").report_text(self))
+        from obsynth.results.checks_table import report_text
+
+        return report_text(self)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the report as plain data."""

@@ -1,5 +1,6 @@
 """Simulated plants: exact recursions of discrete descriptor systems."""
 
-from obsynth.simulation.linear import Trajectory, simulate_plant
+from obsynth.simulation.linear import simulate_plant
+from obsynth.simulation.trajectory import Trajectory
 
 __all__ = ["Trajectory", "simulate_plant"]

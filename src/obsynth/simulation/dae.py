@@ -2,43 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SolverError, SpecError
-from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
+from obsynth.numerics.arguments import is_whole
+from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.covariances import covariance_factor
 from obsynth.plants.dae.checks import checked_inputs, finite_vector, step_length
 from obsynth.plants.dae.functions import Compiled, DAEFunctions, take_samples
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.dae.step import ImplicitStep
+from obsynth.simulation.trajectory import Trajectory
 
 #: A step of backward Euler this much shorter than dt puts a state onto its constraint and moves it no further.
 PROJECTION_SHARE = 1e-6
 #: Smaller moves, in sizes of the states, are the motion during that step and no projection.
 PROJECTION_NOTICE = 1e-5
-
-
-@dataclass(frozen=True, eq=False)
-class DAETrajectory:
-    """A simulated record.
-
-    Parameters
-    ----------
-    states : FloatArray
-        ``(samples, nx)``.
-    outputs : FloatArray
-        ``(samples, ny)``, with noise.
-    residuals : FloatArray
-        ``(samples,)``: scaled Newton residual of each step.
-    """
-
-    states: FloatArray
-    outputs: FloatArray
-    residuals: FloatArray
 
 
 def simulate_dae(
@@ -52,7 +34,7 @@ def simulate_dae(
     R: ArrayLike | None = None,
     integration: str = "radau",
     seed: int = 0,
-) -> DAETrajectory:
+) -> Trajectory:
     """Simulate a plant whose inputs are constant during each step.
 
     Parameters
@@ -79,7 +61,7 @@ def simulate_dae(
 
     Returns
     -------
-    DAETrajectory
+    Trajectory
         States, outputs with noise, and the residual of every step.
 
     Raises
@@ -92,7 +74,7 @@ def simulate_dae(
     inputs, length = checked_inputs(model, u), step_length(dt)
     theta = _parameters(model, parameters, len(inputs))
     x = finite_vector(initial_state, model.state_names, model.nominal_state, "initial_state")
-    if not isinstance(seed, (int, np.integer)) or isinstance(seed, bool) or seed < 0:
+    if not is_whole(seed) or seed < 0:
         raise SpecError(f"seed is {seed!r}: give a whole number, not negative.", path="seed")
     rng = np.random.default_rng(seed)
     pushed = _noise(Q, model.nx, "Q", rng, len(inputs))
@@ -100,7 +82,8 @@ def simulate_dae(
     run = _Run(ImplicitStep(DAEFunctions(model, integration), length), inputs, theta, pushed)
     run.start(_consistent(model, x, inputs, theta, length))
     take_samples(1, len(inputs), run.together, run.alone)
-    return DAETrajectory(read_only(run.states), read_only(run.outputs + heard), read_only(run.residuals))
+    time = length * np.arange(len(inputs), dtype=np.float64)
+    return Trajectory(run.states, run.outputs + heard, inputs, theta, time=time, residuals=run.residuals)
 
 
 def _consistent(model: DAEModel, x: FloatArray, inputs: FloatArray, theta: FloatArray, dt: float) -> FloatArray:

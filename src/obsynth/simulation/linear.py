@@ -12,7 +12,7 @@ samples.  All arrays of runs are ``(steps, runs, signals)``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,35 +20,12 @@ from numpy.typing import ArrayLike
 
 from obsynth.analysis.transformations import StateRecovery, discretise, eliminate_algebraic_states
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
-from obsynth.numerics.holds import first_order_hold
+from obsynth.numerics.arguments import is_whole
+from obsynth.numerics.arrays import FloatArray, as_matrix
+from obsynth.numerics.holds import driven, first_order_hold
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.simulation.scenario_signals import Drive
-
-
-@dataclass(frozen=True, eq=False)
-class Trajectory:
-    """What a plant did, one row per sample; arrays are read-only.
-
-    Fields: states, outputs: ``(steps, nx)`` and ``(steps, ny)``; inputs, faults, disturbances, noise: ``(steps, nu)``,
-    ``(steps, nf)``, ``(steps, nd)``, ``(steps, nw)``: what drove it; time: ``(steps,)``, seconds; starts at zero;
-    inconsistency: Norm of the change that the given initial state needed to satisfy the algebraic equations at k = 0;
-    only rounding for a consistent one.
-    """
-
-    states: FloatArray
-    outputs: FloatArray
-    inputs: FloatArray
-    faults: FloatArray
-    disturbances: FloatArray
-    noise: FloatArray
-    time: FloatArray
-    inconsistency: float
-
-    def __post_init__(self) -> None:
-        """Make the arrays private and read-only."""
-        for field in fields(self)[:-1]:
-            object.__setattr__(self, field.name, read_only(getattr(self, field.name)))
+from obsynth.simulation.trajectory import Trajectory
 
 
 def simulate_plant(
@@ -70,7 +47,7 @@ def simulate_plant(
             "The plant is continuous: sample it first, with obsynth.discretise or transform: {sample_time: ...}.",
             path="dt",
         )
-    if isinstance(steps, bool) or not isinstance(steps, (int, np.integer)) or steps < 1:
+    if not is_whole(steps) or steps < 1:
         raise SpecError(f"steps is {steps!r}: give a whole number of samples, 1 or more.", path="steps")
     sizes = {"u": plant.nu, "f": plant.nf, "d": plant.nd, "w": plant.nw}
     given = {"u": u, "f": f, "d": d, "w": w}
@@ -79,7 +56,8 @@ def simulate_plant(
     elimination = eliminate_algebraic_states(plant)
     reduced, recovery = elimination.plant, elimination.recovery
     drive = _sum_of(signals, {"u": reduced.B, "f": reduced.Bf, "d": reduced.Bd, "w": reduced.Bw})
-    dynamic = _recursion(reduced.A, dynamic_part(plant, recovery, start), drive)
+    dynamic = driven(reduced.A, dynamic_part(plant, recovery, start), drive)
+    _require_finite(dynamic, "simulate fewer steps", "steps")
     states = dynamic @ recovery.from_state.T + _sum_of(
         signals,
         {
@@ -134,21 +112,14 @@ def dynamic_part(plant: DescriptorSystem, recovery: StateRecovery, state: FloatA
     return np.asarray(np.linalg.solve(r, q.T @ (plant.E @ state / sizes)))
 
 
-def _recursion(a: FloatArray, start: FloatArray, drive: FloatArray) -> FloatArray:
-    """Return x(0), x(1), ... of ``x+ = a x + drive``."""
-    states = np.empty_like(drive)
-    states[0] = start
-    with np.errstate(over="ignore", invalid="ignore"):
-        for k in range(len(drive) - 1):
-            states[k + 1] = a @ states[k] + drive[k]
-    finite = np.all(np.isfinite(states), axis=1)
-    if not np.all(finite):
+def _require_finite(states: FloatArray, advice: str, path: str) -> None:
+    """Raise `SpecError` where states ``(steps, ...)`` overflow."""
+    finite = np.isfinite(states).reshape(len(states), -1).all(axis=1)
+    if not finite.all():
         raise SpecError(
-            f"The states outgrow double precision at sample {int(np.argmin(finite))}: the plant is unstable; "
-            "simulate fewer steps.",
-            path="steps",
+            f"The states outgrow double precision at sample {int(np.argmin(finite))}: the plant is unstable; {advice}.",
+            path=path,
         )
-    return states
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,18 +149,8 @@ class Stepper:
         runs, nw)``.
         """
         drive = signals @ self.held.T + differences @ self.ramped.T + noise @ self.noisy.T
-        x = np.empty_like(drive)
-        x[0] = self.start
-        turned = np.ascontiguousarray(self.transition.T)
-        with np.errstate(over="ignore", invalid="ignore"):
-            for k in range(len(drive) - 1):
-                x[k + 1] = x[k] @ turned + drive[k]
-        finite = np.isfinite(x).all(axis=(1, 2))
-        if not finite.all():
-            raise SpecError(
-                f"The states outgrow double precision at sample {int(np.argmin(finite))}: the plant is unstable; "
-                "shorten the horizon, or set stabilise.", path="horizon",
-            )  # fmt: skip
+        x = driven(self.transition, self.start, drive)
+        _require_finite(x, "shorten the horizon, or set stabilise", "horizon")
 
         def seen(parts: tuple[FloatArray, FloatArray, FloatArray]) -> FloatArray:
             return np.asarray(x @ parts[0].T + signals @ parts[1].T + noise @ parts[2].T)
@@ -206,7 +167,7 @@ def make_stepper(plant: DescriptorSystem, drive: Drive, *, initial_state: FloatA
     elimination = eliminate_algebraic_states(plant)
     reduced, recovery = elimination.plant, elimination.recovery
     start = dynamic_part(plant, recovery, initial_state)
-    gain = _stabilising(reduced) if stabilise else None
+    gain = stabilising_feedback(reduced) if stabilise else None
     closing = np.zeros((reduced.nu, reduced.nx)) if gain is None else gain
     a = reduced.A - reduced.B @ closing
     inputs = np.hstack([reduced.B, reduced.Bf, reduced.Bd])
@@ -241,7 +202,7 @@ def _sampled_noise(
     return sampled.Bw, sampled.Dw, np.zeros((len(recovery.names), sampled.nw))
 
 
-def _stabilising(plant: DescriptorSystem) -> FloatArray:
+def stabilising_feedback(plant: DescriptorSystem) -> FloatArray:
     """Return the linear-quadratic state feedback with unit weights of a plant with ``E = I``."""
     from scipy.linalg import solve_continuous_are, solve_discrete_are
 

@@ -2,28 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.analysis.time_varying import algebraic_rows
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arguments import real_array, real_vector, whole_number
-from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
+from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.ranks import decide_rank
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
-
-
-@dataclass(frozen=True, eq=False)
-class VaryingTrajectory:
-    """A simulated record.
-
-    Fields: states: ``(samples, nx)``; outputs: ``(samples, ny)``; the first row is NaN: the model begins with y(1).
-    """
-
-    states: FloatArray
-    outputs: FloatArray
+from obsynth.simulation.trajectory import Trajectory
 
 
 def simulate_time_varying(
@@ -35,7 +23,7 @@ def simulate_time_varying(
     initial_state: ArrayLike | None = None,
     equation_noise: ArrayLike | None = None,
     output_noise: ArrayLike | None = None,
-) -> VaryingTrajectory:
+) -> Trajectory:
     """Simulate a plant whose algebraic equations (rows of E that are zero for every k) determine the rest of the state.
 
     Parameters
@@ -56,8 +44,8 @@ def simulate_time_varying(
 
     Returns
     -------
-    VaryingTrajectory
-        States and outputs.
+    Trajectory
+        States and outputs, and what drove them.
 
     Raises
     ------
@@ -83,7 +71,8 @@ def simulate_time_varying(
         equation_noise=mu[:, None],
         output_noise=nu[:, None],
     )
-    return VaryingTrajectory(read_only(states[:, 0]), read_only(outputs[:, 0]))
+    time = plant.dt * np.arange(samples, dtype=np.float64)
+    return Trajectory(states[:, 0], outputs[:, 0], inputs, theta, time=time)
 
 
 def varying_runs(

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from obsynth.errors import SpecError
+from obsynth.numerics.arguments import is_whole
 from obsynth.spec.documents import described
 
 if TYPE_CHECKING:
@@ -69,11 +70,11 @@ def checked_spec(document: Mapping[str, Any], source: Path) -> tuple[SpecDocumen
     if identifier == AUTO and isinstance(raw_options, dict) and checked is not None:
         problems.raise_if_any()
         return checked, _options_of_any(raw_options, source)
-    if isinstance(identifier, str) and identifier not in REGISTRY:
+    if isinstance(identifier, str) and identifier not in (*REGISTRY, AUTO):
         close = _suggestion(identifier, list(REGISTRY))
         known = ", ".join(sorted([*REGISTRY, AUTO]))
         problems.add("method.id", f"unknown method {identifier!r}; the known methods are: {known}.{close}")
-    elif isinstance(identifier, str) and isinstance(raw_options, dict):
+    elif isinstance(identifier, str) and identifier != AUTO and isinstance(raw_options, dict):
         options = _validated(options_schema(identifier), raw_options, problems, prefix="method.options")
     problems.raise_if_any()
     if checked is None or options is None:
@@ -123,7 +124,7 @@ def _check_version(document: Mapping[str, Any], problems: DocumentProblems) -> N
     from obsynth.spec.schema import SCHEMA_VERSION
 
     version = document.get("schema_version")
-    if isinstance(version, int) and not isinstance(version, bool) and version != SCHEMA_VERSION:
+    if is_whole(version) and version != SCHEMA_VERSION:
         problems.add("schema_version", f"version {version} is unknown; this obsynth reads version {SCHEMA_VERSION}.")
         problems.raise_if_any()
 

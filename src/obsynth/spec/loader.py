@@ -16,12 +16,12 @@ from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.simulation.failures import KINDS
-from obsynth.simulation.parameter_scenario_signals import check_recursive
 from obsynth.simulation.profiles import Profile
 from obsynth.simulation.scenario import Scenario
+from obsynth.simulation.scenario_signals import check_parameters
 from obsynth.spec.checking import DocumentProblems, checked_plant, checked_spec
 from obsynth.spec.documents import read_yaml
-from obsynth.spec.plants import built_plant, linearised, read_value, transformed
+from obsynth.spec.plants import built_plant, linearised, matlab_plant, read_value, transformed
 
 if TYPE_CHECKING:
     from obsynth.analysis.transformations import Transformation
@@ -52,7 +52,7 @@ def built_scenario(
             scenario.check_names(plant)
             scenario.step_of(plant)
         else:
-            check_recursive(plant, scenario)
+            check_parameters(plant, scenario)
     except SpecError as error:
         problems.add(f"scenario.{error.path}", str(error))
         problems.raise_if_any()
@@ -124,17 +124,24 @@ class Spec:
 
 def load_model(path: str | Path) -> tuple[DAEModel, Spec | None]:
     """Return the nonlinear plant of a spec, with the spec, or of a file that holds a plant alone."""
+    plant, spec = load_plant(path)
+    if not isinstance(plant, DAEModel):
+        raise SpecError(f"{path} holds no nonlinear plant (kind: dae).", path=str(path))
+    return plant, spec
+
+
+def load_plant(
+    path: str | Path,
+) -> tuple[DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel, Spec | None]:
+    """Return the plant of a spec as it was written, with the spec, or that of a file that holds a plant alone."""
     source = Path(path)
     document = read_yaml(source)
-    if "method" in document or "plant" in document:
-        spec = load_spec(source)
-        model = spec.model
-    else:
-        spec, found = None, built_plant(checked_plant(document, source), source, "")
-        model = found if isinstance(found, DAEModel) else None
-    if model is None:
-        raise SpecError(f"{source} holds no nonlinear plant (kind: dae).", path=str(source))
-    return model, spec
+    if "method" not in document and "plant" not in document:
+        return built_plant(checked_plant(document, source), source, ""), None
+    spec = load_spec(source)
+    if spec.model is not None:
+        return spec.model, spec
+    return spec.plant if spec.transformation is None else spec.transformation.source, spec
 
 
 def load_spec(path: str | Path) -> Spec:
@@ -168,7 +175,8 @@ def spec_of(document: Mapping[str, Any], source: Path, *, plant_changes: Mapping
     section: Any = checked.plant
     plant_source, prefix = source, "plant"
     reference = section if hasattr(section, "file") else None
-    if reference is not None:
+    from_mat = None if reference is None else matlab_plant(reference, source)
+    if reference is not None and from_mat is None:
         plant_source, prefix = source.parent / reference.file, ""
         plant_document = changed_document(read_yaml(plant_source, where="plant.file"), plant_changes or {})
         section = checked_plant(plant_document, plant_source)
@@ -178,7 +186,7 @@ def spec_of(document: Mapping[str, Any], source: Path, *, plant_changes: Mapping
         for name, value in raw_options.items()
     }
     problems.raise_if_any()
-    plant, transformation = built_plant(section, plant_source, prefix), None
+    plant, transformation = built_plant(section, plant_source, prefix) if from_mat is None else from_mat, None
     # A plant may serve several methods: the spec's own transform takes the place of the plant's.
     asked: tuple[TransformSection | None, Path, str] = (getattr(section, "transform", None), plant_source, prefix)
     if reference is not None and reference.transform is not None:

@@ -163,6 +163,10 @@ SPARSE_FROM = 300
 ENTRIES_PER_LINE = 1000
 
 
+#: Whole numbers with more digits are damage.
+MOST_DIGITS = 15
+
+
 def read_matrix_market(path: Path, *, maximum_entries: int, keep_sparse: bool = False) -> Any:
     """Return the matrix in a Matrix Market file: an array, or a CSR array of a large one that may stay sparse."""
     with path.open(encoding="utf-8") as stream:
@@ -220,9 +224,7 @@ def _from_coordinates(tokens: list[str], size: tuple[int, int, int], field: str,
     rows, columns, stored = size
     width = 2 if field == "pattern" else 3
     _require_count(len(tokens), width * stored)
-    positions = [
-        np.array([_whole(token, "an index") for token in tokens[k::width]], dtype=np.int64) - 1 for k in (0, 1)
-    ]
+    positions = [_indices(tokens[k::width]) - 1 for k in (0, 1)]
     for position, limit in zip(positions, (rows, columns), strict=True):
         if np.any(position < 0) or np.any(position >= limit):
             raise ValueError("an index is outside the matrix")
@@ -257,11 +259,17 @@ def _mirrored(lower: FloatArray, symmetry: str) -> FloatArray:
 
 
 def _numbers(tokens: list[str]) -> FloatArray:
-    return np.fromiter((float(token) for token in tokens), dtype=np.float64, count=len(tokens))
+    return np.fromiter(map(float, tokens), dtype=np.float64, count=len(tokens))
+
+
+def _indices(tokens: list[str]) -> Any:
+    if not all(map(str.isdecimal, tokens)) or max(map(len, tokens), default=0) > MOST_DIGITS:
+        return np.array([_whole(token, "an index") for token in tokens], dtype=np.int64)
+    return np.fromiter(map(int, tokens), dtype=np.int64, count=len(tokens))
 
 
 def _whole(token: str, what: str) -> int:
-    if not token.isdecimal() or len(token) > 15:
+    if not token.isdecimal() or len(token) > MOST_DIGITS:
         raise ValueError(f"{what} must be whole numbers, not {token[:20]!r}")
     return int(token)
 

@@ -12,10 +12,11 @@ from obsynth.analysis.diagnosis.banks import residual_bank
 from obsynth.analysis.diagnosis.columns import Question, decided_exactly
 from obsynth.analysis.diagnosis.hidden_motions import hidden_motion
 from obsynth.analysis.diagnosis.verdicts import Diagnosis, FaultDiagnosis
+from obsynth.analysis.transformations.recovery import Transformation, linear_plant
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import is_finite_number, require_kind
+from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.pencils import pencil_structure
-from obsynth.numerics.threads import one_thread_if_small
+from obsynth.numerics.threads import on_one_thread_if_small
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.exosystems import Exosystem, exosystem
 from obsynth.plants.fault_models import stated_eigenvalues
@@ -24,8 +25,9 @@ from obsynth.plants.fault_models import stated_eigenvalues
 MOST_ZEROS = 4
 
 
+@on_one_thread_if_small
 def diagnose(
-    plant: DescriptorSystem,
+    plant: DescriptorSystem | Transformation,
     *,
     fault_model: Any = "step",
     frequencies: Sequence[float] = (),
@@ -40,7 +42,7 @@ def diagnose(
 
     Parameters
     ----------
-    plant : DescriptorSystem
+    plant : DescriptorSystem or Transformation
         ``E, A (nx, nx)``, ``C (ny, nx)``, ``Bf (nx, nf)``, ``Bd (nx, nd)``, ``Df, Dd`` allowed.  Where ``sE - A`` is
         not regular, the verdicts are about all trajectories that satisfy the equations, and a warning says so.
     fault_model : str, mapping or FaultModel, optional
@@ -67,23 +69,22 @@ def diagnose(
     .. [Varga] A. Varga, Solving Fault Diagnosis Problems, Springer 2017: fault detectability, weak and strong, and
        isolability.  Here all of it is read from one reduction of a pencil, and decided exactly where that can be.
     """
-    require_kind(plant, DescriptorSystem, "plant", "an obsynth.DescriptorSystem")
+    plant = linear_plant(plant)
     if not all(is_finite_number(value) and value >= 0.0 for value in frequencies):
         raise SpecError(f"frequencies is {list(frequencies)!r}: give numbers in rad/s, 0 or more.", path="frequencies")
     model = exosystem(fault_model, plant.fault_names, plant.dt)
     report_stage = progress or (lambda _: None)
     exactly = decided_exactly(plant)
-    with one_thread_if_small(plant.nx):
-        report_stage("asking what shows each fault")
-        shown = [Question(plant, (), i, exactly) for i in range(plant.nf)]
-        free = [Question(plant, _others(plant, i), i, exactly) for i in range(plant.nf)]
-        faults = tuple(
-            _verdict(plant, own, alone, frequencies, model_points(model, i), suggest=suggest)
-            for i, (own, alone) in enumerate(zip(shown, free, strict=True))
-        )
-        report_stage("telling faults from each other")
-        weak, strong, pairs = _isolability(plant, shown, exactly)
-        bank = residual_bank(plant, exactly)
+    report_stage("asking what shows each fault")
+    shown = [Question(plant, (), i, exactly) for i in range(plant.nf)]
+    free = [Question(plant, _others(plant, i), i, exactly) for i in range(plant.nf)]
+    faults = tuple(
+        _verdict(plant, own, alone, frequencies, model_points(model, i), suggest=suggest)
+        for i, (own, alone) in enumerate(zip(shown, free, strict=True))
+    )
+    report_stage("telling faults from each other")
+    weak, strong, pairs = _isolability(plant, shown, exactly)
+    bank = residual_bank(plant, exactly)
     return Diagnosis(
         faults, weak, strong, bank, plant.disturbance_names, "; ".join(dict.fromkeys(model.descriptions)), exactly,
         _warnings(plant, [*shown, *free, *pairs]),

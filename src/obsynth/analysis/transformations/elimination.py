@@ -22,6 +22,7 @@ from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
 from obsynth.numerics.scaling import equilibrate_pencil, power_of_two_below
 from obsynth.numerics.sparse import is_sparse
+from obsynth.numerics.threads import one_thread_if_small
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.origin import note_source, with_origin
 from obsynth.plants.uncertainty import ELIMINATED
@@ -32,12 +33,12 @@ MANY_VARIABLES = 500
 SPARSE_SHARE = 0.05
 
 
-def eliminate_algebraic_states(plant: DescriptorSystem) -> Transformation:
+def eliminate_algebraic_states(plant: DescriptorSystem | Transformation) -> Transformation:
     """Solve the algebraic equations of an index-1 plant, so that ``E = I``.
 
     Parameters
     ----------
-    plant : DescriptorSystem
+    plant : DescriptorSystem or Transformation
         Regular, index 0 or 1, either time, but for variables that act on no state and no output.
 
     Returns
@@ -59,13 +60,16 @@ def eliminate_algebraic_states(plant: DescriptorSystem) -> Transformation:
     where data were computed, results so small beside the terms they come from that they are only rounding are set to
     zero: the flags of the recovery depend on what is exactly zero.
     """
+    if isinstance(plant, Transformation):
+        return plant.then(eliminate_algebraic_states(plant.plant))
     if _is_identity(plant.E):
         same = plant.dense()
         return Transformation(plant, same, "", unchanged_states(plant, same, from_state=np.eye(plant.nx)))
-    if plant.nx > MOST_STATES and (plant.is_sparse or _has_few_entries(plant)):
-        return eliminated_by_sparsity(plant)
-    arrays = plant.dense()
-    found = eliminated_exactly(arrays) or _eliminated_in_floating_point(arrays)
+    with one_thread_if_small(plant.nx):
+        if plant.nx > MOST_STATES and (plant.is_sparse or _has_few_entries(plant)):
+            return eliminated_by_sparsity(plant)
+        arrays = plant.dense()
+        found = eliminated_exactly(arrays) or _eliminated_in_floating_point(arrays)
     if not found.dropped:
         found = found.with_tolerances(ELIMINATED)
     note_source(arrays, found.plant)

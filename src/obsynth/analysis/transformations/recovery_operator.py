@@ -12,7 +12,7 @@ import numpy as np
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
 from obsynth.numerics.sparse import csr
-from obsynth.numerics.sparse_factor import SparseFactor
+from obsynth.numerics.sparse_factor import SAMPLED, SAMPLES, SparseFactor
 
 #: Signals in the order in which they stand in the algebraic equations.
 SIGNALS = ("state", "input", "fault", "disturbance", "noise")
@@ -142,6 +142,16 @@ def without_rounding(factor: SparseFactor, solution: FloatArray) -> FloatArray:
         return solution
     found = solution.copy()
     part = np.ix_(rows, columns)
+    if len(rows) > SAMPLES * len(columns):
+        # Many rows: almost all of them are decided by an estimate.
+        usual = CANCELLATION_TOLERANCE * factor.usual_size_of_terms(solution[:, columns])[rows]
+        nothing = np.abs(solution[part]) <= usual / SAMPLED
+        found[part] = np.where(nothing, 0.0, solution[part])
+        open_still = ~nothing & (np.abs(solution[part]) <= usual * SAMPLED * np.sqrt(factor.size))
+        rows = rows[open_still.any(axis=1)]
+        if not rows.size:
+            return found
+        part = np.ix_(rows, columns)
     terms = factor.size_of_terms(solution[:, columns], rows)
-    found[part] = np.where(np.abs(solution[part]) > CANCELLATION_TOLERANCE * terms, solution[part], 0.0)
+    found[part] = np.where(np.abs(solution[part]) > CANCELLATION_TOLERANCE * terms, found[part], 0.0)
     return found

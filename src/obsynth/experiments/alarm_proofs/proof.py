@@ -22,7 +22,7 @@ from obsynth.experiments.monitors.adaptive_bound import adaptive_bound
 from obsynth.experiments.monitors.adaptive_monitor import start_of
 from obsynth.experiments.monitors.adaptive_record import thresholds_of_records
 from obsynth.files.outputs import FileKind, write_atomically
-from obsynth.numerics.arguments import is_finite_number
+from obsynth.numerics.arguments import is_finite_number, is_whole
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.names import index_of
 from obsynth.results.design import ObserverDesign
@@ -100,6 +100,10 @@ def document(certificate: Mapping[str, Any]) -> str:
 WINDOW = 20
 
 
+#: The solver of linear programmes may take so long; without an answer nothing is proved.
+SOLVER_SECONDS = 60.0
+
+
 #: Multipliers are kept to this many significant digits: any numbers prove a bound, and few digits stay readable.
 MULTIPLIER_DIGITS = 12
 
@@ -117,7 +121,7 @@ class AlarmProof:
     window : int
         Samples of the window.
     margin : float
-        Proved lower bound of what all bounds would have to be exceeded by, in the signals' units; 0 or less: no proof.
+        Proved lower bound of the share by which all bounds at once would have to be exceeded; 0 or less: no proof.
     statement : str
         What is proved, or why it cannot be.
     origin : str
@@ -222,7 +226,7 @@ class Question:
         plant, _ = design.linear
         if not plant.is_discrete:
             raise SpecError("A window is proved for sampled designs: this one is continuous in time.", path="gains")
-        if isinstance(window, bool) or not isinstance(window, int) or window < 2:
+        if not is_whole(window) or window < 2:
             raise SpecError(f"window is {window!r}: give a whole number of samples, 2 or more.", path="window")
         bounds = np.full(plant.nd, np.nan)
         for name, value in (disturbance_bounds or {}).items():
@@ -271,7 +275,7 @@ def solved(programme: Window) -> tuple[FloatArray, FloatArray] | None:
     given = {"A_eq": equal, "b_eq": programme.equal.right} if programme.equal.right else {}
     found = linprog(
         cost, A_ub=below, b_ub=programme.below.right, bounds=np.stack([programme.lower, programme.upper], axis=1),
-        method="highs", **given,
+        method="highs", options={"time_limit": SOLVER_SECONDS}, **given,
     )  # fmt: skip
     if found.status != 0:
         return None

@@ -1,13 +1,15 @@
 """The linear programme of a window: states, disturbances and constants that explain its data without a fault.
 
 Products of a constant and a state are variables of their own, between the planes of McCormick on bounds of the state.
-``t >= 0`` relaxes every inequality: where its least value is above zero, nothing explains the data.
+``t >= 0`` relaxes every inequality: where its least value is above zero, nothing explains the data.  Variables and rows
+are scaled to about one, by powers of two, which changes no number; t is a share of the bounds.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fractions import Fraction
 
 import numpy as np
@@ -15,7 +17,7 @@ import numpy as np
 from obsynth.analysis.transformations.uncertain_plant import AffinePlant
 from obsynth.numerics.arrays import FloatArray
 
-#: The largest value of t that is of interest.
+#: The largest value of t that is of interest, in bounds of the variables.
 LARGEST_RELAXATION = 1e3
 #: Bounds of the state are widened by this share: more than rounding can take from them.
 OUTWARD = 1e-9
@@ -23,18 +25,27 @@ OUTWARD = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Sparse rows ``sum value * variable (= or <=) right``: lists of columns and values, and right sides."""
+    """Sparse rows ``sum value * variable (= or <=) right``: lists of columns and values, and right sides.
 
-    columns: list[list[int]]
-    values: list[list[float]]
-    right: list[float]
+    ``scales (variables,)``: powers of two in which the variables are counted; the last one is t.
+    """
 
-    def add(self, entries: Mapping[int, float], right: float) -> None:
-        """Append a row."""
-        kept = {column: value for column, value in entries.items() if value != 0.0}
-        self.columns.append(list(kept))
-        self.values.append([float(value) for value in kept.values()])
-        self.right.append(float(right))
+    scales: FloatArray
+    columns: list[list[int]] = field(default_factory=list)
+    values: list[list[float]] = field(default_factory=list)
+    right: list[float] = field(default_factory=list)
+
+    def add(self, entries: Mapping[int, float], right: float, *, relaxed: bool = False) -> None:
+        """Append a row for variables in their own units; t relaxes it by its largest entry."""
+        kept = {column: float(value * self.scales[column]) for column, value in entries.items() if value != 0.0}
+        unit = _power_of_two(max((abs(value) for value in kept.values()), default=1.0))
+        columns, values = list(kept), [value / unit for value in kept.values()]
+        if relaxed:
+            columns.append(len(self.scales) - 1)
+            values.append(-1.0)
+        self.columns.append(columns)
+        self.values.append(values)
+        self.right.append(float(right) / unit)
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,23 +133,37 @@ def window_programme(plant: AffinePlant, bounds: FloatArray, data: WindowData) -
     ]  # fmt: skip
     at = _Variables(steps, n, bd.shape[1], p, len(pairs), varying=plant.box.variation == "varying")
     size = np.maximum(np.abs(data.low), np.abs(data.high))
-    equal, below = Rows([], [], []), Rows([], [], [])
+    scales = _scales(at, size, bounds, [j for _, j in pairs])
+    equal, below = Rows(scales), Rows(scales)
     builder = _Builder(plant, at, pairs, data, size, bounds, bd, dd)
     for k in range(steps):
         builder.dynamics(k, equal, below)
         builder.outputs(k, below)
         builder.products(k, below)
         builder.state(k, below)
-    lower, upper = np.zeros(at.count), np.zeros(at.count)
     # The bounds of the state are rows that t relaxes; the variables themselves have room for that.
-    lower[: at.d], upper[: at.d] = (data.low - LARGEST_RELAXATION).ravel(), (data.high + LARGEST_RELAXATION).ravel()
-    upper[at.d : at.q] = np.tile(bounds, steps)
+    upper = np.full(at.count, LARGEST_RELAXATION)
+    upper[at.d : at.q] = np.tile(bounds, steps) / scales[at.d : at.q]
     upper[at.q : at.products] = 1.0
-    sizes = [size[k, [j for _, j in pairs]] for k in range(steps)]
-    upper[at.products : at.t] = np.concatenate(sizes) + LARGEST_RELAXATION
-    lower[at.d : at.t] = -upper[at.d : at.t]
-    upper[at.t] = LARGEST_RELAXATION
+    lower = -upper
+    lower[at.t] = 0.0
     return Window(equal, below, lower, upper)
+
+
+def _scales(at: _Variables, size: FloatArray, bounds: FloatArray, states: list[int]) -> FloatArray:
+    """Return powers of two near the bounds of the variables; those of a state are the same at all samples."""
+    steps, largest = len(size), size.max(axis=0, initial=0.0)
+    least = float(min(largest[largest > 0.0], default=1.0))
+    own = np.array([_power_of_two(value if value > 0.0 else least) for value in largest])
+    found = np.ones(at.count)
+    found[: at.d] = np.tile(own, steps)
+    found[at.d : at.q] = np.tile([_power_of_two(value if value > 0.0 else 1.0) for value in bounds], steps)
+    found[at.products : at.t] = np.tile(own[states], steps)
+    return found
+
+
+def _power_of_two(value: float) -> float:
+    return math.ldexp(1.0, math.frexp(value)[1])
 
 
 def _with_noise(plant: AffinePlant) -> tuple[FloatArray, FloatArray]:
@@ -200,15 +225,14 @@ class _Builder:
             loose += 1e-15 * float(abs(data.y[k, r]) + plant.D.magnitude[r] @ np.abs(data.u[k]))
             for sign in (1.0, -1.0):
                 row = {column: sign * value for column, value in entries.items()}
-                row[at.t] = -1.0
-                below.add(row, sign * right + loose)
+                below.add(row, sign * right + loose, relaxed=True)
 
     def state(self, k: int, below: Rows) -> None:
         """Add the bounds of the state, relaxed by t."""
         for i in range(self.at.n):
             place = self.at.state(k, i)
-            below.add({place: 1.0, self.at.t: -1.0}, float(self.data.high[k, i]))
-            below.add({place: -1.0, self.at.t: -1.0}, -float(self.data.low[k, i]))
+            below.add({place: 1.0}, float(self.data.high[k, i]), relaxed=True)
+            below.add({place: -1.0}, -float(self.data.low[k, i]), relaxed=True)
 
     def products(self, k: int, below: Rows) -> None:
         """Add the four planes of McCormick of each product, relaxed by t."""
@@ -216,8 +240,8 @@ class _Builder:
         for j, (i, c) in enumerate(self.pairs):
             low, high = float(data.low[k, c]), float(data.high[k, c])
             for q, s, sign in ((-1.0, low, -1.0), (1.0, high, -1.0), (1.0, low, 1.0), (-1.0, high, 1.0)):
-                row = {at.product(k, j): sign, at.state(k, c): -sign * q, at.constant(k, i): -sign * s, at.t: -1.0}
-                below.add(row, -sign * q * s)
+                row = {at.product(k, j): sign, at.state(k, c): -sign * q, at.constant(k, i): -sign * s}
+                below.add(row, -sign * q * s, relaxed=True)
 
     def _between(self, equal: Rows, below: Rows, entries: Mapping[int, float], right: float, loose: float) -> None:
         if loose == 0.0:

@@ -73,7 +73,7 @@ def _first_of_some(bound: AdaptiveBound, v: FloatArray) -> tuple[FloatArray, Flo
     flat = np.ascontiguousarray(v).reshape(-1, nv)
     into = flat @ np.ascontiguousarray(bound.drive[:, :nz]).reshape(-1, nv).T
     seen = (flat @ np.ascontiguousarray(bound.drive[:, nz:]).reshape(-1, nv).T).reshape(-1, rows + no)
-    psi = _filtered(bound.structure.Az, into.reshape(runs, steps, p, nz))
+    psi = filtered(bound.structure.Az, into.reshape(runs, steps, p, nz))
     seen += psi.reshape(-1, nz) @ bound.shown.T
     whole = seen.reshape(runs, steps, p, rows + no)
     offsets = bound.structure.offsets
@@ -90,7 +90,7 @@ def _seen(bound: AdaptiveBound, values: FloatArray) -> FloatArray:
     return np.moveaxis(bound.structure.seen(np.moveaxis(values, -1, 0)), 0, -1)
 
 
-def _filtered(az: FloatArray, w: FloatArray) -> FloatArray:
+def filtered(az: FloatArray, w: FloatArray) -> FloatArray:
     """Return ``psi(k+1) = Az psi(k) + w(k)`` from zero, ``(runs, steps, p, nz)``; blocks side by side."""
     runs, steps, p, nz = w.shape
     size = max(1, int(np.sqrt(steps)))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -14,9 +15,10 @@ from obsynth.experiments.monitors.adaptive_bound import THRESHOLD_ROUNDING
 from obsynth.experiments.monitors.adaptive_monitor import adaptive_plan, adaptive_statement
 from obsynth.experiments.monitors.adaptive_record import thresholds_of_records
 from obsynth.experiments.monitors.adaptive_rule import AdaptivePlan, record_columns
+from obsynth.experiments.monitors.adaptive_screening import Records, Screening, first_passed
 from obsynth.experiments.monitors.monitor import Detection, Monitor
 from obsynth.numerics.arrays import FloatArray
-from obsynth.observers.linear.observer import Estimates
+from obsynth.observers.estimates import Estimates
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario
 from obsynth.simulation.scenario_signals import resolve
@@ -64,7 +66,11 @@ class AdaptiveMonitor(Monitor):
             raise SpecError("An adaptive monitor needs a plan: use obsynth.monitor.", path="plan")
         return self.plan
 
-    def passed_in(self, runs: Runs, residuals: slice) -> np.ndarray:
+    @cached_property
+    def _screening(self) -> Screening:
+        return Screening.of(self._plan)
+
+    def passed_in(self, runs: Runs, residuals: slice, *, onset: int | None = None) -> np.ndarray:
         """Return at which samples of which runs a threshold is passed, ``(steps, runs)``.
 
         Parameters
@@ -73,31 +79,57 @@ class AdaptiveMonitor(Monitor):
             What happened.
         residuals : slice
             Rows of the observer that are residuals.
+        onset : int, optional
+            First sample at which something is wrong; with it, only whether a run passes before that, and where it
+            passes first after that, are right.
         """
         plan = self._plan
-        no = plan.bound.counts[4]
+        no, m = plan.bound.counts[4], plan.bound.counts[3]
         values = np.abs(runs.rows[:, :, runs.rows.shape[2] - no :])
         norm = self.statistic(runs.rows[:, :, residuals])
         # No threshold over the box is below the nominal one: runs that never pass that need no other.
-        m = plan.bound.counts[3]
         start = np.array([plan.bound.start_at(k)[m:] for k in range(len(values))])
-        beyond = (values > (plan.bound.nominal[m:] + start)[:, None]).any(axis=(0, 2))
         begun = np.linalg.norm(start[:, plan.residuals], axis=1) if plan.start_beyond_nominal else 0.0
-        beyond |= (norm > (self.threshold + begun)[:, None] + self.floor).any(axis=0)
+        candidates = (values > (plan.bound.nominal[m:] + start)[:, None]).any(axis=2)
+        candidates |= norm > (self.threshold + begun)[:, None] + self.floor
+        if onset is None or plan.bound.varying:
+            return self._all_passed(runs, values, norm, candidates, len(values))
         passed = np.zeros(norm.shape, dtype=bool)
-        chosen = np.flatnonzero(beyond)
+        chosen = np.flatnonzero(candidates.any(axis=0))
         if not len(chosen):
             return passed
-        rows, inputs, outputs = _by_run(runs, chosen)
+        reading = plan.bound.structure.reading
+        records = Records(runs.rows[:, chosen] @ reading.T, runs.inputs[:, chosen], runs.outputs[:, chosen],
+                          values[:, chosen], norm[:, chosen], self.threshold + self.floor)  # fmt: skip
+        sure, left = first_passed(self._screening, records, candidates[:, chosen], onset)
+        passed[:, chosen] = sure
+        if left.any():
+            undecided = np.zeros_like(passed)
+            undecided[:, chosen] = left
+            length = int(np.flatnonzero(left.any(axis=1))[-1]) + 1
+            passed |= self._all_passed(runs, values, norm, undecided, length)
+        return passed
+
+    def _all_passed(
+        self, runs: Runs, values: FloatArray, norm: FloatArray, candidates: np.ndarray, length: int
+    ) -> np.ndarray:
+        """Compute the thresholds of runs with candidates in full, up to a number of samples."""
+        plan = self._plan
+        passed = np.zeros(norm.shape, dtype=bool)
+        chosen = np.flatnonzero(candidates.any(axis=0))
+        if not len(chosen):
+            return passed
+        rows, inputs, outputs = (item[:, :length] for item in _by_run(runs, chosen))
         found = thresholds_of_records(plan.bound, rows @ plan.bound.structure.reading.T, inputs, outputs)
         at = plan.residuals
         parts = [found.shift[..., at], found.rest[..., at], *np.moveaxis(found.first[..., at], 2, 0)]
         if plan.start_beyond_nominal:
             parts.append(found.start[..., at])
         beside = sum(np.linalg.norm(part, axis=2) for part in parts) + np.linalg.norm(plan.bound.more[at])
-        limit = (self.threshold[:, None] + self.floor + np.asarray(beside).T) * THRESHOLD_ROUNDING
-        passed[:, chosen] = (norm[:, chosen] > limit) | (values[:, chosen] > np.moveaxis(found.total, 0, 1)).any(axis=2)
-        return passed
+        limit = (self.threshold[:length, None] + self.floor + np.asarray(beside).T) * THRESHOLD_ROUNDING
+        beyond = (values[:length, chosen] > np.moveaxis(found.total, 0, 1)).any(axis=2)
+        passed[:length, chosen] = (norm[:length, chosen] > limit) | beyond
+        return np.asarray(passed & candidates)
 
     def watch(self, estimates: Estimates) -> Detection:
         """Refuse: the threshold needs the record of inputs and outputs.

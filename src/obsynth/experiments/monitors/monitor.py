@@ -10,7 +10,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, read_only
-from obsynth.observers.linear.observer import Estimates
+from obsynth.observers.estimates import Estimates
 
 KINDS = ("paper", "pointwise", "window", "chi-square", "cusum")
 STATEMENTS: Mapping[str, str] = {
@@ -170,7 +170,7 @@ class Monitor:
         """
         return np.asarray(self.statistic(residuals) > self.threshold[:, None] + self.floor)
 
-    def passed_in(self, runs: Any, residuals: slice) -> np.ndarray:
+    def passed_in(self, runs: Any, residuals: slice, *, onset: int | None = None) -> np.ndarray:
         """Return the same from everything that happened in many runs.
 
         Parameters
@@ -179,7 +179,11 @@ class Monitor:
             With `rows` of the observer ``(steps, runs, rows)``.
         residuals : slice
             Which of them are residuals.
+        onset : int, optional
+            First sample at which something is wrong; with it, only whether a run passes before that, and where it
+            passes first after that, need be right.
         """
+        del onset
         return self.passed(runs.rows[:, :, residuals])
 
     def isolated(self, faults: FloatArray, k: int) -> int:

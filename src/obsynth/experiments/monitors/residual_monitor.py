@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.experiments.batch_simulation import Bench, make_bench
+from obsynth.experiments.batch_simulation import LinearBench, make_bench
 from obsynth.experiments.monitors.adaptive_monitor import EXACT, tolerances_of
 from obsynth.experiments.monitors.monitor import KINDS, Monitor, statement_of
 from obsynth.experiments.monitors.residual_model import ResidualModel, residual_model, watches_estimates
@@ -20,7 +20,7 @@ from obsynth.experiments.monitors.thresholds import (
     window_threshold,
 )
 from obsynth.experiments.monitors.whitening import cusum_whitener, settled, steady_mean, whitener_of, window_covariance
-from obsynth.numerics.arguments import is_finite_number, require_kind, require_mapping
+from obsynth.numerics.arguments import is_finite_number, is_whole, require_kind, require_mapping
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.names import index_of
 from obsynth.results.design import ObserverDesign
@@ -161,7 +161,7 @@ def require_options(
         if value is not None and not (is_finite_number(value) and value >= 0.0):
             raise SpecError(f"{name} is {value!r}: give a number, 0 or more.", path=name)
     for name, count, least in (("window", window, 1), ("isolation_delay", isolation_delay, 0)):
-        if isinstance(count, bool) or not isinstance(count, int) or count < least:
+        if not is_whole(count) or count < least:
             raise SpecError(f"{name} is {count!r}: give a whole number of samples, {least} or more.", path=name)
     if not (is_finite_number(false_alarms) and 0.0 < false_alarms < 1.0):
         raise SpecError(f"false_alarms is {false_alarms!r}: give a probability between 0 and 1.", path="false_alarms")
@@ -202,7 +202,7 @@ def _statistical(
     return threshold
 
 
-def _floor(bench: Bench, scenario: Scenario, rows: slice) -> float:
+def _floor(bench: LinearBench, scenario: Scenario, rows: slice) -> float:
     """Return what rounding may add to the norm of the residual, from the size of what it is made of."""
     runs = bench.run([scenario.seed])
     size = (

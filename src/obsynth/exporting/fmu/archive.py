@@ -62,7 +62,7 @@ def write_fmu(
     wrapper = f"fmi{version[0]}.c"
     sources = {f"{_PREFIX}.c": texts[0], f"{_PREFIX}.h": texts[1], "layout.h": _layout(design, model)}
     folder = files("obsynth.exporting.fmu")
-    sources |= {name: folder.joinpath(name).read_text(encoding="utf-8") for name in ("instance.h", wrapper)}
+    sources |= {name: folder.joinpath(name).read_text(encoding="utf-8") for name in ("instance.h", "common.h", wrapper)}
     compiled = [f"{_PREFIX}.c", wrapper]
     content: dict[str, bytes] = {f"sources/{name}": text.encode() for name, text in sources.items()}
     if version == "2.0":

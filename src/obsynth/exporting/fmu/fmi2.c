@@ -23,31 +23,20 @@ typedef struct {
     fmi2ComponentEnvironment componentEnvironment;
 } fmi2CallbackFunctions;
 
+#define FMI(name) fmi2##name
+#define OF_STATE(before, after) fmi2##before##FMUstate##after
+#define DESERIALIZED fmi2DeSerializeFMUstate
+#include "common.h"
+
 EXPORTED const char *fmi2GetTypesPlatform(void) { return "default"; }
 EXPORTED const char *fmi2GetVersion(void) { return "2.0"; }
-
-EXPORTED fmi2Status fmi2SetDebugLogging(fmi2Component c, fmi2Boolean on, size_t n, const fmi2String categories[])
-{
-    (void)c; (void)on; (void)n; (void)categories;
-    return fmi2OK;
-}
 
 EXPORTED fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String token, fmi2String resources,
                                        const fmi2CallbackFunctions *functions, fmi2Boolean visible, fmi2Boolean logging)
 {
-    instance *m;
     (void)name; (void)resources; (void)functions; (void)visible; (void)logging;
-    if (type != fmi2CoSimulation || token == NULL || strcmp(token, TOKEN) != 0) {
-        return NULL;
-    }
-    m = calloc(1, sizeof *m);
-    if (m != NULL) {
-        begin(m);
-    }
-    return m;
+    return type == fmi2CoSimulation ? made(token) : NULL;
 }
-
-EXPORTED void fmi2FreeInstance(fmi2Component c) { free(c); }
 
 EXPORTED fmi2Status fmi2SetupExperiment(fmi2Component c, fmi2Boolean has_tolerance, fmi2Real tolerance, fmi2Real start,
                                         fmi2Boolean has_stop, fmi2Real stop)
@@ -60,9 +49,6 @@ EXPORTED fmi2Status fmi2SetupExperiment(fmi2Component c, fmi2Boolean has_toleran
 }
 
 EXPORTED fmi2Status fmi2EnterInitializationMode(fmi2Component c) { (void)c; return fmi2OK; }
-EXPORTED fmi2Status fmi2ExitInitializationMode(fmi2Component c) { show_start(c); return fmi2OK; }
-EXPORTED fmi2Status fmi2Terminate(fmi2Component c) { (void)c; return fmi2OK; }
-EXPORTED fmi2Status fmi2Reset(fmi2Component c) { begin(c); return fmi2OK; }
 
 EXPORTED fmi2Status fmi2GetReal(fmi2Component c, const fmi2ValueReference vr[], size_t n, fmi2Real value[])
 {
@@ -181,56 +167,4 @@ EXPORTED fmi2Status fmi2GetDirectionalDerivative(fmi2Component c, const fmi2Valu
 {
     (void)c; (void)unknown; (void)n_unknown; (void)known; (void)n_known; (void)seed; (void)value;
     return fmi2Error;
-}
-
-EXPORTED fmi2Status fmi2GetFMUstate(fmi2Component c, fmi2FMUstate *state)
-{
-    if (*state == NULL) {
-        *state = calloc(1, sizeof(instance));
-    }
-    if (*state == NULL) {
-        return fmi2Error;
-    }
-    memcpy(*state, c, sizeof(instance));
-    return fmi2OK;
-}
-
-EXPORTED fmi2Status fmi2SetFMUstate(fmi2Component c, fmi2FMUstate state)
-{
-    memcpy(c, state, sizeof(instance));
-    return fmi2OK;
-}
-
-EXPORTED fmi2Status fmi2FreeFMUstate(fmi2Component c, fmi2FMUstate *state)
-{
-    (void)c;
-    free(*state);
-    *state = NULL;
-    return fmi2OK;
-}
-
-EXPORTED fmi2Status fmi2SerializedFMUstateSize(fmi2Component c, fmi2FMUstate state, size_t *size)
-{
-    (void)c; (void)state;
-    *size = sizeof(instance);
-    return fmi2OK;
-}
-
-EXPORTED fmi2Status fmi2SerializeFMUstate(fmi2Component c, fmi2FMUstate state, fmi2Byte bytes[], size_t size)
-{
-    (void)c;
-    if (size < sizeof(instance)) {
-        return fmi2Error;
-    }
-    memcpy(bytes, state, sizeof(instance));
-    return fmi2OK;
-}
-
-EXPORTED fmi2Status fmi2DeSerializeFMUstate(fmi2Component c, const fmi2Byte bytes[], size_t size, fmi2FMUstate *state)
-{
-    if (size != sizeof(instance) || fmi2GetFMUstate(c, state) != fmi2OK) {
-        return fmi2Error;
-    }
-    memcpy(*state, bytes, sizeof(instance));
-    return fmi2OK;
 }

@@ -33,13 +33,12 @@ typedef void (*fmi3UnlockPreemptionCallback)(void);
 typedef void (*fmi3IntermediateUpdateCallback)(fmi3InstanceEnvironment, fmi3Float64, fmi3Boolean, fmi3Boolean,
                                                fmi3Boolean, fmi3Boolean, fmi3Boolean *, fmi3Float64 *);
 
-EXPORTED const char *fmi3GetVersion(void) { return "3.0"; }
+#define FMI(name) fmi3##name
+#define OF_STATE(before, after) fmi3##before##FMUState##after
+#define DESERIALIZED fmi3DeserializeFMUState
+#include "common.h"
 
-EXPORTED fmi3Status fmi3SetDebugLogging(fmi3Instance c, fmi3Boolean on, size_t n, const fmi3String categories[])
-{
-    (void)c; (void)on; (void)n; (void)categories;
-    return fmi3OK;
-}
+EXPORTED const char *fmi3GetVersion(void) { return "3.0"; }
 
 EXPORTED fmi3Instance fmi3InstantiateModelExchange(fmi3String name, fmi3String token, fmi3String resources,
                                                    fmi3Boolean visible, fmi3Boolean logging,
@@ -55,17 +54,9 @@ EXPORTED fmi3Instance fmi3InstantiateCoSimulation(fmi3String name, fmi3String to
                                                   fmi3InstanceEnvironment environment, fmi3LogMessageCallback log,
                                                   fmi3IntermediateUpdateCallback update)
 {
-    instance *m;
     (void)name; (void)resources; (void)visible; (void)logging; (void)events; (void)early; (void)required; (void)n;
     (void)environment; (void)log; (void)update;
-    if (token == NULL || strcmp(token, TOKEN) != 0) {
-        return NULL;
-    }
-    m = calloc(1, sizeof *m);
-    if (m != NULL) {
-        begin(m);
-    }
-    return m;
+    return made(token);
 }
 
 EXPORTED fmi3Instance fmi3InstantiateScheduledExecution(fmi3String name, fmi3String token, fmi3String resources,
@@ -80,8 +71,6 @@ EXPORTED fmi3Instance fmi3InstantiateScheduledExecution(fmi3String name, fmi3Str
     return NULL;
 }
 
-EXPORTED void fmi3FreeInstance(fmi3Instance c) { free(c); }
-
 EXPORTED fmi3Status fmi3EnterInitializationMode(fmi3Instance c, fmi3Boolean has_tolerance, fmi3Float64 tolerance,
                                                 fmi3Float64 start, fmi3Boolean has_stop, fmi3Float64 stop)
 {
@@ -92,10 +81,7 @@ EXPORTED fmi3Status fmi3EnterInitializationMode(fmi3Instance c, fmi3Boolean has_
     return fmi3OK;
 }
 
-EXPORTED fmi3Status fmi3ExitInitializationMode(fmi3Instance c) { show_start(c); return fmi3OK; }
 EXPORTED fmi3Status fmi3EnterEventMode(fmi3Instance c) { (void)c; return fmi3Error; }
-EXPORTED fmi3Status fmi3Terminate(fmi3Instance c) { (void)c; return fmi3OK; }
-EXPORTED fmi3Status fmi3Reset(fmi3Instance c) { begin(c); return fmi3OK; }
 
 EXPORTED fmi3Status fmi3GetFloat64(fmi3Instance c, const fmi3ValueReference vr[], size_t n, fmi3Float64 values[],
                                    size_t n_values)
@@ -196,58 +182,6 @@ EXPORTED fmi3Status fmi3GetVariableDependencies(fmi3Instance c, fmi3ValueReferen
 {
     (void)c; (void)vr; (void)of_dependent; (void)independents; (void)of_independents; (void)kinds; (void)n;
     return fmi3Error;
-}
-
-EXPORTED fmi3Status fmi3GetFMUState(fmi3Instance c, fmi3FMUState *state)
-{
-    if (*state == NULL) {
-        *state = calloc(1, sizeof(instance));
-    }
-    if (*state == NULL) {
-        return fmi3Error;
-    }
-    memcpy(*state, c, sizeof(instance));
-    return fmi3OK;
-}
-
-EXPORTED fmi3Status fmi3SetFMUState(fmi3Instance c, fmi3FMUState state)
-{
-    memcpy(c, state, sizeof(instance));
-    return fmi3OK;
-}
-
-EXPORTED fmi3Status fmi3FreeFMUState(fmi3Instance c, fmi3FMUState *state)
-{
-    (void)c;
-    free(*state);
-    *state = NULL;
-    return fmi3OK;
-}
-
-EXPORTED fmi3Status fmi3SerializedFMUStateSize(fmi3Instance c, fmi3FMUState state, size_t *size)
-{
-    (void)c; (void)state;
-    *size = sizeof(instance);
-    return fmi3OK;
-}
-
-EXPORTED fmi3Status fmi3SerializeFMUState(fmi3Instance c, fmi3FMUState state, fmi3Byte bytes[], size_t size)
-{
-    (void)c;
-    if (size < sizeof(instance)) {
-        return fmi3Error;
-    }
-    memcpy(bytes, state, sizeof(instance));
-    return fmi3OK;
-}
-
-EXPORTED fmi3Status fmi3DeserializeFMUState(fmi3Instance c, const fmi3Byte bytes[], size_t size, fmi3FMUState *state)
-{
-    if (size != sizeof(instance) || fmi3GetFMUState(c, state) != fmi3OK) {
-        return fmi3Error;
-    }
-    memcpy(*state, bytes, sizeof(instance));
-    return fmi3OK;
 }
 
 #define NO_DERIVATIVE(name) \

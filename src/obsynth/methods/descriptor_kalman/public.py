@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from numpy.typing import ArrayLike
 
+from obsynth.analysis.transformations.recovery import Transformation
 from obsynth.methods.designing import design
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.sequences import MatrixLike
@@ -12,7 +13,7 @@ from obsynth.results.design import ObserverDesign
 
 
 def descriptor_kalman(
-    plant: DescriptorSystem | TimeVaryingDescriptorSystem,
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem | Transformation,
     *,
     Q: MatrixLike = None,
     R: MatrixLike = None,

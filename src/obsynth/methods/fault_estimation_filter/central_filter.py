@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 
@@ -33,11 +34,11 @@ LEVEL_FACTORS = (1.0, 1.5)
 #: Above so many states the higher level, which makes gains up to a quarter smaller, would cost up to half of the time.
 MOST_STATES_FOR_LEVELS = 200
 WEIGHT_STEPS = 4
-#: A disturbance that does less than this share of what it does to the starting filter is decoupled; the level at which
-#: such a filter is looked for, relative to the same; a point without meaning; and the share of rows xi that counts as
-#: nothing.
+#: A disturbance that does less than this share of what it does to the starting filter is decoupled; the levels at which
+#: such a filter is looked for in turn, relative to the same; a point without meaning; and the share of rows xi that
+#: counts as nothing.
 DECOUPLED_GAIN = 1e-7
-DECOUPLING_LEVEL = 1e-4
+DECOUPLING_LEVELS = (1e-4, 1e-2)
 GENERIC_POINT = 1.3247
 SAME_ROWS = 1e-8
 #: A level this far above anything a disturbance could do is no limit.
@@ -104,15 +105,16 @@ def search_central_filter(
 
 
 def _decoupling_filter(problem: GainProblem, gain: float) -> tuple[Injection, float] | None:
-    """Return a filter that no disturbance reaches, and its gain, from one solution; ``None`` where there is none.
+    """Return a filter that no disturbance reaches, and its gain, from a solution or two; ``None`` where there is none.
 
     It exists only if what xi shows follows from the measurements at almost every point, whatever the disturbance does.
     """
     if not _follows_from_measurements(problem):
         return None
-    # Next to a zero on the unit circle only little noise leaves the equation a solution.
-    for noise in NOISES[:2]:
-        found = central_injection(problem, DECOUPLING_LEVEL * gain, noise=noise)
+    # The artificial noise has a gain of its own, which in many states may be above the first level; next to a zero on
+    # the unit circle only little of it leaves the equation a solution.
+    for noise, share in product(NOISES[: 2 if problem.order <= FEW_STATES else 1], DECOUPLING_LEVELS):
+        found = central_injection(problem, share * gain, noise=noise)
         if found is not None and (reached := problem.achieved_gain(found)) <= DECOUPLED_GAIN * gain:
             return found, reached
     return None

@@ -10,6 +10,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from obsynth.analysis.diagnosis.decoupled import DecoupledPlant, decoupled
 from obsynth.errors import PreconditionError, SolverError
 from obsynth.methods.riccati import riccati_solution
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.ranks import RANK_TOLERANCE, decide_rank
+from obsynth.numerics.ranks import RANK_TOLERANCE, rank_from
 from obsynth.numerics.spectra import abscissa
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.exosystems import Exosystem
@@ -71,17 +72,18 @@ def _with_fault_models(found: DecoupledPlant, phi: FloatArray, cw: FloatArray, f
     inverse = np.linalg.inv(found.E) if k else np.zeros((0, 0))
     zeros = np.zeros((count, k))
     known = np.hstack([found.Bu, found.By])
+    rows = _telling_rows(np.hstack([found.C, found.G @ cw, -found.Du, found.H, found.M]))
     return FilterModel(
         A=np.block([[inverse @ found.A, inverse @ found.F @ cw], [zeros, phi]]),
-        C=np.hstack([found.C, found.G @ cw]),
+        C=rows @ np.hstack([found.C, found.G @ cw]),
         B=np.vstack([inverse @ known, np.zeros((count, plant.nu + plant.ny))]),
-        L=np.hstack([-found.Du, found.H]),
+        L=rows @ np.hstack([-found.Du, found.H]),
         N=np.vstack([inverse @ found.N, np.zeros((count, plant.nw))]),
-        M=found.M,
+        M=rows @ found.M,
         estimate=np.hstack([np.zeros((len(faults), k)), cw]),
         drive=np.vstack([np.zeros((k, count)), np.eye(count)]),
         T=np.vstack([inverse @ found.rows[:k, : plant.nx], np.zeros((count, plant.nx))]),
-        T0=-found.rows[k:, : plant.nx],
+        T0=-rows @ found.rows[k:, : plant.nx],
         faults=faults,
         order=k,
         fault_sizes=found.fault_sizes,
@@ -89,9 +91,24 @@ def _with_fault_models(found: DecoupledPlant, phi: FloatArray, cw: FloatArray, f
     )
 
 
+def _telling_rows(whole: FloatArray) -> FloatArray:
+    """Return combinations ``(q, p)`` of the rows ``whole (p, columns)`` that say something: some are empty."""
+    if not whole.size:
+        return np.eye(len(whole))
+    sizes = np.max(np.abs(whole), axis=0)
+    left, values, _ = np.linalg.svd(whole / np.where(sizes > 0.0, sizes, 1.0))
+    rank = rank_from(values, expected=len(whole)).rank
+    return np.eye(len(whole)) if rank == len(whole) else np.asarray(left[:, :rank].T)
+
+
 #: Noise that every state gets besides the stated one, as a share of the sensors', where the equation has no stable
 #: solution without: a mode that nothing drives would never be corrected.
 SHARES_OF_NOISE = (0.0, 1e-6, 1e-4, 1e-2, 1.0)
+
+
+#: Noise that exact rows (equations without outputs and noise) are held to have, as a share of the sensors', by whether
+#: the plant is sampled: a continuous gain would be infinite without, a sampled one need not be.
+SHARES_OF_EXACT_ROWS = {True: (0.0, 1e-6, 1e-3), False: (1e-3, 1e-2, 0.1)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,20 +125,32 @@ class KalmanGain:
     added: float
 
 
+def exact_rows(model: FilterModel) -> FloatArray:
+    """Return combinations ``(q, p)`` of the model's rows that no noise enters, of unit length."""
+    p = model.M.shape[0]
+    if not p:
+        return np.zeros((0, 0))
+    left, values, _ = np.linalg.svd(model.M) if model.M.shape[1] else (np.eye(p), np.zeros(0), None)
+    return np.asarray(left[:, rank_from(values, expected=p).rank :].T)
+
+
 def require_noise(model: FilterModel, plant_outputs: tuple[str, ...], noise: FloatArray) -> None:
     """Raise `PreconditionError` where a combination of outputs is free of noise.
 
-    Shapes: ``noise (ny, nw)``.
+    Equations without any output (those of an index of two and more) are exact, and may be.  Shapes: ``noise (ny, nw)``.
     """
+    measured = model.L[:, model.L.shape[1] - len(plant_outputs) :]
+    trusted = exact_rows(model) @ measured
+    if not trusted.size or float(np.max(np.abs(trusted))) <= RANK_TOLERANCE * float(np.max(np.abs(measured))):
+        return
     silent = [name for name, row in zip(plant_outputs, noise, strict=True) if not row.any()]
-    if model.M.shape[0] and decide_rank(model.M, expected=model.M.shape[0]).rank < model.M.shape[0]:
-        which = f"no noise is stated for {', '.join(silent)}" if silent else "equations without any output constrain it"
-        raise PreconditionError(
-            f"A combination of the outputs is free of noise: {which}. A Kalman gain would trust it without limit; "
-            "state the noise of every sensor (sensor_noise), or give poles.",
-            condition="noise of every output",
-            signals=silent or plant_outputs,
-        )
+    which = f"no noise is stated for {', '.join(silent)}" if silent else "its noise cancels"
+    raise PreconditionError(
+        f"A combination of the outputs is free of noise: {which}. A Kalman gain would trust it without limit; "
+        "state the noise of every sensor (sensor_noise), or give poles.",
+        condition="noise of every output",
+        signals=silent or plant_outputs,
+    )
 
 
 def kalman_gain(model: FilterModel, rates: FloatArray, *, lag: int = 0, decay: float = 0.0) -> KalmanGain:
@@ -136,12 +165,15 @@ def kalman_gain(model: FilterModel, rates: FloatArray, *, lag: int = 0, decay: f
     measured, cross = model.M @ model.M.T, model.N @ model.M.T
     unit = max(float(np.max(np.abs(model.N[: model.order]), initial=0.0)), float(np.max(np.abs(model.M), initial=0.0)))
     states = np.diag(np.r_[np.ones(model.order), np.zeros(n - model.order)])
-    for share in SHARES_OF_NOISE:
+    exact, sampled = exact_rows(model), model.dt > 0.0
+    tried = product(SHARES_OF_NOISE, SHARES_OF_EXACT_ROWS[sampled] if len(exact) else (0.0,))
+    for share, trust in tried:
         drive = process + (share * unit) ** 2 * states
-        if model.dt > 0.0:
-            found = _discrete(model, drive, measured, cross, lag, float(np.exp(decay * model.dt)))
+        rows = measured + (trust * unit) ** 2 * (exact.T @ exact)
+        if sampled:
+            found = _discrete(model, drive, rows, cross, lag, float(np.exp(decay * model.dt)))
         else:
-            found = _continuous(model, drive, measured, cross, decay)
+            found = _continuous(model, drive, rows, cross, decay)
         if found is not None:
             return KalmanGain(*found, share * unit)
     raise SolverError(

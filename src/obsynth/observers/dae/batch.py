@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SolverError, SpecError
-from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.c_code import BATCH_PARTS
 from obsynth.observers.dae.compiled_library import compiler
 from obsynth.observers.dae.estimates import DAERow
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.dae.records import advanced
+from obsynth.observers.estimates import Estimates, named_estimates
 from obsynth.observers.progress import shown_progress
 
 #: Samples in one call of the library: a second or less, so that progress shows and an interrupt is heard.
@@ -23,55 +23,29 @@ SAMPLES_PER_CALL = 100_000
 WORTH_COMPILING = 50_000
 
 
-@dataclass(frozen=True, eq=False)
-class DAEBatchEstimates:
-    """Estimates of many trials with one observer.
-
-    Parameters
-    ----------
-    states : FloatArray
-        ``(trials, samples, nx)``: after the measurement of the same sample.
-    parameters : FloatArray
-        ``(trials, samples, nq)``.
-    parameter_covariances : FloatArray
-        ``(trials, samples, nq, nq)``.
-    innovations : FloatArray
-        ``(trials, samples, ny)``; NaN where a sample is missing.
-    nis, nis_degrees : FloatArray
-        ``(trials, samples)``: squared innovations in units of their covariance, and degrees of freedom.
-    residuals : FloatArray
-        ``(trials, samples)``: scaled residual of each step.
-    """
-
-    states: FloatArray
-    parameters: FloatArray
-    parameter_covariances: FloatArray
-    innovations: FloatArray
-    nis: FloatArray
-    nis_degrees: FloatArray
-    residuals: FloatArray
-
-
 def run_dae_batch(
     observer: DAEObserver, y: ArrayLike, u: ArrayLike | None = None, *, compiled: bool | None = None,
     progress: bool | Callable[[int], None] | None = None,
-) -> DAEBatchEstimates:  # fmt: skip
+) -> Estimates:  # fmt: skip
     """Run many trials; see `obsynth.run_batch`.
 
     Shapes: ``y (trials, samples, ny)``.
     """
     outputs, inputs = _checked(observer, y, u)
     trials, samples = outputs.shape[:2]
-    if compiled is None:
+    alone = observer.outside_graph
+    if alone and compiled:
+        raise SpecError(f"The C knows no {alone}: leave compiled=True out, or leave {alone} out.", path="compiled")
+    if compiled is None and not alone:
         compiled = trials * samples >= WORTH_COMPILING and compiler() is not None
     take = _in_c if compiled else _in_casadi
     with shown_progress(progress, trials, "trials") as note:
         parts = take(observer, outputs, inputs, note)
-    seen = ~np.isnan(outputs)
-    return DAEBatchEstimates(
-        read_only(parts["posterior"]), read_only(parts["theta"]), read_only(parts["spread"]),
-        read_only(np.where(seen, parts["innovation"], np.nan)), read_only(parts["nis"][..., 0]),
-        read_only(seen.sum(axis=2)), read_only(parts["residual"][..., 0]),
+    received = ~np.isnan(outputs)
+    return named_estimates(
+        observer, states=parts["posterior"], faults=parts["theta"], residuals=parts["residual"],
+        fault_covariances=parts["spread"], innovations=np.where(received, parts["innovation"], np.nan),
+        nis=parts["nis"][..., 0], nis_degrees=received.sum(axis=2).astype(np.float64), received=received,
     )  # fmt: skip
 
 
@@ -127,7 +101,13 @@ def _in_casadi(
 def _one(observer: DAEObserver, y: FloatArray, u: FloatArray, trial: int) -> dict[str, FloatArray]:
     rows: list[DAERow] = []
     try:
-        advanced(observer.steps, y[trial], _of_trial(u, trial), rows.append)
+        if observer.outside_graph:
+            state = observer.steps.first
+            for outputs, inputs in zip(y[trial], _of_trial(u, trial), strict=True):
+                state, row = observer.steps.advance(state, outputs, inputs)
+                rows.append(row)
+        else:
+            advanced(observer.steps, y[trial], _of_trial(u, trial), rows.append)
     except SolverError as error:
         raise SolverError(f"Trial {trial}: {error}", record={**error.record, "trial": trial}) from error
     return {name: np.concatenate([row.several.part(name) for row in rows]) for name in BATCH_PARTS}

@@ -1,4 +1,4 @@
-"""What an observer of a DAE says, sample by sample, with honest spreads."""
+"""The rows of an observer of a DAE, sample by sample or several at once, and the estimates in them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from obsynth.analysis.dae_index import SINGULAR_CONDITION, involved
 from obsynth.errors import SolverError
-from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.estimates import Estimates, named_estimates
 
 if TYPE_CHECKING:
     from obsynth.observers.dae.settings import DAESettings
@@ -60,9 +61,48 @@ class DAERow:
         return self.part("spread")
 
     @property
+    def cross_covariance(self) -> FloatArray:
+        """Covariance of `x` with `theta` ``(nx, nq)``."""
+        if "cross" in self.graph.memory.shapes:
+            return self.part("cross")
+        K, H, L, Upsilon = (self.part(name) for name in ("K", "H", "L", "Upsilon"))
+        return np.asarray((Upsilon - K @ (H @ Upsilon + L)) @ self.parameter_covariance)
+
+    @property
     def innovation(self) -> FloatArray:
         """Outputs without what was predicted of them ``(ny,)``; NaN where a sample is missing."""
         return np.where(self.seen, self.part("innovation"), np.nan)
+
+    @property
+    def gap(self) -> FloatArray:
+        """The same, under the name that every observer of parameters has for it: parameters are those before."""
+        return self.innovation
+
+    @property
+    def whitened(self) -> FloatArray:
+        """An innovation of the same length in units of its covariance ``(degrees,)``, of one sample; to first order.
+
+        Only its length counts for decisions.
+        """
+        white = np.zeros(self.degrees)
+        white[:1] = np.sqrt(max(float(self.nis), 0.0))
+        return white
+
+    @property
+    def regressor(self) -> FloatArray:
+        """Regressor of `whitened` ``(degrees, 0)``: there is none."""
+        return np.zeros((self.degrees, 0))
+
+    @property
+    def state_deviations(self) -> FloatArray:
+        """Standard deviations of `x` ``(nx,)``."""
+        return np.asarray(np.sqrt(np.maximum(np.einsum("...ii->...i", self.covariance), 0.0)))
+
+    @property
+    def is_finite(self) -> bool:
+        """Whether no number has overflown."""
+        arrays = (self.x, self.theta, self.state_deviations, self.parameter_covariance)
+        return all(bool(np.isfinite(array).all()) for array in arrays)
 
     @property
     def nis(self) -> FloatArray:
@@ -98,64 +138,8 @@ class DAERow:
         return np.asarray(np.abs(np.linalg.eigvals(self.several.part("kept"))).max(axis=1))
 
 
-@dataclass(frozen=True, eq=False)
-class DAEEstimates:
-    """Estimates of an observer of a DAE, one row per sample.
-
-    Parameters
-    ----------
-    states, state_deviations : FloatArray
-        ``(samples, nx)``: after the measurement of the same sample, and standard deviations of their errors.
-    parameters : FloatArray
-        ``(samples, nq)``.
-    parameter_covariances : FloatArray
-        ``(samples, nq, nq)``: the covariance of the estimates while the parameters are constant (or walk as stated).
-        S is none: with forgetting it says how much is still remembered.
-    innovations : FloatArray
-        ``(samples, ny)``, in units of the outputs; NaN where a sample is missing.
-    innovation_covariances : FloatArray
-        ``(samples, ny, ny)``: what is expected of the innovations; rows and columns of missing samples are those of the
-        identity.
-    nis, nis_degrees : FloatArray
-        ``(samples,)``: squared innovations in units of their covariance, and degrees of freedom.
-    excitation : FloatArray
-        ``(samples,)``: least eigenvalue of the information on the parameters in the last `window` samples, in units of
-        ``S_0^-1``: below one, a window says less than was known before.  Zero while the window fills.
-    residuals, conditions : FloatArray
-        ``(samples,)``: scaled residual of each step, and condition of (7).
-    contraction : FloatArray
-        ``(samples,)``: spectral radius of F (I - K H); an error of the state filter decays in about
-        ``-1 / log`` of it steps, which should not be longer than the window ``1 / (1 - lambda)``.
-    projection : FloatArray
-        ``(nx,)``: how far the initial state was moved onto its constraint.
-    state_names, parameter_names : tuple of str
-        Names of the columns.
-    """
-
-    states: FloatArray
-    state_deviations: FloatArray
-    parameters: FloatArray
-    parameter_covariances: FloatArray
-    innovations: FloatArray
-    innovation_covariances: FloatArray
-    nis: FloatArray
-    nis_degrees: FloatArray
-    excitation: FloatArray
-    residuals: FloatArray
-    conditions: FloatArray
-    contraction: FloatArray
-    projection: FloatArray
-    state_names: tuple[str, ...]
-    parameter_names: tuple[str, ...]
-
-    @property
-    def parameter_deviations(self) -> FloatArray:
-        """Standard deviations of the parameters ``(samples, nq)``."""
-        return np.asarray(np.sqrt(np.einsum("kii->ki", self.parameter_covariances)))
-
-
 class GatheredRows:
-    """What `DAEEstimates` keeps of the rows of a record, while it is being run.
+    """What the estimates keep of the rows of a record, while it is being run.
 
     Fields: observer: Whose rows they are.
     """
@@ -175,11 +159,9 @@ class GatheredRows:
     def add_regular(self, rows: DAERow) -> None:
         """Keep some rows, unless the matrix of (7) was singular to working precision in one of them."""
         self.add(rows)
-        conditions = self.parts[-1]["conditions"]
-        if len(conditions) and conditions.max() > SINGULAR_CONDITION:
-            raise _singular(self.observer, rows.several, int(np.argmax(conditions > SINGULAR_CONDITION)))
+        require_regular(self.observer, rows, self.parts[-1]["conditions"])
 
-    def estimates(self, informations: FloatArray | None = None) -> DAEEstimates:
+    def estimates(self, informations: FloatArray | None = None) -> Estimates:
         """Return what was gathered.
 
         Shapes: ``informations (any, nq, nq)``.
@@ -188,16 +170,22 @@ class GatheredRows:
         seen = whole.pop("information")
         levels = _excitation(self.observer, seen if informations is None else informations)
         whole["excitation"] = levels[len(levels) - len(whole["nis"]) :]
-        return DAEEstimates(
-            **{name: read_only(value) for name, value in whole.items()}, projection=read_only(self.projection),
-            state_names=self.observer.state_names, parameter_names=self.observer.fault_names,
-        )  # fmt: skip
+        received = ~np.isnan(whole["innovations"])
+        received.setflags(write=False)
+        return named_estimates(self.observer, **whole, projection=self.projection, received=received)
 
 
-def _singular(observer: DAESettings, rows: DAERow, i: int) -> SolverError:
+def require_regular(observer: DAESettings, rows: DAERow, conditions: FloatArray) -> None:
+    """Raise `SolverError` where the matrix of (7) was singular to working precision.
+
+    Shapes: ``conditions (samples,)``.
+    """
+    if not len(conditions) or conditions.max() <= SINGULAR_CONDITION:
+        return
+    rows, i = rows.several, int(np.argmax(conditions > SINGULAR_CONDITION))
     equations, states = involved(observer.model, rows.part("scaled")[i])
-    k, condition = rows.k + i, float(rows.conditions[i])
-    return SolverError(
+    k, condition = rows.k + i, float(conditions[i])
+    raise SolverError(
         f"The matrix of (7), dF/dx' / dt + dF/dx, is singular at k = {k} (condition {condition:.3g}): the equations "
         f"{', '.join(map(repr, equations))} do not determine {', '.join(map(repr, states))} there.",
         record={"k": k, "condition": condition},
@@ -205,13 +193,13 @@ def _singular(observer: DAESettings, rows: DAERow, i: int) -> SolverError:
 
 
 def _columns(rows: DAERow) -> dict[str, FloatArray]:
-    """Return what `DAEEstimates` keeps of some samples."""
-    variances = np.einsum("kii->ki", rows.part("covariance"))
+    """Return what the estimates keep of some samples."""
     return {
-        "states": rows.x, "state_deviations": np.sqrt(np.maximum(variances, 0.0)),
-        "parameters": rows.theta, "parameter_covariances": rows.parameter_covariance,
+        "states": rows.x, "state_deviations": rows.state_deviations,
+        "state_covariances": rows.covariance, "cross_covariances": rows.cross_covariance,
+        "faults": rows.theta, "fault_covariances": rows.parameter_covariance,
         "innovations": rows.innovation, "innovation_covariances": rows.part("expected"), "nis": rows.nis,
-        "nis_degrees": rows.seen.sum(axis=1).astype(np.float64), "residuals": rows.part("residual")[:, 0],
+        "nis_degrees": rows.seen.sum(axis=1).astype(np.float64), "residuals": rows.part("residual"),
         "conditions": rows.conditions, "contraction": rows.contractions, "information": rows.part("information"),
     }  # fmt: skip
 

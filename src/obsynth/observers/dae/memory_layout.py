@@ -81,8 +81,8 @@ class Layout:
 
 #: Arrays that stay matrices when they have one column.
 MATRICES = frozenset({
-    "P", "S", "spread", "cross", "Upsilon", "K", "H", "L", "information", "covariance", "F", "G", "kept", "scaled",
-    "expected",
+    "P", "S", "spread", "cross", "Upsilon", "K", "H", "L", "information", "covariance", "F", "G", "noise", "kept",
+    "scaled", "expected",
 })  # fmt: skip
 
 
@@ -103,15 +103,16 @@ def memory_layout(observer: DAESettings) -> Layout:
 def row_layout(observer: DAESettings) -> Layout:
     """Return what is said of one sample besides what is remembered.
 
-    ``expected`` is the covariance of the innovation, that of the identity for what is not seen; ``kept`` is F (I - K H)
-    with K and H of the sample before, ``scaled`` the equilibrated matrix of (7), and ``trusted`` one where the step of
-    the compiled graph was solved.
+    ``expected`` is the covariance of the innovation, that of the identity for what is not seen; ``noise`` is the
+    derivative by what is added to the equations, ``kept`` F (I - K H) with K and H of the sample before, ``scaled`` the
+    equilibrated matrix of (7), and ``trusted`` one where the step of the compiled graph was solved.
     """
     nx, ny, nq = observer.model.nx, observer.model.ny, observer.model.nq
     n = nx * len(BUTCHER[observer.integration])
     return Layout({
         "innovation": (ny, 1), "expected": (ny, ny), "nis": (1, 1), "information": (nq, nq), "covariance": (nx, nx),
-        "F": (nx, nx), "G": (nx, nq), "kept": (nx, nx), "scaled": (n, n), "residual": (1, 1), "trusted": (1, 1),
+        "F": (nx, nx), "G": (nx, nq), "noise": (nx, nx), "kept": (nx, nx), "scaled": (n, n), "residual": (1, 1),
+        "trusted": (1, 1),
     })  # fmt: skip
 
 

@@ -11,17 +11,18 @@ from numpy.typing import ArrayLike
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.compiled_library import DAELibrary
-from obsynth.observers.dae.estimates import DAEEstimates, DAERow, GatheredRows
+from obsynth.observers.dae.estimates import DAERow, GatheredRows, require_regular
 from obsynth.observers.dae.records import run_record
 from obsynth.observers.dae.settings import DAESettings
 from obsynth.observers.dae.step_graph import ObserverGraph
 from obsynth.observers.dae.steps import DAEState, Steps
-from obsynth.observers.recursive.records import measured_record
-from obsynth.observers.running import RunningObserver
+from obsynth.observers.estimates import Estimates
+from obsynth.observers.records import measured_record
+from obsynth.observers.running import StepObserver
 from obsynth.plants.dae.checks import checked_inputs, require_known
 
 
-class DAEObserver(DAESettings):
+class DAEObserver(DAESettings, StepObserver[DAEState, DAERow]):
     """An observer: what `start` and `run` need, and nothing that depends on data.
 
     Parameters
@@ -62,6 +63,9 @@ class DAEObserver(DAESettings):
         of one sensor; or taken at the limit.
     outlier_limit : float or None
         In standard deviations of the prediction: 6 for ``gate`` and 3 for ``huber`` by default.
+    reset : float
+        Detect and reset: probability, per sample, that innovations which no change has made larger pass the threshold
+        above which the covariance of the parameters starts again from S_0.  Zero never resets.
 
     Raises
     ------
@@ -74,41 +78,17 @@ class DAEObserver(DAESettings):
         """What follows from the observer alone, made when it is first needed."""
         return Steps(self)
 
-    def init(self) -> DAEState:
-        """Return the state before the first sample, k = 0."""
-        return self.steps.first
+    @property
+    def _steps(self) -> Steps:
+        return self.steps
 
-    def advance(self, state: DAEState, y: FloatArray, u: FloatArray) -> tuple[DAEState, DAERow]:
-        """Return the next state and what is said at a sample, without checking it.
+    def _allow(self, state: DAEState) -> None:
+        """Raise nothing: a model has no horizon."""
 
-        Parameters
-        ----------
-        state : DAEState
-            Before the sample.
-        y, u : FloatArray
-            ``(ny,)``, NaN for what is missing, and ``(nu,)``.
-        """
-        return self.steps.advance(state, y, u)
+    def _trust(self, row: DAERow) -> None:
+        require_regular(self, row, row.conditions)
 
-    def step(self, state: DAEState, y: ArrayLike, u: ArrayLike = ()) -> tuple[DAEState, DAEEstimates]:
-        """Return the state after a sample, and the estimates at it.
-
-        Parameters
-        ----------
-        state : DAEState
-            Before the sample; it is not changed.
-        y : array_like
-            Outputs ``(ny,)``; NaN marks a missing one.
-        u : array_like, optional
-            Known inputs ``(nu,)`` during the step that ends at this sample.
-
-        Raises
-        ------
-        SpecError
-            A sample has the wrong length, or an input is not finite.
-        SolverError
-            The step has no solution; k, iteration and worst equation are named.
-        """
+    def _sample(self, state: DAEState, y: ArrayLike, u: ArrayLike) -> tuple[FloatArray, FloatArray]:
         outputs = measured_record(np.atleast_2d(np.asarray(y)), self.model.ny)[0]
         try:
             inputs = np.atleast_1d(np.asarray(u, dtype=np.float64))
@@ -117,14 +97,12 @@ class DAEObserver(DAESettings):
         if inputs.shape != (self.model.nu,):
             raise SpecError(f"u must be {self.model.nu} finite number(s) at k = {state.k}.", path="u")
         require_known(self.model, inputs[None], state.k)
-        after, row = self.advance(state, outputs, inputs)
-        found = GatheredRows(self)
-        found.add_regular(row)
-        return after, found.estimates(np.array(after.informations))
+        return outputs, inputs
 
-    def start(self) -> RunningObserver[DAEState, DAERow, DAEEstimates]:
-        """Return a running observer, at k = 0."""
-        return RunningObserver(self)
+    def _estimates(self, state: DAEState, row: DAERow) -> Estimates:
+        found = GatheredRows(self)
+        found.add(row)
+        return found.estimates(np.array(state.informations))
 
     @property
     def graph(self) -> ObserverGraph:
@@ -145,7 +123,7 @@ class DAEObserver(DAESettings):
     def run(
         self, y: ArrayLike, u: ArrayLike | None = None, *, compiled: bool | None = None,
         progress: bool | Callable[[int], None] | None = None,
-    ) -> DAEEstimates:  # fmt: skip
+    ) -> Estimates:  # fmt: skip
         """Run over a whole record.
 
         Parameters
@@ -164,7 +142,7 @@ class DAEObserver(DAESettings):
 
         Returns
         -------
-        DAEEstimates
+        Estimates
             One row per sample.
 
         Raises

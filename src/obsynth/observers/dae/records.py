@@ -9,8 +9,9 @@ import numpy as np
 from obsynth.errors import SolverError, SpecError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.compiled_library import DAELibrary
-from obsynth.observers.dae.estimates import DAEEstimates, DAERow, GatheredRows
+from obsynth.observers.dae.estimates import DAERow, GatheredRows
 from obsynth.observers.dae.steps import DAEState, Steps
+from obsynth.observers.estimates import Estimates
 from obsynth.observers.progress import shown_progress
 from obsynth.plants.dae.functions import Compiled, take_samples
 
@@ -21,19 +22,20 @@ SAMPLES_PER_CALL = 10_000
 def run_record(
     steps: Steps, y: FloatArray, u: FloatArray, *, compiled: bool | None, library: DAELibrary | None,
     progress: bool | Callable[[int], None] | None,
-) -> DAEEstimates:  # fmt: skip
+) -> Estimates:  # fmt: skip
     """Run over a whole record.
 
     Shapes: ``y (samples, ny)``, ``u (samples, nu)``.
     """
-    if library is not None and steps.settings.outliers != "none":
-        raise SpecError("The C knows no outliers: leave compiled=True out, or take outliers='none'.", path="compiled")
+    alone = steps.settings.outside_graph
+    if library is not None and alone:
+        raise SpecError(f"The C knows no {alone}: leave compiled=True out, or leave {alone} out.", path="compiled")
     found = GatheredRows(steps.settings)
     found.add(_nothing(steps))
     with shown_progress(progress, len(y), "samples") as note:
         if library is not None:
             _in_c(steps, library, y, u, found.add_regular, note)
-        elif compiled is None and steps.settings.outliers == "none":
+        elif compiled is None and not alone:
             advanced(steps, y, u, found.add_regular, note)
         else:
             state = steps.first

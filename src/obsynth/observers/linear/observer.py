@@ -12,7 +12,14 @@ from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
-from obsynth.observers.linear.checking import NAME_FIELDS, checked_record, checked_sample, is_delay, require_names
+from obsynth.observers.estimates import Estimates
+from obsynth.observers.records import (
+    NAME_FIELDS,
+    checked_sample,
+    is_delay,
+    require_names,
+    whole_record,
+)
 from obsynth.observers.running import RunningObserver
 
 
@@ -147,7 +154,7 @@ class LinearObserver:
         start = np.zeros(self.order) if initial_state is None else initial_state
         return LinearState(checked_sample(start, self.order, "initial_state").copy())
 
-    def start(self, initial_state: ArrayLike | None = None) -> RunningObserver[LinearState, FloatArray, Estimates]:
+    def start(self, initial_state: ArrayLike | None = None) -> RunningObserver[LinearState, FloatArray]:
         """Return a running observer, which takes one sample at a time.
 
         Parameters
@@ -214,63 +221,9 @@ class LinearObserver:
         SpecError
             Shapes do not fit, or a sample is not finite.
         """
-        outputs = checked_record(y, len(self.output_names), "y")
-        known = np.zeros((len(outputs), 0)) if u is None and not self.input_names else u
-        inputs = checked_record(known, len(self.input_names), "u")
-        if len(inputs) != len(outputs):
-            raise SpecError(f"u has {len(inputs)} samples and y has {len(outputs)}: give the same number.", path="u")
+        outputs, inputs = whole_record(y, u, len(self.output_names), len(self.input_names), complete=True)
         state = self.init(initial_state)
         rows = np.empty((len(outputs), self.Cz.shape[0]))
         for k in range(len(outputs)):
             state, rows[k] = self.advance(state, outputs[k], inputs[k])
         return Estimates.split(self, rows)
-
-
-@dataclass(frozen=True, eq=False)
-class Estimates:
-    """What an observer says, one row per sample.
-
-    Parameters
-    ----------
-    states : FloatArray
-        ``(steps, nx)``; column i estimates state i at ``k - state_delays[i]``.
-    faults : FloatArray
-        ``(steps, nf)``; column i estimates fault i at ``k - fault_delays[i]``.
-    residuals : FloatArray
-        ``(steps, nr)``.
-    state_names, fault_names, residual_names : tuple of str
-        Names of the columns.
-    state_delays, fault_delays : tuple of int
-        Delays in samples.
-    """
-
-    states: FloatArray
-    faults: FloatArray
-    residuals: FloatArray
-    state_names: tuple[str, ...]
-    fault_names: tuple[str, ...]
-    residual_names: tuple[str, ...]
-    state_delays: tuple[int, ...]
-    fault_delays: tuple[int, ...]
-
-    @classmethod
-    def split(cls, observer: LinearObserver, rows: FloatArray) -> Estimates:
-        """Return the estimates in the output rows of an observer.
-
-        Parameters
-        ----------
-        observer : LinearObserver
-            Whose rows they are.
-        rows : FloatArray
-            ``(steps, nx + nf + nr)``.
-        """
-        return cls(
-            read_only(rows[:, observer.state_rows]),
-            read_only(rows[:, observer.fault_rows]),
-            read_only(rows[:, observer.residual_rows]),
-            observer.state_names,
-            observer.fault_names,
-            observer.residual_names,
-            observer.state_delays,
-            observer.fault_delays,
-        )

@@ -19,10 +19,11 @@ from typing import NamedTuple
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.covariances import covariance_factor
 from obsynth.numerics.least_squares_step import DEPENDENT_COLUMN, SUSPECT_PARITY
-from obsynth.observers.recursive.estimates import RecursiveEstimates, deviations_of, received_in
+from obsynth.observers.estimates import Estimates, named_estimates
+from obsynth.observers.recursive.estimates import received_in, recursive_estimates
 from obsynth.observers.recursive.recursion import RawEstimate, Recursion, RecursiveState
 from obsynth.observers.recursive.settings import RecursiveSettings
 from obsynth.observers.recursive.step_model import PlantSteps, StepMatrices, StepModel, stacked_noise
@@ -150,7 +151,7 @@ def kernel_is_chosen(observer: RecursiveSettings, samples: int, compiled: bool |
     return True
 
 
-def run_record(recursion: Recursion, y: FloatArray, u: FloatArray, compiled: bool | None) -> RecursiveEstimates:
+def run_record(recursion: Recursion, y: FloatArray, u: FloatArray, compiled: bool | None) -> Estimates:
     """Run over a whole record.
 
     Shapes: ``y (samples, ny)``, ``u (samples, nu)``.
@@ -161,7 +162,7 @@ def run_record(recursion: Recursion, y: FloatArray, u: FloatArray, compiled: boo
     for k in range(len(y)):
         state, row = recursion.advance(state, y[k], u[k])
         rows.append(row)
-    return RecursiveEstimates.of(recursion.settings, rows)
+    return recursive_estimates(recursion.settings, rows)
 
 
 @dataclass
@@ -185,26 +186,26 @@ class _Record:
 
     def note(self, k: int, row: RawEstimate) -> None:
         """Keep one sample of a running observer."""
-        self.states[k], self.deviations[k] = row.x, deviations_of(row)
-        self.parameters[k], self.covariances[k] = row.parameters.theta, row.parameters.spread @ row.parameters.spread.T
+        self.states[k], self.deviations[k] = row.x, row.state_deviations
+        self.parameters[k], self.covariances[k] = row.theta, row.parameter_covariance
         self.innovations[k, : len(row.innovation)], self.degrees[k] = row.innovation, len(row.innovation)
 
-    def estimates(self, observer: RecursiveSettings, y: FloatArray) -> RecursiveEstimates:
+    def estimates(self, observer: RecursiveSettings, y: FloatArray) -> Estimates:
         """Return the whole."""
         most = int(self.degrees.max(initial=0.0))
         innovations = self.innovations[:, :most]
         samples, nq = self.parameters.shape
         # Without parameters there is nothing to excite; with a random walk no window is watched.
         excitation = np.full(samples, 0.0 if observer.adaptation is None else np.nan)
-        return RecursiveEstimates(
-            read_only(self.states), read_only(self.deviations), read_only(self.parameters),
-            read_only(self.covariances), read_only(innovations), read_only(np.full((samples, most, nq), np.nan)),
-            read_only(np.nansum(innovations * innovations, axis=1)), read_only(self.degrees),
-            read_only(excitation), observer.state_names, observer.fault_names, received_in(y),
+        return named_estimates(
+            observer, states=self.states, state_deviations=self.deviations, faults=self.parameters,
+            fault_covariances=self.covariances, innovations=innovations,
+            regressors=np.full((samples, most, nq), np.nan), nis=np.nansum(innovations * innovations, axis=1),
+            nis_degrees=self.degrees, excitation=excitation, received=received_in(y),
         )  # fmt: skip
 
 
-def run_compiled(recursion: Recursion, y: FloatArray, u: FloatArray) -> RecursiveEstimates:
+def run_compiled(recursion: Recursion, y: FloatArray, u: FloatArray) -> Estimates:
     """Run over a whole record with the kernel; single steps where samples are missing or a rank has to be decided.
 
     Shapes: ``y (samples, ny)``, ``u (samples, nu)``.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import chain
 from typing import NamedTuple
 
@@ -12,13 +11,19 @@ from numpy.typing import ArrayLike, NDArray
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import real_array
-from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.least_squares_step import least_squares_step, rank_revealing_step
 from obsynth.numerics.recursive_least_squares import update
+from obsynth.observers.estimates import Estimates, named_estimates
+from obsynth.observers.records import require_horizon
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.recursive.parameter_steps import posterior_residual
-from obsynth.observers.recursive.records import require_horizon
-from obsynth.observers.recursive.step_model import EarlyConstraintSteps, StepMatrices, require_in_range
+from obsynth.observers.recursive.step_model import (
+    EarlyConstraintSteps,
+    PreparedStep,
+    StepMatrices,
+    require_in_range,
+)
 
 
 class GainStep(NamedTuple):
@@ -53,6 +58,7 @@ def gain_steps(
     factor, Upsilon, parameters, diffuse = start.factor, start.Upsilon, start.parameters, start.diffuse
     adaptation, model = observer.adaptation, recursion.model
     first = [model.first()] if isinstance(model, EarlyConstraintSteps) else []
+    prepared: PreparedStep | None = None
     for k, step in enumerate(chain(first, (model.at(k) for k in range(steps))), 1 - len(first)):
         ne, rows, nq = len(step.A), len(step.H), Upsilon.shape[1]
         S = np.zeros((rows, max(factor.shape[1] + step.noise.shape[1], rows)))
@@ -67,7 +73,13 @@ def gain_steps(
         if received is not None and k and not received[k].all():
             kept = np.concatenate([np.ones(ne, dtype=bool), received[k], np.ones(len(step.Dn), dtype=bool)])
             H, S, right, unknown = H[kept], S[kept], right[kept], unknown[kept]
-        found = None if unknown.shape[1] else least_squares_step(H, S, right)
+        if unknown.shape[1]:
+            found = None
+        elif H is step.H:
+            prepared = PreparedStep.of(step, prepared)
+            found = prepared.taken(factor, right)
+        else:
+            found = least_squares_step(H, S, right)
         found = found or rank_revealing_step(H, S, right, unknown, mapped=rows)
         diffuse = found.diffuse
         gain, Upsilon, factor = found.estimate[:, :rows], found.estimate[:, rows:], found.factor
@@ -85,26 +97,7 @@ def gain_steps(
         yield GainStep(step, gain, parity, G, Upsilon, factor, learn, forget, parameters.spread)
 
 
-@dataclass(frozen=True, eq=False)
-class BatchEstimates:
-    """Estimates of many trials that share one model.
-
-    Parameters
-    ----------
-    states : FloatArray
-        ``(trials, samples, nx)``.
-    parameters : FloatArray
-        ``(trials, samples, nq)``.
-    innovations : FloatArray
-        ``(trials, samples, m)``: whitened, of the model without parameters; NaN at k = 0.
-    """
-
-    states: FloatArray
-    parameters: FloatArray
-    innovations: FloatArray
-
-
-def run_batch(observer: RecursiveObserver, y: ArrayLike, u: ArrayLike | None = None) -> BatchEstimates:
+def run_batch(observer: RecursiveObserver, y: ArrayLike, u: ArrayLike | None = None) -> Estimates:
     """Run many trials at once: the gains do not depend on data, so a step is one product for all trials.
 
     Shapes: ``y (trials, samples, ny)``.
@@ -146,8 +139,8 @@ def run_batch(observer: RecursiveObserver, y: ArrayLike, u: ArrayLike | None = N
     padded = np.full((trials, samples, most), np.nan)
     for k, found in enumerate(innovations):
         padded[:, k, : found.shape[1]] = found
-    return BatchEstimates(
-        read_only(np.stack(states, axis=1)), read_only(np.stack(parameters, axis=1)), read_only(padded)
+    return named_estimates(
+        observer, states=np.stack(states, axis=1), faults=np.stack(parameters, axis=1), innovations=padded
     )
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.alarms import Alarm, Decision, alone, quantile, tail
-from obsynth.observers.recursive.estimates import RecursiveEstimates
+from obsynth.observers.estimates import Estimates
 from obsynth.observers.recursive.gain_schedule import gain_steps
 from obsynth.observers.recursive.observer import RecursiveObserver
 
@@ -19,7 +19,7 @@ GLR_LOOKS = 1.0 / 4.0
 SMALLEST_INFORMATION = float(np.finfo(np.float64).tiny / np.finfo(np.float64).eps)
 
 
-def pull_of_the_start(observer: RecursiveObserver, estimates: RecursiveEstimates, error: FloatArray) -> FloatArray:
+def pull_of_the_start(observer: RecursiveObserver, estimates: Estimates, error: FloatArray) -> FloatArray:
     """Return what is left, in the estimates at each sample, of an error of the initial parameters, ``(samples, nq)``.
 
     Shapes: ``error (nq,)``.
@@ -40,7 +40,7 @@ def pull_of_the_start(observer: RecursiveObserver, estimates: RecursiveEstimates
 
 
 def likelihood_ratio(
-    observer: RecursiveObserver, estimates: RecursiveEstimates, gaps: FloatArray, false_alarms: float
+    observer: RecursiveObserver, estimates: Estimates, gaps: FloatArray, false_alarms: float
 ) -> Decision:
     """Return the generalised likelihood ratio of a jump at any of the last onsets.
 

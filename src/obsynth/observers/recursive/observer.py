@@ -9,15 +9,16 @@ from numpy.typing import ArrayLike
 
 from obsynth.numerics.arguments import real_array, real_vector
 from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.estimates import Estimates
+from obsynth.observers.records import measured_record, require_horizon, whole_record
 from obsynth.observers.recursive.compiled_run import run_record
-from obsynth.observers.recursive.estimates import RecursiveEstimates
-from obsynth.observers.recursive.records import measured_record, require_horizon, whole_record
+from obsynth.observers.recursive.estimates import recursive_estimates
 from obsynth.observers.recursive.recursion import RawEstimate, Recursion, RecursiveState
 from obsynth.observers.recursive.settings import RecursiveSettings
-from obsynth.observers.running import RunningObserver
+from obsynth.observers.running import StepObserver
 
 
-class RecursiveObserver(RecursiveSettings):
+class RecursiveObserver(RecursiveSettings, StepObserver[RecursiveState, RawEstimate]):
     """A recursive observer: what `start` and `run` need, and nothing that depends on data.
 
     Parameters
@@ -51,52 +52,24 @@ class RecursiveObserver(RecursiveSettings):
         """What follows from the observer alone, made when it is first needed."""
         return Recursion(self)
 
-    def init(self) -> RecursiveState:
-        """Return the state before the first sample, k = 0."""
-        return self.recursion.first
+    @property
+    def _steps(self) -> Recursion:
+        return self.recursion
 
-    def advance(self, state: RecursiveState, y: FloatArray, u: FloatArray) -> tuple[RecursiveState, RawEstimate]:
-        """Return the next state and what is known at a sample, without checking it.
-
-        Parameters
-        ----------
-        state : RecursiveState
-            Before the sample.
-        y, u : FloatArray
-            ``(ny,)``, NaN for what is missing, and ``(nu,)``.
-        """
-        return self.recursion.advance(state, y, u)
-
-    def step(self, state: RecursiveState, y: ArrayLike, u: ArrayLike = ()) -> tuple[RecursiveState, RecursiveEstimates]:
-        """Return the state after a sample, which keeps u(k) for the next, and the estimates at it.
-
-        Parameters
-        ----------
-        state : RecursiveState
-            Before the sample; it is not changed.
-        y : array_like
-            Outputs ``(ny,)``; NaN marks a missing one.  y(0) is not used.
-        u : array_like, optional
-            Known inputs ``(nu,)``.
-
-        Raises
-        ------
-        SpecError
-            A sample has the wrong length, an input is not finite, or the horizon is passed.
-        PreconditionError
-            Rank H_k is lost at this k although no sample is missing.
-        """
-        outputs = measured_record(np.atleast_2d(real_array(y, "y")), self.plant.ny)[0]
-        inputs = real_vector(u, self.plant.nu, "u")
+    def _allow(self, state: RecursiveState) -> None:
         require_horizon(self.plant.horizon, state.k + 1, early=self.early_constraints)
-        after, row = self.advance(state, outputs, inputs)
-        return after, RecursiveEstimates.of(self, [row], window=after.regressors)
 
-    def start(self) -> RunningObserver[RecursiveState, RawEstimate, RecursiveEstimates]:
-        """Return a running observer, at k = 0."""
-        return RunningObserver(self)
+    def _trust(self, row: RawEstimate) -> None:
+        """Raise nothing: a step says itself where it loses rank."""
 
-    def run(self, y: ArrayLike, u: ArrayLike | None = None, *, compiled: bool | None = None) -> RecursiveEstimates:
+    def _sample(self, state: RecursiveState, y: ArrayLike, u: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        outputs = measured_record(np.atleast_2d(real_array(y, "y")), self.plant.ny)[0]
+        return outputs, real_vector(u, self.plant.nu, "u")
+
+    def _estimates(self, state: RecursiveState, row: RawEstimate) -> Estimates:
+        return recursive_estimates(self, [row], window=state.regressors)
+
+    def run(self, y: ArrayLike, u: ArrayLike | None = None, *, compiled: bool | None = None) -> Estimates:
         """Run over a whole record.
 
         Parameters
@@ -112,7 +85,7 @@ class RecursiveObserver(RecursiveSettings):
 
         Returns
         -------
-        RecursiveEstimates
+        Estimates
             One row per sample.
 
         Raises

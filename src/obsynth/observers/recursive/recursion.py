@@ -18,7 +18,6 @@ from obsynth.numerics.least_squares_step import (
 )
 from obsynth.numerics.recursive_least_squares import ParameterState, start_of, update
 from obsynth.observers.outliers import checked_limit, no_refusals, robust_advance
-from obsynth.observers.recursive.estimates import UNDETERMINED_SHARE
 from obsynth.observers.recursive.parameter_steps import (
     ParameterReset,
     RandomWalkParameterSteps,
@@ -35,6 +34,9 @@ from obsynth.observers.recursive.step_model import (
     require_in_range,
 )
 
+#: Share of a diffuse direction below which a state is held to be determined: rounding of an orthonormal basis.
+UNDETERMINED_SHARE = 1e-8
+
 
 class RawEstimate(NamedTuple):
     """What is known at one sample.
@@ -42,8 +44,8 @@ class RawEstimate(NamedTuple):
     Fields: k: The sample; x: ``(nx,)``: the state estimate, with the parameters as they are estimated now; factor:
     ``(nx, any)``: square root of its covariance; diffuse: ``(nx, r)``: directions about which nothing is known;
     parameters: Estimate and spreads; empty without parameters; innovation: ``(m,)``: whitened parity innovation of the
-    model without parameters; regressor: ``(m, nq)``; nis: Squared length of the innovation at the parameters estimated
-    one sample before; y: ``(ny,)``: the outputs that were given, NaN where one was missing.
+    model without parameters; regressor: ``(m, nq)``; gap: ``(m,)``: the innovation at the parameters estimated one
+    sample before; y: ``(ny,)``: the outputs that were given, NaN where one was missing.
     """
 
     k: int
@@ -53,8 +55,41 @@ class RawEstimate(NamedTuple):
     parameters: ParameterState
     innovation: FloatArray
     regressor: FloatArray
-    nis: float
+    gap: FloatArray
     y: FloatArray
+
+    @property
+    def theta(self) -> FloatArray:
+        """The parameters ``(nq,)``."""
+        return self.parameters.theta
+
+    @property
+    def parameter_covariance(self) -> FloatArray:
+        """Covariance of `theta` ``(nq, nq)``."""
+        return self.parameters.spread @ self.parameters.spread.T
+
+    @property
+    def state_deviations(self) -> FloatArray:
+        """Standard deviations ``(nx,)`` of the states; infinite where one is undetermined."""
+        deviations = np.sqrt(np.einsum("ij,ij->i", self.factor, self.factor))
+        open_states = (np.abs(self.diffuse) > UNDETERMINED_SHARE).any(axis=1)
+        return np.where(open_states, np.inf, deviations)
+
+    @property
+    def whitened(self) -> FloatArray:
+        """The innovation in units of its standard deviations, ``(m,)``."""
+        return self.innovation
+
+    @property
+    def nis(self) -> float:
+        """Squared length of `gap`."""
+        return float(self.gap @ self.gap)
+
+    @property
+    def is_finite(self) -> bool:
+        """Whether no number has overflown; an undetermined state has a finite factor."""
+        arrays = (self.x, self.factor, self.theta, self.parameters.spread, self.innovation)
+        return all(bool(np.isfinite(array).all()) for array in arrays)
 
 
 def step_model_of(settings: RecursiveSettings) -> StepModel:
@@ -168,7 +203,7 @@ class Recursion:
         else:
             after, v, G = state, np.zeros(0), np.zeros((0, state.Upsilon.shape[1]))
         gap = v - G @ theta if len(theta) else v
-        row = self._estimate(after, v, G, float(gap @ gap), y)
+        row = self._estimate(after, v, G, gap, y)
         return after._replace(k=state.k + 1, u=u, regressors=(*state.regressors, G)[-self.window :]), row
 
     def _stepped(
@@ -247,16 +282,16 @@ class Recursion:
         return found, (seen[:, 0], regressor, noise)
 
     def _estimate(
-        self, state: RecursiveState, innovation: FloatArray, regressor: FloatArray, nis: float, y: FloatArray
+        self, state: RecursiveState, innovation: FloatArray, regressor: FloatArray, gap: FloatArray, y: FloatArray
     ) -> RawEstimate:
         x, factor, diffuse = state.x, state.factor, state.diffuse
         if self.random_walk:
             nx = self.settings.plant.nx
             nq = len(x) - nx
             known = ParameterState(x[nx:], np.zeros((nq, nq)), factor[nx:])
-            return RawEstimate(state.k, x[:nx], factor[:nx], diffuse[:nx], known, innovation, np.zeros((0, nq)), nis, y)
+            return RawEstimate(state.k, x[:nx], factor[:nx], diffuse[:nx], known, innovation, np.zeros((0, nq)), gap, y)
         known = state.parameters
         if len(known.theta):
             x = x + state.Upsilon @ known.theta
             factor = np.hstack((factor, state.Upsilon @ known.spread))
-        return RawEstimate(state.k, x, factor, diffuse, known, innovation, regressor, nis, y)
+        return RawEstimate(state.k, x, factor, diffuse, known, innovation, regressor, gap, y)

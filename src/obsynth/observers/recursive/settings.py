@@ -12,6 +12,7 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arguments import Count, ForgettingFactor, Probability, checked_value, real_vector, truth
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.covariances import covariance_factor
+from obsynth.observers.estimates import Undelayed
 from obsynth.observers.outliers import Outliers, checked_limit
 from obsynth.plants.sequences import MatrixSequence
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
@@ -80,7 +81,7 @@ class Adaptation:
 
 
 @dataclass(frozen=True, eq=False)
-class RecursiveSettings:
+class RecursiveSettings(Undelayed):
     """The fields of `obsynth.RecursiveObserver`, which is these with a recursion."""
 
     plant: TimeVaryingDescriptorSystem

@@ -105,6 +105,11 @@ def _value(expression: Expression, known: Mapping[str, Any], path: str) -> Any:
             f"{path}: {expression.text!r} uses {', '.join(map(repr, unknown))}, which is no state, input, parameter, "
             f"constant or earlier definition; there are: {', '.join(n for n in known if 'der(' not in n)}.", path=path,
         )  # fmt: skip
+    return symbolic_value(expression, known)
+
+
+def symbolic_value(expression: Expression, known: Mapping[str, Any]) -> Any:
+    """Return a parsed expression of symbols by name as a symbol."""
     import casadi as ca
 
     return ca.SX(expression.translated(known, _translation))

@@ -1,75 +1,47 @@
-"""Plant, scenario and recursive observer side by side: time-varying plants many runs at once, DAEs one by one."""
+"""Plants with parameters side by side with their observers, and the bench of any design."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TypeAlias
 
 import numpy as np
 
-from obsynth.errors import SpecError
+from obsynth.experiments.batch_simulation import Bench, Runs, make_bench
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.covariances import covariance_factor
-from obsynth.observers.dae.estimates import DAEEstimates
 from obsynth.observers.dae.observer import DAEObserver
-from obsynth.observers.recursive.estimates import RecursiveEstimates
+from obsynth.observers.estimates import Estimates
+from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.recursive.gain_schedule import run_batch
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.plants.sequences import MatrixSequence
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.dae import simulate_dae
-from obsynth.simulation.parameter_scenario_signals import resolve_recursive
 from obsynth.simulation.scenario import Scenario
-from obsynth.simulation.scenario_signals import Drive
+from obsynth.simulation.scenario_signals import resolve_parameters
 from obsynth.simulation.time_varying import varying_runs
 
-RowEstimates: TypeAlias = RecursiveEstimates | DAEEstimates
-
 
 @dataclass(frozen=True, eq=False)
-class RecursiveRuns:
-    """What happened in several runs.
+class ParameterBench(Bench):
+    """A recursive or nonlinear design and a scenario.
 
-    Fields: states, outputs: ``(steps, runs, nx)`` and ``(steps, runs, ny)``, outputs as measured; those of a
-    time-varying plant begin with y(1); inputs, parameters: ``(steps, nu)`` and ``(steps, nq)``, of all runs; estimates:
-    One per run.
-    """
-
-    states: FloatArray
-    outputs: FloatArray
-    inputs: FloatArray
-    parameters: FloatArray
-    estimates: tuple[RowEstimates, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class RecursiveBench:
-    """A recursive design and a scenario, ready to run; it can be sent to another process if the model is data.
-
-    Fields: drive: Signals, as they differ from their nominal values; observer: The observer, with the plant;
-    initial_state: ``(nx,)``: true state at the start, as asked for; inputs, parameters: ``(steps, nu)`` and ``(steps,
+    Fields: drive: Signals, as they differ from their nominal values; inputs, parameters: ``(steps, nu)`` and ``(steps,
     nq)``: the true signals.
     """
 
-    drive: Drive
     observer: RecursiveObserver | DAEObserver
-    initial_state: FloatArray
     inputs: FloatArray
     parameters: FloatArray
 
-    @property
-    def onset(self) -> int | None:
-        """First sample at which a parameter is not nominal or a sensor is faulty."""
-        return self.drive.first_fault(slice(self.inputs.shape[1], None))
-
-    def run(self, seeds: Sequence[int]) -> RecursiveRuns:
+    def run(self, seeds: Sequence[int]) -> Runs:
         """Run the plant and the observer, once for each seed."""
         if isinstance(self.observer, DAEObserver):
             return self._run_dae(self.observer, seeds)
         return self._run_varying(self.observer, seeds)
 
-    def _run_varying(self, observer: RecursiveObserver, seeds: Sequence[int]) -> RecursiveRuns:
+    def _run_varying(self, observer: RecursiveObserver, seeds: Sequence[int]) -> Runs:
         steps = self.drive.steps
         mu, nu = np.zeros((steps, len(seeds), observer.plant.ne)), np.zeros((steps - 1, len(seeds), observer.plant.ny))
         process, sensing = _factors(observer.Q, steps), _factors(observer.R, steps - 1)
@@ -85,9 +57,9 @@ class RecursiveBench:
             equation_noise=mu, output_noise=nu,
         )  # fmt: skip
         outputs = self.drive.measured(clean)
-        return RecursiveRuns(states, outputs, self.inputs, self.parameters, self._watched(observer, outputs))
+        return self._runs(states, outputs, self._watched(observer, outputs))
 
-    def _watched(self, observer: RecursiveObserver, outputs: FloatArray) -> tuple[RowEstimates, ...]:
+    def _watched(self, observer: RecursiveObserver, outputs: FloatArray) -> tuple[Estimates, ...]:
         """Return the estimates of every run; gains and covariances are those of the first, unless the observer resets.
 
         They depend on no data: the other runs are one matrix product a step for all of them.
@@ -99,13 +71,13 @@ class RecursiveBench:
         others = run_batch(observer, np.swapaxes(outputs[:, 1:], 0, 1), self.inputs)
         width = first.innovations.shape[1]
         found = [first]
-        for states, parameters, innovations in zip(others.states, others.parameters, others.innovations, strict=True):
+        for states, parameters, innovations in zip(others.states, others.faults, others.innovations, strict=True):
             seen = read_only(innovations[:, :width])
             nis = read_only(_squares(seen, first.regressors, parameters))
-            found.append(replace(first, states=states, parameters=parameters, innovations=seen, nis=nis))
+            found.append(replace(first, states=states, faults=parameters, innovations=seen, nis=nis))
         return tuple(found)
 
-    def _run_dae(self, observer: DAEObserver, seeds: Sequence[int]) -> RecursiveRuns:
+    def _run_dae(self, observer: DAEObserver, seeds: Sequence[int]) -> Runs:
         share = self.drive.noise**2
         states, outputs, estimates = [], [], []
         for seed in seeds:
@@ -118,29 +90,43 @@ class RecursiveBench:
             states.append(truth.states)
             outputs.append(measured)
             estimates.append(observer.run(measured, self.inputs))
-        return RecursiveRuns(
-            np.stack(states, axis=1), np.stack(outputs, axis=1), self.inputs, self.parameters, tuple(estimates)
+        return self._runs(np.stack(states, axis=1), np.stack(outputs, axis=1), tuple(estimates))
+
+    def _runs(self, states: FloatArray, outputs: FloatArray, estimates: tuple[Estimates, ...]) -> Runs:
+        steps, runs = outputs.shape[:2]
+        inputs, parameters = (
+            np.broadcast_to(signal[:, None], (steps, runs, signal.shape[1]))
+            for signal in (self.inputs, self.parameters)
         )
+        rows = np.stack([np.hstack([found.states, found.faults, found.residuals]) for found in estimates], axis=1)
+        none = np.zeros((steps, runs, 0))
+        return Runs(states, outputs, inputs, parameters, none, rows, self.observer, estimates)
 
 
-def make_recursive_bench(design: ObserverDesign, scenario: Scenario) -> RecursiveBench:
-    """Return the bench of a recursive design and a scenario."""
-    observer = design.observer
-    if isinstance(observer, DAEObserver):
+def bench_of(design: ObserverDesign, scenario: Scenario) -> Bench:
+    """Return a design and a scenario, ready to run."""
+    if isinstance(design.observer, LinearObserver):
+        return make_bench(design, scenario)
+    observer: RecursiveObserver | DAEObserver
+    if isinstance(design.observer, DAEObserver):
+        observer = design.observer
         model = observer.model
-        drive = resolve_recursive(model, scenario, dt=observer.dt)
+        drive = resolve_parameters(model, scenario, dt=observer.dt)
         start, inputs, theta = model.nominal_state, model.nominal_input, model.nominal_parameters
-    elif isinstance(observer, RecursiveObserver):
-        adaptation = observer.adaptation
-        drive = resolve_recursive(observer.plant, scenario, dt=observer.dt)
-        start, inputs = observer.initial_state, np.zeros(observer.plant.nu)
-        theta = np.zeros(observer.plant.nq) if adaptation is None else adaptation.initial_parameters
+        note = "The plant was integrated by Radau IIA, with inputs constant during each step."
     else:
-        raise SpecError("The design is linear: use make_bench.", path="design")
+        observer = design.recursive[1]
+        adaptation = observer.adaptation
+        drive = resolve_parameters(observer.plant, scenario, dt=observer.dt)
+        start, inputs = observer.initial_state, np.zeros(observer.plant.nu)
+        note = "The model begins with y(1): the first row of the outputs is empty."
+        theta = np.zeros(observer.plant.nq) if adaptation is None else adaptation.initial_parameters
     names = observer.state_names
     begin = np.array([scenario.initial_state.get(name, value) for name, value in zip(names, start, strict=True)])
-    nu = len(inputs)
-    return RecursiveBench(drive, observer, begin, inputs + drive.left[:, :nu], theta + drive.left[:, nu:])
+    nu, estimated = len(inputs), tuple(range(len(observer.fault_names)))
+    true = inputs + drive.left[:, :nu], theta + drive.left[:, nu:]
+    true = inputs + drive.left[:, :nu], theta + drive.left[:, nu:]
+    return ParameterBench(drive, observer, begin, slice(nu, None), estimated, (note,), *true)
 
 
 def _factors(covariances: MatrixSequence, steps: int) -> FloatArray:

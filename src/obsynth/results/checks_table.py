@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from io import StringIO
+from typing import TYPE_CHECKING
 
 from rich.console import Console, Group, RenderableType
 from rich.padding import Padding
@@ -11,8 +12,10 @@ from rich.rule import Rule
 from rich.table import Table
 from rich.text import Text
 
-from obsynth.report.layout import number, print_section, verdict
-from obsynth.results.report import Check, VerificationReport
+from obsynth.results.layout import number, print_section, verdict
+
+if TYPE_CHECKING:
+    from obsynth.results.report import Check, VerificationReport
 
 #: On narrower terminals the claim stands below the numbers, over the whole width.
 WIDE_ENOUGH = 110

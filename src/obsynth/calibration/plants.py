@@ -1,0 +1,168 @@
+"""What a calibration needs of a plant: one implicit step and the outputs as CasADi functions of unknown constants."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+
+from obsynth.calibration.logs import Log
+from obsynth.errors import SpecError
+from obsynth.numerics.arrays import FloatArray
+from obsynth.plants.dae.functions import DAEFunctions
+from obsynth.plants.dae.model import DAEModel
+from obsynth.plants.dae.symbols import symbols_of
+from obsynth.plants.names import index_of
+
+#: Deviation of an initial state that is not stated, as a share of its nominal size.
+DEFAULT_STATE_SHARE = 0.1
+
+
+class CalibrationPlant(Protocol):
+    """A plant whose constants are to be found."""
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """The states."""
+        ...
+
+    @property
+    def equation_names(self) -> tuple[str, ...]:
+        """The equations, to whose right sides noise may be added."""
+        ...
+
+    @property
+    def values(self) -> Mapping[str, float]:
+        """Nominal value of all that may be unknown."""
+        ...
+
+    @property
+    def unstated(self) -> frozenset[str]:
+        """Those of them without a value that is stated."""
+        ...
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        """Units by name."""
+        ...
+
+    @property
+    def nominal_state(self) -> FloatArray:
+        """``(nx,)``."""
+        ...
+
+    @property
+    def state_scales(self) -> FloatArray:
+        """Sizes of the states ``(nx,)``."""
+        ...
+
+    @property
+    def state_deviations(self) -> FloatArray:
+        """What an initial state may differ by ``(nx,)``."""
+        ...
+
+    @property
+    def nominal_signals(self) -> FloatArray:
+        """``(ns,)``."""
+        ...
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences of every verdict."""
+        ...
+
+    def signals(self, log: Log) -> FloatArray:
+        """Return what steps and outputs take of each row ``(n, ns)``."""
+        ...
+
+    def step(self, unknown: Sequence[str], integration: str) -> tuple[int, Any]:
+        """Return stages, and the function from stages, state before, signals, constants and dt to equations."""
+        ...
+
+    def outputs(self, unknown: Sequence[str]) -> Any:
+        """Return the function from state, signals and constants to y, H and L."""
+        ...
+
+
+class NonlinearPlant:
+    """A `DAEModel`; its signals are its inputs."""
+
+    unstated: frozenset[str] = frozenset()
+    notes: tuple[str, ...] = ()
+
+    def __init__(self, model: DAEModel) -> None:
+        self.model = model
+        self.state_names, self.equation_names = model.state_names, model.equation_names
+        self.values: Mapping[str, float] = {**model.constants, **model.parameters}
+        self.units = model.units
+        self.nominal_state, self.state_scales = np.array(model.nominal_state), np.array(model.state_scales)
+        self.state_deviations = DEFAULT_STATE_SHARE * self.state_scales
+        self.nominal_signals = np.array(model.nominal_input)
+        self._promoted: dict[tuple[str, ...], DAEModel] = {}
+
+    def signals(self, log: Log) -> FloatArray:
+        """Return the inputs ``(n, nu)``."""
+        return log.u
+
+    def promoted(self, unknown: Sequence[str]) -> DAEModel:
+        """Return the model with what is unknown among its parameters."""
+        key = tuple(unknown)
+        if key not in self._promoted:
+            self._promoted[key] = promoted(self.model, key)
+        return self._promoted[key]
+
+    def theta(self, unknown: Sequence[str], t: Any) -> list[Any]:
+        """Return all parameters of the promoted model: the unknown from t, and nominal values for the rest."""
+        model = self.promoted(unknown)
+        entries: list[Any] = model.nominal_parameters.tolist()
+        for i, name in enumerate(unknown):
+            entries[model.parameter_names.index(name)] = t[i]
+        return entries
+
+    def step(self, unknown: Sequence[str], integration: str) -> tuple[int, Any]:
+        """Return stages, and the function from stages, state before, signals, constants and dt to equations."""
+        import casadi as ca
+
+        functions = DAEFunctions(self.promoted(unknown), integration)
+        X, x = ca.SX.sym("X", functions.stages * len(self.nominal_state)), ca.SX.sym("x", len(self.nominal_state))
+        u, t, dt = ca.SX.sym("u", len(self.nominal_signals)), ca.SX.sym("t", len(unknown)), ca.SX.sym("dt")
+        theta = _column(self.theta(unknown, t))
+        found = functions.residual_function(X, x, u, theta, dt)[0]
+        return functions.stages, ca.Function("equations", [X, x, u, t, dt], [found])
+
+    def outputs(self, unknown: Sequence[str]) -> Any:
+        """Return the function from state, signals and constants to y, H and L."""
+        import casadi as ca
+
+        model = self.promoted(unknown)
+        symbols = symbols_of(model)
+        columns = [model.parameter_names.index(name) for name in unknown]
+        H = ca.jacobian(symbols.outputs, symbols.x)
+        L = ca.jacobian(symbols.outputs, symbols.theta)[:, columns]
+        full = ca.Function("h", [symbols.x, symbols.theta], [ca.densify(part) for part in (symbols.outputs, H, L)])
+        x, u, t = ca.SX.sym("x", model.nx), ca.SX.sym("u", model.nu), ca.SX.sym("t", len(unknown))
+        return ca.Function("outputs", [x, u, t], list(full(x, _column(self.theta(unknown, t)))))
+
+
+def _column(entries: Sequence[Any]) -> Any:
+    import casadi as ca
+
+    return ca.vertcat(*(ca.SX(entry) for entry in entries)) if entries else ca.SX(0, 1)
+
+
+def promoted(model: DAEModel, names: Sequence[str]) -> DAEModel:
+    """Return a model whose named constants are parameters, before those it has."""
+    for name in names:
+        index_of(name, [*model.parameter_names, *model.constants], what="unknown")
+    new = [name for name in names if name in model.constants]
+    if not new:
+        return model
+    if not model.is_data:
+        raise SpecError(f"{new[0]!r} is a constant of Python functions, which only texts can give up: make it a "
+                        "parameter.", path=f"unknown.{new[0]}")  # fmt: skip
+    return model.replace(
+        constants={name: value for name, value in model.constants.items() if name not in new},
+        parameters={**{name: model.constants[name] for name in new}, **model.parameters},
+        units={**dict.fromkeys(new, "1"), **model.units},
+    )

@@ -1,0 +1,216 @@
+"""Logs are read afterwards: estimates from what came later as well, on arrays and on logs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from obsynth.data.linear_log import engine_of
+from obsynth.data.log_estimator import Engine, Entry
+from obsynth.data.signals import TIME, Signals
+from obsynth.data.sources import chunks
+from obsynth.data.stamps import Stamps
+from obsynth.data.step_log import SteppingEngine
+from obsynth.errors import SpecError
+from obsynth.numerics.arguments import require_kind
+from obsynth.numerics.arrays import read_only
+from obsynth.observers.estimates import Estimates
+from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.robustness import with_outliers
+from obsynth.observers.smoothing.chain import Smoothed, deviations_in
+from obsynth.observers.smoothing.keeping import (
+    Chain,
+    KeepingObserver,
+    checked_lag,
+    parameters_of,
+    smoothed_estimates,
+    smoothed_record,
+)
+from obsynth.results.design import ObserverDesign
+
+#: Rows of a log that are read at a time.
+CHUNK_ROWS = 10_000
+
+
+class _Waiting(NamedTuple):
+    entry: Entry
+    chain: Chain
+    k: int
+
+
+class LaterRows:
+    """Rows of a log that wait for those after them.
+
+    Fields: engine: Of a recursive or nonlinear design; lag: How many samples they wait; ``None`` for the end.
+    """
+
+    def __init__(self, engine: Engine, lag: int | None) -> None:
+        if not isinstance(engine, SteppingEngine):
+            raise SpecError(
+                "Smoothing is for recursive and nonlinear designs, whose covariances say how much a later sample tells "
+                "of an earlier one: design a descriptor-kalman, adaptive-observer or dae-adaptive-observer.",
+                path="smooth",
+            )
+        self.engine, self.lag = engine, checked_lag(lag)
+        self.keeping = KeepingObserver(engine.observer)
+        engine.observer = self.keeping  # type: ignore[assignment]
+        self.waiting: list[_Waiting] = []
+
+    def take(self, entry: Entry) -> Iterator[tuple[Entry, Any, Smoothed]]:
+        """Take a row after its step; yield those that are smoothed now, with what the observer said of them."""
+        chain = self.keeping.chain
+        if self.waiting and self.waiting[0].chain is not chain:
+            # The observer has started again: what comes says nothing of what was.
+            yield from self.flush()
+        self.waiting.append(_Waiting(entry, chain, chain.last))
+        if self.lag is None:
+            return
+        while self.waiting[0].k + self.lag <= chain.last:
+            ready = self.waiting.pop(0)
+            found = chain.smoothed(self.keeping.links, ready.k, ready.k + self.lag)[0]
+            yield self._shown(ready, found)
+        chain.drop_before(self.waiting[0].k)
+
+    def flush(self) -> Iterator[tuple[Entry, Any, Smoothed]]:
+        """Yield the rows that wait, smoothed by as many samples as there are."""
+        waiting, self.waiting = self.waiting, []
+        if not waiting:
+            return
+        chain = waiting[0].chain
+        found = chain.smoothed(self.keeping.links, waiting[0].k, waiting[-1].k)
+        for ready in waiting:
+            yield self._shown(ready, found[ready.k - waiting[0].k])
+
+    def _shown(self, ready: _Waiting, found: Smoothed) -> tuple[Entry, Any, Smoothed]:
+        nx, row = len(self.engine.state_names), ready.entry.row
+        theta, spread = parameters_of(found, nx)
+        own = (found.x[:nx], theta, deviations_in(found.factor, found.diffuse)[:nx],
+               np.sqrt(np.einsum("ij,ij->i", spread, spread)))  # fmt: skip
+        estimated = np.concatenate(own)
+        values = np.concatenate((estimated, row.values[len(estimated) :]))
+        return ready.entry._replace(row=row._replace(values=values)), ready.chain.row(ready.k), found
+
+
+def smooth(
+    design: ObserverDesign,
+    data: Any,
+    u: ArrayLike | None = None,
+    *,
+    lag: int | None = None,
+    columns: Mapping[str, str] | None = None,
+    time_column: str | None = None,
+    scales: Mapping[str, float] | None = None,
+    outliers: str | None = None,
+) -> Estimates:
+    r"""Estimate each sample of a record from those after it as well.
+
+    A filter knows the past; a log is mostly read afterwards.  With ``x_k = m_k + F_k c_k``, where ``F_k F_k'`` is the
+    filter's covariance and ``c_k ~ N(0, I)``, the orthogonal factorisations of a step give ``c_k`` from ``c_{k+1}``:
+
+    .. math::
+        c_k = j_k + J_k c_{k+1} + N_k b, \quad b \sim N(0, I)
+
+    so that what is known in the end is carried back by products alone.  Smoothed deviations are never above those of
+    the filter.
+
+    Parameters
+    ----------
+    design : ObserverDesign
+        Of the methods ``descriptor-kalman``, ``adaptive-observer`` or ``dae-adaptive-observer``.
+    data : array_like, tuple of two arrays, path, text stream or pandas.DataFrame
+        Outputs ``(samples, ny)``, NaN where a sample is missing, or outputs and inputs; or a log as `run_on_data`
+        takes it, in the signals' units.
+    u : array_like, optional
+        Known inputs ``(samples, nu)`` beside an array of outputs.
+    lag : int, optional
+        Samples that are waited for: the estimate at k is the one from samples up to ``k + lag`` (as many as there are,
+        at the end).  By default the whole record.
+    columns, time_column, scales : optional
+        Of a log, as `run_on_data` takes them.
+    outliers : {"gate", "huber", "none"}, optional
+        What is done with a sample that its prediction excludes; by default what the design says, and for logs a gate
+        where it says nothing.  The smoother takes what the filter took.
+
+    Returns
+    -------
+    Estimates
+        One row per sample (of a log: per row of it, with the operating point added back).  States, parameters and their
+        deviations are smoothed; innovations and what belongs to them are the filter's.
+
+    Raises
+    ------
+    SpecError
+        The design is of another method, shapes do not fit, ``lag`` is no positive number, or the whole record of a
+        stream is asked for; a log has irregular time stamps (the row is named).
+    PreconditionError
+        Form ``literal``, whose residuals are correlated in time; rank H_k is lost at some k.
+
+    Notes
+    -----
+    Rauch, Tung and Striebel need the inverse of the predicted covariance; here nothing is inverted but triangles, so
+    that E, Q, R and P_0 may be singular.  States that missing samples leave undetermined keep infinite deviations only
+    if nothing later determines them.
+
+    Parameters: as states where they walk.  Forms with a forgetting factor lambda weigh samples before and after k by
+    ``lambda ** |j - k|``, with the covariance that this estimate has while the parameters are constant; for
+    ``lambda = 1`` it is the least-squares estimate from the whole record.  Behind a reset nothing is carried.
+
+    Nonlinear designs are linearised along the filter's estimates (the extended smoother), which is exact for linear
+    plants; forms ``random-walk`` and ``augmented-kalman`` take states and parameters together.  Bounds of parameters
+    cut the estimates and leave covariances as they are.
+
+    References
+    ----------
+    .. [RauchTungStriebel1965] Maximum likelihood estimates of linear dynamic systems, AIAA Journal 3 (8), 1445-1450.
+    .. [Paige1977] Paige, Saunders, Least squares estimation of discrete linear dynamic systems using orthogonal
+       transformations, SIAM Journal on Numerical Analysis 14 (2), 180-193: the square-root form; ours keeps the way
+       back of each step instead of one large factorisation, and lets E be singular.
+    """
+    require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
+    waited = checked_lag(lag)
+    if isinstance(design.observer, LinearObserver):
+        # The same refusal as on logs.
+        LaterRows(engine_of(design), waited)
+    if _is_log(data):
+        if u is not None:
+            raise SpecError("u is for arrays: a log has the inputs in its columns.", path="u")
+        if waited is None and hasattr(data, "readline"):
+            raise SpecError("A stream has no end: give a lag, or the whole log as a file.", path="lag")
+        if time_column is not None:
+            columns = {**(columns or {}), TIME: time_column}
+        engine = engine_of(design, outliers=outliers)
+        return _smoothed_log(engine, data, waited, Signals.of(engine, columns, scales))
+    if columns or scales or time_column:
+        raise SpecError("columns, time_column and scales are for logs: arrays have their signals in order.",
+                        path="columns")  # fmt: skip
+    observer: Any = design.observer
+    if outliers is not None:
+        observer = with_outliers(observer, outliers)
+    if isinstance(data, tuple) and len(data) == 2 and u is None and np.ndim(data[0]) == 2:
+        data, u = data
+    return smoothed_record(observer, data, u, waited)
+
+
+def _is_log(data: Any) -> bool:
+    return isinstance(data, str) or hasattr(data, "__fspath__") or hasattr(data, "readline") or hasattr(data, "columns")
+
+
+def _smoothed_log(engine: Any, data: Any, lag: int | None, signals: Signals) -> Estimates:
+    later, observer = LaterRows(engine, lag), engine.observer.observer
+    found: list[tuple[Entry, Any, Smoothed]] = []
+    count = 0
+    for chunk in chunks(data, signals, Stamps(), CHUNK_ROWS):
+        values = signals.scale * chunk[:, 1:] - signals.offset
+        for time, deviations in zip(chunk[:, 0].tolist(), values, strict=True):
+            count += 1
+            found.extend(later.take(Entry(time, deviations, engine.step(time, deviations, count))))
+    found.extend(later.flush())
+    known = smoothed_estimates(observer, [row for _, row, _ in found], [sample for _, _, sample in found])
+    point = signals.estimates_point(engine)
+    nx, nq = len(engine.state_names), len(engine.fault_names)
+    return replace(known, states=read_only(known.states + point[:nx]),
+                   faults=read_only(known.faults + point[nx : nx + nq]))  # fmt: skip

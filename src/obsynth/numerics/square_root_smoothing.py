@@ -1,0 +1,180 @@
+r"""One step of a least-squares filter with the way back from what is known later: smoothing in square roots.
+
+A filter knows ``x = m + F c + D d`` with ``c ~ N(0, I)`` and d unknown.  From the coordinates ``(c, d)`` of a sample
+and those of the next one, the orthogonal factorisations of the step give
+
+.. math::
+    \begin{bmatrix} c_k \\ d_k \end{bmatrix} = j_0 + J_1 \begin{bmatrix} c_{k+1} \\ d_{k+1} \end{bmatrix}
+    + J_2 b + J_3 w, \quad b \sim N(0, I), \quad w \text{ unknown},
+
+in which b and w are independent of everything later.  No covariance is formed, and nothing is inverted but triangles,
+so that covariances may be singular: the smoother of Rauch, Tung and Striebel without its inverse of the predicted
+covariance.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.least_squares_step import PERFECT_PARITY, SUSPECT_PARITY, projection_of
+from obsynth.numerics.ranks import RANK_TOLERANCE
+
+
+class Gaussian(NamedTuple):
+    """Coordinates of a sample as far as they are known: ``mean + factor e + diffuse w``.
+
+    Fields: mean: ``(c, columns)``: the first column is the mean, the others its derivatives by parameters; factor:
+    ``(c, any)``; diffuse: ``(c, any)``: directions about which nothing is known.
+    """
+
+    mean: FloatArray
+    factor: FloatArray
+    diffuse: FloatArray
+
+
+class WayBack(NamedTuple):
+    """The coordinates of one sample from those of the next.
+
+    Fields: offset: ``(c, columns)``: j_0; from_next: ``(c, c_next)``: J_1; noise: ``(c, any)``: J_2; unknown: ``(c,
+    any)``: J_3.
+    """
+
+    offset: FloatArray
+    from_next: FloatArray
+    noise: FloatArray
+    unknown: FloatArray
+
+
+class JointStep(NamedTuple):
+    """A step of a filter and the way back.
+
+    Fields: estimate: ``(n, columns)``; factor: ``(n, any)``: square root of the covariance; diffuse: ``(n, r)``;
+    back: From the coordinates after the step to those before it.
+    """
+
+    estimate: FloatArray
+    factor: FloatArray
+    diffuse: FloatArray
+    back: WayBack
+
+
+def joint_step(
+    H: FloatArray, known: FloatArray, noise: FloatArray, right: FloatArray, unknown: FloatArray
+) -> JointStep:
+    """Solve ``H x = right + [known noise] e + unknown d``, where known and unknown multiply the coordinates before.
+
+    Shapes: ``H (rows, n)``, ``known (rows, c)``, ``noise (rows, any)``, ``right (rows, columns)``, ``unknown (rows,
+    r)``.  The rank of H may be short where samples are missing.
+    """
+    S = np.hstack((known, noise))
+    if S.shape[1] < len(H):
+        S = np.hstack((S, np.zeros((len(H), len(H) - S.shape[1]))))
+    found = None if unknown.shape[1] else _regular(H, S, known.shape[1], right)
+    return _by_rank(H, S, known.shape[1], right, unknown) if found is None else found
+
+
+def _regular(H: FloatArray, S: FloatArray, width: int, right: FloatArray) -> JointStep | None:
+    """Solve a step by LAPACK alone, or return ``None`` where a rank has to be decided."""
+    from scipy.linalg import solve_triangular
+
+    projection = projection_of(H)
+    if projection is None:
+        return None
+    n, rows = len(projection.head), len(H)
+    m = rows - n
+    orthogonal, triangle = np.linalg.qr((projection.rotation @ S).T, mode="complete")
+    data = projection.rotation @ right
+    if m and np.abs(np.diagonal(triangle)[:m]).min() <= SUSPECT_PARITY * np.linalg.norm(S):
+        return None
+    white = -solve_triangular(triangle[:m, :m].T, data[:m], lower=True) if m else data[:0]
+    carried = data[m:] + triangle[:m, m:rows].T @ white
+    solved = solve_triangular(projection.head, np.hstack((carried, triangle[m:rows, m:rows].T)))
+    head = orthogonal[:width]
+    back = WayBack(head[:, :m] @ white, head[:, m:rows], head[:, rows:], np.zeros((width, 0)))
+    columns = right.shape[1]
+    return JointStep(solved[:, :columns], solved[:, columns:], np.zeros((n, 0)), back)
+
+
+def _by_rank(H: FloatArray, S: FloatArray, width: int, right: FloatArray, unknown: FloatArray) -> JointStep:
+    """Solve a step in which x may be undetermined, noise may be missing, and earlier directions are unknown."""
+    from scipy.linalg import qr, solve_triangular
+
+    n, columns = H.shape[1], right.shape[1]
+    whole = np.hstack([H, -unknown])
+    lengths = np.linalg.norm(whole, axis=0)
+    lengths[lengths == 0.0] = 1.0
+    q, r, order = qr(whole / lengths, pivoting=True)
+    sizes = np.abs(np.diagonal(r))
+    rank = int(np.sum(sizes > RANK_TOLERANCE * max(float(sizes[0]), 0.0))) if sizes.size else 0
+    q1, q2, head = q[:, :rank], q[:, rank:], r[:rank, :rank]
+    white, turned, count = _whitened(q2, S, right)
+    rotated = q1.T @ S @ turned
+    solved = np.zeros((whole.shape[1], columns + S.shape[1] - count))
+    if rank:
+        data = np.hstack((q1.T @ right + rotated[:, :count] @ white, rotated[:, count:]))
+        solved[order[:rank]] = solve_triangular(head, data)
+    solved = solved / lengths[:, None]
+    # The part of the solution that is free: x and the coordinates d, in scaled units.
+    free = np.zeros((whole.shape[1], whole.shape[1] - rank))
+    if rank and free.shape[1]:
+        free[order[:rank]] = -solve_triangular(head, r[:rank, rank:])
+    free[order[rank:]] = np.eye(free.shape[1])
+    free = np.linalg.qr(free)[0] if free.shape[1] else free
+    left, values, right_vectors = np.linalg.svd(free[:n], full_matrices=True)
+    kept = int(np.sum(values > RANK_TOLERANCE))
+    basis, weights = np.linalg.qr(left[:, :kept] / lengths[:n, None])
+    into = right_vectors[:kept].T @ (np.linalg.inv(weights) / values[:kept, None])
+    # What acts on x, in as few directions as it needs; the others only act on what came before.
+    spread = solved[:n, columns:]
+    compact, triangle = np.linalg.qr(spread.T, mode="complete")
+    most = min(n, spread.shape[1])
+    before, lost = turned[:width, count:], free[n:] / lengths[n:, None]
+    upper = np.hstack((before @ compact[:, :most], np.zeros((width, kept))))
+    lower = np.hstack((solved[n:, columns:] @ compact[:, :most], lost @ into))
+    back = WayBack(
+        np.vstack((turned[:width, :count] @ white, solved[n:, :columns])), np.vstack((upper, lower)),
+        np.vstack((before @ compact[:, most:], solved[n:, columns:] @ compact[:, most:])),
+        np.vstack((np.zeros((width, free.shape[1] - kept)), lost @ right_vectors[kept:].T)),
+    )  # fmt: skip
+    return JointStep(solved[:n, :columns], triangle[:most].T, basis, back)
+
+
+def _whitened(q2: FloatArray, S: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray, int]:
+    """Return what the parity says of some directions of e, an orthogonal matrix that has these first, and how many.
+
+    Rows that are free of noise are those of perfect equations, which the filter has found to agree.
+    """
+    from scipy.linalg import qr, solve_triangular
+
+    if not q2.shape[1]:
+        return np.zeros((0, right.shape[1])), np.eye(S.shape[1]), 0
+    sizes = np.abs(q2.T) @ np.linalg.norm(S, axis=1)
+    sizes[sizes == 0.0] = 1.0
+    turned, t, order = qr((q2.T @ S / sizes[:, None]).T, pivoting=True)
+    count = int(np.sum(np.abs(np.diagonal(t)) > PERFECT_PARITY))
+    data = (q2.T @ right / sizes[:, None])[order][:count]
+    white = -solve_triangular(t[:count, :count].T, data, lower=True) if count else data
+    return white, turned, count
+
+
+def stepped_back(later: Gaussian, back: WayBack) -> Gaussian:
+    """Return what is known of the coordinates before a step from what is known of those after it."""
+    mean = back.offset + back.from_next @ later.mean
+    factor = np.hstack((back.from_next @ later.factor, back.noise))
+    if factor.shape[1] > len(factor):
+        factor = np.asarray(np.linalg.qr(factor.T, mode="r")).T
+    diffuse = np.hstack((back.from_next @ later.diffuse, back.unknown))
+    if diffuse.shape[1]:
+        left, values, _ = np.linalg.svd(diffuse, full_matrices=False)
+        diffuse = left[:, values > RANK_TOLERANCE * max(float(values[0]), 1.0)]
+    return Gaussian(mean, factor, diffuse)
+
+
+def nothing_later(width: int, unknown: int, columns: int) -> Gaussian:
+    """Return what a filter knows of its own coordinates: c ~ N(0, I), and nothing of d."""
+    factor, diffuse = np.zeros((width + unknown, width)), np.zeros((width + unknown, unknown))
+    factor[:width], diffuse[width:] = np.eye(width), np.eye(unknown)
+    return Gaussian(np.zeros((width + unknown, columns)), factor, diffuse)

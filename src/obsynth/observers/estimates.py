@@ -1,0 +1,203 @@
+"""What an observer says: estimates with their names and delays, and how far they may be off where it knows."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from obsynth.numerics.arrays import FloatArray, read_only
+
+if TYPE_CHECKING:
+    from obsynth.observers.linear.observer import LinearObserver
+
+NOTHING = read_only(np.zeros(0))
+#: The residual of an observer of a nonlinear plant: of its equations in each step.
+STEP_RESIDUAL = ("equations",)
+
+
+def nothing() -> FloatArray:
+    """Return an empty array: what an observer does not say."""
+    return NOTHING
+
+
+@dataclass(frozen=True, eq=False)
+class Estimates:
+    """What an observer says, one row per sample; of a batch there is an axis of trials before the samples.
+
+    Every observer gives the first eight; recursive and nonlinear ones say besides how far their estimates may be off,
+    and what their innovations are.  Arrays that an observer does not know are empty, and deviations NaN.
+
+    Parameters
+    ----------
+    states : FloatArray
+        ``(samples, nx)``; column i estimates state i at ``k - state_delays[i]``.
+    faults : FloatArray
+        ``(samples, nf)``; column i estimates fault i at ``k - fault_delays[i]``.  The faults of a plant with parameters
+        are these: `parameters` is another name.
+    residuals : FloatArray
+        ``(samples, nr)``; of a nonlinear observer one column, the scaled residual of the equations in each step.
+    state_names, fault_names, residual_names : tuple of str
+        Names of the columns.
+    state_delays, fault_delays : tuple of int
+        Delays in samples.
+    state_deviations : FloatArray
+        ``(samples, nx)``: standard deviations; infinite where missing samples leave a state undetermined.
+    fault_covariances : FloatArray
+        ``(samples, nf, nf)``: the covariance of the estimates while the parameters are constant (or walk as stated).
+        S is none: with forgetting it says how much is still remembered.
+    state_covariances, cross_covariances : FloatArray
+        ``(samples, nx, nx)`` and ``(samples, nx, nf)``: of the states, and of states with faults, see
+        `joint_covariances`; recursive observers (but for the compiled kernel) and nonlinear ones (but for batches).
+    innovations : FloatArray
+        ``(samples, m)``.  Recursive observers: whitened parity innovations of the model without parameters; NaN where
+        there are fewer.  Nonlinear ones: in units of the outputs; NaN where a sample is missing.
+    regressors : FloatArray
+        ``(samples, m, nq)``, recursive observers: innovations minus regressors times the true parameters are white,
+        N(0, I).
+    innovation_covariances : FloatArray
+        ``(samples, ny, ny)``, nonlinear observers: what is expected of the innovations; rows and columns of missing
+        samples are those of the identity.
+    nis, nis_degrees : FloatArray
+        ``(samples,)``: squared innovations in units of their covariance, at the parameters estimated one sample before,
+        and degrees of freedom, not counting the parameters.
+    excitation : FloatArray
+        ``(samples,)``: least eigenvalue of the information on the parameters in the last `window` samples, in parameter
+        units to the power -2 (nonlinear observers: in units of ``S_0^-1``, so that below one a window says less than
+        was known before); (26) asks that it stays above some alpha > 0.  Zero while the window fills; NaN for the
+        random walk of a recursive observer, which has no regressors (`certificate.claims` hold the least level).
+    conditions : FloatArray
+        ``(samples,)``, nonlinear observers: condition of (7).
+    contraction : FloatArray
+        ``(samples,)``, nonlinear observers: spectral radius of F (I - K H); an error of the state filter decays in
+        about ``-1 / log`` of it steps, which should not be longer than the window ``1 / (1 - lambda)``.
+    projection : FloatArray
+        ``(nx,)``, nonlinear observers: how far the initial state was moved onto its constraint.
+    received : numpy.ndarray
+        ``(samples, ny)``, of bool: which outputs were there; recursive and nonlinear observers.
+    """
+
+    states: FloatArray
+    faults: FloatArray
+    residuals: FloatArray
+    state_names: tuple[str, ...]
+    fault_names: tuple[str, ...]
+    residual_names: tuple[str, ...]
+    state_delays: tuple[int, ...]
+    fault_delays: tuple[int, ...]
+    state_deviations: FloatArray = field(default_factory=nothing)
+    fault_covariances: FloatArray = field(default_factory=nothing)
+    state_covariances: FloatArray = field(default_factory=nothing)
+    cross_covariances: FloatArray = field(default_factory=nothing)
+    innovations: FloatArray = field(default_factory=nothing)
+    regressors: FloatArray = field(default_factory=nothing)
+    innovation_covariances: FloatArray = field(default_factory=nothing)
+    nis: FloatArray = field(default_factory=nothing)
+    nis_degrees: FloatArray = field(default_factory=nothing)
+    excitation: FloatArray = field(default_factory=nothing)
+    conditions: FloatArray = field(default_factory=nothing)
+    contraction: FloatArray = field(default_factory=nothing)
+    projection: FloatArray = field(default_factory=nothing)
+    received: NDArray[np.bool_] = field(default_factory=lambda: NOTHING.astype(bool))
+
+    def __post_init__(self) -> None:
+        nf = len(self.fault_names)
+        unknown = {"state_deviations": self.states.shape, "fault_covariances": (*self.faults.shape, nf)}
+        for name, shape in unknown.items():
+            if getattr(self, name) is NOTHING:
+                object.__setattr__(self, name, np.broadcast_to(np.nan, shape))
+
+    @property
+    def has_deviations(self) -> bool:
+        """Whether the observer says how far its estimates may be off."""
+        return not (np.isnan(self.state_deviations).all() and np.isnan(self.fault_covariances).all())
+
+    @property
+    def fault_deviations(self) -> FloatArray:
+        """Standard deviations of the fault estimates ``(samples, nf)``; NaN where the observer knows none."""
+        return np.asarray(np.sqrt(np.einsum("...ii->...i", self.fault_covariances)))
+
+    @property
+    def joint_covariances(self) -> FloatArray:
+        """Covariances of states and faults together ``(samples, nx + nf, nx + nf)``; empty where they are not known."""
+        if not self.state_covariances.size:
+            return NOTHING
+        across = self.cross_covariances
+        return np.concatenate([
+            np.concatenate([self.state_covariances, across], axis=-1),
+            np.concatenate([np.swapaxes(across, -1, -2), self.fault_covariances], axis=-1),
+        ], axis=-2)  # fmt: skip
+
+    @property
+    def parameters(self) -> FloatArray:
+        """The estimates of the parameters ``(samples, nq)``: the same as `faults`."""
+        return self.faults
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """The same as `fault_names`."""
+        return self.fault_names
+
+    @property
+    def parameter_covariances(self) -> FloatArray:
+        """The same as `fault_covariances`, ``(samples, nq, nq)``."""
+        return self.fault_covariances
+
+    @property
+    def parameter_deviations(self) -> FloatArray:
+        """The same as `fault_deviations`, ``(samples, nq)``."""
+        return self.fault_deviations
+
+    @classmethod
+    def split(cls, observer: LinearObserver, rows: FloatArray) -> Estimates:
+        """Return the estimates in the output rows of a linear observer.
+
+        Parameters
+        ----------
+        observer : LinearObserver
+            Whose rows they are.
+        rows : FloatArray
+            ``(samples, nx + nf + nr)``.
+        """
+        return cls(
+            read_only(rows[..., observer.state_rows]), read_only(rows[..., observer.fault_rows]),
+            read_only(rows[..., observer.residual_rows]), observer.state_names, observer.fault_names,
+            observer.residual_names, observer.state_delays, observer.fault_delays,
+        )  # fmt: skip
+
+
+class Undelayed(ABC):
+    """An observer whose estimates are of the sample that it has just been given."""
+
+    @property
+    @abstractmethod
+    def state_names(self) -> tuple[str, ...]:
+        """The states that are estimated, in order."""
+
+    @property
+    @abstractmethod
+    def fault_names(self) -> tuple[str, ...]:
+        """The faults or parameters that are estimated, in order."""
+
+    @property
+    def state_delays(self) -> tuple[int, ...]:
+        """Samples by which each state estimate lags: none."""
+        return (0,) * len(self.state_names)
+
+    @property
+    def fault_delays(self) -> tuple[int, ...]:
+        """Samples by which each fault estimate lags: none."""
+        return (0,) * len(self.fault_names)
+
+
+def named_estimates(observer: Undelayed, *, states: FloatArray, faults: FloatArray, **known: Any) -> Estimates:
+    """Return the estimates of an observer without delays; arrays are made read-only."""
+    residuals = known.pop("residuals", np.zeros((*states.shape[:-1], 0)))
+    arrays: dict[str, Any] = {name: value if value.dtype == bool else read_only(value) for name, value in known.items()}
+    return Estimates(
+        read_only(states), read_only(faults), read_only(residuals), observer.state_names, observer.fault_names,
+        STEP_RESIDUAL[: residuals.shape[-1]], observer.state_delays, observer.fault_delays, **arrays,
+    )  # fmt: skip

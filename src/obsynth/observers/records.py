@@ -1,0 +1,107 @@
+"""Checking what an observer is made of, and the samples and records it is given."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from obsynth.errors import SpecError
+from obsynth.numerics.arguments import is_whole, real_array
+from obsynth.numerics.arrays import FloatArray, as_matrix, unmasked
+
+#: The fields of an observer that hold names.
+NAME_FIELDS = ("input_names", "output_names", "state_names", "fault_names", "residual_names")
+
+
+def require_names(names: Any, field: str) -> None:
+    """Raise `SpecError` unless ``names`` is a tuple of unique, non-empty texts."""
+    if not isinstance(names, tuple):
+        raise SpecError(f"{field} of the observer is a {type(names).__name__}: give a tuple of names.", path=field)
+    if not all(isinstance(name, str) and name.strip() for name in names):
+        raise SpecError(f"{field} of the observer must be a tuple of non-empty texts.", path=field)
+    repeated = sorted({name for name in names if names.count(name) > 1})
+    if repeated:
+        raise SpecError(
+            f"{field} of the observer repeats {', '.join(map(repr, repeated))}: names must be unique.", path=field
+        )
+
+
+def is_delay(delay: Any) -> bool:
+    """Whether ``delay`` is a whole number of samples, 0 or more."""
+    return is_whole(delay) and delay >= 0
+
+
+def require_horizon(horizon: int | None, samples: int, *, early: bool) -> None:
+    """Raise `SpecError` when a record of ``samples`` is longer than a model of ``horizon`` steps reaches."""
+    if horizon is None:
+        return
+    reach = horizon if early else horizon + 1
+    if samples > reach:
+        raise SpecError(
+            f"The record has {samples} samples, but the plant's horizon of {horizon} steps is good for {reach}"
+            f"{' (early constraints need one step more)' if early else ''}: extend the model, or "
+            "shorten the record.", path="horizon",
+        )  # fmt: skip
+
+
+def measured_record(value: ArrayLike, columns: int) -> FloatArray:
+    """Return outputs ``(samples, columns)`` in which NaN marks what is missing."""
+    try:
+        array = real_array(value, "y")
+    except SpecError:
+        raise SpecError("y must be numbers (NaN for a missing sample), with the same number at each sample.",
+                        path="y") from None  # fmt: skip
+    if array.ndim == 1 and columns == 1:
+        array = array.reshape(-1, 1)
+    if array.ndim != 2 or array.shape[1] != columns:
+        raise SpecError(f"y has shape {array.shape}, but the observer needs (samples, {columns}).", path="y")
+    if np.isinf(array).any():
+        raise SpecError("y holds an infinity: mark a missing sample by NaN.", path="y")
+    return array
+
+
+def _numbers(value: Any, name: str) -> FloatArray:
+    """Return an array of finite real numbers of one or two dimensions; raise `SpecError` naming it."""
+    try:
+        raw = np.asarray(unmasked(value))
+    except ValueError:
+        raise SpecError(f"{name} is ragged: give the same number of signals at each sample.", path=name) from None
+    if raw.ndim <= 1:
+        return np.asarray(as_matrix(raw.reshape(1, -1), name)[0])
+    return as_matrix(raw, name)
+
+
+def checked_record(value: Any, columns: int, name: str) -> FloatArray:
+    """Return a record ``(samples, columns)``; one signal may be given as a plain list."""
+    if value is None:
+        raise SpecError(f"{name} is missing: the observer needs {columns} signal(s).", path=name)
+    array = _numbers(value, name)
+    if array.ndim == 1 and columns == 1:
+        array = array.reshape(-1, 1)
+    if array.ndim != 2 or array.shape[1] != columns:
+        raise SpecError(f"{name} has shape {array.shape}, but the observer needs (samples, {columns}).", path=name)
+    return array
+
+
+def checked_sample(value: Any, count: int, name: str) -> FloatArray:
+    """Return one sample ``(count,)``."""
+    array = _numbers(value, name)
+    if array.shape != (count,):
+        raise SpecError(f"{name} has shape {array.shape}, but the observer needs {count} number(s).", path=name)
+    return array
+
+
+def whole_record(
+    y: ArrayLike, u: ArrayLike | None, ny: int, nu: int, *, complete: bool = False
+) -> tuple[FloatArray, FloatArray]:
+    """Return outputs ``(samples, ny)``, all there where ``complete``, and known inputs ``(samples, nu)``.
+
+    Inputs may be left out where there are none.
+    """
+    outputs = checked_record(y, ny, "y") if complete else measured_record(y, ny)
+    inputs = checked_record(np.zeros((len(outputs), 0)) if u is None and not nu else u, nu, "u")
+    if len(inputs) != len(outputs):
+        raise SpecError(f"u has {len(inputs)} samples and y has {len(outputs)}: give the same number.", path="u")
+    return outputs, inputs

@@ -1,0 +1,1 @@
+"""Smoothers: estimates of each sample from those after it as well."""

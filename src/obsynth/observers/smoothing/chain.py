@@ -1,0 +1,166 @@
+"""The samples of a run as a chain that can be followed backwards: what the end of a record says of its beginning."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.square_root_smoothing import Gaussian, WayBack, nothing_later, stepped_back
+from obsynth.observers.recursive.recursion import UNDETERMINED_SHARE
+
+
+class Lesson(NamedTuple):
+    """What the samples up to one, and that one itself, say of constant parameters.
+
+    Fields: theta: ``(nq,)``: the estimate; triangle: ``(any, nq)``: its weight is ``triangle' triangle``; spread:
+    ``(nq, any)``: square root of its covariance; v, G: ``v = G theta + noise`` of this sample, ``(m,)`` and ``(m,
+    nq)``; noise: ``(m, any)``: square root of the covariance of that noise, in units of the weight; is_reset: Whether
+    what was learnt before this sample was forgotten at it.
+    """
+
+    theta: FloatArray
+    triangle: FloatArray
+    spread: FloatArray
+    v: FloatArray
+    G: FloatArray
+    noise: FloatArray
+    is_reset: bool = False
+
+
+class Node(NamedTuple):
+    """One sample of the chain: ``x = origin [1; theta] + factor c + diffuse d`` with parameters theta.
+
+    Fields: origin: ``(n, 1 + nq)`` of constant parameters, ``(n, 1)`` where they are among the states or none; factor:
+    ``(n, any)``; diffuse: ``(n, r)``; back: To the coordinates of the sample before; `None` at the first; lesson: Of
+    constant parameters; `None` where there are none.
+    """
+
+    origin: FloatArray
+    factor: FloatArray
+    diffuse: FloatArray
+    back: WayBack | None
+    lesson: Lesson | None = None
+
+
+class Smoothed(NamedTuple):
+    """One smoothed sample.
+
+    Fields: x: ``(n,)``; factor: ``(n, any)``: square root of its covariance; diffuse: ``(n, r)``: directions about
+    which nothing is known; theta: ``(nq,)``; spread: ``(nq, any)``: square root of their covariance; both empty where
+    parameters are among the states.
+    """
+
+    x: FloatArray
+    factor: FloatArray
+    diffuse: FloatArray
+    theta: FloatArray
+    spread: FloatArray
+
+
+class LaterLessons:
+    """Constant parameters from the samples after one, with weights that fall by the forgetting factor.
+
+    They are independent of what the sample itself has learnt, and of the errors of the states at given parameters.
+
+    Fields: forgetting: lambda; triangle: ``(any, nq + 1)``: weight and weighted data; noise: ``(nq, any)``: square root
+    of the covariance of the weighted sum.
+    """
+
+    def __init__(self, forgetting: float, nq: int) -> None:
+        self.forgetting = forgetting
+        self.triangle, self.noise = np.zeros((0, nq + 1)), np.zeros((nq, 0))
+
+    def add(self, lesson: Lesson) -> None:
+        """Take in one more sample, before those that were taken in."""
+        if lesson.is_reset:
+            # The change lies here: what came later does not hold before it, and it is the later sample that says so.
+            self.triangle, self.noise = self.triangle[:0], self.noise[:, :0]
+            return
+        share, nq = self.forgetting, len(self.noise)
+        stacked = np.vstack((self.triangle, np.column_stack((lesson.G, lesson.v)))) * np.sqrt(share)
+        self.triangle = np.asarray(np.linalg.qr(stacked, mode="r")) if len(stacked) > nq + 1 else stacked
+        noise = np.hstack((self.noise, lesson.G.T @ lesson.noise)) * share
+        self.noise = np.asarray(np.linalg.qr(noise.T, mode="r")).T if noise.shape[1] > nq else noise
+
+    def beside(self, lesson: Lesson) -> tuple[FloatArray, FloatArray]:
+        """Return the parameters, and a square root of their covariance, from both sides."""
+        nq = len(lesson.theta)
+        if not len(self.triangle):
+            return lesson.theta, lesson.spread
+        stacked = np.vstack((np.column_stack((lesson.triangle, lesson.triangle @ lesson.theta)), self.triangle))
+        packed: FloatArray = np.asarray(np.linalg.qr(stacked, mode="r"))
+        triangle = packed[:nq, :nq]
+        sums = np.hstack((lesson.triangle.T @ (lesson.triangle @ lesson.spread), self.noise))
+        theta: FloatArray = np.asarray(np.linalg.solve(triangle, packed[:nq, nq]))
+        return theta, np.asarray(np.linalg.solve(triangle, np.linalg.solve(triangle.T, sums)))
+
+
+@dataclass(frozen=True)
+class Links:
+    """How an observer makes a chain.
+
+    Fields: first: From the state after the first sample and its row to its node; next: From the node before, the states
+    before and after a sample, its row and its input to its node; begun: From the state at which a run went on to the
+    node it stands for; forgetting: lambda of constant parameters; limits: Lower and upper bounds of the states and of
+    the parameters ``(2, n)`` and ``(2, nq)``.
+    """
+
+    first: Callable[[Any, Any, FloatArray], Node]
+    next: Callable[[Node, Any, Any, Any, FloatArray], Node]
+    begun: Callable[[Any], Node]
+    forgetting: float = 1.0
+    limits: tuple[FloatArray, FloatArray] | None = None
+
+
+def smoothed_from(links: Links, nodes: Sequence[Node], begin: int, end: int) -> list[Smoothed]:
+    """Return the samples ``begin ... end`` as those up to ``end`` say, in this order."""
+    last = nodes[end]
+    columns = last.origin.shape[1]
+    known = nothing_later(last.factor.shape[1], last.diffuse.shape[1], columns)
+    later = LaterLessons(links.forgetting, 0 if last.lesson is None else len(last.lesson.theta))
+    found = []
+    for i in range(end, begin - 1, -1):
+        node = nodes[i]
+        found.append(_smoothed(links, node, known, later))
+        if i > begin and node.back is not None:
+            known = stepped_back(known, node.back)
+            if node.lesson is not None:
+                later.add(node.lesson)
+    return found[::-1]
+
+
+def _smoothed(links: Links, node: Node, known: Gaussian, later: LaterLessons) -> Smoothed:
+    both = np.hstack((node.factor, node.diffuse))
+    x, factor, diffuse = node.origin + both @ known.mean, both @ known.factor, both @ known.diffuse
+    theta, spread = np.zeros(0), np.zeros((0, 0))
+    if node.lesson is not None:
+        theta, spread = later.beside(node.lesson)
+    if x.shape[1] > 1:
+        factor = np.hstack((factor, x[:, 1:] @ spread))
+    estimate = x[:, 0] + x[:, 1:] @ theta if x.shape[1] > 1 else x[:, 0]
+    if links.limits is not None:
+        of_states, of_parameters = links.limits
+        estimate = np.clip(estimate, *of_states)
+        theta = np.clip(theta, *of_parameters) if len(theta) else theta
+    return Smoothed(estimate, factor, diffuse, theta, spread)
+
+
+def all_smoothed(links: Links, nodes: Sequence[Node], lag: int | None) -> list[Smoothed]:
+    """Return every sample, from the whole chain or from ``lag`` samples after it."""
+    last = len(nodes) - 1
+    if not nodes:
+        return []
+    if lag is None or lag >= last:
+        return smoothed_from(links, nodes, 0, last)
+    found = [smoothed_from(links, nodes, i, i + lag)[0] for i in range(last - lag)]
+    return found + smoothed_from(links, nodes, last - lag, last)
+
+
+def deviations_in(factor: FloatArray, diffuse: FloatArray) -> FloatArray:
+    """Return standard deviations ``(n,)``, infinite where a state is undetermined."""
+    deviations = np.sqrt(np.einsum("ij,ij->i", factor, factor))
+    return np.where((np.abs(diffuse) > UNDETERMINED_SHARE).any(axis=1), np.inf, deviations)

@@ -1,0 +1,199 @@
+"""The chain of an observer of a nonlinear plant: linearised along what the observer found, as the observer is itself.
+
+Constant parameters (form ``forgetting``): states at given parameters, which are estimated from both sides.  Parameters
+that walk are states of the chain.  Form ``random-walk`` estimates them beside the states in two stages; its chain takes
+both together, which is what its equations say, so that its last sample is not quite the observer's.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import NamedTuple
+
+import numpy as np
+
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.covariances import covariance_factor
+from obsynth.numerics.square_root_smoothing import joint_step
+from obsynth.observers.dae.estimates import DAERow
+from obsynth.observers.dae.steps import DAEState, Steps
+from obsynth.observers.recursive.step_model import stacked_noise
+from obsynth.observers.smoothing.chain import Lesson, Links, Node
+
+
+def dae_links(steps: Steps) -> Links:
+    """Return how a chain is made of the steps of an observer of a nonlinear plant."""
+    settings = steps.settings
+    of_parameters = np.stack((settings.lower, settings.upper))
+    of_states = np.tile([[-np.inf], [np.inf]], (1, settings.model.nx))
+    own: _DAELinks
+    if settings.form == "forgetting":
+        own, forgetting = _ConstantLinks(steps), settings.forgetting
+    else:
+        own, forgetting = _WalkingLinks(steps), 1.0
+        of_states = np.hstack((of_states, of_parameters))
+    return Links(own.first, own.next, own.begun, forgetting, (of_states, of_parameters))
+
+
+class _Sample(NamedTuple):
+    """One sample of an observer at the point where its step was linearised.
+
+    Fields: x, theta: Before the measurement; F, G, noise: Of the step; e, H, L, R: Innovation, derivatives and
+    covariance of the outputs that are there.
+    """
+
+    x: FloatArray
+    theta: FloatArray
+    F: FloatArray
+    G: FloatArray
+    noise: FloatArray
+    e: FloatArray
+    H: FloatArray
+    L: FloatArray
+    R: FloatArray
+
+
+class _DAELinks(ABC):
+    def __init__(self, steps: Steps) -> None:
+        self.steps, settings = steps, steps.settings
+        self.nx, self.nq = settings.model.nx, settings.model.nq
+        self.Q = covariance_factor(settings.Q, "Q")
+        self.walk = covariance_factor(settings.random_walk, "random_walk") if self.nq else np.zeros((0, 0))
+
+    def sample(self, before: DAEState, after: DAEState, row: DAERow) -> _Sample:
+        """Return a sample as the observer predicted it."""
+        theta = self.steps.part(before, "theta")
+        x = self.steps.part(after, "x")
+        if self.steps.settings.form == "augmented-kalman":
+            x = x - self.steps.part(after, "K") @ row.part("innovation")
+        else:
+            x = x - self.steps.part(after, "Upsilon") @ (self.steps.part(after, "theta") - theta)
+        seen = row.seen
+        _, H, L = self.steps.graph.functions.outputs(x, theta)
+        R = self.steps.settings.R[np.ix_(seen, seen)]
+        return _Sample(x, theta, row.part("F"), row.part("G"), row.part("noise") @ self.Q, row.innovation[seen],
+                       H[seen], L[seen], R)  # fmt: skip
+
+    def first(self, after: DAEState, row: DAERow, u: FloatArray) -> Node:
+        """Return the node of k = 0."""
+        return self.begun(after)
+
+    @abstractmethod
+    def begun(self, state: DAEState) -> Node:
+        """Return the node of a state from which a chain begins."""
+
+    @abstractmethod
+    def next(self, node: Node, before: DAEState, after: DAEState, row: DAERow, u: FloatArray) -> Node:
+        """Return the node of the next sample."""
+
+    def through(self, state: DAEState) -> FloatArray:
+        """Return the derivative of the state after the measurement by the parameters."""
+        K, H, L, Upsilon = (self.steps.part(state, name) for name in ("K", "H", "L", "Upsilon"))
+        return np.asarray(Upsilon - K @ (H @ Upsilon + L))
+
+    def own_factor(self, state: DAEState) -> FloatArray:
+        """Return a square root of the covariance of the states at given parameters, not for joint ones."""
+        K, H, P = (self.steps.part(state, name) for name in ("K", "H", "P"))
+        root = covariance_factor(0.5 * (P + P.T), "P")
+        noise = covariance_factor(self.steps.settings.R, "R")
+        factor = np.hstack((root - K @ (H @ root), K @ noise))
+        return np.asarray(np.linalg.qr(factor.T, mode="r")).T
+
+
+class _ConstantLinks(_DAELinks):
+    """States at given parameters, and what each sample says of the parameters."""
+
+    def begun(self, state: DAEState) -> Node:
+        """Return the node of a state from which a chain begins; y(0) corrects the states alone."""
+        nothing = np.zeros((0, self.nq))
+        return Node(self._origin(state), self.own_factor(state), np.zeros((self.nx, 0)), None,
+                    self._lesson(state, np.zeros(0), nothing, np.zeros((0, 0))))  # fmt: skip
+
+    def next(self, node: Node, before: DAEState, after: DAEState, row: DAERow, u: FloatArray) -> Node:
+        """Return the node of the next sample."""
+        at, theta = self.sample(before, after, row), self.steps.part(after, "theta")
+        # The state is corrected where the parameters have moved it already.
+        moved = self.steps.part(after, "x")
+        y = at.e + self.steps.graph.functions.outputs(at.x, at.theta)[0][row.seen]
+        expected, H, L = (part[row.seen] for part in self.steps.graph.functions.outputs(moved, theta))
+        nx, count = self.nx, len(y)
+        right = np.zeros((nx + count, 1 + self.nq))
+        right[:nx, 1:], right[nx:, 0], right[nx:, 1:] = self.steps.part(after, "Upsilon"), y - expected, -L
+        root = covariance_factor(at.R, "R") if count else np.zeros((0, 0))
+        known = np.vstack((at.F @ node.factor, np.zeros((count, node.factor.shape[1]))))
+        found = joint_step(np.vstack((np.eye(nx), H)), known, stacked_noise(at.noise, root), right,
+                           np.zeros((nx + count, 0)))  # fmt: skip
+        # Its way back is written about the parameters of this sample.
+        offset = found.back.offset.copy()
+        offset[:, 0] -= offset[:, 1:] @ theta
+        return Node(self._origin(after), found.factor, found.diffuse, found.back._replace(offset=offset),
+                    self._learnt(after, at, node.factor))  # fmt: skip
+
+    def _origin(self, state: DAEState) -> FloatArray:
+        through = self.through(state)
+        return np.column_stack((self.steps.part(state, "posterior") - through @ self.steps.part(state, "theta"),
+                                through))  # fmt: skip
+
+    def _learnt(self, after: DAEState, at: _Sample, factor: FloatArray) -> Lesson | None:
+        """Return what a sample says of the parameters: its innovation at parameters zero, and how it follows them."""
+        Omega = at.H @ self.steps.part(after, "Upsilon") + at.L
+        spread = at.H @ np.hstack((at.F @ factor, at.noise))
+        Sigma = spread @ spread.T + at.R
+        weight = at.R if self.steps.settings.weight == "paper" else Sigma
+        if not len(Omega):
+            return self._lesson(after, np.zeros(0), Omega, np.zeros((0, 0)))
+        root = np.linalg.cholesky(weight)
+        noise = np.linalg.solve(root, np.linalg.cholesky(Sigma))
+        v, G = np.linalg.solve(root, at.e + Omega @ at.theta), np.linalg.solve(root, Omega)
+        return self._lesson(after, v, G, noise)
+
+    def _lesson(self, after: DAEState, v: FloatArray, G: FloatArray, noise: FloatArray) -> Lesson | None:
+        if not self.nq:
+            return None
+        theta, S, spread = (self.steps.part(after, name) for name in ("theta", "S", "spread"))
+        triangle = np.linalg.inv(np.linalg.cholesky(S))
+        return Lesson(theta, triangle, covariance_factor(0.5 * (spread + spread.T), "spread"), v, G, noise)
+
+
+class _WalkingLinks(_DAELinks):
+    """States and parameters together."""
+
+    def begun(self, state: DAEState) -> Node:
+        """Return the node of a state from which a chain begins."""
+        nx, nq = self.nx, self.nq
+        spread = self.steps.part(state, "spread")
+        if self._is_joint:
+            P, cross = self.steps.part(state, "P"), self.steps.part(state, "cross")
+            whole = np.block([[P, cross], [cross.T, spread]])
+            factor = covariance_factor(0.5 * (whole + whole.T), "covariance")
+        else:
+            root = covariance_factor(0.5 * (spread + spread.T), "spread")
+            factor = stacked_noise(self.own_factor(state), root)
+            factor[:nx, nx:] = self.through(state) @ root
+        return Node(self._posterior(state)[:, None], factor, np.zeros((nx + nq, 0)), None)
+
+    @property
+    def _is_joint(self) -> bool:
+        return self.steps.settings.form == "augmented-kalman"
+
+    def _posterior(self, state: DAEState) -> FloatArray:
+        return np.concatenate((self.steps.part(state, "posterior"), self.steps.part(state, "theta")))
+
+    def next(self, node: Node, before: DAEState, after: DAEState, row: DAERow, u: FloatArray) -> Node:
+        """Return the node of the next sample."""
+        at, nx, nq = self.sample(before, after, row), self.nx, self.nq
+        count = len(at.e)
+        F = np.block([[at.F, at.G], [np.zeros((nq, nx)), np.eye(nq)]])
+        noise = stacked_noise(at.noise, self.walk)
+        # The parameters of a sample act in the step that leads there.
+        noise[:nx, at.noise.shape[1] :] = at.G @ self.walk
+        away = node.origin[:, 0] - self._posterior(before)
+        right = np.concatenate((F @ away, at.e))[:, None]
+        root = covariance_factor(at.R, "R") if count else np.zeros((0, 0))
+        known = np.vstack((F @ node.factor, np.zeros((count, node.factor.shape[1]))))
+        rows = np.vstack((np.eye(nx + nq), np.hstack((at.H, at.L))))
+        found = joint_step(rows, known, stacked_noise(noise, root), right, np.zeros((len(rows), 0)))
+        own = np.concatenate((at.x, at.theta)) + found.estimate[:, 0]
+        # The observer's own estimate, which keeps to the bounds, where the chain follows the same equations.
+        own = self._posterior(after) if self._is_joint else own
+        return Node(own[:, None], found.factor, found.diffuse, found.back)
