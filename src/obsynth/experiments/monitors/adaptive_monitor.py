@@ -19,6 +19,7 @@ from obsynth.plants.uncertainty import SAMPLED
 from obsynth.results.design import ObserverDesign
 from obsynth.tolerances.responses import loop_radius
 from obsynth.tolerances.robustness import EXACT_MODEL, structure_of, with_tolerances
+from obsynth.tolerances.subdivision import index_one_on_box
 from obsynth.tolerances.tracking import Tracking, tracking_of
 
 #: What a statement adds where no tolerance is known.
@@ -36,6 +37,7 @@ def adaptive_plan(
     plant, observer = design.linear
     affine = affine_plant(plant)
     tracking = tracking_of(design, affine)
+    require_regular(plant)
     varying = affine.box.variation == "varying"
     noise = noise_bound if plant.nw else 0.0
     sizes = np.where(np.isfinite(bounds), bounds, 0.0)
@@ -64,6 +66,21 @@ def adaptive_plan(
         )  # fmt: skip
 
     return plan(start), plan(later)
+
+
+def require_regular(plant: DescriptorSystem) -> None:
+    """Refuse a box with a plant that is singular, or not of index 1."""
+    uncertain = plant.uncertainty
+    if uncertain is None or not uncertain.box.names:
+        return
+    found = index_one_on_box(plant)
+    if found.verdict == "refuted" and found.at is not None:
+        values = uncertain.box.values(found.at)
+        where = ", ".join(f"{name} = {values[name]:.6g}" for name in uncertain.box.names)
+        raise PreconditionError(
+            f"The plant is singular, or not of index 1, inside the box: at {where}. Give smaller tolerances.",
+            condition="regularity",
+        )
 
 
 def start_of(
