@@ -17,8 +17,9 @@ from obsynth.analysis.transformations.recovery import Transformation, linear_pla
 from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.norms import response
 from obsynth.numerics.ranks import decide_rank
-from obsynth.numerics.spectra import abscissa, response
+from obsynth.numerics.spectra import abscissa
 from obsynth.numerics.threads import on_one_thread_if_small
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
