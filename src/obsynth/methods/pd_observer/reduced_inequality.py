@@ -44,6 +44,8 @@ MOST_NORMALISATIONS = 4
 NEGLIGIBLE_SHARE = 1e-12
 #: With more states the Riccati equation is solved by doubling first.
 MANY_STATES = 60
+#: With more still, the QZ algorithm would take minutes.
+MOST_STATES_FOR_QZ = 200
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,6 +125,8 @@ def _normalising(a: FloatArray, c: FloatArray) -> tuple[FloatArray, FloatArray] 
     one = np.eye(len(a))
     try:
         p = _doubled(a, c)
+        if p is None and len(a) > MOST_STATES_FOR_QZ:
+            return None
         p = solve_continuous_are(a.T, c.T, one, np.eye(len(c))) if p is None else p
         sizes, directions = np.linalg.eigh(0.5 * (p + p.T))
     except (np.linalg.LinAlgError, ValueError):
@@ -181,6 +185,8 @@ def _riccati_gain(a: FloatArray, c: FloatArray, record: Mapping[str, Any]) -> Fl
             return gain
     except np.linalg.LinAlgError:
         pass
+    if n > MOST_STATES_FOR_QZ:
+        raise SolverError("The Riccati equation was not solved: nothing is known.", record=record)
     try:
         p = solve_continuous_are(a.T, c.T, one, np.eye(len(c)))
     except (np.linalg.LinAlgError, ValueError) as error:
