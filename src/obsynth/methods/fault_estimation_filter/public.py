@@ -12,6 +12,7 @@ from obsynth.methods.designing import design, draft_of
 from obsynth.methods.verifying import verify
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
+from obsynth.simulation.scenario import Scenario
 
 
 def fault_estimation_filter(
@@ -27,6 +28,8 @@ def fault_estimation_filter(
     solver: str = "auto",
     tolerance: float = 1e-6,
     mean: int = 1,
+    model_error: str = "none",
+    scenario: Scenario | None = None,
     name: str = "design",
 ) -> ObserverDesign:
     r"""Design a fault-estimation filter with a guaranteed l2 gain from the disturbance to the fault error.
@@ -70,6 +73,12 @@ def fault_estimation_filter(
     mean : int, optional, samples
         Over how many samples each fault estimate is averaged; adds ``(mean - 1) // 2`` to its delay.  The gain gamma is
         proved for the estimate before the mean, which makes no l2 norm larger.
+    model_error : {"none", "columns"}, optional
+        With "columns", for a plant with tolerances: the directions that are to blame for what the tolerances do are
+        tried as noise of several weights, and as unknown inputs where they can be told from the faults; what is shipped
+        has the smallest mean adaptive threshold over ``scenario``.  A note says what was chosen.
+    scenario : Scenario, optional
+        For ``model_error``: inputs, disturbances and noise; its faults do not count.
     name : str, optional
         Name of the design.
 
@@ -119,6 +128,8 @@ def fault_estimation_filter(
         solver=solver,
         tolerance=tolerance,
         mean=mean,
+        model_error=model_error,
+        scenario=scenario,
     )
 
 
