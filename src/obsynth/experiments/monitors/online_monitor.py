@@ -23,6 +23,7 @@ from obsynth.numerics.arguments import is_finite_number, require_kind, require_m
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.holds import first_order_hold
 from obsynth.observers.dae.observer import DAEObserver
+from obsynth.observers.decisions import WALKING_FORMS
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.plants.names import index_of
 from obsynth.results.design import ObserverDesign
@@ -253,7 +254,9 @@ def _whitened(
 def _whole_record(observer: RecursiveObserver | DAEObserver) -> str:
     """Return why a likelihood ratio is not among the monitors, and what to use instead."""
     why = " glr compares every time at which a change may have begun, which takes a whole record"
-    if isinstance(observer, DAEObserver) or observer.adaptation is None or observer.adaptation.form == "random-walk":
+    if isinstance(observer, DAEObserver):
+        return f"{why}, and regressors, which a nonlinear design does not have: chi-square, cusum or nis serve here."
+    if observer.adaptation is None or observer.adaptation.form == "random-walk":
         return f"{why}, and regressors, which this design does not have: chi-square or nis serve here."
     return f"{why}: obsynth.decide(..., statistic='glr') has it for recorded estimates; row by row, use cusum."
 
@@ -270,7 +273,7 @@ def _of_parameters(
         )
     names = observer.fault_names
     if isinstance(observer, DAEObserver):
-        start, residuals, form = observer.initial_parameters, observer.model.ny, "nonlinear"
+        start, residuals, form = observer.initial_parameters, observer.model.ny, observer.form
     else:
         adaptation, plant = observer.adaptation, observer.plant
         start = np.zeros(0) if adaptation is None else adaptation.initial_parameters
@@ -283,7 +286,7 @@ def _of_parameters(
         theta[place] = float(value)
     if kind != "nis" and not len(theta):
         raise SpecError(f"{kind} watches parameters, and this design estimates none: use nis.", path="kind")
-    if kind == "cusum" and form in ("random-walk", "nonlinear"):
+    if kind == "cusum" and form in WALKING_FORMS:
         raise SpecError(f"cusum needs regressors, which a {form} design does not have: use chi-square or nis.",
                         path="kind")  # fmt: skip
     rule = ParameterRule(kind, theta, np.full(len(theta), float(change)), false_alarms)

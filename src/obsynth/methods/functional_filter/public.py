@@ -54,7 +54,8 @@ def functional_filter(
     decay : float, optional, 1/s
         Every error decays at this rate or faster.
     poles : sequence, optional, 1/s (dimensionless for ``dt > 0``)
-        Poles of the filter instead of a Kalman gain, as for `ui_pi_observer`.
+        Poles of the filter instead of a Kalman gain, as for `ui_pi_observer`; where several filters are asked for
+        (one for each fault, or set of faults), a list of poles for each.
     noise : float or mapping of str to float, optional
         Standard deviation of each output that the gain is for, per sample; what the plant states by default.
     residuals : {"detect", "isolate"} or sequence, optional

@@ -61,6 +61,14 @@ class DAERow:
         return self.part("spread")
 
     @property
+    def cross_covariance(self) -> FloatArray:
+        """Covariance of `x` with `theta` ``(nx, nq)``."""
+        if "cross" in self.graph.memory.shapes:
+            return self.part("cross")
+        K, H, L, Upsilon = (self.part(name) for name in ("K", "H", "L", "Upsilon"))
+        return np.asarray((Upsilon - K @ (H @ Upsilon + L)) @ self.parameter_covariance)
+
+    @property
     def innovation(self) -> FloatArray:
         """Outputs without what was predicted of them ``(ny,)``; NaN where a sample is missing."""
         return np.where(self.seen, self.part("innovation"), np.nan)
@@ -84,6 +92,16 @@ class DAERow:
     def regressor(self) -> FloatArray:
         """Regressor of `whitened` ``(degrees, 0)``: there is none."""
         return np.zeros((self.degrees, 0))
+
+    @property
+    def score(self) -> FloatArray:
+        """What the sample says of the parameters ``(nq,)``, see `row_layout`."""
+        return self.part("score")
+
+    @property
+    def information(self) -> FloatArray:
+        """How much it says of them ``(nq, nq)``."""
+        return self.part("information")
 
     @property
     def state_deviations(self) -> FloatArray:
@@ -159,7 +177,7 @@ class GatheredRows:
         Shapes: ``informations (any, nq, nq)``.
         """
         whole = {name: np.concatenate([part[name] for part in self.parts]) for name in self.parts[0]}
-        seen = whole.pop("information")
+        seen = whole["informations"]
         levels = _excitation(self.observer, seen if informations is None else informations)
         whole["excitation"] = levels[len(levels) - len(whole["nis"]) :]
         received = ~np.isnan(whole["innovations"])
@@ -188,10 +206,12 @@ def _columns(rows: DAERow) -> dict[str, FloatArray]:
     """Return what the estimates keep of some samples."""
     return {
         "states": rows.x, "state_deviations": rows.state_deviations,
+        "state_covariances": rows.covariance, "cross_covariances": rows.cross_covariance,
         "faults": rows.theta, "fault_covariances": rows.parameter_covariance,
         "innovations": rows.innovation, "innovation_covariances": rows.part("expected"), "nis": rows.nis,
         "nis_degrees": rows.seen.sum(axis=1).astype(np.float64), "residuals": rows.part("residual"),
-        "conditions": rows.conditions, "contraction": rows.contractions, "information": rows.part("information"),
+        "conditions": rows.conditions, "contraction": rows.contractions, "informations": rows.information,
+        "scores": rows.score,
     }  # fmt: skip
 
 

@@ -63,6 +63,9 @@ class DAEObserver(DAESettings, StepObserver[DAEState, DAERow]):
         of one sensor; or taken at the limit.
     outlier_limit : float or None
         In standard deviations of the prediction: 6 for ``gate`` and 3 for ``huber`` by default.
+    reset : float
+        Detect and reset: probability, per sample, that innovations which no change has made larger pass the threshold
+        above which the covariance of the parameters starts again from S_0.  Zero never resets.
 
     Raises
     ------

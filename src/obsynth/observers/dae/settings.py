@@ -9,7 +9,7 @@ from typing import Any, Literal, Self, TypeAlias
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import Count, ForgettingFactor, Positive, checked_value
+from obsynth.numerics.arguments import Count, ForgettingFactor, Positive, Probability, checked_value
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.covariances import covariance_factor, is_definite
 from obsynth.observers.estimates import Undelayed
@@ -24,6 +24,7 @@ Integration: TypeAlias = Literal["backward-euler", "radau"]
 _KINDS = {
     "form": Form, "guard": Guard, "weight": Weight, "integration": Integration, "forgetting": ForgettingFactor,
     "window": Count, "largest_move": Positive | None,
+    "reset": Probability,
 }  # fmt: skip
 _DEFINITE = ("R", "initial_parameter_covariance")
 
@@ -52,6 +53,7 @@ class DAESettings(Undelayed):
     window: int = 50
     outliers: Outliers = "none"
     outlier_limit: float | None = None
+    reset: float = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "dt", step_length(self.dt))
@@ -111,6 +113,11 @@ class DAESettings(Undelayed):
     def fault_names(self) -> tuple[str, ...]:
         """The parameters that are estimated, in order."""
         return self.model.parameter_names
+
+    @property
+    def outside_graph(self) -> str:
+        """An option in use that stands outside of the compiled steps, by name; empty without one."""
+        return "outliers" if self.outliers != "none" else "reset" if self.reset else ""
 
     @property
     def order(self) -> int:
