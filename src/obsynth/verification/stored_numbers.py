@@ -30,6 +30,8 @@ from obsynth.verification.remainder_channel import (
 REPEATED = 1.01
 #: A gain is claimed for disturbances that last up to one over this, rad per sample: slower ones are reported.
 SLOWEST, POINTS = 1e-7, 120
+#: With more states, of plant and observer together, fewer are looked at.
+MANY_STATES, FEWER_POINTS = 300, 40
 #: Frequencies beyond that at which the time is looked for after which stored numbers matter, rad per sample.
 SLOWER = tuple(10.0**-k for k in range(8, 17))
 #: Eigenvalues within this of the boundary of stability (relative to the unit circle, or to the largest) may be on it.
@@ -139,9 +141,12 @@ def _gain_rows(
         return
     system = _Composite(plant, observer, tracked, channel)
     unit = 1.0 if plant.dt > 0.0 else system.fastest
-    frequencies = unit * np.geomspace(SLOWEST, np.pi if plant.dt > 0.0 else 10.0, POINTS)
+    few = plant.nx + observer.order <= MANY_STATES
+    points = POINTS if few else FEWER_POINTS
+    frequencies = unit * np.geomspace(SLOWEST, np.pi if plant.dt > 0.0 else 10.0, points)
     angles = system.boundary_angles(unit)
-    frequencies = np.concatenate([frequencies, _around(angles[angles > SLOWEST * unit], unit, plant.dt)])
+    if few:
+        frequencies = np.concatenate([frequencies, _around(angles[angles > SLOWEST * unit], unit, plant.dt)])
     gains = np.array([system.gain(frequency) for frequency in frequencies])
     worst = int(np.argmax(gains))
     level = NOTICED if gamma is None else float(gamma) * (1.0 + GAIN_TOLERANCE)
@@ -150,7 +155,7 @@ def _gain_rows(
     verdict, seconds = _when_it_matters(system, level, unit, float(np.max(nearest, initial=0.0)))
     if gamma is not None:
         text = f"gain d -> fault error of the plant and the stored observer, from {SLOWEST:.0e} rad per sample up"
-        detail = f"largest at {frequencies[worst]:.2g} rad per sample; {verdict}"
+        detail = f"largest of {len(frequencies)} frequencies at {frequencies[worst]:.2g} rad per sample; {verdict}"
         drifting = np.isfinite(seconds) and np.all(nearest <= MOST_DISTANCE)
         if beyond.size and drifting and channel.rounding(tracked, observer) <= ROUNDED:
             # Nobody could store better numbers: no finite gain exists, and what can be said is for how long it holds.
