@@ -38,6 +38,8 @@ class DaeAdaptiveObserverOptions(MethodOptions):
     window: Count = 50
     outliers: Outliers = "none"
     outlier_limit: Positive | None = None
+    sensors: Annotated[Any, WrittenAs("sensor times")] = None
+    state_bounds: Annotated[Any, WrittenAs("named pairs")] = None
 
     def conflicts(self) -> Iterator[str]:
         """Yield a sentence for each rule across options that is broken."""

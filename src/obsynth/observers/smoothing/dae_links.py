@@ -24,15 +24,12 @@ from obsynth.observers.smoothing.chain import Lesson, Links, Node
 def dae_links(steps: Steps) -> Links:
     """Return how a chain is made of the steps of an observer of a nonlinear plant."""
     settings = steps.settings
-    of_parameters = np.stack((settings.lower, settings.upper))
-    of_states = np.tile([[-np.inf], [np.inf]], (1, settings.model.nx))
     own: _DAELinks
     if settings.form == "forgetting":
         own, forgetting = _ConstantLinks(steps), settings.forgetting
     else:
         own, forgetting = _WalkingLinks(steps), 1.0
-        of_states = np.hstack((of_states, of_parameters))
-    return Links(own.first, own.next, own.begun, forgetting, (of_states, of_parameters))
+    return Links(own.first, own.next, own.begun, forgetting, settings.state_bounds, settings.lower, settings.upper)
 
 
 class _Sample(NamedTuple):

@@ -12,7 +12,7 @@ import numpy as np
 from obsynth.analysis.dae_index import SINGULAR_CONDITION
 from obsynth.errors import ObsynthError
 from obsynth.methods.dae_adaptive_observer.conditions import dae_conditions
-from obsynth.methods.recursive.checks import listed_gains
+from obsynth.methods.recursive.checks import listed_gains, refinement_rows
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.covariances import covariance_factor
 from obsynth.numerics.newton import LARGEST_RESIDUAL
@@ -20,7 +20,7 @@ from obsynth.observers.dae.batch import run_dae_batch
 from obsynth.observers.dae.building import OPTIONS, dae_observer_from_options, resolved_options
 from obsynth.observers.dae.nominal_run import NOMINAL_STEPS, DAEFacts, dae_facts
 from obsynth.observers.dae.observer import DAEObserver
-from obsynth.observers.robustness import with_outliers
+from obsynth.observers.robustness import plain_recursion
 from obsynth.results.design import ObserverDesign
 from obsynth.results.report import Check, information, upper_bound_check
 from obsynth.simulation.dae import simulate_dae
@@ -56,8 +56,9 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
         "fits the plant", "observer, options and plant hold the same model and numbers", float(bool(problem)), 0.0,
         source="shipped observer", kind="equality", detail=problem,
     )  # fmt: skip
+    yield from refinement_rows(observer)
     # What is checked is the recursion; records that no plant made would seem full of outliers.
-    observer = with_outliers(observer, "none")
+    observer = plain_recursion(observer)
     try:
         facts = dae_facts(observer)
         yield from _model_rows(observer, facts)
