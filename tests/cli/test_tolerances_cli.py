@@ -71,6 +71,19 @@ def test_an_alarm_is_proved_written_and_verified(gains, tmp_path, capsys) -> Non
     assert main([*command, "--row", "600"]) == 2
 
 
+def test_a_run_proves_its_first_alarm(gains, tmp_path, capsys) -> None:
+    data, certificate = str(log(gains, tmp_path, fault=2.0)), tmp_path / "alarm.json"
+    command = ["run", "--gains", str(gains), "--data", data, "--out", str(tmp_path / "out.csv"), "--warm-up", "0"]
+    command += ["--prove", str(certificate), "--force", "--json"]
+    assert main([*command, "--monitor", "pointwise", "--window", "12", *MONITOR]) == 0
+    proof = json.loads(capsys.readouterr().out)["proof"]
+    assert proof["proved"]
+    assert proof["file"] == str(certificate)
+    assert main(["verify", str(certificate), "--json"]) == 0
+    assert main([*command, "--monitor", "window"]) == 2
+    assert "pointwise" in capsys.readouterr().err
+
+
 def test_evaluate_draws_plants(gains, capsys) -> None:
     command = ["evaluate", "--system", str(DRIVE), "--gains", str(gains), "--runs", "10", "--plants", "10", "--quiet"]
     options = ["--monitor", "pointwise", "--noise-bound", "1.7320508", "--json"]

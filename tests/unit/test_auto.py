@@ -23,6 +23,26 @@ def test_the_design_names_the_method_and_why(tmp_path: Path) -> None:
     assert obsynth.load(found.save(tmp_path / "gains.json")).method == "functional-filter"
 
 
+def test_an_estimate_as_slow_as_the_plant_comes_after_faster_ones() -> None:
+    # A heater with three masses: averaging for as long as the plant settles has the least noise, but nobody waits.
+    e, a = np.diag([900.0, 400, 2500, 0]), [[-6, 0, 0, 6], [0, -9, 1, 8], [0, 1, -3, 0], [6, 8, 0, -14]]
+    plant = obsynth.DescriptorSystem(
+        e, a, [[0.0], [1], [0], [0]], np.eye(3, 4), Bf=[[0], [-1], [0], [0]], Bd=[[0], [0], [2], [0]],
+        Dw=0.1 * np.eye(3),
+    )  # fmt: skip
+    assert obsynth.design(obsynth.discretise(plant, 5.0)).method == "ui-pi-observer"
+
+
+def test_unstable_plants_have_true_figures() -> None:
+    plant = obsynth.DescriptorSystem(
+        None, [[1.2, 1.0], [0.0, 0.5]], [[0.0], [1.0]], [[1.0, 0.0]], Bf=[[1.0], [0.0]], Dw=[[0.01]], dt=1.0
+    )
+    design = obsynth.functional_filter(plant)
+    (found,) = fault_figures(plant, design.observer, 400)
+    assert found.at_horizon == pytest.approx(1.0, abs=1e-6)
+    assert found.peak < 2.0
+
+
 def test_options_choose_among_the_methods_that_have_them() -> None:
     plant = load_spec(DESIGNS / "smib" / "spec.yaml").plant
     assert obsynth.design(plant, gamma=0.5).method == "fault-estimation-filter"

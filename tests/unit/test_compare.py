@@ -68,6 +68,50 @@ def test_tolerances_make_a_bias() -> None:
     assert off.methods[0].faults[0].bias > 3.0 * exact.methods[0].faults[0].bias
 
 
+def pendulum(**changes: object) -> obsynth.DescriptorSystem:
+    # Unstable, with an actuator and an algebraic force.
+    given = {"B": [[0], [0], [5], [0]], "Bf": [[0], [1], [0], [0]], "Dw": 0.001 * np.eye(2)} | changes
+    e, a = np.diag([1.0, 1, 1, 0]), [[0, 1, 0, 0], [9.8, -0.1, 0, 1], [0, 0, -5, 0], [0, 0, 1, -1]]
+    return obsynth.DescriptorSystem(e, a, C=[[1, 0, 0, 0], [0, 0, 1, 0]], **given)
+
+
+def test_an_unstable_descriptor_plant_is_held_and_compared() -> None:
+    found = obsynth.compare(pendulum(), runs=2, tolerance=0.02, methods=["functional-filter", "ui-pi-observer"])
+    assert "a state feedback holds the unstable plant" in found.setting
+    for entry in found.methods:
+        assert entry.faults[0].figures.at_horizon == pytest.approx(1.0, abs=0.05)
+        assert entry.rms < 0.5
+
+
+def test_an_unstable_plant_without_inputs_is_followed_for_as_long_as_numbers_tell() -> None:
+    whole = obsynth.compare(pendulum(), runs=1, methods=["functional-filter"])
+    found = obsynth.compare(pendulum(B=None), runs=1, methods=["functional-filter"])
+    assert found.times[-1] < 0.5 * whole.times[-1]
+    assert found.methods[0].rms < 1.0
+
+
+@pytest.mark.parametrize("sampled", [False, True])
+def test_constants_are_drawn_within_their_stated_tolerances(sampled: bool) -> None:
+    matrices = {
+        "A": [["-k/m", 1.0], [0, -2.0]], "B": [[0], ["1/m"]], "C": np.eye(2), "Bf": [[1.0], [0]],
+        "Dw": 0.01 * np.eye(2),
+    }  # fmt: skip
+    tolerances = {"k": {"nominal": 2.0, "tolerance": "5 %"}, "m": {"nominal": 1.5, "tolerance": "5 %"}}
+    plant = obsynth.uncertain_system(matrices, tolerances)
+    scenario = obsynth.Scenario(
+        horizon=20.0, sample_time=0.1, inputs={"u1": obsynth.Step(size=1.0)}, noise=1.0,
+        faults={"f1": obsynth.Step(size=0.5, start=10.0)},
+    )  # fmt: skip
+    common = {"runs": 4, "methods": ["functional-filter"], "scenario": scenario}
+    if sampled:
+        plant = obsynth.discretise(plant, 0.1).plant
+        common["scenario"] = scenario.replace(sample_time=None)
+    boxed = obsynth.compare(plant, **common)
+    exact = obsynth.compare(plant.replace(uncertainty=None), **common)
+    assert "constants within their tolerances" in boxed.setting
+    assert boxed.methods[0].faults[0].bias > 3.0 * exact.methods[0].faults[0].bias
+
+
 def test_a_log_is_replayed_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     log = pd.read_csv(DESIGNS / "motor" / "log.csv").iloc[:800]
     log["torque"] = pd.read_csv(DESIGNS / "motor" / "true_log.csv")["f"].iloc[:800]

@@ -9,13 +9,15 @@ import sys
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pandas as pd
 import pytest
 
 import obsynth
+from obsynth.errors import SpecError
+from obsynth.methods.method_spec import option_types
 from obsynth.methods.registry import REGISTRY, method_spec
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.estimates import Estimates
@@ -248,3 +250,17 @@ def test_sensors_of_their_own_times_are_taken_or_refused_by_name(method: str, tm
     silent = np.array([[value if due(k)[i] else np.nan for i, value in enumerate(row)] for k, row in enumerate(y)])
     # What is not due is not used.
     np.testing.assert_array_equal(again.observer.run(y, u).states, again.observer.run(silent, u).states)
+
+
+NO_NUMBERS = (True, np.True_, [True], {"leak": True}, object())
+
+
+@EACH
+def test_no_option_takes_what_is_no_number_for_one(method: str) -> None:
+    """True is not 1.0: every option that is no truth itself refuses it, in Python and in lists."""
+    for name, kind in option_types(method_spec(method).options_type).items():
+        if bool in (kind, *get_args(kind)):
+            continue
+        for value in NO_NUMBERS:
+            with pytest.raises(SpecError):
+                obsynth.design(plant_of(method), method, **{**OPTIONS.get(method, {}), name: value})

@@ -202,6 +202,44 @@ def test_a_sensor_without_noise_is_refused() -> None:
         obsynth.functional_filter(plant.replace(Dw=silent), fault_rate=1.0)
 
 
+def test_banks_with_poles_as_asked() -> None:
+    bank = obsynth.functional_filter(tanks(), residuals="isolate", poles=[[0.9], [0.8], [0.7]])
+    assert bank.report.passed
+    assert np.diag(bank.observer.Az) == pytest.approx([0.9, 0.8, 0.7])
+    each = obsynth.functional_filter(tanks(), poles=[[0.9, 0.8], [0.8, 0.7], [[0.7, 0.1], [0.7, -0.1]]])
+    assert sorted(np.abs(np.linalg.eigvals(each.observer.Az)))[-1] == pytest.approx(0.9)
+    with pytest.raises(obsynth.SpecError, match="3 filters are asked for, of 1, 1, 1 poles"):
+        obsynth.functional_filter(tanks(), residuals="isolate", poles=[0.9, 0.8, 0.7])
+    with pytest.raises(obsynth.SpecError, match="functional-filter"):
+        obsynth.functional_filter(tanks(), residuals="isolate", poles=[[0.9], [0.8], [0.7, 0.6]])
+
+
+@pytest.mark.parametrize("sampled", [True, False])
+def test_monitors_of_residuals(sampled: bool) -> None:
+    # The load torque acts all the time and is felt by none of them; sensor noise is what thresholds are against.
+    plant = motor() if not sampled else load_spec(DESIGNS / "motor" / "sampled.yaml").plant
+    design = obsynth.functional_filter(plant, residuals="detect")
+    scenario = obsynth.Scenario(
+        horizon=3.0, sample_time=None if sampled else 0.005, noise=1.0,
+        faults={"torque": obsynth.Step(size=0.3, start=1.5)},
+        disturbances={"load torque": obsynth.Sine(amplitude=0.2, frequency=1.0)},
+    )  # fmt: skip
+    for kind, options in (("pointwise", {"noise_bound": 4.0}), ("window", {"noise_bound": 4.0}), ("chi-square", {})):
+        monitor = obsynth.monitor(design, scenario, kind, **options)
+        counted = obsynth.evaluate(design, scenario, monitor=monitor, runs=20)
+        assert counted.false_alarm_rate.value == 0.0
+        if kind == "chi-square":
+            assert counted.missed_detection_rate.value == 0.0
+
+
+def test_monitors_of_estimates_with_a_delay() -> None:
+    design = obsynth.functional_filter(smib(), fault_rate=0.01, delay=5)
+    scenario = obsynth.Scenario(horizon=6.0, faults={"tm GENCLS 1": obsynth.Step(size=0.5, start=3.0)})
+    monitor = obsynth.monitor(design, scenario, "pointwise")
+    counted = obsynth.evaluate(design, scenario, monitor=monitor, runs=3)
+    assert (counted.false_alarm_rate.value, counted.missed_detection_rate.value) == (0.0, 0.0)
+
+
 def test_saved_file_is_verified_alone_and_exported(tmp_path: Path) -> None:
     found = obsynth.functional_filter(smib(), fault_rate=0.01, delay=5)
     loaded = obsynth.load(found.save(tmp_path / "gains.json"))

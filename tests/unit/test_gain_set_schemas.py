@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import obsynth
@@ -112,3 +113,32 @@ def test_the_gain_over_all_disturbances_is_at_least_that_of_fast_sines(smib):
         effects.append(np.ravel(shown))
     found = np.sqrt(0.5) * np.linalg.norm(np.array(effects), 2) / np.sqrt(step)
     assert found <= value * (1.0 + 1e-6)
+
+
+STATES = sorted((Path(__file__).parents[1] / "data" / "states_of_schema_3").glob("*.state"))
+
+
+@pytest.mark.parametrize("path", STATES, ids=lambda path: path.stem)
+def test_a_saved_state_of_schema_3_goes_on(path: Path, tmp_path: Path):
+    """Eleven rows were run by the version that wrote state and gain set; thirteen follow, as if nothing had been."""
+    assert len(STATES) == 4
+    design = obsynth.load(path.with_suffix(".json"))
+    rng = np.random.default_rng(7)
+    nonlinear = path.stem.startswith("dae")
+    y = 1.0 + 0.01 * rng.standard_normal((24, 1)) if nonlinear else rng.standard_normal((24, 2))
+    u = np.full((24, 1), 0.5) if nonlinear else rng.standard_normal((24, 1))
+    names = ["time", *design.plant.input_names, *design.plant.output_names]
+    log = pd.DataFrame(np.hstack([0.1 * np.arange(24)[:, None], u, y]), columns=names)
+    state = tmp_path / "run.state"
+    state.write_bytes(path.read_bytes())
+    # Outliers were not judged then.
+    options = {} if path.stem.startswith("fault") else {"outliers": "none"}
+    part = obsynth.run_on_data(design, log.iloc[11:], state=state, **options).table
+    whole = obsynth.run_on_data(design, log, **options).table.iloc[11:].reset_index(drop=True)
+    numbers = [name for name in part.columns if name not in ("status", "alarm")]
+    np.testing.assert_allclose(part[numbers], whole[numbers], rtol=1e-9, atol=1e-12)
+    # It is written anew in the schema of today, and belongs to this gain set alone.
+    assert json.loads(state.read_text(encoding="utf-8"))["schema_version"] == 4
+    state.write_bytes(path.read_bytes())
+    with pytest.raises(obsynth.SpecError, match="another gain set"):
+        obsynth.run_on_data(design.replace(name="another"), log.iloc[11:], state=state, **options)

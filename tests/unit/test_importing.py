@@ -278,3 +278,26 @@ def test_what_is_no_such_fmu_is_refused(tmp_path):
         obsynth.from_fmu(tmp_path / "text.fmu")
     with pytest.raises(SpecError, match=r"does not exist"):
         obsynth.from_fmu(tmp_path / "none.fmu")
+
+
+def test_a_spec_may_have_its_plant_in_a_mat_file(tmp_path):
+    struct = {"E": np.diag([1.0, 1.0, 0.0]), "A": [[-1, 0.2, 0.1], [0.1, -2, 1], [0.5, 0.5, -1]],
+              "B": [[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]], "C": [[1.0, 0, 0], [0, 1.0, 0]], "Ts": 0.0}  # fmt: skip
+    scipy.io.savemat(tmp_path / "plant.mat", {"sys": struct})
+    spec = tmp_path / "spec.yaml"
+    lines = "plant: {file: plant.mat, faults: [u2], sensor_noise: {y1: 0.1}, transform: {sample_time: 0.1}}"
+    spec.write_text(f"schema_version: 1\nname: mat\n{lines}\n")
+    found = obsynth.load_spec(spec)
+    own = obsynth.discretise(obsynth.from_matlab(tmp_path / "plant.mat", faults=["u2"], sensor_noise={"y1": 0.1}), 0.1)
+    assert np.array_equal(found.plant.Bf, own.plant.Bf)
+    assert np.array_equal(found.plant.Dw, own.plant.Dw)
+    assert found.transformation.recovery.names == ("x1", "x2", "x3")
+    assert obsynth.design(found.plant, "fault-estimation-filter").report.passed
+    spec.write_text("schema_version: 1\nname: mat\nplant: {file: plant.mat, faults: [u3, u9]}\n")
+    with pytest.raises(obsynth.SpecError, match="'u3'") as error:
+        obsynth.load_spec(spec)
+    assert str(error.value).startswith(str(spec))
+    (tmp_path / "plant.yaml").write_text("schema_version: 1\ndt: 0\nA: [[-1]]\nC: [[1]]\n")
+    spec.write_text("schema_version: 1\nname: mat\nplant: {file: plant.yaml, faults: [u3]}\n")
+    with pytest.raises(obsynth.SpecError, match=r"plant\.faults is for plants in \.mat files"):
+        obsynth.load_spec(spec)

@@ -390,11 +390,11 @@ def test_a_nonlinear_record_is_nearer_to_the_truth() -> None:
         units={"level": "m", "inflow": "m3/s", "leak": "m2.5/s", "gauge": "m"},
     )  # fmt: skip
     rng, errors = np.random.default_rng(8), []
-    made = dae_adaptive_observer(tank, dt=0.5, Q=1e-5, R=1e-3, form="augmented-kalman", random_walk=1e-4)
+    made = dae_adaptive_observer(tank, dt=0.5, Q=1e-5, R=2e-3, form="augmented-kalman", random_walk=1e-4)
     for seed in range(6):
         leak = 0.5 + np.concatenate(([0.0], np.cumsum(0.01 * rng.standard_normal(79))))[:, None]
         u = np.full((80, 1), 0.5)
-        truth = simulate_dae(tank, u, dt=0.5, parameters=leak, Q=1e-5 * np.eye(1), R=1e-3 * np.eye(1), seed=seed,
+        truth = simulate_dae(tank, u, dt=0.5, parameters=leak, Q=1e-5 * np.eye(1), R=2e-3 * np.eye(1), seed=seed,
                              integration=made.observer.integration)  # fmt: skip
         found, filtered = smooth(made, truth.outputs, u), made.observer.run(truth.outputs, u)
         errors.append([np.mean((each.states - truth.states) ** 2) for each in (found, filtered)]

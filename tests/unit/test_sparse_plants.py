@@ -13,7 +13,9 @@ import scipy.sparse as sp
 
 import obsynth
 from obsynth.analysis.transformations.elimination import eliminated_by_sparsity
+from obsynth.analysis.transformations.recovery_operator import without_rounding
 from obsynth.methods.designing import check
+from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
 from obsynth.numerics.sparse import blocks_of, coarse_structure
 from obsynth.numerics.sparse_factor import SparseFactor
 from obsynth.spec.loader import load_spec
@@ -270,3 +272,22 @@ class TestNumerics:
         factor = SparseFactor(sp.csr_array(matrix))
         assert factor.singular
         assert set(np.argsort(-factor.null_vectors().columns)[:2]) == {5, 7}
+
+
+class TestRounding:
+    """Entries that are only rounding: by random signs, as by the rows of the inverse."""
+
+    def test_signs_and_rows_of_the_inverse_agree(self, monkeypatch):
+        rng = np.random.default_rng(5)
+        size = 400
+        links = sp.diags_array([rng.uniform(0.2, 0.5, size - 1), rng.uniform(0.2, 0.5, size - 1)], offsets=[-1, 1])
+        factor = SparseFactor(sp.csr_array(links + 1.5 * sp.eye_array(size)))
+        solution = rng.normal(size=(size, 2)) * 10.0 ** rng.uniform(-20, 0, (size, 2))
+        kept = np.abs(solution) > CANCELLATION_TOLERANCE * factor.size_of_terms(solution, np.arange(size))
+        assert 0 < kept.sum() < kept.size
+        exact_rows, by_rows = [], SparseFactor.size_of_terms
+        monkeypatch.setattr(
+            SparseFactor, "size_of_terms", lambda self, x, rows: exact_rows.append(len(rows)) or by_rows(self, x, rows)
+        )
+        np.testing.assert_array_equal(without_rounding(factor, solution), np.where(kept, solution, 0.0))
+        assert sum(exact_rows) < size // 2

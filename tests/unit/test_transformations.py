@@ -10,6 +10,7 @@ import scipy.io
 from scipy.linalg import block_diag, expm
 from scipy.signal import cont2discrete
 
+import obsynth
 from obsynth.analysis import (
     analyse_structure,
     augment_faults,
@@ -343,3 +344,30 @@ class TestFaultsAsStates:
         for name in ("A", "Bf", "C", "Df"):
             np.testing.assert_allclose(getattr(whole.plant, name), getattr(direct.plant, name), atol=1e-14)
         assert whole.recovery.flags() == direct.recovery.flags()
+
+
+def test_a_transformation_stands_for_its_plant_everywhere():
+    written = obsynth.DescriptorSystem(
+        E=[[1, 0, 0], [0, 1, 0], [0, 0, 0]], A=[[-1, 0.2, 0.1], [0.1, -2, 1], [0.5, 0.5, -1]], B=[[1], [0], [0]],
+        C=["a", "b"], Bf=["a"], state_names=["a", "b", "c"], sensor_noise={"a": 0.1, "b": 0.1},
+    )  # fmt: skip
+    reduced, sampled = obsynth.eliminate_algebraic_states(written), obsynth.discretise(written, 0.1)
+    assert obsynth.analyse_structure(sampled).index == 0
+    assert obsynth.diagnose(sampled).faults[0].name == "a"
+    assert obsynth.check(sampled)["fault-estimation-filter"].passed
+    assert obsynth.decouple(sampled).faults == ("a",)
+    assert obsynth.eliminate_algebraic_states(sampled).recovery.names == ("a", "b", "c")
+    assert obsynth.discretise(reduced, 0.1).recovery.names == ("a", "b", "c")
+    assert obsynth.sensor_sets(sampled).sets
+    assert obsynth.steady_state_filter(sampled, Q=0.01, R=0.01).rate < 1.0
+    assert np.shape(obsynth.simulate(sampled, steps=3).states) == (3, 2)
+    assert obsynth.compare(sampled, methods=["ui-pi-observer"], runs=2).methods[0].method == "ui-pi-observer"
+    designs = [
+        obsynth.design(sampled, "ui-pi-observer"), obsynth.fault_estimation_filter(sampled),
+        obsynth.functional_filter(sampled), obsynth.descriptor_kalman(sampled), obsynth.pd_observer(reduced),
+    ]  # fmt: skip
+    assert [design.recovery.names for design in designs] == [("a", "b", "c")] * 5
+    assert obsynth.detection_filter(reduced).fault_sensitivity > 0.0
+    assert len(obsynth.pd_delta_scan(reduced, delta=[0.1, 1.0], decay=0.1).delta) == 2
+    with pytest.raises(obsynth.SpecError, match=r"give an obsynth\.DescriptorSystem"):
+        obsynth.diagnose("plant.yaml")

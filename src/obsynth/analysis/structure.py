@@ -13,6 +13,7 @@ from types import MappingProxyType
 import numpy as np
 
 from obsynth.analysis.existence.verdicts import hidden_modes
+from obsynth.analysis.transformations.recovery import Transformation, linear_plant
 from obsynth.analysis.zeros import are_outside
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.pencils import FiniteZeros, pencil_structure
@@ -64,12 +65,12 @@ class Structure:
 # Conditions, synthesis and verification ask for the same plant's; plants never change.
 @lru_cache(maxsize=4)
 @on_one_thread_if_small
-def analyse_structure(plant: DescriptorSystem) -> Structure:
+def analyse_structure(plant: DescriptorSystem | Transformation) -> Structure:
     """Analyse regularity, index, stability and observability of ``plant``.
 
     Parameters
     ----------
-    plant : DescriptorSystem
+    plant : DescriptorSystem or Transformation
         ``E, A (nx, nx)``, ``C (ny, nx)``, either time.
 
     Returns
@@ -85,7 +86,7 @@ def analyse_structure(plant: DescriptorSystem) -> Structure:
     ----------
     .. [Dai1989] L. Dai, "Singular Control Systems", 1989, chapters 1 and 2.
     """
-    plant = plant.dense()
+    plant = linear_plant(plant).dense()
     E, A, C = plant.E, plant.A, plant.C
     pencil = pencil_structure(E, A)
     poles = FiniteZeros(pencil.finite_eigenvalues, pencil.normal_rank, pencil.decisions)

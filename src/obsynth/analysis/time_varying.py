@@ -8,6 +8,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from obsynth.analysis.transformations.recovery import Transformation
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import RankDecision, decide_rank
@@ -105,8 +106,11 @@ def horizon_ranks(plant: TimeVaryingDescriptorSystem, *, early: bool = False) ->
     return HorizonRanks(steps, worst, worst_k, condition, condition_k, directions, directions_k)
 
 
-def as_time_varying(plant: DescriptorSystem | TimeVaryingDescriptorSystem) -> TimeVaryingDescriptorSystem:
+def as_time_varying(
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem | Transformation,
+) -> TimeVaryingDescriptorSystem:
     """Return a plant as the recursive methods take it."""
+    plant = plant.plant if isinstance(plant, Transformation) else plant
     if isinstance(plant, TimeVaryingDescriptorSystem):
         return plant
     if not isinstance(plant, DescriptorSystem):

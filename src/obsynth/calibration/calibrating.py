@@ -17,6 +17,7 @@ from obsynth.calibration.reporting import IntegrationError, integration_error, r
 from obsynth.calibration.result import Calibration
 from obsynth.calibration.simulation_error import Fit, SimulationError, simulation_fits
 from obsynth.errors import SolverError, SpecError
+from obsynth.numerics.arguments import is_whole
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
@@ -216,7 +217,7 @@ def _check_options(method: Any, integration: Any, level: Any, starts: Any, input
         raise SpecError(f"integration is {integration!r}: use one of {', '.join(INTEGRATIONS)}.", path="integration")
     if not isinstance(level, (int, float)) or not 0.0 < level < 1.0:
         raise SpecError(f"level is {level!r}: give a probability, such as 0.95.", path="level")
-    if not isinstance(starts, int) or isinstance(starts, bool) or starts < 1:
+    if not is_whole(starts) or starts < 1:
         raise SpecError(f"starts is {starts!r}: give a whole number, at least 1.", path="starts")
-    if input_delay != "auto" and (not isinstance(input_delay, int) or isinstance(input_delay, bool)):
+    if input_delay != "auto" and (not is_whole(input_delay)):
         raise SpecError(f"input_delay is {input_delay!r}: give whole rows, or 'auto'.", path="input_delay")

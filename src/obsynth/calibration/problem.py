@@ -12,6 +12,7 @@ from obsynth.calibration.logs import Log, bad_log, quantum, refused, repeats
 from obsynth.calibration.plants import CalibrationPlant
 from obsynth.calibration.step_graphs import SampleGraphs, sample_graphs
 from obsynth.errors import SpecError
+from obsynth.numerics.arguments import is_number, is_whole
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.covariances import covariance_factor
 from obsynth.plants.dae.checks import finite_vector
@@ -89,7 +90,7 @@ def calibration_problem(
     initial_state: Any, initial_covariance: Any, integration: str, substeps: int,
 ) -> Problem:  # fmt: skip
     """Return the problem, or say what is wrong with what is asked."""
-    if not isinstance(substeps, (int, np.integer)) or isinstance(substeps, bool) or substeps < 1:
+    if not is_whole(substeps) or substeps < 1:
         raise SpecError(f"substeps is {substeps!r}: give a whole number, at least 1.", path="substeps")
     if not log.samples > 1:
         raise bad_log("too-short", f"The log has {log.samples} row(s): a calibration needs more.")
@@ -173,7 +174,7 @@ def _variances(given: Mapping[str, float | None] | None, names: Sequence[str], w
         i = index_of(name, names, what=what)
         if value is None:
             continue
-        if not isinstance(value, (int, float, np.number)) or isinstance(value, bool) or not value > 0.0:
+        if not is_number(value) or not value > 0.0:
             raise SpecError(f"{what}.{name} is {value!r}: give a positive variance, or leave it out to have it found.",
                             path=f"{what}.{name}")  # fmt: skip
         found[i] = float(value)

@@ -90,8 +90,9 @@ def designed(spec: Spec, report_stage: Any) -> ObserverDesign:
 
     recovery = None if spec.transformation is None else spec.transformation.recovery
     found = design(
-        spec.plant, spec.method, name=spec.name, recovery=recovery, progress=report_stage, **dict(spec.options)
-    )
+        spec.plant, spec.method, name=spec.name, recovery=recovery, progress=report_stage, scenario=spec.scenario,
+        **dict(spec.options),
+    )  # fmt: skip
     noted = () if spec.transformation is None else spec.transformation.notes
     return found.replace(notes=(*noted, *found.notes)) if noted else found
 

@@ -74,6 +74,10 @@ def add_data_verbs(verbs: Any) -> None:
     run.add_argument(
         "--state", type=Path, metavar="FILE", help="go on from this saved state if it exists, and save the new one"
     )
+    run.add_argument(
+        "--prove", type=Path, metavar="FILE",
+        help="with --monitor pointwise: prove the first alarm, and write the certificate that 'verify' rechecks",
+    )  # fmt: skip
     add_json(run)
     add_force(run)
     add_quiet(run, "no progress and no summary")

@@ -22,6 +22,7 @@ from obsynth.cli.data_run import (
     summary_of_run,
 )
 from obsynth.cli.output import print_json
+from obsynth.cli.prove_alarm import alarm_of_run, certificate_target
 from obsynth.errors import SpecError, VerificationError
 from obsynth.files.inputs import protect, protect_stream
 from obsynth.files.outputs import require_distinct
@@ -39,6 +40,7 @@ def run_run(options: argparse.Namespace) -> int:
     if options.json and options.out == STREAM:
         raise SpecError("--json and the estimates cannot both go to stdout: give --out a file.", path="--json")
     out = _target(options)
+    certificate = certificate_target(options)
     design = load(options.gains)
     watched = monitor_of(design, options)
     from obsynth.data.run import run_on_data
@@ -54,10 +56,12 @@ def run_run(options: argparse.Namespace) -> int:
         )  # fmt: skip
     for text in found.warnings:
         print(f"Warning: {text}", file=sys.stderr)
+    proof = None if certificate is None else alarm_of_run(design, options, found, certificate)
     if options.json:
         print_json(
             {
                 "command": "run",
+                **({} if proof is None else {"proof": proof}),
                 "gains": str(options.gains),
                 "file": str(out),
                 **found.as_dict(),
@@ -66,7 +70,10 @@ def run_run(options: argparse.Namespace) -> int:
         )
     elif not options.quiet:
         # The estimates themselves may be on stdout.
-        print(summary_of_run(found, watched), file=sys.stderr if out is sys.stdout else sys.stdout)
+        stream = sys.stderr if out is sys.stdout else sys.stdout
+        print(summary_of_run(found, watched), file=stream)
+        if proof is not None:
+            print(proof["statement"], *(["Certificate:", proof["file"]] if proof["file"] else []), file=stream)
     return 0
 
 

@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from obsynth.analysis.transformations.recovery import Transformation, linear_plant
 from obsynth.comparison.result import ComparedMethod, Comparison, FaultComparison
 from obsynth.comparison.scenario_runs import DrawnRuns, alarms, drawn_runs, estimates, rms
 from obsynth.errors import SpecError
 from obsynth.methods.choosing.candidates import Candidate, candidate, linear_methods
-from obsynth.methods.choosing.figures import DECOUPLED, on_the_clock, step_responses
+from obsynth.methods.choosing.figures import DECOUPLED, Held, held, on_the_clock, step_responses
 from obsynth.methods.designing import design
 from obsynth.methods.functional_filter.rates import settling_time
 from obsynth.numerics.arguments import (
@@ -38,7 +39,7 @@ SEED = 7
 
 @on_one_thread_if_small
 def compare(
-    plant: DescriptorSystem,
+    plant: DescriptorSystem | Transformation,
     *,
     scenario: Scenario | None = None,
     options: Mapping[str, Mapping[str, Any]] | None = None,
@@ -59,7 +60,7 @@ def compare(
 
     Parameters
     ----------
-    plant : DescriptorSystem
+    plant : DescriptorSystem or Transformation
         Either time, with faults.  A continuous one is sampled: methods are designed for the samples where they can be.
     scenario : Scenario, optional
         What happens; by default each fault in turn is a step, while every unknown input is a sinusoid.
@@ -98,7 +99,7 @@ def compare(
     ----------
     Ours: see `Comparison` for what each number means.
     """
-    require_kind(plant, DescriptorSystem, "plant", "an obsynth.DescriptorSystem")
+    plant = linear_plant(plant)
     if plant.nf == 0:
         raise SpecError("The plant has no faults: there is nothing to compare estimates of.", path="plant")
     checked_value(tolerance, "tolerance", NonNegative)
@@ -114,20 +115,27 @@ def compare(
     sampled = on_the_clock(plant, dt)
     happening = _scenario(plant, scenario, dt, disturbance)
     steps = int(min(happening.horizon / dt, MOST_STEPS)) + 1
+    kept = held(sampled, steps)
+    if kept.steps < steps:
+        steps, happening = kept.steps, happening.replace(horizon=kept.steps * dt)
     ids = _checked_methods(methods)
     found = []
     for method in ids:
         report_stage(f"designing by {method}")
         found.append(candidate(method, plant, sampled, steps, _maker, (options or {}).get(method, {})))
     report_stage("running the scenario")
-    drawn = drawn_runs(plant, sampled, happening, runs=runs, tolerance=float(tolerance), seed=SEED)
+    drawn = drawn_runs(
+        plant, sampled, happening, runs=runs, tolerance=float(tolerance), seed=SEED, feedback=kept.feedback
+    )
     log = None if data is None else _log(data, sampled)
     limit = within if within is not None else settling_time(plant)
-    compared = [_compared(entry, sampled, drawn, log, steps, limit, false_alarms) for entry in found]
+    compared = [_compared(entry, sampled, drawn, log, kept, limit, false_alarms) for entry in found]
     compared.sort(key=lambda entry: (bool(entry.refused), not entry.fast_enough, entry.rms))
     setting = (
         f"{runs} runs of {happening.horizon:g} s, sampled every {dt:g} s, disturbances and noise drawn"
+        + (", constants within their tolerances" if plant.uncertainty is not None else "")
         + (f", parameters off by up to {tolerance:.0%}" if tolerance else "")
+        + (", a state feedback holds the unstable plant" if kept.feedback.any() else "")
         + f"; 90 % of a step wanted within {limit:.3g} s"
     )
     times: FloatArray = (
@@ -216,16 +224,17 @@ def _log(data: Any, plant: DescriptorSystem) -> _Log:
 
 
 def _compared(
-    entry: Candidate, plant: DescriptorSystem, drawn: DrawnRuns, log: _Log | None, steps: int, limit: float,
+    entry: Candidate, plant: DescriptorSystem, drawn: DrawnRuns, log: _Log | None, kept: Held, limit: float,
     false_alarms: float,
 ) -> ComparedMethod:  # fmt: skip
     nothing = np.zeros((0, 0))
     if entry.observer is None:
         return ComparedMethod(entry.method, entry.refused, None, 0, entry.milliseconds, (), False, nothing, nothing)
     observer = entry.observer
-    _, responses = step_responses(plant, observer, steps)
-    found, quiet = (estimates(observer, drawn.u, outputs) for outputs in (drawn.faulty, drawn.healthy))
-    replayed = None if log is None else estimates(observer, log.u, log.y[None])[0]
+    _, responses = step_responses(plant, observer, kept.steps, kept.feedback)
+    found = estimates(observer, drawn.faulty_u, drawn.faulty)
+    quiet = estimates(observer, drawn.healthy_u, drawn.healthy)
+    replayed = None if log is None else estimates(observer, log.u[None], log.y[None])[0]
     rows = []
     for row, figures in enumerate(entry.figures):
         column = plant.fault_names.index(figures.fault)

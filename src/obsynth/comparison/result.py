@@ -84,7 +84,7 @@ class ComparedMethod:
 
     @property
     def rms(self) -> float:
-        """Root mean square over all faults, each in units of its size in the scenario (of 1 where it is absent)."""
+        """Root mean square over all faults, each in its own unit."""
         return float(np.sqrt(np.mean([found.rms**2 for found in self.faults]))) if self.faults else float("inf")
 
 

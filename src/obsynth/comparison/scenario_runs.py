@@ -13,6 +13,7 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.simulation.scenario import Scenario
 from obsynth.simulation.scenario_signals import resolve
+from obsynth.tolerances.exact_plant import plant_at
 
 #: Entries of A, B, Bf, Bd that tolerances do not touch: they are kinematics, not parameters.
 EXACT = (0.0, 1.0, -1.0)
@@ -22,12 +23,13 @@ EXACT = (0.0, 1.0, -1.0)
 class DrawnRuns:
     """Outputs of drawn plants: with the scenario's faults and without any, for the same draws otherwise.
 
-    Fields: u ``(steps, nu)``; faulty, healthy ``(runs, steps, ny)``; faults ``(steps, nf)``; dt.
+    Fields: faulty, healthy ``(runs, steps, ny)`` with their known inputs ``(runs, steps, nu)``; faults ``(steps, nf)``.
     """
 
-    u: FloatArray
     faulty: FloatArray
+    faulty_u: FloatArray
     healthy: FloatArray
+    healthy_u: FloatArray
     faults: FloatArray
     dt: float
 
@@ -40,8 +42,12 @@ def drawn_runs(
     runs: int,
     tolerance: float,
     seed: int,
+    feedback: FloatArray,
 ) -> DrawnRuns:
-    """Return the runs; plants are drawn before they are sampled, and disturbances by a factor between -1 and 1."""
+    """Return the runs; plants are drawn before they are sampled, and disturbances by a factor between -1 and 1.
+
+    Plants that state tolerances of their constants are drawn within these; an unstable one is held by ``feedback``.
+    """
     from obsynth.methods.choosing.figures import on_the_clock
 
     drive = resolve(sampled, scenario)
@@ -50,36 +56,52 @@ def drawn_runs(
     seeds = [int(value) for value in rng.integers(0, 2**31, size=runs)]
     random, noise, sensors = drive.drawn(seeds, sampled.nw)
     scales = rng.uniform(-1.0, 1.0, size=(runs, sampled.nd))
-    faulty: list[FloatArray] = []
-    healthy: list[FloatArray] = []
+    found: dict[str, list[tuple[FloatArray, FloatArray]]] = {"faulty": [], "healthy": []}
+    off = tolerance > 0.0 or source.uncertainty is not None
     for run in range(runs):
-        plant = on_the_clock(_drawn(source, tolerance, rng), sampled.dt) if tolerance else sampled
+        plant = on_the_clock(_drawn(source, tolerance, rng), sampled.dt) if off else sampled
         signals = drive.left + random[:, run]
         d = signals[:, nu + nf :] * scales[run]
         shaken = noise[:, run] if noise.shape[2] == plant.nw else np.zeros((drive.steps, plant.nw))
-        for f, kept in ((signals[:, nu : nu + nf], faulty), (np.zeros((drive.steps, nf)), healthy)):
-            kept.append(_outputs(plant, signals[:, :nu], d, f, shaken) + sensors[:, run])
-    return DrawnRuns(drive.left[:, :nu], np.array(faulty), np.array(healthy), drive.left[:, nu : nu + nf], drive.dt)
+        for name, f in (("faulty", signals[:, nu : nu + nf]), ("healthy", np.zeros((drive.steps, nf)))):
+            outputs, known = _outputs(plant, signals[:, :nu], d, f, shaken, feedback)
+            found[name].append((outputs + sensors[:, run], known))
+    (faulty, faulty_u), (healthy, healthy_u) = (
+        [np.array(part) for part in zip(*found[name], strict=True)] for name in ("faulty", "healthy")
+    )
+    return DrawnRuns(faulty, faulty_u, healthy, healthy_u, drive.left[:, nu : nu + nf], drive.dt)
 
 
 def estimates(observer: LinearObserver, u: FloatArray, outputs: FloatArray) -> FloatArray:
-    """Return fault estimates ``(runs, steps, faults)`` of an observer at rest on outputs ``(runs, steps, ny)``."""
-    rows, y = observer.fault_rows, outputs.swapaxes(0, 1)
-    z = driven(observer.Az, np.zeros(observer.order), y @ observer.By.T + (u @ observer.Bu.T)[:, None])
+    """Return fault estimates ``(runs, steps, faults)`` of an observer at rest; u and outputs ``(runs, steps, ...)``."""
+    rows, y, known = observer.fault_rows, outputs.swapaxes(0, 1), u.swapaxes(0, 1)
+    z = driven(observer.Az, np.zeros(observer.order), y @ observer.By.T + known @ observer.Bu.T)
     with np.errstate(over="ignore", invalid="ignore"):
-        found = z @ observer.Cz[rows].T + y @ observer.Dy[rows].T + (u @ observer.Du[rows].T)[:, None]
+        found = z @ observer.Cz[rows].T + y @ observer.Dy[rows].T + known @ observer.Du[rows].T
     return np.ascontiguousarray(found.swapaxes(0, 1))
 
 
-def _outputs(plant: DescriptorSystem, u: FloatArray, d: FloatArray, f: FloatArray, w: FloatArray) -> FloatArray:
+def _outputs(
+    plant: DescriptorSystem, u: FloatArray, d: FloatArray, f: FloatArray, w: FloatArray, feedback: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return outputs and known inputs ``(steps, ..)`` of a plant at rest, with ``u - feedback x`` as its input."""
     into = u @ plant.B.T + d @ plant.Bd.T + f @ plant.Bf.T + w @ plant.Bw.T
     direct = u @ plant.D.T + d @ plant.Dd.T + f @ plant.Df.T + w @ plant.Dw.T
-    states = driven(plant.A, np.zeros(plant.nx), into)
-    return np.asarray(states @ plant.C.T + direct)
+    closed, seen = plant.A - plant.B @ feedback, plant.C - plant.D @ feedback
+    states = driven(closed, np.zeros(plant.nx), into)
+    return np.asarray(states @ seen.T + direct), np.asarray(u - states @ feedback.T)
 
 
 def _drawn(plant: DescriptorSystem, tolerance: float, rng: np.random.Generator) -> DescriptorSystem:
-    """Return a plant whose parameters are off by up to the tolerance, each by itself; equal entries stay equal."""
+    """Return a plant whose parameters are off by up to the tolerance, each by itself; equal entries stay equal.
+
+    Constants with stated tolerances are drawn within these.
+    """
+    if plant.uncertainty is not None:
+        box = plant.uncertainty.box
+        plant = plant_at(plant, box.values(rng.uniform(-1.0, 1.0, size=len(box.names))))
+        if not tolerance:
+            return plant
     factors: dict[float, float] = {}
 
     def off(matrix: FloatArray) -> FloatArray:

@@ -12,9 +12,10 @@ import numpy as np
 from obsynth.analysis.diagnosis.additions import Sensor, state_sensors
 from obsynth.analysis.diagnosis.decoupled import fault_numbers
 from obsynth.analysis.diagnosis.sensor_search import GOALS, SensorSearch, Task, reached
+from obsynth.analysis.transformations.recovery import Transformation, linear_plant
 from obsynth.errors import ObsynthError, PreconditionError, SpecError
 from obsynth.methods.functional_filter.public import functional_filter
-from obsynth.numerics.arguments import is_finite_number, require_kind
+from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.threads import on_one_thread_if_small
 from obsynth.plants.descriptor import DescriptorSystem
 
@@ -110,7 +111,7 @@ class SensorSets:
 
 @on_one_thread_if_small
 def sensor_sets(
-    plant: DescriptorSystem,
+    plant: DescriptorSystem | Transformation,
     *,
     goal: str = "estimate",
     faults: Sequence[str] | None = None,
@@ -130,7 +131,7 @@ def sensor_sets(
 
     Parameters
     ----------
-    plant : DescriptorSystem
+    plant : DescriptorSystem or Transformation
         Either time; its outputs are there already.
     goal : {"detect", "isolate", "estimate-step", "estimate"}, optional
         What every fault asked for must be: shown free of the unknown inputs; told from each other fault as well;
@@ -172,7 +173,7 @@ def sensor_sets(
     .. [Krysander] M. Krysander, E. Frisk, "Sensor placement for fault diagnosis", IEEE Trans. SMC-A 38, 2008: the
        question, on structure alone.  Here the numbers decide, zeros included.
     """
-    require_kind(plant, DescriptorSystem, "plant", "an obsynth.DescriptorSystem")
+    plant = linear_plant(plant)
     report_stage = progress or (lambda _: None)
     chosen = tuple(range(plant.nf)) if faults is None else tuple(fault_numbers(plant, faults, "faults"))
     if goal not in GOALS:

@@ -13,7 +13,7 @@ from obsynth.data.sources import Data, chunks
 from obsynth.data.stamps import Stamps
 from obsynth.errors import SpecError
 from obsynth.experiments.alarm_proofs.proof import WINDOW, AlarmProof, proved_alarm
-from obsynth.numerics.arguments import require_kind, require_mapping
+from obsynth.numerics.arguments import is_whole, require_kind, require_mapping
 from obsynth.results.design import ObserverDesign
 
 #: Rows that are read at a time.
@@ -71,7 +71,7 @@ def prove_alarm(
     require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
     for name, value in (("columns", columns), ("scales", scales)):
         require_mapping(value, name)
-    if isinstance(row, bool) or not isinstance(row, int) or row < 2:
+    if not is_whole(row) or row < 2:
         raise SpecError(f"row is {row!r}: give the number of a row, 2 or more.", path="row")
     reader = DataObserver(design)
     signals = Signals.of(reader, columns, scales)

@@ -119,6 +119,7 @@ class Job:
         #: The file of the state that the first rows go on from: only they show whether its parts fit together.
         self.resumed_from: Path | None = None
         self.statuses, self.alarms, self.isolated = Counter[str](), dict[str, float](), ""
+        self.alarm_rows = dict[str, int]()
 
     def take(self, chunk: FloatArray) -> list[list[Any]]:
         """Take rows ``[time, u, y]`` as read; return rows of output.
@@ -170,16 +171,18 @@ class Job:
             for time, row, cells in zip(times, found, shown, strict=True)
         ]
         if self._levels or self.monitor is not None:
-            for time, row, values, cells in zip(times, found, estimates, rows, strict=True):
-                cells.extend(self._decided(time, row, values))
+            first = self.rows - len(rows) + 1
+            for number, (time, row, values, cells) in enumerate(zip(times, found, estimates, rows, strict=True), first):
+                cells.extend(self._decided(time, row, values, number))
         return rows
 
-    def _decided(self, time: float, row: Row, values: FloatArray) -> list[Any]:
+    def _decided(self, time: float, row: Row, values: FloatArray, number: int) -> list[Any]:
         """Return statistic and threshold, if there is a monitor, and what alarms there are."""
         deciding = row.status in DECIDING
         names = [name for name, i, level in self._levels if deciding and np.abs(values[i]) > level]
         for name in names:
             self.alarms.setdefault(name, time)
+            self.alarm_rows.setdefault(name, number)
         cells: list[Any] = []
         if self.monitor is not None:
             seen = self.monitor.see(
@@ -191,6 +194,7 @@ class Job:
             if seen.alarm:
                 if self.monitor.kind not in self.alarms:
                     self.alarms[self.monitor.kind], self.isolated = time, seen.fault
+                    self.alarm_rows[self.monitor.kind] = number
                 names.append(f"{self.monitor.kind}: {seen.fault}" if seen.fault else self.monitor.kind)
         return [*cells, "; ".join(names)]
 

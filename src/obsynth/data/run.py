@@ -9,23 +9,22 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
-import numpy as np
-
 from obsynth.data.job import Job
 from obsynth.data.linear_log import engine_of
 from obsynth.data.log_estimator import Engine, Later
-from obsynth.data.saved_state import digest_of_gains, resume_state, save_state
+from obsynth.data.saved_state import resume_state, save_state
 from obsynth.data.signals import TIME, Signals
-from obsynth.data.sinks import FrameSink, Sink, TextSink, file_sink
+from obsynth.data.sinks import FrameSink, Sink, TextSink, file_sink, measured_frame
 from obsynth.data.sources import Data, chunks
 from obsynth.data.stamps import Stamps
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.monitors.online import OnlineMonitor
 from obsynth.files.outputs import check_output, require_distinct
 from obsynth.files.signals import HeldSignals, ending_signals
-from obsynth.numerics.arguments import require_kind, require_mapping, truth
+from obsynth.numerics.arguments import is_whole, require_kind, require_mapping, truth
 from obsynth.numerics.arrays import FloatArray
 from obsynth.results.design import ObserverDesign
+from obsynth.results.gain_sets import gain_set_digest
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -65,6 +64,8 @@ class DataRun:
         Whether the log has seconds, or dates and times: ``stamps.shown(time)`` is a time as the log writes it.
     thresholds : mapping of str to float
         Those that were given.
+    alarm_rows : mapping of str to int
+        Numbers of the rows of these alarms, from 1.
     """
 
     rows: int
@@ -79,11 +80,13 @@ class DataRun:
     measured: pd.DataFrame | None = field(default=None, repr=False)
     stamps: Stamps = field(default_factory=Stamps, repr=False)
     thresholds: Mapping[str, float] = field(default_factory=dict, repr=False)
+    alarm_rows: Mapping[str, int] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the summary as plain data, without the table."""
         return {
             "rows": self.rows, "statuses": dict(self.statuses), "alarms": dict(self.alarms),
+            "alarm_rows": dict(self.alarm_rows),
             "alarm_stamps": {name: self.stamps.shown(time) for name, time in self.alarms.items()},
             "isolated": self.isolated, "recovered": dict(self.recovered),
             "outliers": dict(self.outliers), "warnings": list(self.warnings),
@@ -204,7 +207,7 @@ def run_on_data(
         require_kind(state, (str, Path), "state", "the name of a file")
     if out is not None and not hasattr(out, "write"):
         require_kind(out, (str, Path), "out", "the name of a file, or a text stream")
-    if isinstance(chunk_rows, bool) or not isinstance(chunk_rows, int) or chunk_rows < 1:
+    if not is_whole(chunk_rows) or chunk_rows < 1:
         raise SpecError(f"chunk_rows is {chunk_rows!r}: give a whole number, 1 or more.", path="chunk_rows")
     require_distinct({
         "state": state, "data": data if isinstance(data, str | Path) else None,
@@ -221,9 +224,9 @@ def run_on_data(
     watched = None if monitor is None else copy.deepcopy(monitor)
     later = _later_rows(engine, data, smooth=smooth, lag=lag, state=state)
     job = Job(engine, Signals.of(engine, columns, scales), design.recovery, thresholds or {}, watched, recovered, later)
-    digest = digest_of_gains(design)
+    digest = gain_set_digest(design)
     if state is not None and Path(state).exists():
-        resume_state(Path(state), job, digest)
+        resume_state(Path(state), job, digest, design.file_digest)
     kept: list[FloatArray] | None = [] if out is None else None
     rows = _kept(chunks(data, job.signals, stamps, chunk_rows), kept)
     with _sink(out, job.header, stamps) as sink:
@@ -238,8 +241,8 @@ def run_on_data(
     return DataRun(
         job.rows, dict(job.statuses), dict(job.alarms), job.isolated, shown,
         dict(getattr(engine, "outliers", {})),
-        (*engine.notes, *job.first.warnings()), digest, table, _measured(kept, job.signals, stamps), stamps,
-        dict(thresholds or {}),
+        (*engine.notes, *job.first.warnings()), digest, table, measured_frame(kept, job.signals, stamps), stamps,
+        dict(thresholds or {}), dict(job.alarm_rows),
     )  # fmt: skip
 
 
@@ -264,19 +267,6 @@ def _kept(rows: Iterator[FloatArray], kept: list[FloatArray] | None) -> Iterator
         if kept is not None:
             kept.append(chunk)
         yield chunk
-
-
-def _measured(kept: list[FloatArray] | None, signals: Signals, stamps: Stamps) -> pd.DataFrame | None:
-    """Return what was read, in the signals' units."""
-    if kept is None:
-        return None
-    import pandas as pd
-
-    rows = np.concatenate(kept)
-    frame = pd.DataFrame(signals.scale * rows[:, 1:], columns=list(signals.names))
-    times = [stamps.moment(time) for time in rows[:, 0].tolist()] if stamps.is_dated else rows[:, 0]
-    frame.insert(0, TIME, times)
-    return frame
 
 
 def _run_rows(job: Job, rows: Iterator[FloatArray], sink: Sink, progress: Callable[[int], None] | None) -> None:

@@ -6,13 +6,19 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Protocol, TextIO
+from typing import TYPE_CHECKING, Any, Protocol, TextIO
 
-from obsynth.data.signals import TIME
+import numpy as np
+
+from obsynth.data.signals import TIME, Signals
 from obsynth.data.sources import check_suffix
 from obsynth.data.stamps import Stamps
 from obsynth.files.outputs import FileKind, replacement_of
 from obsynth.files.tables import TableWriter
+from obsynth.numerics.arrays import FloatArray
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 #: A table that a run on measured data has written, as CSV or as Parquet.
 ESTIMATES = FileKind("a table of estimates of obsynth", rb"\Atime,status,|\APAR1(?s:.*)status(?s:.*)hat\[")
@@ -123,3 +129,16 @@ def file_sink(path: Path, header: Sequence[str], texts: set[str], stamps: Stamps
         else:
             with os.fdopen(handle, "w", encoding="utf-8", newline="") as stream:
                 yield TextSink(stream, header, stamps)
+
+
+def measured_frame(kept: list[FloatArray] | None, signals: Signals, stamps: Stamps) -> pd.DataFrame | None:
+    """Return what was read, in the signals' units."""
+    if kept is None:
+        return None
+    import pandas as pd
+
+    rows = np.concatenate(kept)
+    frame = pd.DataFrame(signals.scale * rows[:, 1:], columns=list(signals.names))
+    times = [stamps.moment(time) for time in rows[:, 0].tolist()] if stamps.is_dated else rows[:, 0]
+    frame.insert(0, TIME, times)
+    return frame

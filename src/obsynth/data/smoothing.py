@@ -162,7 +162,7 @@ def smooth(
 
     Nonlinear designs are linearised along the filter's estimates (the extended smoother), which is exact for linear
     plants; forms ``random-walk`` and ``augmented-kalman`` take states and parameters together.  Bounds of parameters
-    cut the estimates and leave covariances as they are.
+    cut the estimates, bounds of states project them, and both leave covariances as they are.
 
     References
     ----------

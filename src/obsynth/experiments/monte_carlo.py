@@ -17,7 +17,7 @@ from obsynth.experiments.intervals import Interval, mean, share
 from obsynth.experiments.monitors.monitor import Monitor
 from obsynth.experiments.progress import Progress, shown_progress
 from obsynth.experiments.simulation import aligned_errors
-from obsynth.numerics.arguments import is_finite_number, require_kind
+from obsynth.numerics.arguments import is_finite_number, is_whole, require_kind
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.decisions import ParameterMonitor
 from obsynth.observers.estimates import Estimates
@@ -152,11 +152,11 @@ def evaluate(
     """
     require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
     require_kind(scenario, Scenario, "scenario", "an obsynth.Scenario")
-    if isinstance(runs, bool) or not isinstance(runs, int) or runs < 1:
+    if not is_whole(runs) or runs < 1:
         raise SpecError(f"runs is {runs!r}: give a whole number, 1 or more.", path="runs")
     if not (is_finite_number(confidence) and 0.0 < confidence < 1.0):
         raise SpecError(f"confidence is {confidence!r}: give a number between 0 and 1.", path="confidence")
-    if plants is not None and (isinstance(plants, bool) or not isinstance(plants, int) or plants < 1):
+    if plants is not None and (not is_whole(plants) or plants < 1):
         raise SpecError(f"plants is {plants!r}: give a whole number, 1 or more.", path="plants")
     runs = runs if plants is None else max(runs, plants)
     seeds = range(scenario.seed, scenario.seed + runs)

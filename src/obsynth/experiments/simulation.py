@@ -9,6 +9,7 @@ from typing import Any, cast, overload
 
 import numpy as np
 
+from obsynth.analysis.transformations.recovery import Transformation, plant_and_recovery
 from obsynth.errors import SpecError
 from obsynth.experiments.batch_simulation import CONSISTENCY_TOLERANCE
 from obsynth.experiments.benches import bench_of
@@ -159,9 +160,11 @@ class Simulation:
 @overload
 def simulate(design: ObserverDesign, scenario: Scenario) -> Simulation: ...
 @overload
-def simulate(design: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel, **signals: Any) -> Trajectory: ...
 def simulate(
-    design: ObserverDesign | DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel,
+    design: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel | Transformation, **signals: Any
+) -> Trajectory: ...
+def simulate(
+    design: ObserverDesign | DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel | Transformation,
     scenario: Scenario | None = None,
     **signals: Any,
 ) -> Simulation | Trajectory:
@@ -169,7 +172,7 @@ def simulate(
 
     Parameters
     ----------
-    design : ObserverDesign, DescriptorSystem, TimeVaryingDescriptorSystem or DAEModel
+    design : ObserverDesign, DescriptorSystem, TimeVaryingDescriptorSystem, DAEModel or Transformation
         A design of any method, the plant of a linear one of index 0 or 1; or a plant.
     scenario : Scenario, optional
         What happens; for a design.  For a time-varying plant or a DAE, ``inputs`` and ``faults`` are added to the
@@ -205,6 +208,7 @@ def simulate(
     taken as linear between samples.  The continuous observer runs on the samples, by a first-order hold.  A DAE is
     integrated by Radau IIA (fifth order) with inputs that are constant during each step, whatever its observer uses.
     """
+    design, _ = plant_and_recovery(design)
     for kind, plant_alone in _PLANTS.items():
         if isinstance(design, kind) and scenario is None:
             found: Trajectory = plant_alone(design, **signals)

@@ -30,6 +30,7 @@ from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.results.design import Certificate, ObserverDesign
 from obsynth.results.plant_source import source_of
 from obsynth.results.report import VerificationReport
+from obsynth.simulation.scenario import Scenario
 from obsynth.verification.means import before_the_mean
 from obsynth.verification.plant import condition_rows
 from obsynth.verification.stored_numbers import StoredErrors
@@ -43,6 +44,10 @@ _KINDS: Mapping[PlantKind, tuple[type, str]] = {
 }
 
 
+#: Where designs that know their tolerances are made: above the methods, as they are compared by their thresholds.
+MODEL_ERROR = "obsynth.experiments.tolerant_designs"
+
+
 def _silent(_: str) -> None:
     """Progress that nobody watches."""
 
@@ -54,6 +59,7 @@ def design(
     name: str = "design",
     recovery: StateRecovery | None = None,
     progress: Callable[[str], None] | None = None,
+    scenario: Scenario | None = None,
     **options: Any,
 ) -> ObserverDesign:
     """Design an observer and verify what is shipped.
@@ -73,6 +79,8 @@ def design(
         Map back to the states of the plant before its transformation, kept with the design.
     progress : callable, optional
         Called with a text at the start of each stage.
+    scenario : Scenario, optional
+        What the plant is expected to do, for options that compare designs over it (``model_error``).
     **options
         Options of the method.
 
@@ -100,7 +108,16 @@ def design(
     own, recovery = plant_and_recovery(plant, recovery)
 
     def made(plant: Plant, method: str, options: Mapping[str, Any], *, advise: bool = False) -> ObserverDesign:
-        return _designed(plant, method, options, name=name, recovery=recovery, progress=report_stage, advise=advise)
+        each = partial(_designed, method=method, name=name, recovery=recovery, progress=report_stage, advise=advise)
+        if method_spec(method).read_options(options).as_given().get("model_error", "none") == "none":
+            return each(plant, options=options)
+        from importlib import import_module
+
+        ways = import_module(MODEL_ERROR)
+        found: ObserverDesign = ways.with_model_error(
+            plant, scenario, partial(each, options={**options, "model_error": "none"}), report_stage
+        )
+        return found
 
     if method == AUTO:
         report_stage("designing by every method that exists")
@@ -112,7 +129,7 @@ def design(
 
 
 def _designed(
-    plant: Plant, method: str, options: Mapping[str, Any], *, name: str, recovery: StateRecovery | None,
+    plant: Plant, *, method: str, options: Mapping[str, Any], name: str, recovery: StateRecovery | None,
     progress: Callable[[str], None], advise: bool,
 ) -> ObserverDesign:  # fmt: skip
     """Return the verified design of one method; with ``advise`` a refusal says what would help."""

@@ -14,7 +14,7 @@ import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arrays import FloatArray, unmasked
+from obsynth.numerics.arrays import FloatArray, holds_truth, unmasked
 
 
 def real_number(value: Any, name: str, what: str = "a number") -> float:
@@ -26,7 +26,7 @@ def real_number(value: Any, name: str, what: str = "a number") -> float:
 
 def whole_number(value: Any, name: str, what: str = "a whole number", *, least: int = 1) -> int:
     """Return an integer that is ``least`` or more; raise `SpecError` naming the argument and ``what`` it should be."""
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
+    if not is_whole(value) or value < least:
         raise SpecError(f"{name} is {shown(value)}: give {what}, at least {least}.", path=name)
     return int(value)
 
@@ -59,7 +59,7 @@ def real_array(value: Any, name: str) -> FloatArray:
         raw = np.asarray(unmasked(value))
     except (TypeError, ValueError):
         raise SpecError(f"{name} has rows of different lengths.", path=name) from None
-    if raw.dtype.kind not in "fiu" and raw.size:
+    if (raw.dtype.kind not in "fiu" and raw.size) or holds_truth(value):
         raise SpecError(f"{name} is {shown(value)}: give real numbers.", path=name)
     return np.asarray(raw, dtype=np.float64) if raw.size else np.zeros(raw.shape)
 
@@ -74,6 +74,11 @@ def chosen(value: Any, name: str, choices: tuple[str, ...]) -> str:
 def is_number(value: Any) -> bool:
     """Whether ``value`` is a single real number, of Python or numpy."""
     return isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
+
+
+def is_whole(value: Any) -> bool:
+    """Whether ``value`` is a single whole number, of Python or numpy."""
+    return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
 
 
 def require_kind(value: Any, kinds: type | tuple[type, ...], name: str, wanted: str) -> None:
@@ -142,7 +147,9 @@ def problem_with(value: Any, name: str, kind: Any) -> str | None:
         return None
     plain, *marks = next((get_args(part) for part in options if get_origin(part) is Annotated), (options[0],))
     if plain is Any:
-        return None
+        return _problem_with_written(
+            value, name, next((mark.kind for mark in marks if isinstance(mark, WrittenAs)), "")
+        )
     if get_origin(plain) is Literal:
         allowed = get_args(plain)
         fits = any(type(value) is type(choice) and value == choice for choice in allowed)
@@ -150,12 +157,27 @@ def problem_with(value: Any, name: str, kind: Any) -> str | None:
     if plain is bool:
         return None if isinstance(value, (bool, np.bool_)) else f"{name} is {shown(value)}: give True or False."
     whole = plain is int
-    fits = is_finite_number(value) and (not whole or isinstance(value, (int, np.integer)))
+    fits = is_finite_number(value) and (not whole or is_whole(value))
     limits = [(*_BOUNDS[type(mark)][1:], getattr(mark, _BOUNDS[type(mark)][0])) for mark in marks]
     if fits and all(holds(value, limit) for holds, _, limit in limits):
         return None
     bounds = " and ".join(f"{word} {limit:g}" for _, word, limit in limits)
     return f"{name} is {shown(value)}: give a {'whole ' if whole else ''}number{f' {bounds}' if bounds else ''}."
+
+
+#: What an option is that is written as some kind, and the Python types of it.
+_LISTS: Mapping[str, tuple[str, tuple[type, ...]]] = {
+    "poles": ("a list of poles", (list, tuple, np.ndarray)), "texts": ("a list of names", (str, list, tuple)),
+    "fault sets": ("'detect', 'isolate' or lists of names", (str, list, tuple)),
+}  # fmt: skip
+
+
+def _problem_with_written(value: Any, name: str, kind: str) -> str | None:
+    wanted, kinds = _LISTS.get(kind, ("numbers", ()))
+    fits = not isinstance(value, (bool, np.bool_)) and (not kinds or value is None or isinstance(value, kinds))
+    if fits and kind == "fault sets" and not isinstance(value, (str, type(None))):
+        fits = all(isinstance(entry, (str, list, tuple)) for entry in value)
+    return None if fits else f"{name} is {shown(value)}: give {wanted}."
 
 
 def checked_value(value: Any, name: str, kind: Any) -> Any:

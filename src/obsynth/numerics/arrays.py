@@ -28,6 +28,11 @@ def unmasked(value: Any) -> Any:
     return np.where(np.ma.getmaskarray(value), np.nan, np.ma.getdata(value))
 
 
+def holds_truth(value: Any) -> bool:
+    """Whether a list has True or False among its entries, which numpy would take for 1 and 0 beside numbers."""
+    return isinstance(value, (bool, np.bool_)) or (isinstance(value, (list, tuple)) and any(map(holds_truth, value)))
+
+
 def as_matrix(value: Any, name: str) -> FloatArray:
     """Convert nested lists or an array to a finite, read-only matrix; raise `SpecError` naming it.
 
@@ -38,12 +43,17 @@ def as_matrix(value: Any, name: str) -> FloatArray:
         raw = np.asarray(unmasked(value))
     except ValueError:
         raise SpecError(f"{name} has rows of different lengths: give a full matrix.", path=name) from None
-    if raw.dtype.kind not in "fiu":
+    truths = holds_truth(value)
+    if raw.dtype.kind not in "fiu" or truths:
         if raw.size == 0:
             raw = raw.astype(np.float64)
         else:
-            kind = {"b": "booleans", "c": "complex numbers", "U": "text"}.get(
-                raw.dtype.kind, "entries that are no numbers"
+            kind = (
+                "booleans"
+                if truths
+                else {"b": "booleans", "c": "complex numbers", "U": "text"}.get(
+                    raw.dtype.kind, "entries that are no numbers"
+                )
             )
             raise SpecError(f"{name} holds {kind}: every entry must be a real number.", path=name)
     if raw.ndim == 0:

@@ -18,6 +18,8 @@ NOTHING = 1e-18
 #: Residual of a Riccati equation that counts as solved, relative to its terms.
 EQUATION_TOLERANCE = 1e-8
 MOST_DOUBLINGS = 60
+#: A change larger than the solution, after the first steps, is a jump through infinity: a solution has none, or one.
+FIRST_STEPS, LARGE_CHANGE, MOST_JUMPS = 8, 1.5, 1
 #: Eigenvalues that are smaller than the largest by more than this share do not set the rate of a Cayley transform.
 WIDEST_SPECTRUM = 1e-3
 #: Keeps that rate off an eigenvalue, which a single one would be.
@@ -101,9 +103,9 @@ def _doubled(
     """
     n = len(power)
     back, solution = 0.5 * (back + back.T), 0.5 * (solution + solution.T)
-    error = np.inf
+    error, jumps = np.inf, 0
     with np.errstate(over="ignore", invalid="ignore"):
-        for _ in range(MOST_DOUBLINGS):
+        for step in range(MOST_DOUBLINGS):
             if possible is not None and not possible(solution):
                 return None
             # `dot` is `@` with half the overhead, which for few states is most of the time.
@@ -119,6 +121,9 @@ def _doubled(
             if not math.isfinite(size):
                 return None
             error, last = math.sqrt(np.vdot(change, change)) / max(size, SMALLEST), error
+            jumps += step >= FIRST_STEPS and error > LARGE_CHANGE
+            if jumps > MOST_JUMPS:
+                return None
             # Rounding leaves changes that shrink no more; small ones are as good as none.
             if error <= DOUBLING_TOLERANCE or last <= error <= STAGNATION:
                 return solution

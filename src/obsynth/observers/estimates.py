@@ -49,6 +49,9 @@ class Estimates:
     fault_covariances : FloatArray
         ``(samples, nf, nf)``: the covariance of the estimates while the parameters are constant (or walk as stated).
         S is none: with forgetting it says how much is still remembered.
+    state_covariances, cross_covariances : FloatArray
+        ``(samples, nx, nx)`` and ``(samples, nx, nf)``: of the states, and of states with faults, see
+        `joint_covariances`; recursive observers (but for the compiled kernel) and nonlinear ones (but for batches).
     innovations : FloatArray
         ``(samples, m)``.  Recursive observers: whitened parity innovations of the model without parameters; NaN where
         there are fewer.  Nonlinear ones: in units of the outputs; NaN where a sample is missing.
@@ -87,6 +90,8 @@ class Estimates:
     fault_delays: tuple[int, ...]
     state_deviations: FloatArray = field(default_factory=nothing)
     fault_covariances: FloatArray = field(default_factory=nothing)
+    state_covariances: FloatArray = field(default_factory=nothing)
+    cross_covariances: FloatArray = field(default_factory=nothing)
     innovations: FloatArray = field(default_factory=nothing)
     regressors: FloatArray = field(default_factory=nothing)
     innovation_covariances: FloatArray = field(default_factory=nothing)
@@ -114,6 +119,17 @@ class Estimates:
     def fault_deviations(self) -> FloatArray:
         """Standard deviations of the fault estimates ``(samples, nf)``; NaN where the observer knows none."""
         return np.asarray(np.sqrt(np.einsum("...ii->...i", self.fault_covariances)))
+
+    @property
+    def joint_covariances(self) -> FloatArray:
+        """Covariances of states and faults together ``(samples, nx + nf, nx + nf)``; empty where they are not known."""
+        if not self.state_covariances.size:
+            return NOTHING
+        across = self.cross_covariances
+        return np.concatenate([
+            np.concatenate([self.state_covariances, across], axis=-1),
+            np.concatenate([np.swapaxes(across, -1, -2), self.fault_covariances], axis=-1),
+        ], axis=-2)  # fmt: skip
 
     @property
     def parameters(self) -> FloatArray:

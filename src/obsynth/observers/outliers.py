@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.errors import SolverError, SpecError
+from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray
 
 BoolArray = NDArray[np.bool_]
@@ -36,8 +37,7 @@ def checked_limit(kind: str, limit: float | None) -> float:
         raise SpecError(f"outliers is {kind!r}: use one of {', '.join(KINDS)}.", path="outliers")
     if limit is None:
         return LIMITS.get(kind, float("inf"))
-    number = isinstance(limit, (int, float, np.number)) and not isinstance(limit, bool)
-    if not number or not (np.isfinite(limit) and limit > 0.0):
+    if not is_finite_number(limit) or not limit > 0.0:
         raise SpecError(f"outlier_limit is {limit!r}: give a positive number of standard deviations.",
                         path="outlier_limit")  # fmt: skip
     return float(limit)

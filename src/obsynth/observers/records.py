@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import real_array
+from obsynth.numerics.arguments import is_whole, real_array
 from obsynth.numerics.arrays import FloatArray, as_matrix, unmasked
 
 #: The fields of an observer that hold names.
@@ -30,7 +30,7 @@ def require_names(names: Any, field: str) -> None:
 
 def is_delay(delay: Any) -> bool:
     """Whether ``delay`` is a whole number of samples, 0 or more."""
-    return isinstance(delay, int) and not isinstance(delay, bool) and delay >= 0
+    return is_whole(delay) and delay >= 0
 
 
 def require_horizon(horizon: int | None, samples: int, *, early: bool) -> None:

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
+from obsynth.numerics.arguments import is_number, is_whole
 from obsynth.numerics.arrays import ComplexArray, FloatArray, as_matrix, read_only
 from obsynth.numerics.ranks import decide_rank
 from obsynth.numerics.scaling import LogBalance
@@ -141,7 +142,7 @@ class FaultModel:
 
 def polynomial(order: int) -> FaultModel:
     """Return the model of a polynomial in time: order 0 is a step, 1 a ramp."""
-    if isinstance(order, bool) or not isinstance(order, int) or not 0 <= order <= HIGHEST_ORDER:
+    if not is_whole(order) or not 0 <= order <= HIGHEST_ORDER:
         raise SpecError(
             f"A polynomial fault model has order {order!r}: give a whole number from 0 (step) to {HIGHEST_ORDER}.",
             path="fault_model",
@@ -258,7 +259,7 @@ def _observable(model: FaultModel) -> FaultModel:
 
 
 def _number(value: Any, what: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
+    if not is_number(value):
         raise SpecError(f"The {what} model needs a number, not {value!r}.", path="fault_model")
     if not np.isfinite(value):
         raise SpecError(f"The {what} model needs a finite number, not {value}.", path="fault_model")

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
+from obsynth.numerics.arguments import is_finite_number, is_whole
 from obsynth.numerics.expressions import CONSTANTS
 from obsynth.plants.sequences import MatrixSequence, zeros
 from obsynth.plants.validation import Problems, checked_dt
@@ -46,7 +47,7 @@ def checked_constants(constants: Mapping[str, float] | None) -> dict[str, float]
     for name, value in constants.items():
         if not (isinstance(name, str) and name.isidentifier()) or name == "k" or name in CONSTANTS:
             raise SpecError(f"constants names {name!r}: use letters, digits and '_', not k or pi.", path="constants")
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
+        if not is_finite_number(value):
             raise SpecError(f"The constant {name!r} is {value!r}: give a finite number.", path=f"constants.{name}")
         checked[name] = float(value)
     return checked
@@ -81,7 +82,7 @@ def _wrong_shape(name: str, shape: tuple[int, int], wanted: str) -> None:
 
 def checked_horizon(horizon: int | None, values: Mapping[str, MatrixSequence]) -> int | None:
     """Return the number of steps that all stacks are good for, or ``None`` without any limit."""
-    if horizon is not None and (isinstance(horizon, bool) or not isinstance(horizon, (int, np.integer)) or horizon < 1):
+    if horizon is not None and (not is_whole(horizon) or horizon < 1):
         raise SpecError(f"horizon is {horizon!r}: give the number of steps, at least 1.", path="horizon")
     lengths = {name: m.length - (name in LATE) for name, m in values.items() if m.length is not None}
     if not lengths:

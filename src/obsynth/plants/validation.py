@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
+from obsynth.numerics.arguments import is_number
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.sparse import as_sparse_matrix, is_sparse
 from obsynth.plants.names import is_name_list, require_known, rows_picking
@@ -133,7 +134,7 @@ def _by(shape: tuple[int, ...]) -> str:
 
 def checked_dt(dt: Any) -> float:
     """Return a sampling time in seconds, 0 for continuous time."""
-    if isinstance(dt, bool) or not isinstance(dt, (int, float, np.integer, np.floating)):
+    if not is_number(dt):
         raise SpecError(f"dt is {dt!r}: give the sampling time in seconds, or 0 for continuous time.", path="dt")
     if not np.isfinite(dt) or dt < 0:
         raise SpecError(f"dt is {dt}: give a sampling time >= 0 in seconds (0 for continuous time).", path="dt")

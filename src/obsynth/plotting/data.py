@@ -15,6 +15,7 @@ from obsynth.plotting.panels import (
     BAND_STYLE,
     BAND_WIDTH,
     ESTIMATE_STYLE,
+    LINE_COLOURS,
     MARK_STYLE,
     PANEL_HEIGHT,
     RESIDUAL_STYLE,
@@ -23,6 +24,7 @@ from obsynth.plotting.panels import (
     WIDTH,
     legend_above,
     new_panels,
+    short_dates,
     tidy,
     with_unit,
 )
@@ -42,7 +44,6 @@ _FAR = 30.0
 #: Rows in which nothing is decided lie in grey, those with an alarm in red.
 _UNDECIDED: dict[str, Any] = {"color": "0.9", "linewidth": 0.0, "zorder": 0}
 _ALARM: dict[str, Any] = {"color": "tab:red", "alpha": 0.15, "linewidth": 0.0, "zorder": 0}
-_LINES = ("-", "--", "-.", ":")
 
 
 def plot_data(
@@ -86,7 +87,8 @@ def plot_data(
     plans = _plans(run.table, run.measured, show)
     panels = new_panels(axes, len(plans), size=(WIDTH, PANEL_HEIGHT * max(len(plans), 1) + 0.6))
     units = {} if design is None else dict(design.plant.units)
-    told: set[str] = set()
+    # A marked alarm explains the red rows as well.
+    told = {"alarm"} if any(part == "faults" and name in run.alarms for part, name in plans) else set[str]()
     for panel, (part, name) in zip(panels, plans, strict=True):
         _shade(panel, run.table, told, alarms=part != "outputs")
         _DRAWN[part](panel, run, name, units, design)
@@ -94,6 +96,8 @@ def plot_data(
         tidy(panel)
     if panels:
         panels[-1].set_xlabel("time" if run.stamps.is_dated else "time (s)")
+        if run.stamps.is_dated:
+            short_dates(panels[-1])
     return panels
 
 
@@ -140,14 +144,24 @@ def _draw_fault(panel: Axes, run: DataRun, column: str, units: dict[str, str], d
         centre = 0.0 if design is None or name in biases else design.plant.operating_point.get(name, 0.0)
         for i, side in enumerate((centre + level, centre - level)):
             panel.axhline(side, label="threshold" if i == 0 else None, **THRESHOLD_STYLES[0])
+    if column in run.alarms:
+        _mark_alarm(panel, run, column, times, values)
     panel.set_ylabel(with_unit(name, units))
+
+
+def _mark_alarm(panel: Axes, run: DataRun, column: str, times: Any, values: Any) -> None:
+    """Mark where a threshold is first passed, with its time."""
+    table: Any = run.table
+    row = int(table["alarm"].astype(str).str.contains(column, regex=False).to_numpy().argmax())
+    panel.plot([times.iloc[row]], [values[row]], marker="o", color="black",
+               label=f"alarm at {run.stamps.shown(run.alarms[column])}", **MARK_STYLE)  # fmt: skip
 
 
 def _draw_residuals(panel: Axes, run: DataRun, _: str, units: dict[str, str], __: Any) -> None:
     table: Any = run.table
     names = [name for name in table.columns if name.startswith("r[")]
     for i, name in enumerate(names[:MOST]):
-        style = {**RESIDUAL_STYLE, "linestyle": _LINES[i % len(_LINES)], "color": str(min(0.2 * i, 0.6))}
+        style = {**RESIDUAL_STYLE, "linewidth": 0.9, "color": LINE_COLOURS[i]}
         panel.plot(table["time"], table[name], label=name, **style)
     for i, name in enumerate(name for name in names[:MOST] if name in run.thresholds):
         style = THRESHOLD_STYLES[i % len(THRESHOLD_STYLES)]

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from obsynth.errors import SpecError
+from obsynth.numerics.arguments import is_number
 from obsynth.plotting.panels import WIDTH, tidy
 
 if TYPE_CHECKING:
@@ -93,7 +94,7 @@ def _parameter(results: list[Any], parameter: str | None) -> str | None:
     numbers = {}
     for name in {name for result in results for name in result.parameters}:
         values = [result.parameters.get(name) for result in results]
-        if all(isinstance(value, (int, float)) and not isinstance(value, bool) for value in values):
+        if all(is_number(value) for value in values):
             numbers[name] = len(set(values))
     if parameter is not None and parameter not in numbers:
         known = ", ".join(numbers) or "none"

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from obsynth.errors import SpecError
+from obsynth.numerics.arguments import is_number
 from obsynth.plotting.panels import PANEL_HEIGHT, WIDTH, new_panels, tidy
 from obsynth.results.design import ObserverDesign
 
@@ -67,11 +68,7 @@ def plot_trade_off(
 
 def _number(design: ObserverDesign, name: str) -> float:
     claims, checks = design.certificate.claims, {check.name: check.value for check in design.report.checks}
-    options = {
-        key: float(value)
-        for key, value in design.options.items()
-        if isinstance(value, (int, float)) and not isinstance(value, bool)
-    }
+    options = {key: float(value) for key, value in design.options.items() if is_number(value)}
     for source in (claims, checks, options):
         if name in source:
             return float(source[name])

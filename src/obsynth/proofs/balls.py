@@ -177,6 +177,15 @@ class Ball(Enclosure):
             radius = abs(factor) * self.radius + UNIT_ROUNDOFF * np.abs(product) + UNDERFLOW
             return type(self)(product, rounded_up(radius, 4))
 
+    def widened(self, share: float) -> Ball:
+        """Return the ball of every member times a number that is off one by at most ``share``."""
+        radius = self.radius + share * (np.abs(self.midpoint) + self.radius)
+        return Ball(self.midpoint, rounded_up(radius, 4))
+
+    def added(self, radius: float) -> Ball:
+        """Return the ball of all sums with a matrix of entries of at most so much."""
+        return Ball(self.midpoint, rounded_up(self.radius + radius, 2))
+
     @property
     def is_exact(self) -> bool:
         """Whether there is one member alone."""

@@ -1,14 +1,24 @@
-"""Enclosures of matrix exponentials, from python-flint's ball arithmetic, as balls of double precision."""
+"""Enclosures of matrix exponentials as balls of double precision: by python-flint, or by BLAS for many states.
+
+In many states a Taylor polynomial of a short interval, with a bound on its remainder, is squared (doubled) in balls;
+where its radius is no share of it any more, python-flint has the word, with the digits that takes.
+"""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
-from obsynth.proofs.balls import UNDERFLOW, UNIT_ROUNDOFF, Ball
+from obsynth.proofs.balls import UNDERFLOW, UNIT_ROUNDOFF, Ball, rounded_up
 
 #: Digits in which exponentials are formed, in bits.
 BITS = 160
+#: With more states double precision comes first, where its radius is below this share of the largest entry.
+MANY_STATES, LARGEST_SHARE = 60, 1e-7
+#: Norm of the shortest interval's exponent, and orders of the Taylor polynomials: what is left is below 1e-18.
+SHORT, ORDER, ENERGY_ORDER = 2.0**-4, 10, 12
 
 
 def exponential(matrix: FloatArray, time: float) -> Ball:
@@ -18,6 +28,10 @@ def exponential(matrix: FloatArray, time: float) -> Ball:
     n = len(matrix)
     if not n:
         return Ball.exact(np.zeros((0, 0)))
+    if n > MANY_STATES:
+        found = _Doubling(matrix, time).exponential()
+        if found is not None:
+            return found
     with flint.ctx.workprec(BITS):
         scaled = flint.arb_mat(n, n, [flint.arb(value) for value in np.ravel(matrix).tolist()]) * flint.arb(float(time))
         return as_ball(scaled.exp())
@@ -37,6 +51,10 @@ def energy(a: FloatArray, b: FloatArray, time: float) -> Ball:
     import flint
 
     n = len(a)
+    if n > MANY_STATES:
+        found = _Doubling(a, time).energy(b)
+        if found is not None:
+            return found
     with flint.ctx.workprec(2 * BITS):
         rows = [[flint.arb(0)] * (2 * n) for _ in range(2 * n)]
         inputs = flint.arb_mat(b.shape[0], b.shape[1], [flint.arb(value) for value in np.ravel(b).tolist()])
@@ -49,6 +67,71 @@ def energy(a: FloatArray, b: FloatArray, time: float) -> Ball:
         late = flint.arb_mat([[whole[n + j, n + i] for j in range(n)] for i in range(n)])
         upper = flint.arb_mat([[whole[i, n + j] for j in range(n)] for i in range(n)])
         return as_ball(late * upper)
+
+
+def _is_sharp(ball: Ball) -> bool:
+    return bool(np.max(ball.radius) <= LARGEST_SHARE * np.max(np.abs(ball.midpoint)))
+
+
+class _Doubling:
+    """Exponentials over an interval from those over a short one, in states whose units balance the matrix."""
+
+    def __init__(self, matrix: FloatArray, time: float) -> None:
+        from scipy.linalg import matrix_balance
+
+        units = matrix_balance(matrix, permute=False, separate=True)[1][0]
+        self.exponents = np.asarray(np.round(np.log2(units)), dtype=np.int64)
+        moved = self._moved(matrix, -1)
+        balanced = Ball(moved, np.full(moved.shape, UNDERFLOW))
+        norm = float(np.max(np.sum(np.abs(balanced.midpoint), axis=1))) * abs(float(time))
+        self.times = max(0, math.ceil(math.log2(norm / SHORT))) + 1 if 0.0 < norm < math.inf else 0
+        self.short = math.ldexp(float(time), -self.times)
+        self.x = balanced.scaled(self.short)
+        #: Above the norm of the exponent over the short interval.
+        self.norm = float(np.max(rounded_up(np.sum(np.abs(self.x.midpoint) + self.x.radius, axis=1), len(matrix) + 2)))
+
+    def _moved(self, matrix: FloatArray, sign: int) -> FloatArray:
+        """Return a matrix in the units of the plant (1) or in the balanced ones (-1): exact but for underflow."""
+        with np.errstate(over="ignore"):
+            return np.asarray(np.ldexp(matrix, sign * (self.exponents[:, None] - self.exponents)))
+
+    def _first(self) -> Ball:
+        one = np.eye(len(self.exponents))
+        total = Ball.exact(one)
+        for k in range(ORDER, 0, -1):
+            total = Ball.exact(one) + (self.x @ total).scaled(1.0 / k).widened(UNIT_ROUNDOFF)
+        return total.added(_remainder(self.norm, ORDER + 1, ORDER + 1))
+
+    def exponential(self) -> Ball | None:
+        """Return a ball that holds the exponential; ``None`` where it is not sharp."""
+        found = self._first()
+        for _ in range(self.times):
+            found = found @ found
+        if not _is_sharp(found):
+            return None
+        return Ball(self._moved(found.midpoint, 1), self._moved(found.radius, 1) + UNDERFLOW)
+
+    def energy(self, b: FloatArray) -> Ball | None:
+        """Return a ball that holds the energy of inputs; ``None`` where it is not sharp."""
+        inputs = Ball.exact(np.ldexp(b, -self.exponents[:, None]))
+        term = (inputs @ inputs.T).scaled(self.short)
+        largest = float(np.max(rounded_up(np.abs(term.midpoint) + term.radius, 2), initial=0.0))
+        total = term
+        for k in range(2, ENERGY_ORDER + 1):
+            through = self.x @ term
+            term = (through + through.T).scaled(1.0 / k).widened(UNIT_ROUNDOFF)
+            total = total + term
+        total = total.added(largest * _remainder(2.0 * self.norm, ENERGY_ORDER, ENERGY_ORDER + 1))
+        moving = self._first()
+        for _ in range(self.times):
+            total = total + moving @ total @ moving.T
+            moving = moving @ moving
+        return total.congruent(self.exponents) if _is_sharp(total) else None
+
+
+def _remainder(norm: float, power: int, factorial: int) -> float:
+    """Return an upper bound on the sum of ``norm^(power + i) / (factorial + i)!`` over i from 0."""
+    return 2.0 * norm**power / math.factorial(factorial) if norm < 1.0 else math.inf
 
 
 def as_ball(content: object) -> Ball:

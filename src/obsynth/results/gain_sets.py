@@ -131,7 +131,8 @@ def _design_of(document: Any, arrays: bytes | None, source: str) -> ObserverDesi
     if not intact:
         raise SpecError(f"{source} was changed after it was written: its digest does not match.", path=source)
     try:
-        return _design_from(checked_parts(restored(body if arrays is None else with_arrays(body, arrays))))
+        parts = checked_parts(restored(body if arrays is None else with_arrays(body, arrays)))
+        return _design_from(parts, document["sha256"])
     except (SpecError, AttributeError, LookupError, TypeError, ValueError, ArithmeticError, RecursionError) as error:
         raise SpecError(f"{source} is incomplete: {str(error).rstrip('.')}.", path=source) from error
 
@@ -146,7 +147,7 @@ def _recovery_from(**data: Any) -> StateRecovery:
     return StateRecovery.from_operator(names, operator, data["noise_kept"], data["operating_point"])
 
 
-def _design_from(data: dict[str, Any]) -> ObserverDesign:
+def _design_from(data: dict[str, Any], digest: str) -> ObserverDesign:
     if not isinstance(data.get("kind"), (str, type(None))) or data.get("kind") not in KINDS:
         raise SpecError(f"A design of the kind {data['kind']!r} is unknown to this obsynth.", path="kind")
     plant, observer = types_of(data.get("kind"))
@@ -164,4 +165,5 @@ def _design_from(data: dict[str, Any]) -> ObserverDesign:
         recovery=None if recovery is None else made("recovery", _recovery_from, **recovery),
         report=made("report", VerificationReport.from_dict, data["report"]),
         source=None if data.get("source") is None else made("source", PlantSource.from_dict, data["source"]),
+        file_digest=digest,
     )

@@ -17,11 +17,12 @@ from rich.text import Text
 
 if TYPE_CHECKING:
     from obsynth.results.report import Check
+from obsynth.numerics.arguments import is_number
 
 
 def number(value: float, *, digits: int = 4) -> str:
     """Return ``value`` with a few significant digits; a dash for "not a number", whatever a changed file may hold."""
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or math.isnan(value):
+    if not is_number(value) or math.isnan(value):
         return "-"
     if math.isinf(value):
         return "inf" if value > 0 else "-inf"

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SolverError, SpecError
+from obsynth.numerics.arguments import is_whole
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.covariances import covariance_factor
 from obsynth.plants.dae.checks import checked_inputs, finite_vector, step_length
@@ -73,7 +74,7 @@ def simulate_dae(
     inputs, length = checked_inputs(model, u), step_length(dt)
     theta = _parameters(model, parameters, len(inputs))
     x = finite_vector(initial_state, model.state_names, model.nominal_state, "initial_state")
-    if not isinstance(seed, (int, np.integer)) or isinstance(seed, bool) or seed < 0:
+    if not is_whole(seed) or seed < 0:
         raise SpecError(f"seed is {seed!r}: give a whole number, not negative.", path="seed")
     rng = np.random.default_rng(seed)
     pushed = _noise(Q, model.nx, "Q", rng, len(inputs))

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 
 from obsynth.analysis.transformations import StateRecovery, discretise, eliminate_algebraic_states
 from obsynth.errors import PreconditionError, SpecError
+from obsynth.numerics.arguments import is_whole
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.holds import driven, first_order_hold
 from obsynth.plants.descriptor import DescriptorSystem
@@ -46,7 +47,7 @@ def simulate_plant(
             "The plant is continuous: sample it first, with obsynth.discretise or transform: {sample_time: ...}.",
             path="dt",
         )
-    if isinstance(steps, bool) or not isinstance(steps, (int, np.integer)) or steps < 1:
+    if not is_whole(steps) or steps < 1:
         raise SpecError(f"steps is {steps!r}: give a whole number of samples, 1 or more.", path="steps")
     sizes = {"u": plant.nu, "f": plant.nf, "d": plant.nd, "w": plant.nw}
     given = {"u": u, "f": f, "d": d, "w": w}
@@ -166,7 +167,7 @@ def make_stepper(plant: DescriptorSystem, drive: Drive, *, initial_state: FloatA
     elimination = eliminate_algebraic_states(plant)
     reduced, recovery = elimination.plant, elimination.recovery
     start = dynamic_part(plant, recovery, initial_state)
-    gain = _stabilising(reduced) if stabilise else None
+    gain = stabilising_feedback(reduced) if stabilise else None
     closing = np.zeros((reduced.nu, reduced.nx)) if gain is None else gain
     a = reduced.A - reduced.B @ closing
     inputs = np.hstack([reduced.B, reduced.Bf, reduced.Bd])
@@ -201,7 +202,7 @@ def _sampled_noise(
     return sampled.Bw, sampled.Dw, np.zeros((len(recovery.names), sampled.nw))
 
 
-def _stabilising(plant: DescriptorSystem) -> FloatArray:
+def stabilising_feedback(plant: DescriptorSystem) -> FloatArray:
     """Return the linear-quadratic state feedback with unit weights of a plant with ``E = I``."""
     from scipy.linalg import solve_continuous_are, solve_discrete_are
 

@@ -13,6 +13,7 @@ from typing import ClassVar, TypeAlias
 import numpy as np
 
 from obsynth.errors import SpecError
+from obsynth.numerics.arguments import is_number
 from obsynth.numerics.arrays import FloatArray
 
 #: Share of a sample by which rounding may move a start or an end.
@@ -36,7 +37,7 @@ class Profile:
             value = getattr(self, field.name)
             if value is None and field.name == "value":
                 continue
-            number = isinstance(value, (int, float)) and not isinstance(value, bool)
+            number = is_number(value)
             if not number or math.isnan(value) or (math.isinf(value) and field.name != "end"):
                 raise SpecError(f"{field.name} is {value!r}: give a finite number.", path=field.name)
         if not self.end > self.start:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
 from typing import Any
 
 from obsynth.errors import SpecError
+from obsynth.numerics.arguments import is_finite_number, is_whole
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.names import index_of
 from obsynth.simulation.failures import RANDOM, LostEffectiveness, Stuck
@@ -75,11 +75,11 @@ class Scenario:
     def __post_init__(self) -> None:
         for name in ("horizon", "sample_time"):
             value = getattr(self, name)
-            if not (value is None and name == "sample_time") and not (_is_finite(value) and value > 0.0):
+            if not (value is None and name == "sample_time") and not (is_finite_number(value) and value > 0.0):
                 raise SpecError(f"{name} is {value!r}: give seconds, a positive number.", path=name)
-        if not (_is_finite(self.noise) and self.noise >= 0.0):
+        if not (is_finite_number(self.noise) and self.noise >= 0.0):
             raise SpecError(f"noise is {self.noise!r}: give a factor, 0 or more.", path="noise")
-        if isinstance(self.seed, bool) or not isinstance(self.seed, int) or self.seed < 0:
+        if not is_whole(self.seed) or self.seed < 0:
             raise SpecError(f"seed is {self.seed!r}: give a whole number, 0 or more.", path="seed")
         for group, (kinds, _) in _ALLOWED.items():
             object.__setattr__(self, group, MappingProxyType(_checked_profiles(getattr(self, group), group, kinds)))
@@ -88,7 +88,7 @@ class Scenario:
         if any(value < 0.0 for value in self.sensor_noise.values()):
             raise SpecError("A standard deviation is negative.", path="sensor_noise")
         if self.observer_state is not None:
-            if not all(map(_is_finite, self.observer_state)):
+            if not all(map(is_finite_number, self.observer_state)):
                 raise SpecError("observer_state must be finite numbers.", path="observer_state")
             object.__setattr__(self, "observer_state", tuple(map(float, self.observer_state)))
 
@@ -157,10 +157,6 @@ def _made(given: dict[str, Any]) -> Scenario:
     return Scenario(**given)
 
 
-def _is_finite(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
-
-
 def _checked_profiles(given: Any, group: str, kinds: tuple[type[Profile], ...]) -> dict[str, tuple[Profile, ...]]:
     if not isinstance(given, Mapping):
         raise SpecError(f"{group} must map names of signals to profiles.", path=group)
@@ -186,6 +182,6 @@ def _checked_numbers(given: Any, name: str) -> dict[str, float]:
     if not isinstance(given, Mapping):
         raise SpecError(f"{name} must map names of signals to numbers.", path=name)
     for key, value in given.items():
-        if not _is_finite(value):
+        if not is_finite_number(value):
             raise SpecError(f"{key!r} is {value!r}: give a finite number.", path=f"{name}.{key}")
     return {str(key): float(value) for key, value in given.items()}

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from obsynth.errors import SpecError
+from obsynth.numerics.arguments import is_whole
 from obsynth.spec.documents import described
 
 if TYPE_CHECKING:
@@ -123,7 +124,7 @@ def _check_version(document: Mapping[str, Any], problems: DocumentProblems) -> N
     from obsynth.spec.schema import SCHEMA_VERSION
 
     version = document.get("schema_version")
-    if isinstance(version, int) and not isinstance(version, bool) and version != SCHEMA_VERSION:
+    if is_whole(version) and version != SCHEMA_VERSION:
         problems.add("schema_version", f"version {version} is unknown; this obsynth reads version {SCHEMA_VERSION}.")
         problems.raise_if_any()
 

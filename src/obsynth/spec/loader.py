@@ -21,7 +21,7 @@ from obsynth.simulation.scenario import Scenario
 from obsynth.simulation.scenario_signals import check_parameters
 from obsynth.spec.checking import DocumentProblems, checked_plant, checked_spec
 from obsynth.spec.documents import read_yaml
-from obsynth.spec.plants import built_plant, linearised, read_value, transformed
+from obsynth.spec.plants import built_plant, linearised, matlab_plant, read_value, transformed
 
 if TYPE_CHECKING:
     from obsynth.analysis.transformations import Transformation
@@ -175,7 +175,8 @@ def spec_of(document: Mapping[str, Any], source: Path, *, plant_changes: Mapping
     section: Any = checked.plant
     plant_source, prefix = source, "plant"
     reference = section if hasattr(section, "file") else None
-    if reference is not None:
+    from_mat = None if reference is None else matlab_plant(reference, source)
+    if reference is not None and from_mat is None:
         plant_source, prefix = source.parent / reference.file, ""
         plant_document = changed_document(read_yaml(plant_source, where="plant.file"), plant_changes or {})
         section = checked_plant(plant_document, plant_source)
@@ -185,7 +186,7 @@ def spec_of(document: Mapping[str, Any], source: Path, *, plant_changes: Mapping
         for name, value in raw_options.items()
     }
     problems.raise_if_any()
-    plant, transformation = built_plant(section, plant_source, prefix), None
+    plant, transformation = built_plant(section, plant_source, prefix) if from_mat is None else from_mat, None
     # A plant may serve several methods: the spec's own transform takes the place of the plant's.
     asked: tuple[TransformSection | None, Path, str] = (getattr(section, "transform", None), plant_source, prefix)
     if reference is not None and reference.transform is not None:

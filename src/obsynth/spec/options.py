@@ -56,6 +56,7 @@ KINDS: Mapping[str, Any] = {
     "fault model": Text | dict[Text, Any],
     "fault sets": Text | list[Text | list[Text]] | None,
     "poles": list[float | Two] | None,
+    "pole sets": list[float | Two] | list[list[float | Two]] | None,
     "pole region": PoleRegion | None,
     "noise weights": NoiseSection | None,
     "named covariance": Positive | Matrix | dict[Text, NonNegative] | None,

@@ -19,7 +19,7 @@ from obsynth.spec.matrices import read_matrices, read_matrix
 
 if TYPE_CHECKING:
     from obsynth.analysis.transformations import Transformation
-    from obsynth.spec.schema import DAESection, PlantSection, TimeVaryingSection, TransformSection
+    from obsynth.spec.schema import DAESection, PlantReference, PlantSection, TimeVaryingSection, TransformSection
 
 _Plant = TypeVar("_Plant", DescriptorSystem, TimeVaryingDescriptorSystem, DAEModel)
 
@@ -123,6 +123,19 @@ def _invariant_plant(section: PlantSection, source: Path, prefix: str) -> Descri
             arguments[names] = arguments[matrix]
 
     return _placed(lambda: with_constants(DescriptorSystem(**arguments), section), source, prefix)
+
+
+def matlab_plant(reference: PlantReference, spec: Path) -> DescriptorSystem | None:
+    """Return the plant in a ``.mat`` file that a spec refers to; `None` where it refers to another kind of file."""
+    arguments = reference.model_dump(exclude={"file", "transform"}, exclude_none=True)
+    if Path(reference.file).suffix.lower() == ".mat":
+        from obsynth.importing.matlab import from_matlab
+
+        return _placed(lambda: from_matlab(spec.parent / reference.file, **arguments), spec, "plant")
+    if arguments:
+        raise SpecError(f"{spec}: plant.{next(iter(arguments))} is for plants in .mat files; of {reference.file} it is "
+                        "said there.", path=f"plant.{next(iter(arguments))}")  # fmt: skip
+    return None
 
 
 def linearised(wanted: TransformSection | None, model: DAEModel, source: Path, prefix: str) -> DescriptorSystem | None:

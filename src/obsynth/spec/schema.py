@@ -167,10 +167,23 @@ class DAEDocument(DAESection):
 
 
 class PlantReference(Section):
-    """A plant in another file: ``{file: plant.yaml}``; a transform given here takes the place of the file's."""
+    """A plant in another file: ``{file: plant.yaml}``, whose transform may be replaced, or ``{file: plant.mat}``.
+
+    All but the first two entries are for ``.mat`` files, and are arguments of `obsynth.from_matlab`.
+    """
 
     file: Text
     transform: TransformSection | None = None
+    variable: Text | None = None
+    dt: Annotated[float, Field(ge=0.0)] | None = None
+    faults: list[Text] | None = None
+    disturbances: list[Text] | None = None
+    actuator_faults: list[Text] | None = None
+    sensor_faults: list[Text] | None = None
+    sensor_noise: dict[Text, Positive] | None = None
+    operating_point: dict[Text, float] | None = None
+    scales: dict[Text, float] | None = None
+    units: dict[Text, str] | None = None
 
 
 class MethodSection(Section):

@@ -297,7 +297,9 @@ def _designed(case: SweepCase) -> ObserverDesign:
         raise SpecError(f"The case {case.name!r} has neither a spec nor a plant.", path="cases")
     spec = spec_of(case.document, case.source, plant_changes=case.plant_changes)
     recovery = None if spec.transformation is None else spec.transformation.recovery
-    found = design(spec.plant, spec.method, name=case.name, recovery=recovery, **dict(spec.options))
+    found = design(
+        spec.plant, spec.method, name=case.name, recovery=recovery, scenario=spec.scenario, **dict(spec.options)
+    )
     notes = () if spec.transformation is None else spec.transformation.notes
     return found.replace(notes=(*notes, *found.notes)) if notes else found
 

@@ -10,26 +10,38 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.analysis.transformations.uncertain_plant import AffinePlant, affine_plant, moving_family
+from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
+from obsynth.analysis.transformations.uncertain_plant import (
+    ROUNDING_SHARE,
+    AffinePlant,
+    affine_plant,
+    moving_basis,
+    moving_family,
+    untouched_states,
+)
 from obsynth.errors import ObsynthError, PreconditionError, SpecError
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.constants import ConstantsBox
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.uncertain_system import uncertain_system
 from obsynth.plants.uncertainty import Uncertainty
 from obsynth.proofs.affine import AffineMatrix
 from obsynth.results.design import ObserverDesign
+from obsynth.tolerances.directions import told_from_faults
 from obsynth.tolerances.error_structure import ErrorStructure, error_structure
 from obsynth.tolerances.exact_plant import is_sampled, moving_at, plant_at
 from obsynth.tolerances.responses import Responses, blame, blamed_rows, largest_factor, loop_radius, responses_of
-from obsynth.tolerances.subdivision import BoxVerdict, index_one_on_box, proved_stable
+from obsynth.tolerances.subdivision import MOST_BOXES, BoxVerdict, index_one_on_box, proved_stable
 from obsynth.tolerances.tracking import Tracking, tracking_of
 
 #: A design without tolerances says this.
 EXACT_MODEL = "assumes an exact model"
 #: Vertices beyond this number are drawn at random.
 MOST_VERTICES = 32
+#: Boxes for stability after which it is left open where most states are algebraic: each elimination takes long.
+FEW_BOXES = 40
 #: Samples over which the gain at a vertex is summed up, at most.
 MOST_GAIN_SAMPLES = 5_000
 #: What is left of a response when its sum ends.
@@ -69,6 +81,10 @@ class Robustness:
         Parts into which the box was cut for that.
     reason : str
         Why there is no bound; empty where there is one.
+    sharing : tuple of str
+        Constants that act where a fault acts: no observer can ever tell their tolerance from it.
+    untouched : tuple of complex
+        Modes of the plant that no constant touches and that are not stable: ``stable`` is about all others.
     """
 
     box: ConstantsBox
@@ -84,6 +100,8 @@ class Robustness:
     stable: str
     boxes: int
     reason: str = ""
+    sharing: tuple[str, ...] = ()
+    untouched: tuple[complex, ...] = ()
 
     def __post_init__(self) -> None:
         for name in ("breaking", "blame", "rows", "error_per_unit", "vertex_gains"):
@@ -112,7 +130,11 @@ class Robustness:
         yield "constants", f"{len(self.box.names)} with a tolerance ({names}), {self.box.variation}, {self.box.source}"
         yield "regular, index 1", self.regular + (self._where() if self.regular == "refuted" else "")
         where = self._where() if self.stable == "refuted" and self.regular != "refuted" else ""
-        yield "plant stable", self.stable + where + (f" ({self.boxes} boxes)" if self.boxes else "")
+        lasting = ", ".join(f"{value.real:.4g}" if not value.imag else f"{value:.4g}" for value in self.untouched)
+        but = f", but for the mode at {lasting}, which no constant touches" if lasting else ""
+        yield "plant stable", self.stable + where + (f" ({self.boxes} boxes)" if self.boxes else "") + but
+        if self.sharing:
+            yield "never told from a fault", f"{', '.join(self.sharing)}: they act where a fault acts"
         if self.loop_radius is None:
             yield "bounds", f"none: {self.reason}"
             return
@@ -140,6 +162,7 @@ class Robustness:
             "largest_tolerance": self.largest_tolerance, "blame": dict(self.blame), "rows": dict(self.rows),
             "error_per_unit": {name: dict(row) for name, row in self.error_per_unit.items()},
             "vertex_gains": dict(self.vertex_gains), "stable": self.stable, "boxes": self.boxes, "reason": self.reason,
+            "sharing": list(self.sharing), "untouched": [[value.real, value.imag] for value in self.untouched],
         }  # fmt: skip
 
     def __str__(self) -> str:
@@ -232,12 +255,17 @@ def robustness(
     try:
         affine = affine_plant(plant)
         told("stability over the box")
-        stable = _stability(plant, affine)
+        stable, untouched = _stability(plant, affine)
     except PreconditionError as error:
-        affine, stable, reason = None, BoxVerdict("open", 0), str(error)
+        affine, stable, untouched, reason = None, BoxVerdict("open", 0), (), str(error)
     breaking = _values(uncertain.box, regular if regular.verdict == "refuted" else stable)
     radius = factor = None
-    shares, rows, errors = dict[str, float](), dict[str, float](), dict[str, dict[str, float]]()
+    shares, rows, gains, errors = (
+        dict[str, float](),
+        dict[str, float](),
+        dict[str, float](),
+        dict[str, dict[str, float]](),
+    )
     if affine is not None:
         try:
             told("loop over the box")
@@ -252,13 +280,13 @@ def robustness(
             parts = (affine.E.parts, affine.A.parts)
             rows = _named(plant.state_names, blamed_rows(responses, tracking.T, parts))
             errors = _error_per_unit(design, responses, affine)
+            told("gains at the vertices")
+            gains = _vertex_gains(design, plant, affine, tracking)
         except PreconditionError as error:
             reason = str(error)
-    told("gains at the vertices")
-    gains = {} if affine is None or not plant.is_discrete else _vertex_gains(design, plant)
     return Robustness(
         uncertain.box, False, regular.verdict, breaking, radius, factor, shares, rows, errors, gains, stable.verdict,
-        stable.boxes, reason,
+        stable.boxes, reason, tuple(name for name, found in told_from_faults(plant).items() if found.shares), untouched,
     )  # fmt: skip
 
 
@@ -289,18 +317,41 @@ def _values(box: ConstantsBox, found: BoxVerdict) -> dict[str, float]:
     return {name: values[name] for name in box.names}
 
 
-def _stability(plant: DescriptorSystem, affine: AffinePlant) -> BoxVerdict:
-    """Return whether the plant is stable on the box; for E that must be inverted, after that."""
+def _stability(plant: DescriptorSystem, affine: AffinePlant) -> tuple[BoxVerdict, tuple[complex, ...]]:
+    """Return whether the plant is stable on the box, but for modes that no constant touches, and these.
+
+    For E that must be inverted, after that.
+    """
     box, uncertain = affine.box, plant.uncertainty
     sampled = uncertain is not None and is_sampled(uncertain.steps)
+    discrete = plant.is_discrete and not sampled
+    basis = moving_basis(plant, box)
+    whole = moving_family(plant, box, basis)
+    least = np.vstack([np.abs(whole.center), whole.spread + whole.radius])
+    size = whole.magnitude.sum(axis=1)
+    apart = untouched_states(least, np.concatenate([size, size]))
+    values = np.linalg.eigvals(whole.center[np.ix_(apart, apart)])
+    outside = np.abs(values) >= 1.0 - ROUNDING_SHARE if discrete else values.real >= -ROUNDING_SHARE * size.max()
+    lasting = tuple(complex(value) for value in values[outside])
+    # Stable modes that no constant touches are stable everywhere.
+    rest = [i for i in range(len(whole.center)) if i not in apart]
+    back = 2.0 * np.eye(len(basis)) - basis
 
     def exactly(q: FloatArray) -> FloatArray:
-        return moving_at(plant, box.values(q))
+        found = moving_at(plant, box.values(q))
+        return np.asarray((back @ found @ basis)[np.ix_(rest, rest)])
 
     def build(lower: FloatArray, upper: FloatArray) -> AffineMatrix:
-        return moving_family(plant, box.part(lower, upper))
+        return moving_family(plant, box.part(lower, upper), basis)[rest, rest]
 
-    return proved_stable(build, affine.count, exactly, discrete=plant.is_discrete and not sampled)
+    most = MOST_BOXES if plant.uncertainty is None or len(basis) * 4 > len(_written(plant)) else FEW_BOXES
+    return proved_stable(build, affine.count, exactly, discrete=discrete, most=most), lasting
+
+
+def _written(plant: DescriptorSystem) -> FloatArray:
+    """Return A as written."""
+    uncertain = plant.uncertainty
+    return plant.A if uncertain is None or uncertain.written is None else np.asarray(uncertain.written["A"])
 
 
 def _error_per_unit(design: ObserverDesign, responses: Responses, affine: AffinePlant) -> dict[str, dict[str, float]]:
@@ -320,7 +371,9 @@ def _error_per_unit(design: ObserverDesign, responses: Responses, affine: Affine
     return {label: _named(names, row) for label, row in zip(labels, total, strict=True)}
 
 
-def _vertex_gains(design: ObserverDesign, plant: DescriptorSystem) -> dict[str, float]:
+def _vertex_gains(
+    design: ObserverDesign, plant: DescriptorSystem, affine: AffinePlant, tracking: Tracking
+) -> dict[str, float]:
     """Return the largest peak (l1) gain from disturbances at the vertices; some drawn where there are too many."""
     observer, uncertain = design.linear[1], plant.uncertainty
     labels = (*(f"fhat[{name}]" for name in observer.fault_names), *(f"r[{name}]" for name in observer.residual_names))
@@ -330,26 +383,45 @@ def _vertex_gains(design: ObserverDesign, plant: DescriptorSystem) -> dict[str, 
     corners = np.array(list(itertools.product((-1.0, 1.0), repeat=count))) if 2**count <= MOST_VERTICES else (
         np.random.default_rng(0).choice([-1.0, 1.0], (MOST_VERTICES, count))
     )  # fmt: skip
+    followed, basis = tracking.T, affine.coordinates
+    nominal = eliminate_algebraic_states(plant)
+    if plant.nx != nominal.plant.nx:
+        followed, basis = followed @ plant.E @ nominal.recovery.from_state, np.eye(nominal.plant.nx)
     worst = np.zeros(len(labels))
     for corner in corners:
-        worst = np.maximum(worst, _peak_gain(design, plant_at(plant, uncertain.box.values(corner))))
+        at = plant_at(plant, uncertain.box.values(corner))
+        worst = np.maximum(worst, _peak_gain(observer, at, followed, basis))
     return _named(labels, worst)
 
 
-def _peak_gain(design: ObserverDesign, plant: DescriptorSystem) -> FloatArray:
-    """Return the peak gain of plant and observer in series, infinite where the series is unstable."""
-    from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
+def _peak_gain(
+    observer: LinearObserver, plant: DescriptorSystem, followed: FloatArray, basis: FloatArray
+) -> FloatArray:
+    """Return the peak gain of plant and error in series, infinite where the series is unstable.
 
-    observer = design.linear[1]
+    Directions of the state that reach neither error nor outputs are left out, whether or not they are stable.
+    """
     shown = slice(observer.fault_rows.start, len(observer.Cz))
     try:
         smooth = eliminate_algebraic_states(plant).plant
     except ObsynthError:
         return np.full(len(observer.Cz) - observer.fault_rows.start, np.inf)
-    nx, nz = smooth.nx, observer.order
-    a = np.block([[smooth.A, np.zeros((nx, nz))], [observer.By @ smooth.C, observer.Az]])
-    b = np.vstack([smooth.Bd, observer.By @ smooth.Dd])
-    c = np.hstack([observer.Dy[shown] @ smooth.C, observer.Cz[shown]])
+    back = 2.0 * np.eye(len(basis)) - basis
+    into = observer.Az @ followed + observer.By @ smooth.C - followed @ smooth.A
+    through = observer.Cz[shown] @ followed + observer.Dy[shown] @ smooth.C
+    seen = np.vstack([back @ smooth.A, into, through])
+    terms = np.concatenate([
+        np.abs(back @ smooth.A).sum(axis=1),
+        (np.abs(observer.Az @ followed) + np.abs(observer.By) @ np.abs(smooth.C)).sum(axis=1),
+        (np.abs(observer.Cz[shown]) @ np.abs(followed) + np.abs(observer.Dy[shown]) @ np.abs(smooth.C)).sum(axis=1),
+    ])  # fmt: skip
+    apart = untouched_states(seen @ basis, terms)
+    kept = [i for i in range(smooth.nx) if i not in apart]
+    nx, nz = len(kept), observer.order
+    a = np.block([[(back @ smooth.A @ basis)[np.ix_(kept, kept)], np.zeros((nx, nz))],
+                  [(into @ basis)[:, kept], observer.Az]])  # fmt: skip
+    b = np.vstack([(back @ smooth.Bd)[kept], observer.By @ smooth.Dd - followed @ smooth.Bd])
+    c = np.hstack([(through @ basis)[:, kept], observer.Cz[shown]])
     total = np.abs(observer.Dy[shown] @ smooth.Dd).sum(axis=1)
     if np.max(np.abs(np.linalg.eigvals(a)), initial=0.0) >= 1.0:
         return np.full(len(c), np.inf)

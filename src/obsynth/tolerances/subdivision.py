@@ -111,8 +111,9 @@ def proved_regular(build: Build, count: int, exact_at: Callable[[FloatArray], Fl
 
 
 def proved_stable(
-    build: Build, count: int, exact_at: Callable[[FloatArray], FloatArray], *, discrete: bool
-) -> BoxVerdict:
+    build: Build, count: int, exact_at: Callable[[FloatArray], FloatArray], *, discrete: bool,
+    most: int = MOST_BOXES,
+) -> BoxVerdict:  # fmt: skip
     """Return whether a matrix is stable on the whole box, in the norm of a Lyapunov function of each part's centre."""
 
     def stable(part: AffineMatrix) -> bool:
@@ -122,7 +123,7 @@ def proved_stable(
         values = np.linalg.eigvals(point)
         return bool(np.max(np.abs(values)) >= 1.0 if discrete else np.max(values.real) >= 0.0)
 
-    return subdivided(build, count, stable, unstable, exact_at)
+    return subdivided(build, count, stable, unstable, exact_at, most=most)
 
 
 def _contracts(part: AffineMatrix, *, discrete: bool) -> bool:

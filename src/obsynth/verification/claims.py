@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from obsynth.analysis.transformations import StateRecovery
+from obsynth.numerics.arguments import is_number
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.report import Check, information, upper_bound_check
 from obsynth.verification.identities import EQUALITY_TOLERANCE
@@ -37,7 +38,7 @@ UNCERTAIN = "rounding leaves no digit: two ways of computing it disagree"
 def claimed(claims: Mapping[str, Any], name: str) -> float:
     """Return a claim as a number; NaN where it is missing or none."""
     value = claims.get(name)
-    return float(value) if isinstance(value, (int, float)) and not isinstance(value, bool) else math.nan
+    return float(value) if value is not None and is_number(value) else math.nan
 
 
 def claim_rows(plant: DescriptorSystem, claims: Mapping[str, Any]) -> Iterator[Check]:
@@ -164,7 +165,7 @@ def closed_claims(
     for name, value in claims.items():
         row = covered.get(name)
         # NaN claims nothing: a number that this design does not have.
-        number = isinstance(value, (int, float)) and not isinstance(value, bool) and not math.isinf(value)
+        number = is_number(value) and not math.isinf(value)
         if not row or not number or (row != STATED and row not in names):
             wrong.append(str(name))
     for name in design.certificate.matrices:

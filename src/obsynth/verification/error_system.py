@@ -73,8 +73,18 @@ class ErrorSystem:
     state_output: tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 
     @classmethod
-    def of(cls, plant: DescriptorSystem, observer: LinearObserver, tracking: FloatArray, lag: int) -> ErrorSystem:
-        """Return the error system of ``observer`` on ``plant``, given the tracking map ``(nz, nx (lag + 1))``."""
+    def of(
+        cls,
+        plant: DescriptorSystem,
+        observer: LinearObserver,
+        tracking: FloatArray,
+        lag: int,
+        algebraic: FloatArray | None = None,
+    ) -> ErrorSystem:
+        """Return the error system of ``observer`` on ``plant``, given the tracking map ``(nz, nx (lag + 1))``.
+
+        ``algebraic (rows, nx)``: equations that the outputs add, with ``Cz V E + Dy C = K + algebraic A``.
+        """
         lagged = LaggedPlant.of(plant, lag)
 
         def driven(b: FloatArray, d: FloatArray) -> FloatArray:
@@ -82,7 +92,10 @@ class ErrorSystem:
 
         def output(rows: slice) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
             direct = observer.Dy[rows]
-            return observer.Cz[rows], direct @ plant.Df, direct @ plant.Dd, direct @ plant.Dw
+            added = np.zeros((len(direct), plant.nx)) if algebraic is None else algebraic[rows]
+            seen = ((plant.Bf, plant.Df), (plant.Bd, plant.Dd), (plant.Bw, plant.Dw))
+            fault, disturbance, noise = (direct @ d - added @ b for b, d in seen)
+            return observer.Cz[rows], fault, disturbance, noise
 
         return cls(
             observer.Az,

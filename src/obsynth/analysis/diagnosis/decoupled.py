@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from obsynth.analysis.diagnosis.reduction import LeftPart, PencilUnits, finite_values, left_part
+from obsynth.analysis.transformations.recovery import Transformation, linear_plant
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import ComplexArray, FloatArray, read_only
 from obsynth.numerics.ranks import CLEAR_GAP, RankDecision
 from obsynth.numerics.threads import on_one_thread_if_small
@@ -112,7 +112,7 @@ class DecoupledPlant:
 
 @on_one_thread_if_small
 def decouple(
-    plant: DescriptorSystem, *, without: Sequence[str] = (), faults: Sequence[str] | None = None
+    plant: DescriptorSystem | Transformation, *, without: Sequence[str] = (), faults: Sequence[str] | None = None
 ) -> DecoupledPlant:
     """Remove the unknown inputs, and faults that are not to show, from a plant.
 
@@ -121,7 +121,7 @@ def decouple(
 
     Parameters
     ----------
-    plant : DescriptorSystem
+    plant : DescriptorSystem or Transformation
         Either time; ``sE - A`` need not be regular.
     without : sequence of str, optional
         Names of faults to remove together with every unknown input.
@@ -143,7 +143,7 @@ def decouple(
     .. [Frisk] E. Frisk, M. Nyberg, "A minimal polynomial basis solution to residual generation for fault diagnosis in
        linear systems", Automatica 37, 2001: the null space; here it is never formed, but reduced to a state space.
     """
-    require_kind(plant, DescriptorSystem, "plant", "an obsynth.DescriptorSystem")
+    plant = linear_plant(plant)
     removed = fault_numbers(plant, without, "without")
     kept = (
         [i for i in range(plant.nf) if i not in removed] if faults is None else fault_numbers(plant, faults, "faults")

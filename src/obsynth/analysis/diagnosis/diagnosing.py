@@ -12,8 +12,9 @@ from obsynth.analysis.diagnosis.banks import residual_bank
 from obsynth.analysis.diagnosis.columns import Question, decided_exactly
 from obsynth.analysis.diagnosis.hidden_motions import hidden_motion
 from obsynth.analysis.diagnosis.verdicts import Diagnosis, FaultDiagnosis
+from obsynth.analysis.transformations.recovery import Transformation, linear_plant
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import is_finite_number, require_kind
+from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.threads import on_one_thread_if_small
 from obsynth.plants.descriptor import DescriptorSystem
@@ -26,7 +27,7 @@ MOST_ZEROS = 4
 
 @on_one_thread_if_small
 def diagnose(
-    plant: DescriptorSystem,
+    plant: DescriptorSystem | Transformation,
     *,
     fault_model: Any = "step",
     frequencies: Sequence[float] = (),
@@ -41,7 +42,7 @@ def diagnose(
 
     Parameters
     ----------
-    plant : DescriptorSystem
+    plant : DescriptorSystem or Transformation
         ``E, A (nx, nx)``, ``C (ny, nx)``, ``Bf (nx, nf)``, ``Bd (nx, nd)``, ``Df, Dd`` allowed.  Where ``sE - A`` is
         not regular, the verdicts are about all trajectories that satisfy the equations, and a warning says so.
     fault_model : str, mapping or FaultModel, optional
@@ -68,7 +69,7 @@ def diagnose(
     .. [Varga] A. Varga, Solving Fault Diagnosis Problems, Springer 2017: fault detectability, weak and strong, and
        isolability.  Here all of it is read from one reduction of a pencil, and decided exactly where that can be.
     """
-    require_kind(plant, DescriptorSystem, "plant", "an obsynth.DescriptorSystem")
+    plant = linear_plant(plant)
     if not all(is_finite_number(value) and value >= 0.0 for value in frequencies):
         raise SpecError(f"frequencies is {list(frequencies)!r}: give numbers in rad/s, 0 or more.", path="frequencies")
     model = exosystem(fault_model, plant.fault_names, plant.dt)

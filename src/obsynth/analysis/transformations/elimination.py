@@ -33,12 +33,12 @@ MANY_VARIABLES = 500
 SPARSE_SHARE = 0.05
 
 
-def eliminate_algebraic_states(plant: DescriptorSystem) -> Transformation:
+def eliminate_algebraic_states(plant: DescriptorSystem | Transformation) -> Transformation:
     """Solve the algebraic equations of an index-1 plant, so that ``E = I``.
 
     Parameters
     ----------
-    plant : DescriptorSystem
+    plant : DescriptorSystem or Transformation
         Regular, index 0 or 1, either time, but for variables that act on no state and no output.
 
     Returns
@@ -60,6 +60,8 @@ def eliminate_algebraic_states(plant: DescriptorSystem) -> Transformation:
     where data were computed, results so small beside the terms they come from that they are only rounding are set to
     zero: the flags of the recovery depend on what is exactly zero.
     """
+    if isinstance(plant, Transformation):
+        return plant.then(eliminate_algebraic_states(plant.plant))
     if _is_identity(plant.E):
         same = plant.dense()
         return Transformation(plant, same, "", unchanged_states(plant, same, from_state=np.eye(plant.nx)))

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from obsynth.analysis.transformations.equations_at_a_point import local_equations
 from obsynth.errors import PreconditionError, SpecError
+from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.names import index_of
@@ -42,8 +43,7 @@ def nominal_point(model: DAEModel, given: Mapping[str, float], free: Sequence[st
     known = [*model.state_names, *model.input_names, *model.parameter_names, *model.output_names]
     for name, value in given.items():
         index_of(name, known, what="given")
-        number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
-        if not number or not np.isfinite(value):
+        if not is_finite_number(value):
             raise SpecError(f"given.{name} is {value!r}: give a finite number.", path=f"given.{name}")
         if name in free:
             raise SpecError(f"{name!r} is both given and free: choose one.", path=f"given.{name}")

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
+from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.uncertainty import matrices_of
@@ -145,6 +146,14 @@ def plant_and_recovery(given: Any, recovery: StateRecovery | None = None) -> tup
     if not isinstance(given, Transformation):
         return given, recovery
     return given.plant, given.recovery if recovery is None else recovery
+
+
+def linear_plant(given: Any) -> DescriptorSystem:
+    """Return a linear plant, of a transformation the transformed one; raise `SpecError` for anything else."""
+    plant = given.plant if isinstance(given, Transformation) else given
+    require_kind(plant, DescriptorSystem, "plant", "an obsynth.DescriptorSystem")
+    found: DescriptorSystem = plant
+    return found
 
 
 def unchanged_states(

@@ -11,6 +11,7 @@ from obsynth.analysis.transformations.exact_elimination import MOST_STATES, samp
 from obsynth.analysis.transformations.recovery import Transformation, unchanged_states
 from obsynth.analysis.zeros import fault_zeros
 from obsynth.errors import PreconditionError, SpecError
+from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, SLOW_ZERO_RADIUS
 from obsynth.numerics.scaling import power_of_two_below
@@ -57,7 +58,7 @@ def discretise(plant: DescriptorSystem | Transformation, sample_time: float) -> 
         return plant.then(discretise(plant.plant, sample_time))
     if plant.dt > 0.0:
         raise SpecError(f"The plant is already sampled (dt = {plant.dt:g} s): give a continuous plant.", path="dt")
-    if not (math.isfinite(sample_time) and sample_time > 0.0):
+    if not is_finite_number(sample_time) or not sample_time > 0.0:
         raise SpecError(f"sample_time is {sample_time}: give a positive number of seconds.", path="sample_time")
     first = eliminate_algebraic_states(plant)
     smooth = first.plant

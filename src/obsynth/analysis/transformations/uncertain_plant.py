@@ -19,6 +19,8 @@ from obsynth.proofs.affine import AffineMatrix, affine_block, affine_inverse, af
 UNTOUCHED_SHARE = 1e-7
 #: Their coordinates are rounded to this many digits: any invertible change of coordinates is exact.
 COORDINATE_DIGITS = 9
+#: What one state does to a row counts as rounding below this share of all that the row holds.
+ROUNDING_SHARE = 1e-9
 #: Inputs, in the order in which they stand side by side.
 _INPUTS, _DIRECT = ("B", "Bf", "Bd"), ("D", "Df", "Dd")
 
@@ -81,13 +83,42 @@ def affine_plant(plant: DescriptorSystem, box: ConstantsBox | None = None) -> Af
     return AffinePlant(plant, box, {**reduced, **back}, basis)
 
 
-def moving_family(plant: DescriptorSystem, box: ConstantsBox) -> AffineMatrix:
-    """Return A of the plant over a box, with its algebraic states eliminated, E inverted, and before it was sampled."""
+def moving_family(plant: DescriptorSystem, box: ConstantsBox, basis: FloatArray | None = None) -> AffineMatrix:
+    """Return A of the plant over a box, with its algebraic states eliminated, E inverted, and before it was sampled.
+
+    In coordinates ``basis`` of the dynamic state, such as those of `moving_basis`.
+    """
     uncertain = plant.uncertainty
     if uncertain is None:
         return AffineMatrix.exact(plant.A, 0)
     written: Mapping[str, FloatArray] = matrices_of(plant) if uncertain.written is None else uncertain.written
-    return _reduced(written, uncertain.affine(written, box), None)["A"]
+    return _reduced(written, uncertain.affine(written, box), basis)["A"]
+
+
+def moving_basis(plant: DescriptorSystem, box: ConstantsBox) -> FloatArray:
+    """Return coordinates of the dynamic state in which what no constant touches is a state of its own."""
+    uncertain = plant.uncertainty
+    if uncertain is None:
+        return np.eye(plant.nx)
+    written: Mapping[str, FloatArray] = matrices_of(plant) if uncertain.written is None else uncertain.written
+    first = _reduced(written, uncertain.affine(written, box), None)
+    return untouched_coordinates(_touched(first), _moved(first))
+
+
+def untouched_states(columns: FloatArray, sizes: FloatArray) -> list[int]:
+    """Return states that drive none but each other: ``columns (m, n)`` of what they do, rows of A first.
+
+    ``sizes (m,)``: of the rows; what is below `ROUNDING_SHARE` of these is rounding.
+    """
+    n = columns.shape[1]
+    acting = np.abs(columns) > ROUNDING_SHARE * np.maximum(sizes, np.finfo(np.float64).tiny)[:, None]
+    found = [j for j in range(n) if not acting[n:, j].any()]
+    while True:
+        others = [i for i in range(n) if i not in found]
+        kept = [j for j in found if not acting[others, j].any()]
+        if kept == found:
+            return found
+        found = kept
 
 
 def untouched_coordinates(touched: FloatArray, moved: FloatArray) -> FloatArray:

@@ -22,7 +22,7 @@ from obsynth.experiments.monitors.adaptive_bound import adaptive_bound
 from obsynth.experiments.monitors.adaptive_monitor import start_of
 from obsynth.experiments.monitors.adaptive_record import thresholds_of_records
 from obsynth.files.outputs import FileKind, write_atomically
-from obsynth.numerics.arguments import is_finite_number
+from obsynth.numerics.arguments import is_finite_number, is_whole
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.names import index_of
 from obsynth.results.design import ObserverDesign
@@ -226,7 +226,7 @@ class Question:
         plant, _ = design.linear
         if not plant.is_discrete:
             raise SpecError("A window is proved for sampled designs: this one is continuous in time.", path="gains")
-        if isinstance(window, bool) or not isinstance(window, int) or window < 2:
+        if not is_whole(window) or window < 2:
             raise SpecError(f"window is {window!r}: give a whole number of samples, 2 or more.", path="window")
         bounds = np.full(plant.nd, np.nan)
         for name, value in (disturbance_bounds or {}).items():

@@ -61,6 +61,10 @@ def tracked_errors(design: ObserverDesign, plant: DescriptorSystem) -> TrackedEr
         return TrackedErrors(
             ErrorSystem.of(with_faults_as_states(plant), observer, tracking, 0), tracking[:, : plant.nx]
         )
+    if design.method == "functional-filter":
+        # Its states follow T E x, and its rows add equations of the plant.
+        system = ErrorSystem.of(plant, observer, matrices["T"], 0, matrices["T0"])
+        return TrackedErrors(system, matrices["T"])
     if "tracking" not in matrices:
         raise SpecError(f"Design {design.name!r} has no tracking map: its residual has no model.", path="observer")
     # A fault model's states come after the plant's own in the map; they track no fault here.
@@ -214,7 +218,7 @@ class ContinuousDesign:
 
 def watches_estimates(design: ObserverDesign) -> bool:
     """Whether the fault estimates are watched, as the residual is made not to see the faults that are modelled."""
-    return "Phi" in design.certificate.matrices
+    return "Phi" in design.certificate.matrices and bool(design.linear[1].fault_names)
 
 
 def residual_model(

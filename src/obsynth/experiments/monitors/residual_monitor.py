@@ -20,7 +20,7 @@ from obsynth.experiments.monitors.thresholds import (
     window_threshold,
 )
 from obsynth.experiments.monitors.whitening import cusum_whitener, settled, steady_mean, whitener_of, window_covariance
-from obsynth.numerics.arguments import is_finite_number, require_kind, require_mapping
+from obsynth.numerics.arguments import is_finite_number, is_whole, require_kind, require_mapping
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.names import index_of
 from obsynth.results.design import ObserverDesign
@@ -161,7 +161,7 @@ def require_options(
         if value is not None and not (is_finite_number(value) and value >= 0.0):
             raise SpecError(f"{name} is {value!r}: give a number, 0 or more.", path=name)
     for name, count, least in (("window", window, 1), ("isolation_delay", isolation_delay, 0)):
-        if isinstance(count, bool) or not isinstance(count, int) or count < least:
+        if not is_whole(count) or count < least:
             raise SpecError(f"{name} is {count!r}: give a whole number of samples, {least} or more.", path=name)
     if not (is_finite_number(false_alarms) and 0.0 < false_alarms < 1.0):
         raise SpecError(f"false_alarms is {false_alarms!r}: give a probability between 0 and 1.", path="false_alarms")

@@ -12,6 +12,8 @@ from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
 
 #: The start counts as forgotten when its effect on the residual is below this share of the residual's deviation.
 START_SHARE = 0.05
+#: A disturbance that moves the residual by less than this share of its noise is decoupled, but for rounding.
+NOTHING_FELT = 1e-6
 #: Whitened residuals count as white when their correlations sum up to no more than this.
 WHITE_SHARE = 0.01
 #: What may be left of a correlation, relative to where it began, when its sum ends; and after how many samples at most.
@@ -20,7 +22,7 @@ CORRELATION_LEFT, MOST_LAGS = 1e-9, 200_000
 
 def window_covariance(model: ResidualModel, window: int) -> FloatArray:
     """Return the covariance ``(window nr, window nr)`` of consecutive residuals in steady state, oldest first."""
-    reached = np.any(model.Bd != 0.0, axis=0) | np.any(model.Dd != 0.0, axis=0)
+    reached = _felt(model)
     if any(bool(hit) and not calm for hit, calm in zip(reached, model.steady, strict=True)):
         raise SpecError(
             "A disturbance that reaches the residual has a part that is not random or does not last: its covariance "
@@ -39,6 +41,19 @@ def window_covariance(model: ResidualModel, window: int) -> FloatArray:
     return np.block([
         [lagged[i - j] if i >= j else lagged[j - i].T for j in range(window)] for i in range(window)
     ])  # fmt: skip
+
+
+def _felt(model: ResidualModel) -> list[bool]:
+    """Return which disturbances reach the residual by more than rounding: from most observers some are decoupled."""
+
+    def size(b: FloatArray, d: FloatArray) -> FloatArray:
+        return np.asarray(np.sqrt(np.abs(np.diag(output_covariance(model.A, b, model.C, d)))))
+
+    noise, sizes = size(model.Bw, model.Dw), np.where(np.isfinite(model.bounds), model.bounds, 1.0)
+    return [
+        bool(np.any(size(model.Bd[:, [j]] * largest, model.Dd[:, [j]] * largest) > NOTHING_FELT * noise))
+        for j, largest in enumerate(sizes)
+    ]
 
 
 def whitener_of(covariance: FloatArray) -> FloatArray:

@@ -73,7 +73,8 @@ def _chosen(
         # The functional filter needs least: what forbids it forbids the fault.
         last = next((name for name in ("functional-filter", *FAULT_METHODS) if name in possible), possible[0])
         return refusing(plant, last, options)
-    best, *others = sorted(found, key=lambda entry: entry.rank(plant.nd > 0))
+    settling = settling_time(plant)
+    best, *others = sorted(found, key=lambda entry: entry.rank(plant.nd > 0, settling))
     if best.design is None:
         raise PreconditionError("No method exists for this plant.", condition="existence")
     return _with_note(best.design, reason(best, others, plant))

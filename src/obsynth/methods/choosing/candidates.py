@@ -21,6 +21,8 @@ from obsynth.results.design import ObserverDesign
 
 #: Methods whose designs are continuous whatever the plant is used for: they are sampled afterwards.
 CONTINUOUS_ONLY = ("pd-observer",)
+#: An estimate that shows 90 % of a step later than this share of the plant's settling time comes after faster ones.
+SLOW = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,19 +39,22 @@ class Candidate:
     milliseconds: float
     refused: str
 
-    def rank(self, leaky: bool) -> tuple[float, ...]:
+    def rank(self, leaky: bool, settling: float = np.inf) -> tuple[float, ...]:
         """Return what sorts candidates by closed-form figures, the best first; ``leaky``: there are unknown inputs.
 
-        A mean over time T divides noise by the root of T: the deviation times the root of the delay is what averaging
-        cannot change.
+        Steps that are reached first, then decoupled estimates, then those that show a step well within the plant's
+        settling time (s); among these a mean over time T divides noise by the root of T: the deviation times the root
+        of the delay is what averaging cannot change.
         """
         if not self.figures:
-            return (2.0, 0.0, np.inf)
+            return (2.0, 0.0, 0.0, np.inf)
         missed = float(not all(found.reaches for found in self.figures))
         leak = float(leaky and any(found.leak > DECOUPLED for found in self.figures))
+        slow = float(any(found.most > SLOW * settling for found in self.figures))
         dt = self.observer.dt if self.observer is not None else 0.0
         prices = [found.deviation * np.sqrt(max(found.most, dt)) for found in self.figures]
-        return (missed, leak, float(np.prod(prices) ** (1.0 / len(prices))) if np.all(np.isfinite(prices)) else np.inf)
+        price = float(np.prod(prices) ** (1.0 / len(prices))) if np.all(np.isfinite(prices)) else np.inf
+        return (missed, leak, slow, price)
 
 
 def candidate(

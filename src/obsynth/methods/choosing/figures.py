@@ -13,9 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.analysis.transformations import discretise, eliminate_algebraic_states
+from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.simulation.linear import stabilising_feedback
 
 #: Shares of a step at which its delay is read.
 HALF, MOST = 0.5, 0.9
@@ -23,6 +25,9 @@ HALF, MOST = 0.5, 0.9
 REACHED = 0.1
 #: Peak gain from an unknown input to a fault estimate, in fault per input, above which it is not decoupled.
 DECOUPLED = 1e-3
+#: An unstable plant that grows by more than this is held by a feedback; one without inputs is followed until it has
+#: grown by the second, beyond which differences of its outputs are rounding.
+GROWTH, MOST_GROWTH = 1e3, 1e6
 
 
 @dataclass(frozen=True)
@@ -66,17 +71,48 @@ def on_the_clock(plant: DescriptorSystem, sample_time: float | None) -> Descript
     return discretise(plant, sample_time).plant
 
 
-def step_responses(plant: DescriptorSystem, observer: LinearObserver, steps: int) -> tuple[FloatArray, FloatArray]:
-    """Return impulse responses ``(steps, faults, nf + nd + nw)`` and step responses ``(steps, faults, nf)``."""
+@dataclass(frozen=True, eq=False)
+class Held:
+    """How an unstable plant is kept in bounds: ``u = -feedback x`` with ``feedback (nu, nx)``, for so many samples."""
+
+    feedback: FloatArray
+    steps: int
+
+
+def held(plant: DescriptorSystem, steps: int) -> Held:
+    """Return what holds a sampled plant ``(E = I)``: nothing where it hardly grows; with no input, a shorter time."""
+    nothing = np.zeros((plant.nu, plant.nx))
+    rate = float(np.log(max(float(np.max(np.abs(np.linalg.eigvals(plant.A)), initial=0.0)), 1.0)))
+    if rate * steps <= np.log(GROWTH):
+        return Held(nothing, steps)
+    try:
+        found = stabilising_feedback(plant)
+        if float(np.max(np.abs(np.linalg.eigvals(plant.A - plant.B @ found)))) < 1.0:
+            return Held(found, steps)
+    except PreconditionError:
+        pass
+    return Held(nothing, max(int(np.log(MOST_GROWTH) / rate), 2))
+
+
+def step_responses(
+    plant: DescriptorSystem, observer: LinearObserver, steps: int, feedback: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """Return impulse responses ``(steps, faults, nf + nd + nw)`` and step responses ``(steps, faults, nf)``.
+
+    A feedback ``u = -feedback x`` is known to the observer, so that it changes no estimate; it keeps numbers small.
+    """
     order, rows = observer.order, observer.fault_rows
     # Where no noise is stated, every output has one of its own, of deviation one.
     silent = not plant.Dw.any() and not plant.Bw.any()
     driven, measured = (np.zeros((plant.nx, plant.ny)), np.eye(plant.ny)) if silent else (plant.Bw, plant.Dw)
     inputs = np.hstack([plant.Bf, plant.Bd, driven])
     direct = np.hstack([plant.Df, plant.Dd, measured])
-    a = np.block([[plant.A, np.zeros((plant.nx, order))], [observer.By @ plant.C, observer.Az]])
+    gain = np.zeros((plant.nu, plant.nx)) if feedback is None else feedback
+    seen = plant.C - plant.D @ gain
+    moved, into = plant.A - plant.B @ gain, observer.By @ seen - observer.Bu @ gain
+    a = np.block([[moved, np.zeros((plant.nx, order))], [into, observer.Az]])
     b = np.vstack([inputs, observer.By @ direct])
-    c = np.hstack([observer.Dy[rows] @ plant.C, observer.Cz[rows]])
+    c = np.hstack([observer.Dy[rows] @ seen - observer.Du[rows] @ gain, observer.Cz[rows]])
     found = np.empty((steps, len(c), b.shape[1]))
     found[0] = observer.Dy[rows] @ direct
     state = b
@@ -89,7 +125,8 @@ def step_responses(plant: DescriptorSystem, observer: LinearObserver, steps: int
 
 def fault_figures(plant: DescriptorSystem, observer: LinearObserver, steps: int) -> tuple[FaultFigures, ...]:
     """Return the figures of every fault that a sampled observer estimates on a sampled plant ``(E = I)``."""
-    impulse, step = step_responses(plant, observer, steps)
+    kept = held(plant, steps)
+    impulse, step = step_responses(plant, observer, kept.steps, kept.feedback)
     unknown = impulse[:, :, plant.nf : plant.nf + plant.nd]
     noise = impulse[:, :, plant.nf + plant.nd :]
     # An observer that runs away has figures beyond all numbers, and needs no warning besides.

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal, TypeAlias
 
 from obsynth.methods.method_spec import MethodOptions
-from obsynth.numerics.arguments import Count, ForgettingFactor, Positive, WrittenAs
-from obsynth.observers.dae.settings import Form, Guard, Weight
+from obsynth.numerics.arguments import Count, ForgettingFactor, Positive, Probability, WrittenAs
+from obsynth.observers.dae.settings import Guard, Weight
 from obsynth.observers.outliers import Outliers
 
+FormChoice: TypeAlias = Literal["forgetting", "random-walk", "augmented-kalman", "auto"]
 IntegrationChoice: TypeAlias = Literal["backward-euler", "radau", "auto"]
 
 
@@ -23,11 +24,11 @@ class DaeAdaptiveObserverOptions(MethodOptions):
     dt: Positive | None = None
     Q: Annotated[Any, WrittenAs("named covariance")] = None
     R: Annotated[Any, WrittenAs("named covariance")] = None
-    form: Form = "forgetting"
+    form: FormChoice = "auto"
     forgetting: ForgettingFactor = 0.98
     guard: Guard = "regularise"
     weight: Weight = "innovation"
-    integration: IntegrationChoice = "backward-euler"
+    integration: IntegrationChoice = "auto"
     random_walk: Annotated[Any, WrittenAs("named covariance")] = None
     initial_state: Annotated[Any, WrittenAs("named vector")] = None
     initial_covariance: Annotated[Any, WrittenAs("named covariance")] = None
@@ -40,6 +41,7 @@ class DaeAdaptiveObserverOptions(MethodOptions):
     outlier_limit: Positive | None = None
     sensors: Annotated[Any, WrittenAs("sensor times")] = None
     state_bounds: Annotated[Any, WrittenAs("named pairs")] = None
+    reset: Probability = 0.0
 
     def conflicts(self) -> Iterator[str]:
         """Yield a sentence for each rule across options that is broken."""

@@ -17,11 +17,11 @@ def dae_adaptive_observer(
     dt: float | None = None,
     Q: ArrayLike | Mapping[str, float] | None = None,
     R: ArrayLike | Mapping[str, float] | None = None,
-    form: str = "forgetting",
+    form: str = "auto",
     forgetting: float = 0.98,
     guard: str = "regularise",
     weight: str = "innovation",
-    integration: str = "backward-euler",
+    integration: str = "auto",
     random_walk: ArrayLike | Mapping[str, float] | None = None,
     initial_state: ArrayLike | Mapping[str, float] | None = None,
     initial_covariance: ArrayLike | Mapping[str, float] | None = None,
@@ -34,6 +34,7 @@ def dae_adaptive_observer(
     outlier_limit: float | None = None,
     sensors: Mapping[str, Mapping[str, int]] | None = None,
     state_bounds: Mapping[str, Sequence[float]] | ArrayLike | None = None,
+    reset: float = 0.0,
     name: str = "design",
 ) -> ObserverDesign:
     r"""Design an observer of states and parameters of a plant ``F(x', x, u, theta) = 0``, ``y = h(x, theta)``.
@@ -52,20 +53,20 @@ def dae_adaptive_observer(
         all, or variances by equation (zero for those not named), in units of the equations squared.
     R : array_like or mapping
         Covariance of the sensors ``(ny, ny)``, one variance for all, or variances by output.
-    form : {"forgetting", "random-walk", "augmented-kalman"}, optional
-        Adaptive observer with a forgetting factor, or with parameters that walk; or the extended Kalman filter of
-        states and parameters together.
+    form : {"auto", "forgetting", "random-walk", "augmented-kalman"}, optional
+        Adaptive observer with a forgetting factor, or with parameters that walk (by default where ``random_walk`` is
+        stated); or the extended Kalman filter of states and parameters together.  Covariances of the last two are
+        those of parameters that walk as stated.
     forgetting : float, optional, dimensionless
         lambda in (0, 1].
     guard : {"regularise", "none"}, optional
         ``(1 - lambda) S_0^-1`` is added to the information, so that S never exceeds S_0 (default); or nothing.
     weight : {"innovation", "paper"}, optional
         Covariance in (18): that of the innovation, or R as printed.
-    integration : {"backward-euler", "radau", "auto"}, optional
+    integration : {"auto", "backward-euler", "radau"}, optional
         Backward Euler is the paper's; on data of a continuous plant with fast motion it finds wrong parameters, Radau
-        IIA of order five does not.
-        ``"auto"`` takes Radau where a mode at the nominal point turns by more than 0.05 radians in a step; with
-        backward Euler a note says so.
+        IIA of order five does not.  By default Radau where a mode at the nominal point turns by more than 0.05
+        radians in a step, which a note then says; with backward Euler asked for, a note says what it damps.
     random_walk : array_like or mapping, optional
         Covariance of one step of the parameters: ``(nq, nq)``, one variance for all, or variances by parameter.
     initial_state, initial_parameters : array_like or mapping, optional
@@ -93,6 +94,9 @@ def dae_adaptive_observer(
     state_bounds : mapping or array_like, optional
         ``{name: [low, high]}``, or ``(nx, 2)``: estimates are projected onto these bounds in the metric of their
         covariance, which stays as it is without them. The next step begins at the projected states.
+    reset : float, optional, dimensionless
+        Detect and reset: when the innovations of 20 samples pass a threshold (with this probability per sample where
+        nothing has changed), the covariance of the parameters starts again from S_0.  Zero never resets.
     name : str, optional
         Name of the design.
 
@@ -128,4 +132,5 @@ def dae_adaptive_observer(
         initial_covariance=initial_covariance, initial_parameters=initial_parameters,
         initial_parameter_covariance=initial_parameter_covariance, bounds=bounds, largest_move=largest_move,
         window=window, outliers=outliers, outlier_limit=outlier_limit, sensors=sensors, state_bounds=state_bounds,
+        reset=reset,
     )  # fmt: skip

@@ -69,6 +69,11 @@ def _notes(observer: DAEObserver, facts: DAEFacts) -> Iterator[str]:
             f"At the nominal point a mode turns by {turn:.2g} radians in a step, which backward Euler damps: "
             "parameters that take up the difference will be wrong. Take integration: radau (or auto)."
         )
+    if observer.integration == "radau" and turn > LARGEST_TURN:
+        yield (
+            f"Steps are taken by Radau IIA: at the nominal point a mode rotates by {turn:.2g} radians in one, which "
+            "backward Euler would damp."
+        )
     for direction in facts.identifiable.faint:
         shares = ", ".join(f"{name} ({share:+.3g})" for name, share in direction.items())
         yield (

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 from numpy.typing import ArrayLike
 
+from obsynth.analysis.transformations.recovery import Transformation
 from obsynth.methods.designing import design
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.sequences import MatrixLike
@@ -14,7 +15,7 @@ from obsynth.results.design import ObserverDesign
 
 
 def descriptor_kalman(
-    plant: DescriptorSystem | TimeVaryingDescriptorSystem,
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem | Transformation,
     *,
     Q: MatrixLike = None,
     R: MatrixLike = None,

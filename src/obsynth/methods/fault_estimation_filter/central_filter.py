@@ -33,11 +33,11 @@ LEVEL_FACTORS = (1.0, 1.5)
 #: Above so many states the higher level, which makes gains up to a quarter smaller, would cost up to half of the time.
 MOST_STATES_FOR_LEVELS = 200
 WEIGHT_STEPS = 4
-#: A disturbance that does less than this share of what it does to the starting filter is decoupled; the level at which
-#: such a filter is looked for, relative to the same; a point without meaning; and the share of rows xi that counts as
-#: nothing.
+#: A disturbance that does less than this share of what it does to the starting filter is decoupled; the levels at which
+#: such a filter is looked for in turn, relative to the same; a point without meaning; and the share of rows xi that
+#: counts as nothing.
 DECOUPLED_GAIN = 1e-7
-DECOUPLING_LEVEL = 1e-4
+DECOUPLING_LEVELS = (1e-4, 1e-2)
 GENERIC_POINT = 1.3247
 SAME_ROWS = 1e-8
 #: A level this far above anything a disturbance could do is no limit.
@@ -104,15 +104,18 @@ def search_central_filter(
 
 
 def _decoupling_filter(problem: GainProblem, gain: float) -> tuple[Injection, float] | None:
-    """Return a filter that no disturbance reaches, and its gain, from one solution; ``None`` where there is none.
+    """Return a filter that no disturbance reaches, and its gain, from a solution or two; ``None`` where there is none.
 
     It exists only if what xi shows follows from the measurements at almost every point, whatever the disturbance does.
     """
     if not _follows_from_measurements(problem):
         return None
-    found = central_injection(problem, DECOUPLING_LEVEL * gain, noise=NOISES[0])
-    reached = np.inf if found is None else problem.achieved_gain(found)
-    return (found, reached) if found is not None and reached <= DECOUPLED_GAIN * gain else None
+    # The artificial noise has a gain of its own, which in many states may be above the first level.
+    for share in DECOUPLING_LEVELS:
+        found = central_injection(problem, share * gain, noise=NOISES[0])
+        if found is not None and (reached := problem.achieved_gain(found)) <= DECOUPLED_GAIN * gain:
+            return found, reached
+    return None
 
 
 def _follows_from_measurements(problem: GainProblem) -> bool:

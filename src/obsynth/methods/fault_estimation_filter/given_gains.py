@@ -21,6 +21,7 @@ from obsynth.methods.fault_estimation_filter.notes import notes
 from obsynth.methods.fault_estimation_filter.prepared_plant import prepare, with_sensor_faults_as_states
 from obsynth.methods.fault_estimation_filter.realisation import realise_filter
 from obsynth.methods.method_spec import Synthesis
+from obsynth.numerics.arguments import is_whole
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.ranks import decide_rank
 from obsynth.plants.descriptor import DescriptorSystem
@@ -61,7 +62,7 @@ def _checked(indexes: Sequence[int] | None, work: DescriptorSystem) -> tuple[int
     if indexes is None:
         return None
     listed: list[Any] = list(indexes) if isinstance(indexes, (list, tuple, np.ndarray)) else []
-    whole = all(isinstance(index, (int, np.integer)) and not isinstance(index, bool) for index in listed)
+    whole = all(is_whole(index) for index in listed)
     if len(listed) != work.nf or not whole or not all(1 <= index <= work.nx for index in listed):
         raise SpecError(
             f"indexes is {indexes!r}: give one whole number from 1 to {work.nx} for each of "

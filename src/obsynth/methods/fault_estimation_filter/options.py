@@ -31,6 +31,7 @@ class FilterOptions(MethodOptions):
     solver: Literal["auto", "SCHUR", "CLARABEL", "SCS"] = "auto"
     tolerance: OpenUnitInterval = 1e-6
     mean: Count = 1
+    model_error: Literal["none", "columns"] = "none"
 
     def conflicts(self) -> Iterator[str]:
         """Yield a sentence for each rule across options that is broken."""

@@ -6,16 +6,17 @@ from collections.abc import Sequence
 
 from numpy.typing import ArrayLike
 
-from obsynth.analysis.transformations.recovery import plant_and_recovery
+from obsynth.analysis.transformations.recovery import Transformation, plant_and_recovery
 from obsynth.errors import SpecError
 from obsynth.methods.designing import design, draft_of
 from obsynth.methods.verifying import verify
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
+from obsynth.simulation.scenario import Scenario
 
 
 def fault_estimation_filter(
-    plant: DescriptorSystem,
+    plant: DescriptorSystem | Transformation,
     *,
     gamma: float | None = None,
     gamma_search: str = "direct",
@@ -27,6 +28,8 @@ def fault_estimation_filter(
     solver: str = "auto",
     tolerance: float = 1e-6,
     mean: int = 1,
+    model_error: str = "none",
+    scenario: Scenario | None = None,
     name: str = "design",
 ) -> ObserverDesign:
     r"""Design a fault-estimation filter with a guaranteed l2 gain from the disturbance to the fault error.
@@ -36,7 +39,7 @@ def fault_estimation_filter(
 
     Parameters
     ----------
-    plant : DescriptorSystem
+    plant : DescriptorSystem or Transformation
         Discrete time (``dt > 0``), ``E (nx, nx)``, ``C (ny, nx)``, ``Bf (nx, nf)``, ``Bd (nx, nd)``; feedthrough
         ``D, Df, Dd`` and noise ``Bw, Dw`` allowed.
     gamma : float, optional, dimensionless
@@ -70,6 +73,12 @@ def fault_estimation_filter(
     mean : int, optional, samples
         Over how many samples each fault estimate is averaged; adds ``(mean - 1) // 2`` to its delay.  The gain gamma is
         proved for the estimate before the mean, which makes no l2 norm larger.
+    model_error : {"none", "columns"}, optional
+        With "columns", for a plant with tolerances: the directions that are to blame for what the tolerances do are
+        tried as noise of several weights, and as unknown inputs where they can be told from the faults; what is shipped
+        has the smallest mean adaptive threshold over ``scenario``.  A note says what was chosen.
+    scenario : Scenario, optional
+        For ``model_error``: inputs, disturbances and noise; its faults do not count.
     name : str, optional
         Name of the design.
 
@@ -119,11 +128,13 @@ def fault_estimation_filter(
         solver=solver,
         tolerance=tolerance,
         mean=mean,
+        model_error=model_error,
+        scenario=scenario,
     )
 
 
 def fault_estimation_filter_from_gains(
-    plant: DescriptorSystem,
+    plant: DescriptorSystem | Transformation,
     *,
     T: ArrayLike,
     N: ArrayLike,
@@ -137,7 +148,7 @@ def fault_estimation_filter_from_gains(
 
     Parameters
     ----------
-    plant : DescriptorSystem
+    plant : DescriptorSystem or Transformation
         As for `fault_estimation_filter`.
     T, N, L, W : array_like
         ``(nx, nx)``, ``(nx, ny)``, ``(nx, ny)``, ``(nf, ny)`` of eq. (23).
@@ -169,11 +180,11 @@ def fault_estimation_filter_from_gains(
     """
     from obsynth.methods.fault_estimation_filter.given_gains import synthesis_from_gains
 
-    plant, recovery = plant_and_recovery(plant)
-    if plant.nd and gamma is None:
+    own, recovery = plant_and_recovery(plant)
+    if own.nd and gamma is None:
         raise SpecError(
             "gamma is needed: the plant has disturbances, and a gain set claims a bound on them.", path="gamma"
         )
-    found = synthesis_from_gains(plant, T=T, N=N, L=L, W=W, gamma=gamma, indexes=indexes)
-    draft = draft_of(plant, "fault-estimation-filter", found, name=name, recovery=recovery)
+    found = synthesis_from_gains(own, T=T, N=N, L=L, W=W, gamma=gamma, indexes=indexes)
+    draft = draft_of(own, "fault-estimation-filter", found, name=name, recovery=recovery)
     return draft.replace(report=verify(draft))

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from obsynth.analysis.transformations import eliminate_algebraic_states
+from obsynth.analysis.transformations.recovery import Transformation, linear_plant
 from obsynth.errors import PreconditionError, SolverError, SpecError
-from obsynth.numerics.arguments import is_finite_number, require_kind
+from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import decide_rank
 from obsynth.numerics.spectra import abscissa, response
@@ -64,12 +65,14 @@ class DetectionFilter:
 
 
 @on_one_thread_if_small
-def detection_filter(plant: DescriptorSystem, *, band: Sequence[float] = (0.0, 1e3)) -> DetectionFilter:
+def detection_filter(
+    plant: DescriptorSystem | Transformation, *, band: Sequence[float] = (0.0, 1e3)
+) -> DetectionFilter:
     """Design the residual filter of largest H-minus over H-infinity.
 
     Parameters
     ----------
-    plant : DescriptorSystem
+    plant : DescriptorSystem or Transformation
         Continuous time, index 0 or 1, detectable; unknown inputs and noise together reach every output directly
         (``[Dd, Dw]`` of full row rank), noise counting as an unknown input of its deviation.
     band : sequence of float, optional, rad/s
@@ -95,7 +98,7 @@ def detection_filter(plant: DescriptorSystem, *, band: Sequence[float] = (0.0, 1
        detection systems", Int. J. Adaptive Control and Signal Processing 14, 2000.
        Ours: the gain is proved on stored numbers.
     """
-    require_kind(plant, DescriptorSystem, "plant", "an obsynth.DescriptorSystem")
+    plant = linear_plant(plant)
     if plant.dt > 0.0 or plant.nf == 0:
         raise SpecError("Give a continuous plant (dt = 0) with faults.", path="plant")
     listed = list(band)

@@ -33,7 +33,7 @@ class FunctionalFilterOptions(MethodOptions):
     delay: Annotated[int, Ge(0)] = 0
     mean: Count = 1
     decay: NonNegative | None = None
-    poles: Annotated[Any, WrittenAs("poles")] = None
+    poles: Annotated[Any, WrittenAs("pole sets")] = None
     noise: Annotated[Any, WrittenAs("named numbers")] = None
     residuals: Annotated[Any, WrittenAs("fault sets")] = None
 

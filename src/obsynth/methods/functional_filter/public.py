@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from obsynth.analysis.transformations.recovery import Transformation
 from obsynth.methods.designing import design
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
 
 
 def functional_filter(
-    plant: DescriptorSystem,
+    plant: DescriptorSystem | Transformation,
     *,
     faults: Sequence[str] | None = None,
     joint: bool = False,
@@ -33,7 +34,7 @@ def functional_filter(
 
     Parameters
     ----------
-    plant : DescriptorSystem
+    plant : DescriptorSystem or Transformation
         Either time, any index; ``C (ny, nx)``, ``Bf (nx, nf)``, ``Bd (nx, nd)``, ``D, Df, Dd`` allowed.
     faults : sequence of str, optional
         Faults to estimate, all by default.  The others are treated like unknown inputs: no estimate sees them.
@@ -53,7 +54,8 @@ def functional_filter(
     decay : float, optional, 1/s
         Every error decays at this rate or faster.
     poles : sequence, optional, 1/s (dimensionless for ``dt > 0``)
-        Poles of the filter instead of a Kalman gain, as for `ui_pi_observer`.
+        Poles of the filter instead of a Kalman gain, as for `ui_pi_observer`; where several filters are asked for
+        (one for each fault, or set of faults), a list of poles for each.
     noise : float or mapping of str to float, optional
         Standard deviation of each output that the gain is for, per sample; what the plant states by default.
     residuals : {"detect", "isolate"} or sequence, optional

@@ -171,20 +171,27 @@ def _gain(
 
 
 def _placed(plant: DescriptorSystem, models: Sequence[FilterModel], asked: FunctionalFilterOptions) -> list[FilterPart]:
-    """Return the filter with the poles asked for."""
-    if len(models) != 1:
+    """Return the filters with the poles asked for: one list, or one for each of several filters."""
+    given = [asked.poles] if len(models) == 1 else list(asked.poles)
+    if len(given) != len(models) or not all(isinstance(entry, (list, tuple, np.ndarray)) for entry in given):
+        orders = ", ".join(str(len(model.A)) for model in models)
         raise SpecError(
-            f"poles are given, but {len(models)} filters are asked for, each with poles of its own: ask for one fault "
-            "or one set of residuals, or for joint estimates.",
+            f"{len(models)} filters are asked for, of {orders} poles: give a list of poles for each, such as "
+            "[[-1], [-2, -3]], or ask for one fault, one set of residuals, or joint estimates.",
             path="method.options.poles",
         )
-    model = models[0]
-    wanted = checked_poles(asked.poles, len(model.A), np.zeros(0, dtype=np.complex128), plant.dt)
-    gain = place(model.A, model.C, wanted, dt=plant.dt).K
+    return [_placed_filter(plant, model, poles, asked) for model, poles in zip(models, given, strict=True)]
+
+
+def _placed_filter(
+    plant: DescriptorSystem, model: FilterModel, poles: Sequence[Any], asked: FunctionalFilterOptions
+) -> FilterPart:
+    fixed = np.zeros(0, dtype=np.complex128)
+    wanted = checked_poles(poles, len(model.A), fixed, plant.dt, of="functional-filter")
+    gain = place(model.A, model.C, wanted, dt=plant.dt).K if len(model.A) else np.zeros((0, len(model.C)))
     lag = (np.zeros_like(gain),) if plant.dt > 0.0 else ()
     noise = model.M @ model.M.T if plant.nw and np.linalg.matrix_rank(model.M) == len(model.M) else np.eye(len(model.C))
-    shown = whitening(noise)
-    return [filter_part(model, KalmanGain(gain, lag, noise, 0.0), shown, delay=0, mean=asked.mean)]
+    return filter_part(model, KalmanGain(gain, lag, noise, 0.0), whitening(noise), delay=0, mean=asked.mean)
 
 
 def _residual_names(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,8 @@ DECAY_SHARE = 0.1
 DECAY_RETRIES = (1.0, 0.3, 0.1, 0.03)
 #: Gains may grow by this factor for the sake of the default decay rate.
 DECAY_PRICE = 100.0
+#: With more unknown states the least of these rates comes first, in one set of units, and the first failure is the end.
+MANY_STATES = 100
 #: By default a decay rate is never closer to that of an unobservable mode, which nothing moves.
 HIDDEN_SHARE = 0.5
 
@@ -40,6 +43,8 @@ def design_gains(plant: DescriptorSystem, asked: PdOptions) -> tuple[PdGains, li
     target = _default_decay(plant)
     if asked.decay is not None or asked.disk is not None or plain.abscissa <= -target:
         return plain, records
+    if plant.nx + plant.nf > MANY_STATES:
+        return _faster_at_little_cost(plant, asked, plain, target), records
     for share in DECAY_RETRIES:
         if share * target <= -plain.abscissa:
             break
@@ -56,21 +61,37 @@ def design_gains(plant: DescriptorSystem, asked: PdOptions) -> tuple[PdGains, li
     return plain, records
 
 
+def _faster_at_little_cost(plant: DescriptorSystem, asked: PdOptions, plain: PdGains, target: float) -> PdGains:
+    """Return gains that decay as fast as their size allows, for many states: from the least rate upwards."""
+    found = plain
+    for share in sorted(DECAY_RETRIES):
+        if share * target <= -plain.abscissa:
+            continue
+        try:
+            found = gains_for(plant, asked, decay=share * target, most=DECAY_PRICE * plain.size)
+        except (SolverError, InfeasibleError):
+            break  # nobody asked for this rate
+    return found
+
+
 def _default_decay(plant: DescriptorSystem) -> float:
     slowest = max((mode.real for mode in analyse_structure(plant).unobservable_modes), default=-np.inf)
     return float(min(DECAY_SHARE * fastest_mode(plant.A), -HIDDEN_SHARE * slowest))
 
 
-def gains_for(plant: DescriptorSystem, asked: PdOptions, *, decay: float) -> PdGains:
-    """Return gains for one decay rate: of the first coordinates in which the answer is proved."""
+def gains_for(plant: DescriptorSystem, asked: PdOptions, *, decay: float, most: float | None = None) -> PdGains:
+    """Return gains for one decay rate: of the first coordinates in which the answer is proved.
+
+    With ``most``, a bound on their size, of the first coordinates alone.
+    """
     delta = default_delta(plant, asked, decay)
     require_possible(plant, asked, delta=delta, decay=decay)
     failure = SolverError("The gains that the solver returned could not be proved to be stable: nothing is known.")
     engine, *spare = asked.engines_for(plant.nx + plant.nf)
     for name in (engine, *spare):
-        for states, outputs in _units(plant, asked, balanced_first=name != "lmi"):
+        for states, outputs in islice(_units(plant, asked, balanced_first=name != "lmi"), None if most is None else 1):
             try:
-                found = _solved(plant, asked, name, delta, decay, states, outputs)
+                found = _solved(plant, asked, name, delta, decay, states, outputs, most)
             except SolverError as error:
                 # What the spare engine meets says less than why it was needed.
                 failure = error if name == engine else failure
@@ -147,6 +168,7 @@ def _solved(
     decay: float,
     states: FloatArray,
     outputs: FloatArray,
+    most: float | None = None,
 ) -> PdGains | None:
     """Return the gains found in the given units, with a proved certificate where there is one."""
     unit = float(np.exp2(np.round(np.log2(TIME_UNITS / fastest_mode(plant.A)))))
@@ -162,6 +184,8 @@ def _solved(
         loop[plant.nx :, plant.nx :] = g
     back = np.linalg.inv(loop)
     gain_j, gain_l = (loop @ (states[:, None] * part / outputs) for part in (found.J / unit, found.L))
+    if most is not None and not float(np.linalg.norm(np.hstack([gain_j, gain_l]), 2)) <= most:
+        raise SolverError("The gains are out of proportion for a rate that nobody asked for.", record=found.record)
     p3, *p1 = (back.T @ (matrix / states[:, None] / states) @ back for matrix in (found.P3, *found.P1))
     return certified(plant, asked, PdSolution(gain_j, gain_l, tuple(p1), p3, found.record), delta=delta, decay=decay)
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.analysis.transformations.recovery import plant_and_recovery
+from obsynth.analysis.transformations.recovery import Transformation, linear_plant, plant_and_recovery
 from obsynth.errors import SpecError, VerificationError
 from obsynth.methods.designing import design as design_by_method
 from obsynth.methods.designing import draft_of
@@ -18,7 +18,7 @@ from obsynth.results.design import ObserverDesign
 
 
 def pd_observer(
-    plant: DescriptorSystem,
+    plant: DescriptorSystem | Transformation,
     *,
     theorem: int = 1,
     delta: float | None = None,
@@ -41,7 +41,7 @@ def pd_observer(
 
     Parameters
     ----------
-    plant : DescriptorSystem
+    plant : DescriptorSystem or Transformation
         Continuous time (``dt == 0``), ``A (nx, nx)``, ``C (ny, nx)``, ``Bf (nx, nf)``; ``E`` may be singular of index
         1 (its algebraic states are eliminated); feedthrough ``D, Df, Dd`` and noise ``Bw, Dw`` allowed.
     theorem : {1, 2}, optional
@@ -121,7 +121,7 @@ def pd_observer(
 
 
 def pd_observer_from_gains(
-    plant: DescriptorSystem,
+    plant: DescriptorSystem | Transformation,
     *,
     J: ArrayLike,
     L: ArrayLike,
@@ -135,7 +135,7 @@ def pd_observer_from_gains(
 
     Parameters
     ----------
-    plant : DescriptorSystem
+    plant : DescriptorSystem or Transformation
         As for `pd_observer`.
     J, L, M, N : array_like
         ``(nx, ny)``, ``(nx, ny)``, ``(nf, ny)``, ``(nf, ny)`` of eqs. (4), (6); nx after elimination of algebraic
@@ -166,10 +166,10 @@ def pd_observer_from_gains(
     """
     from obsynth.methods.pd_observer.synthesis import synthesis_from_gains
 
-    plant, recovery = plant_and_recovery(plant)
+    own, recovery = plant_and_recovery(plant)
     gains = {"J": J, "L": L, "M": M, "N": N}
-    found = synthesis_from_gains(plant, gains=gains, adaptation_gain=adaptation_gain, decay=decay)
-    draft = draft_of(plant, "pd-observer", found, name=name, recovery=recovery)
+    found = synthesis_from_gains(own, gains=gains, adaptation_gain=adaptation_gain, decay=decay)
+    draft = draft_of(own, "pd-observer", found, name=name, recovery=recovery)
     return draft.replace(report=verify(draft))
 
 
@@ -220,7 +220,7 @@ def apply_adaptation_gain(design: ObserverDesign, adaptation_gain: ArrayLike) ->
 
 
 def pd_delta_scan(
-    plant: DescriptorSystem,
+    plant: DescriptorSystem | Transformation,
     delta: ArrayLike,
     *,
     theorem: int = 1,
@@ -231,7 +231,7 @@ def pd_delta_scan(
 
     Parameters
     ----------
-    plant : DescriptorSystem
+    plant : DescriptorSystem or Transformation
         As for `pd_observer`: ``A (nx, nx)``, ``C (ny, nx)``, ``Bf (nx, nf)``.
     delta : array_like, seconds
         Values ``(k,)`` to try.
@@ -266,6 +266,7 @@ def pd_delta_scan(
 
     given: dict[str, Any] = {"theorem": theorem, "decay": decay, "delta_scan": delta, "solver": solver}
     asked = PdOptions(**given)
+    plant = linear_plant(plant)
     require_all(pd_observer_conditions(plant))
     form = explicit_form(plant)
     return scan_delta(plant if form is None else form.plant, asked, np.ravel(np.asarray(delta)), decay=float(decay))

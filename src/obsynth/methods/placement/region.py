@@ -18,6 +18,7 @@ import numpy as np
 from obsynth.errors import SolverError, SpecError
 from obsynth.methods.conic import lmi
 from obsynth.methods.placement.kalman import KalmanProblem
+from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.spectra import eigenvalues, speeds
 
@@ -50,13 +51,7 @@ class Region:
         known = [field.name for field in fields(cls)]
         problems = [f"unknown key {key!r}; there are: {', '.join(known)}." for key in data if key not in known]
         for key, value in data.items():
-            if key in known and (
-                isinstance(value, bool)
-                or not isinstance(value, (int, float))
-                or not np.isfinite(value)
-                or value < 0.0
-                or (key != "decay" and value == 0.0)
-            ):
+            if key in known and (not is_finite_number(value) or value < 0.0 or (key != "decay" and value == 0.0)):
                 problems.append(f"{key} is {value!r}: give a positive number.")
         if not problems:
             found = cls(**data)

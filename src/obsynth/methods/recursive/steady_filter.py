@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from obsynth.analysis.conditions import Condition, require_all
 from obsynth.analysis.time_varying import as_time_varying
+from obsynth.analysis.transformations.recovery import Transformation
 from obsynth.analysis.zeros import are_outside
 from obsynth.errors import SolverError, SpecError
 from obsynth.methods.recursive.conditions import described_mode, recursive_conditions
@@ -52,7 +53,7 @@ class SteadyState:
 
 
 def steady_state_filter(
-    plant: DescriptorSystem | TimeVaryingDescriptorSystem, *, Q: ArrayLike, R: ArrayLike
+    plant: DescriptorSystem | TimeVaryingDescriptorSystem | Transformation, *, Q: ArrayLike, R: ArrayLike
 ) -> SteadyState:
     r"""Return the steady state of the descriptor Kalman filter.
 
@@ -63,7 +64,7 @@ def steady_state_filter(
 
     Parameters
     ----------
-    plant : DescriptorSystem or TimeVaryingDescriptorSystem
+    plant : DescriptorSystem, TimeVaryingDescriptorSystem or Transformation
         Time-invariant, discrete; ``E (ne, nx)``, ``C (ny, nx)``.
     Q, R : array_like
         ``(ne, ne)`` and ``(ny, ny)``, may be singular; a number stands for that multiple of the identity.

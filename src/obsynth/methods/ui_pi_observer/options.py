@@ -142,8 +142,10 @@ def plain(value: Any) -> Any:
     return value
 
 
-def checked_poles(given: Any, count: int, fixed: ComplexArray, dt: float) -> list[complex]:
-    """Return the wanted poles, in exact conjugate pairs."""
+def checked_poles(
+    given: Any, count: int, fixed: ComplexArray, dt: float, *, of: str = "ui-pi-observer"
+) -> list[complex]:
+    """Return the wanted poles, in exact conjugate pairs; ``of``: what they are for, in messages."""
     listed = [_as_complex(pole) for pole in given]
     problems = []
     if len(listed) != count:
@@ -168,7 +170,7 @@ def checked_poles(given: Any, count: int, fixed: ComplexArray, dt: float) -> lis
     if lonely:
         problems.append(f"{', '.join(f'{pole:.6g}' for pole in lonely)} lack their conjugates.")
     if problems:
-        raise SpecError("Option poles of ui-pi-observer:", path=f"{_PATH}.poles", problems=problems)
+        raise SpecError(f"Option poles of {of}:", path=f"{_PATH}.poles", problems=problems)
     real = [pole for pole in listed if pole.imag == 0.0]
     return [*real, *(p for pole in upper for p in (pole, pole.conjugate()))]
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
-from obsynth.analysis.transformations.recovery import plant_and_recovery
+from obsynth.analysis.transformations.recovery import Transformation, plant_and_recovery
 from obsynth.methods.designing import design, draft_of
 from obsynth.methods.verifying import verify
 from obsynth.plants.descriptor import DescriptorSystem
@@ -15,7 +15,7 @@ from obsynth.results.design import ObserverDesign
 
 
 def ui_pi_observer(
-    plant: DescriptorSystem,
+    plant: DescriptorSystem | Transformation,
     *,
     fault_model: Any = "step",
     poles: Sequence[Any] | None = None,
@@ -39,7 +39,7 @@ def ui_pi_observer(
 
     Parameters
     ----------
-    plant : DescriptorSystem
+    plant : DescriptorSystem or Transformation
         Either time, ``E (nx, nx)``, ``C (ny, nx)``, ``Bf (nx, nf)``, ``Bd (nx, nd)``, ``Df, Dd, D`` allowed; it need
         be neither regular nor of index 1.
     fault_model : str, mapping or FaultModel, optional
@@ -118,7 +118,7 @@ def ui_pi_observer(
 
 
 def ui_pi_observer_from_gains(
-    plant: DescriptorSystem,
+    plant: DescriptorSystem | Transformation,
     *,
     U: ArrayLike,
     D: ArrayLike,
@@ -131,7 +131,7 @@ def ui_pi_observer_from_gains(
 
     Parameters
     ----------
-    plant : DescriptorSystem
+    plant : DescriptorSystem or Transformation
         As for `ui_pi_observer`.
     U, D, K, F : array_like
         ``(nx, nx)``, ``(nx, ny)``, ``(nx, ny)`` of eqs. (11), (12), and ``(nw, ny)`` of (23).
@@ -157,7 +157,7 @@ def ui_pi_observer_from_gains(
     """
     from obsynth.methods.ui_pi_observer.synthesis import synthesis_from_gains
 
-    plant, recovery = plant_and_recovery(plant)
-    found = synthesis_from_gains(plant, U=U, D=D, K=K, F=F, fault_model=fault_model)
-    draft = draft_of(plant, "ui-pi-observer", found, name=name, recovery=recovery)
+    own, recovery = plant_and_recovery(plant)
+    found = synthesis_from_gains(own, U=U, D=D, K=K, F=F, fault_model=fault_model)
+    draft = draft_of(own, "ui-pi-observer", found, name=name, recovery=recovery)
     return draft.replace(report=verify(draft))

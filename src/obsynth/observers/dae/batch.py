@@ -33,7 +33,10 @@ def run_dae_batch(
     """
     outputs, inputs = _checked(observer, y, u)
     trials, samples = outputs.shape[:2]
-    if compiled is None:
+    alone = observer.outside_graph
+    if alone and compiled:
+        raise SpecError(f"The C knows no {alone}: leave compiled=True out, or leave {alone} out.", path="compiled")
+    if compiled is None and not alone:
         compiled = trials * samples >= WORTH_COMPILING and compiler() is not None
     take = _in_c if compiled else _in_casadi
     with shown_progress(progress, trials, "trials") as note:
@@ -98,7 +101,13 @@ def _in_casadi(
 def _one(observer: DAEObserver, y: FloatArray, u: FloatArray, trial: int) -> dict[str, FloatArray]:
     rows: list[DAERow] = []
     try:
-        advanced(observer.steps, y[trial], _of_trial(u, trial), rows.append)
+        if observer.outside_graph:
+            state = observer.steps.first
+            for outputs, inputs in zip(y[trial], _of_trial(u, trial), strict=True):
+                state, row = observer.steps.advance(state, outputs, inputs)
+                rows.append(row)
+        else:
+            advanced(observer.steps, y[trial], _of_trial(u, trial), rows.append)
     except SolverError as error:
         raise SolverError(f"Trial {trial}: {error}", record={**error.record, "trial": trial}) from error
     return {name: np.concatenate([row.several.part(name) for row in rows]) for name in BATCH_PARTS}

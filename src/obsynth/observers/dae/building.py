@@ -12,6 +12,7 @@ import numpy as np
 
 from obsynth.analysis.transformations.equations_at_a_point import local_equations
 from obsynth.errors import SpecError
+from obsynth.numerics.arguments import is_number, real_number
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.plants.dae.checks import finite_vector, step_length
@@ -57,7 +58,7 @@ DEFAULT_PARAMETER_SHARE = 0.1
 OPTIONS = (
     "dt", "Q", "R", "form", "forgetting", "guard", "weight", "integration", "random_walk", "initial_state",
     "initial_covariance", "initial_parameters", "initial_parameter_covariance", "bounds", "largest_move", "window",
-    "outliers", "outlier_limit", "sensors", "state_bounds",
+    "outliers", "outlier_limit", "sensors", "state_bounds", "reset",
 )  # fmt: skip
 
 
@@ -82,12 +83,19 @@ def dae_observer_from_options(model: DAEModel, options: Mapping[str, Any]) -> DA
             _default_parameter_variances(model, options["initial_parameter_covariance"]),
         ),
         random_walk=_covariance(options["random_walk"], parameters, "random_walk", np.zeros(model.nq)),
-        lower=bounds[:, 0], upper=bounds[:, 1], form=options["form"], forgetting=options["forgetting"],
+        lower=bounds[:, 0], upper=bounds[:, 1], form=_form(options), forgetting=options["forgetting"],
         guard=options["guard"], weight=options["weight"], integration=_integration(model, options),
         largest_move=options["largest_move"], window=options["window"],
         outliers=options.get("outliers", "none"), outlier_limit=options.get("outlier_limit"),
         sensors=options.get("sensors"), state_bounds=options.get("state_bounds"),
+        reset=options.get("reset", 0.0),
     )  # fmt: skip
+
+
+def _form(options: Mapping[str, Any]) -> str:
+    """Return the form that is asked for; by itself that of parameters that walk where a walk is stated."""
+    walks = options["random_walk"] is not None
+    return ("random-walk" if walks else "forgetting") if options["form"] == "auto" else str(options["form"])
 
 
 def _integration(model: DAEModel, options: Mapping[str, Any]) -> str:
@@ -122,9 +130,10 @@ def _covariance(value: Any, names: Sequence[str], what: str, default: FloatArray
     if isinstance(value, Mapping):
         variances = np.zeros(len(names))
         for name, variance in value.items():
-            variances[index_of(name, names, what=what)] = _number(variance, f"{what}.{name}")
+            variances[index_of(name, names, what=what)] = real_number(variance, f"{what}.{name}")
         return np.diag(variances)
-    matrix = as_matrix(value, what) if np.size(value) else np.zeros((0, 0))
+    empty = isinstance(value, (list, tuple, np.ndarray)) and not np.asarray(value, dtype=object).size
+    matrix = np.zeros((0, 0)) if empty else as_matrix(value, what)
     return float(matrix[0, 0]) * np.eye(len(names)) if np.ndim(value) == 0 else matrix
 
 
@@ -134,13 +143,14 @@ def _vector(value: Any, names: Sequence[str], default: FloatArray, what: str) ->
     if isinstance(value, Mapping):
         vector = np.array(default)
         for name, entry in value.items():
-            vector[index_of(name, names, what=what)] = _number(entry, f"{what}.{name}")
+            vector[index_of(name, names, what=what)] = real_number(entry, f"{what}.{name}")
         return vector
     return finite_vector(value, names, default, what)
 
 
-def _number(value: Any, path: str) -> float:
-    if not isinstance(value, (int, float, np.number)) or isinstance(value, bool):
+def _bound(value: Any, path: str) -> float:
+    """Return a bound, which may be infinite."""
+    if not is_number(value):
         raise SpecError(f"{path} is {value!r}: give a number.", path=path)
     return float(value)
 
@@ -152,7 +162,7 @@ def _bounds(value: Any, names: Sequence[str]) -> FloatArray:
         for name, pair in value.items():
             if np.shape(pair) != (2,):
                 raise SpecError(f"bounds.{name} must be [lower, upper].", path=f"bounds.{name}")
-            found[index_of(name, names, what="bounds")] = [_number(bound, f"bounds.{name}") for bound in pair]
+            found[index_of(name, names, what="bounds")] = [_bound(bound, f"bounds.{name}") for bound in pair]
         return found
     if value is None:
         return found

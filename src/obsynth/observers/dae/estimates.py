@@ -61,6 +61,14 @@ class DAERow:
         return self.part("spread")
 
     @property
+    def cross_covariance(self) -> FloatArray:
+        """Covariance of `x` with `theta` ``(nx, nq)``."""
+        if "cross" in self.graph.memory.shapes:
+            return self.part("cross")
+        K, H, L, Upsilon = (self.part(name) for name in ("K", "H", "L", "Upsilon"))
+        return np.asarray((Upsilon - K @ (H @ Upsilon + L)) @ self.parameter_covariance)
+
+    @property
     def innovation(self) -> FloatArray:
         """Outputs without what was predicted of them ``(ny,)``; NaN where a sample is missing."""
         return np.where(self.seen, self.part("innovation"), np.nan)
@@ -188,6 +196,7 @@ def _columns(rows: DAERow) -> dict[str, FloatArray]:
     """Return what the estimates keep of some samples."""
     return {
         "states": rows.x, "state_deviations": rows.state_deviations,
+        "state_covariances": rows.covariance, "cross_covariances": rows.cross_covariance,
         "faults": rows.theta, "fault_covariances": rows.parameter_covariance,
         "innovations": rows.innovation, "innovation_covariances": rows.part("expected"), "nis": rows.nis,
         "nis_degrees": rows.seen.sum(axis=1).astype(np.float64), "residuals": rows.part("residual"),

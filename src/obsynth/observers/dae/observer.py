@@ -69,6 +69,9 @@ class DAEObserver(DAESettings, StepObserver[DAEState, DAERow]):
         2 every, ..., or whose values arrive so many rows late.
     state_bounds : FloatArray or None
         ``(nx, 2)``: lower and upper bounds of the states, infinite where there are none.
+    reset : float
+        Detect and reset: probability, per sample, that innovations which no change has made larger pass the threshold
+        above which the covariance of the parameters starts again from S_0.  Zero never resets.
 
     Raises
     ------

@@ -27,14 +27,15 @@ def run_record(
 
     Shapes: ``y (samples, ny)``, ``u (samples, nu)``.
     """
-    if library is not None and steps.settings.outliers != "none":
-        raise SpecError("The C knows no outliers: leave compiled=True out, or take outliers='none'.", path="compiled")
+    alone = steps.settings.outside_graph
+    if library is not None and alone:
+        raise SpecError(f"The C knows no {alone}: leave compiled=True out, or leave {alone} out.", path="compiled")
     found = GatheredRows(steps.settings)
     found.add(_nothing(steps))
     with shown_progress(progress, len(y), "samples") as note:
         if library is not None:
             _in_c(steps, library, y, u, found.add_regular, note)
-        elif compiled is None and steps.settings.outliers == "none":
+        elif compiled is None and not alone:
             advanced(steps, y, u, found.add_regular, note)
         else:
             state = steps.first

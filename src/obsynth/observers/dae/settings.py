@@ -10,7 +10,7 @@ from typing import Any, Literal, Self, TypeAlias
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import Count, ForgettingFactor, Positive, checked_value
+from obsynth.numerics.arguments import Count, ForgettingFactor, Positive, Probability, checked_value
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.covariances import covariance_factor, is_definite
 from obsynth.observers.estimates import Undelayed
@@ -27,6 +27,7 @@ Integration: TypeAlias = Literal["backward-euler", "radau"]
 _KINDS = {
     "form": Form, "guard": Guard, "weight": Weight, "integration": Integration, "forgetting": ForgettingFactor,
     "window": Count, "largest_move": Positive | None,
+    "reset": Probability,
 }  # fmt: skip
 _DEFINITE = ("R", "initial_parameter_covariance")
 
@@ -57,6 +58,7 @@ class DAESettings(Undelayed):
     outlier_limit: float | None = None
     sensors: Mapping[str, Mapping[str, int]] | None = None
     state_bounds: FloatArray | None = None
+    reset: float = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "dt", step_length(self.dt))
@@ -128,6 +130,13 @@ class DAESettings(Undelayed):
     def is_plain(self) -> bool:
         """Whether every sensor is sampled at each row, at once, and no state has bounds."""
         return self.timing.is_plain and self.state_bounds is None
+
+    @property
+    def outside_graph(self) -> str:
+        """An option in use that stands outside of the compiled steps, by name; empty without one."""
+        if self.outliers != "none":
+            return "outliers"
+        return "reset" if self.reset else "" if self.state_bounds is None else "state_bounds"
 
     @property
     def order(self) -> int:

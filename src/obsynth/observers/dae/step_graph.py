@@ -93,16 +93,25 @@ def _predicted(observer: DAESettings, before: Arrays, x: Any, local: tuple[Any, 
     added = noise @ ca.DM(observer.Q) @ noise.T
     kept = ca.DM.eye(observer.model.nx) - K @ H
     after = {**before, "x": x, "F": F, "G": G, "noise": noise, "kept": F @ kept, "scaled": scaled}
+    carried = F @ (kept @ before["Upsilon"] - K @ L)
+    if observer.form != "forgetting":
+        # The parameters of a sample act in the step that leads there: they have walked already.
+        after["spread"] = walked = spread + ca.DM(observer.random_walk)
     if observer.form == "augmented-kalman":
-        # The parameters of a sample act in the step that leads there.
-        spread = spread + ca.DM(observer.random_walk)
         through = F @ before["cross"] @ G.T
-        P = F @ P @ F.T + through + through.T + G @ spread @ G.T + added
-        after["cross"], after["spread"] = F @ before["cross"] + G @ spread, spread
+        P = F @ P @ F.T + through + through.T + G @ walked @ G.T + added
+        after["cross"] = F @ before["cross"] + G @ walked
     else:
         P = F @ (kept @ P @ kept.T + K @ ca.DM(observer.R) @ K.T) @ F.T + added
+    if observer.form == "random-walk" and observer.random_walk.any():
+        # What was learnt holds for the parameters before their walk: a share of it holds for those after, and what
+        # that leaves open is noise of the state alone (Hsieh and Chen 1999), so that both stay uncorrelated.
+        kept_share = definite_solved(walked, spread).T
+        left = spread - kept_share @ spread
+        P, carried = P + carried @ (0.5 * (left + left.T)) @ carried.T, carried @ kept_share
+        after["S"] = before["S"] + ca.DM(observer.random_walk)
     after["P"] = 0.5 * (P + P.T)
-    after["Upsilon"] = F @ kept @ before["Upsilon"] + G - F @ K @ L
+    after["Upsilon"] = carried + G
     return after
 
 
@@ -162,8 +171,6 @@ class _Update:
 
         observer, Sigma, Omega = self.observer, found["Sigma"], found["Omega"]
         prior, spread = self._remembered(found["S"]), found["spread"]
-        if observer.form == "random-walk":
-            spread = spread + ca.DM(observer.random_walk)
         weight = self.R if observer.weight == "paper" else Sigma
         gain = definite_solved(weight + Omega @ prior @ Omega.T, Omega @ prior).T
         S = prior - gain @ Omega @ prior
@@ -178,12 +185,12 @@ class _Update:
         return {**found, **{name: ca.if_else(anything, value, found[name]) for name, value in after.items()}}
 
     def _remembered(self, S: Any) -> Any:
-        """Return S / lambda, or its walk, or what is left of the information beside that of S_0."""
+        """Return S / lambda, or S that has walked, or what is left of the information beside that of S_0."""
         import casadi as ca
 
         observer = self.observer
         if observer.form == "random-walk":
-            return S + ca.DM(observer.random_walk)
+            return S
         if observer.guard == "none" or observer.forgetting == 1.0:
             return S / observer.forgetting
         one = ca.MX(ca.DM.eye(observer.model.nq))

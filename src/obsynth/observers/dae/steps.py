@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -21,10 +21,20 @@ from obsynth.observers.state_bounds import projected
 from obsynth.plants.dae.functions import Compiled, DAEFunctions
 from obsynth.plants.dae.step import ImplicitStep
 
+#: Samples whose squared innovations are summed up before a reset.
+RESET_WINDOW = 20
 #: A step of backward Euler this much shorter than dt puts a state onto its constraint and moves it no further.
 PROJECTION_SHARE = 1e-6
 #: Smaller moves, in sizes of the states, are the motion during that step and no projection.
 PROJECTION_NOTICE = 1e-5
+
+
+@lru_cache(maxsize=256)
+def chi_square_limit(degrees: int, probability: float) -> float:
+    """Return what a chi-square variable passes with a probability."""
+    from scipy.special import chdtri
+
+    return float(chdtri(degrees, probability))
 
 
 class DAEState(NamedTuple):
@@ -32,7 +42,8 @@ class DAEState(NamedTuple):
 
     Fields: memory: Laid out as `memory_layout` says; k: The next sample; u: ``(nu,)``: the inputs of
     the sample before; informations: ``(nq, nq)`` each: on the parameters, of the latest samples; refused: ``(2, ny)``:
-    outliers in a row, and at all.
+    outliers in a row, and at all; surprises: ``(any, 2)``: normalised squares of the latest innovations, and their
+    degrees of freedom, for resets; resets: How many there were.
     """
 
     memory: FloatArray
@@ -40,6 +51,8 @@ class DAEState(NamedTuple):
     u: FloatArray
     informations: tuple[FloatArray, ...]
     refused: FloatArray
+    surprises: FloatArray
+    resets: int
 
 
 class Steps:
@@ -50,7 +63,7 @@ class Steps:
         self.limit = checked_limit(settings.outliers, settings.outlier_limit)
         self.implicit = ImplicitStep(self.graph.functions, settings.dt, largest_move=settings.largest_move)
         self.first = DAEState(initial_memory(settings, settings.initial_state), 0, np.zeros(settings.model.nu), (),
-                              no_refusals(settings.model.ny))  # fmt: skip
+                              no_refusals(settings.model.ny), np.zeros((0, 2)), 0)  # fmt: skip
 
     def part(self, state: DAEState, name: str) -> FloatArray:
         """Return a part of what is remembered, by its name in `memory_layout`."""
@@ -61,10 +74,11 @@ class Steps:
 
         Shapes: ``y (ny,)`` with NaN for what is missing, ``u (nu,)``.
         """
+        take = self.watched if self.settings.reset else self.plain
         if self.settings.outliers == "none":
-            after, row = self.plain(state, y, u)
+            after, row = take(state, y, u)
         else:
-            after, row = robust_advance(self.settings.outliers, self.limit, self.plain, self.predicted, state, y, u)
+            after, row = robust_advance(self.settings.outliers, self.limit, take, self.predicted, state, y, u)
         return (after, row) if self.settings.state_bounds is None else self.within_bounds(after, row)
 
     def within_bounds(self, state: DAEState, row: DAERow) -> tuple[DAEState, DAERow]:
@@ -78,6 +92,32 @@ class Steps:
         if self.settings.form == "augmented-kalman":
             memory[layout.slices["x"]] = memory[layout.slices["posterior"]]
         return state._replace(memory=memory), replace(row, memory=memory)
+
+    def watched(self, state: DAEState, y: FloatArray, u: FloatArray) -> tuple[DAEState, DAERow]:
+        """Take a sample; where innovations have become too large, again with parameters known no better than at first.
+
+        A jump of a parameter is followed from there at once.
+        """
+        after, row = self.plain(state, y, u)
+        latest = [float(row.nis), float(row.degrees)]
+        surprises = np.vstack([state.surprises, latest])[-RESET_WINDOW:] if state.k else state.surprises
+        total, degrees = surprises.sum(axis=0)
+        if not degrees or total <= chi_square_limit(int(degrees), self.settings.reset):
+            return after._replace(surprises=surprises), row
+        after, row = self.plain(state._replace(memory=self._forgetful(state)), y, u)
+        return after._replace(surprises=state.surprises[:0], resets=state.resets + 1), row
+
+    def _forgetful(self, state: DAEState) -> FloatArray:
+        """Return what is remembered with the covariance that the parameters had at the start."""
+        memory, layout, nq = state.memory.copy(), self.graph.memory, self.settings.model.nq
+        spread = np.array(self.settings.initial_parameter_covariance)
+        for name in ("S", "spread"):
+            if name in layout.shapes:
+                memory[layout.slices[name]] = spread.ravel(order="F")
+        if "cross" in layout.shapes:
+            # A filter of both together carries the old share of the parameters in the state's covariance.
+            memory[layout.slices["cross"]] = np.zeros(self.settings.model.nx * nq)
+        return memory
 
     def predicted(self, state: DAEState, heard: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return mean and deviation of each output ``(ny,)`` from what is heard of the next sample."""
@@ -108,7 +148,7 @@ class Steps:
             )  # fmt: skip
         row = DAERow(self.graph, state.k, after[:, 0], said[:, 0], seen, moved)
         informations = (*state.informations, row.part("information"))[-self.settings.window :]
-        return DAEState(after[:, 0], state.k + 1, u, informations, state.refused), row
+        return state._replace(memory=after[:, 0], k=state.k + 1, u=u, informations=informations), row
 
     def stretch(
         self, state: DAEState, y: FloatArray, u: FloatArray, run: Callable[..., tuple[FloatArray, ...]]
@@ -126,7 +166,9 @@ class Steps:
         if taken:
             latest = tuple(rows.part("information")[-self.settings.window :])
             informations = (*state.informations, *latest)[-self.settings.window :]
-            state = DAEState(after[taken - 1].copy(), state.k + taken, u[taken - 1], informations, state.refused)
+            state = state._replace(
+                memory=after[taken - 1].copy(), k=state.k + taken, u=u[taken - 1], informations=informations
+            )
         return state, rows
 
     def projected(self, state: DAEState, u: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -38,6 +38,8 @@ def recursive_estimates(
         state_deviations=np.array([row.state_deviations for row in rows]).reshape(len(rows), nx),
         faults=np.array([row.theta for row in rows]).reshape(len(rows), nq),
         fault_covariances=np.array([row.parameter_covariance for row in rows]).reshape(len(rows), nq, nq),
+        state_covariances=np.array([_state_covariance(row) for row in rows]).reshape(len(rows), nx, nx),
+        cross_covariances=np.array([_cross_covariance(row) for row in rows]).reshape(len(rows), nx, nq),
         innovations=innovations,
         regressors=padded,
         nis=np.array([row.nis for row in rows]),
@@ -45,6 +47,22 @@ def recursive_estimates(
         excitation=levels,
         received=received_in(np.array([row.y for row in rows]).reshape(len(rows), observer.plant.ny)),
     )
+
+
+def _state_covariance(row: RawEstimate) -> FloatArray:
+    """Return the covariance of the states ``(nx, nx)``, infinite variances where missing samples leave one open."""
+    found = row.factor @ row.factor.T
+    unknown = np.isinf(row.state_deviations)
+    found[unknown], found[:, unknown] = np.nan, np.nan
+    found[unknown, unknown] = np.inf
+    return np.asarray(found)
+
+
+def _cross_covariance(row: RawEstimate) -> FloatArray:
+    """Return the covariance of states and parameters ``(nx, nq)``: what their square roots have in common."""
+    spread = row.parameters.spread
+    shared = row.factor[:, row.factor.shape[1] - spread.shape[1] :]
+    return np.asarray(shared @ spread.T)
 
 
 def received_in(y: FloatArray) -> NDArray[np.bool_]:

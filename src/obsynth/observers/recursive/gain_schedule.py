@@ -18,7 +18,12 @@ from obsynth.observers.estimates import Estimates, named_estimates
 from obsynth.observers.records import require_horizon
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.recursive.parameter_steps import posterior_residual
-from obsynth.observers.recursive.step_model import EarlyConstraintSteps, StepMatrices, require_in_range
+from obsynth.observers.recursive.step_model import (
+    EarlyConstraintSteps,
+    PreparedStep,
+    StepMatrices,
+    require_in_range,
+)
 
 
 class GainStep(NamedTuple):
@@ -54,6 +59,7 @@ def gain_steps(
     factor, Upsilon, parameters, diffuse = start.factor, start.Upsilon, start.parameters, start.diffuse
     adaptation, model = observer.adaptation, recursion.model
     first = [model.first()] if isinstance(model, EarlyConstraintSteps) else []
+    prepared: PreparedStep | None = None
     for k, step in enumerate(chain(first, (model.at(k) for k in range(steps))), 1 - len(first)):
         ne, rows, nq = len(step.A), len(step.H), Upsilon.shape[1]
         S = np.zeros((rows, max(factor.shape[1] + step.noise.shape[1], rows)))
@@ -68,7 +74,13 @@ def gain_steps(
         if received is not None and k and not received[k].all():
             kept = np.concatenate([np.ones(ne, dtype=bool), received[k], np.ones(len(step.Dn), dtype=bool)])
             H, S, right, unknown = H[kept], S[kept], right[kept], unknown[kept]
-        found = None if unknown.shape[1] else least_squares_step(H, S, right)
+        if unknown.shape[1]:
+            found = None
+        elif H is step.H:
+            prepared = PreparedStep.of(step, prepared)
+            found = prepared.taken(factor, right)
+        else:
+            found = least_squares_step(H, S, right)
         found = found or rank_revealing_step(H, S, right, unknown, mapped=rows)
         diffuse = found.diffuse
         gain, Upsilon, factor = found.estimate[:, :rows], found.estimate[:, rows:], found.factor

@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from obsynth.analysis.time_varying import STEPS_WITHOUT_HORIZON
+from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.norms import spectral_radius
 from obsynth.numerics.ranks import BOUNDARY_TOLERANCE
 from obsynth.observers.recursive.estimates import excitation_levels
-from obsynth.observers.recursive.gain_schedule import GainStep, gain_steps
+from obsynth.observers.recursive.gain_schedule import gain_steps
 from obsynth.observers.recursive.observer import RecursiveObserver
 
 #: Errors that shrank below this are gone; the product starts anew from there, so that it does not underflow.
 UNDERFLOW = 1e-200
 #: On shorter horizons an error need not have shrunk yet, so that the contraction only informs.
 STEPS_TO_CONTRACT = 50
+#: With more states, and a plant and noise that stay the same, fewer steps are followed, as work goes with the cube of
+#: the states; where errors do not shrink over these, so many times as many, until all were followed.
+MANY_STATES = 100
+FEWEST_STEPS = 60
+FOLLOW_FURTHER = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,19 +78,28 @@ def gain_schedule_summary(observer: RecursiveObserver) -> GainScheduleSummary:
     plain = observer
     if observer.adaptation is not None and random_walk:
         plain = replace(observer, adaptation=replace(observer.adaptation, form="innovation", forgetting=1.0))
-    schedule = list(gain_steps(plain, steps))
-    last = schedule[-1]
-    ne = len(last.step.A)
-    errors = _contraction(schedule, observer.plant.nx)
+    whole = steps + int(observer.early_constraints)
+    product, regressors, last = ErrorProduct(observer.plant.nx, _first_end(observer, whole)), [], None
+    for found in gain_steps(plain, steps):
+        last = found
+        regressors.append(found.G)
+        product.move(found.gain[:, : len(found.step.A)] @ found.step.A)
+        if product.done == product.steps < whole:
+            if product.contraction().mean < 1.0:
+                break
+            product.go_on_to(min(whole, FOLLOW_FURTHER * product.steps))
+    if last is None:
+        raise SpecError("The plant has no steps.", path="horizon")
+    errors, ne = product.contraction(), len(last.step.A)
     window = observer.adaptation.window if observer.adaptation is not None else 1
-    levels = excitation_levels([found.G for found in schedule], window)[window - 1 :]
+    levels = excitation_levels(regressors, window)[window - 1 :]
     deviations, state_deviations = _lengths(last.spread), _lengths(last.factor)
     if random_walk:
         *_, end = gain_steps(observer, steps)
         lengths = _lengths(end.factor)
         state_deviations, deviations = lengths[: observer.plant.nx], lengths[observer.plant.nx :]
     return GainScheduleSummary(
-        steps=len(schedule),
+        steps=len(regressors),
         contraction=errors.mean,
         growth=errors.growth,
         span=errors.span,
@@ -103,36 +117,77 @@ def _lengths(factor: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(np.einsum("ij,ij->i", factor, factor)))
 
 
-def _contraction(schedule: Sequence[GainStep], nx: int) -> Contraction:
-    product, logarithm, growth, steps = np.eye(nx), 0.0, 1.0, len(schedule)
-    late, late_logarithm, middle = np.eye(nx), 0.0, 0.0
-    for k, found in enumerate(schedule, 1):
-        factor = found.gain[:, : len(found.step.A)] @ found.step.A
-        product = factor @ product
-        size = float(np.linalg.norm(product, 2))
-        growth = max(growth, size * float(np.exp(min(logarithm, 0.0))))
+def _first_end(observer: RecursiveObserver, steps: int) -> int:
+    """Return how many steps are followed at first: all, but for a filter of many states whose steps are all alike."""
+    plant = observer.plant
+    alike = plant.is_time_invariant and observer.Q.is_constant and observer.R.is_constant
+    if not alike or plant.horizon or observer.adaptation is not None or plant.nx <= MANY_STATES:
+        return steps
+    return min(steps, max(FEWEST_STEPS, round(steps * (MANY_STATES / plant.nx) ** 3)))
+
+
+class ErrorProduct:
+    """The product of the matrices L_k A_k along so many steps, with its size on the way."""
+
+    def __init__(self, nx: int, steps: int) -> None:
+        self.steps, self.done = steps, 0
+        self.product, self.logarithm, self.growth = np.eye(nx), 0.0, 1.0
+        self.late, self.late_logarithm, self.middle = np.eye(nx), 0.0, 0.0
+        self.ended: Contraction | None = None
+
+    def go_on_to(self, steps: int) -> None:
+        """Go on to a later end, of which less than half is done."""
+        self.steps = steps
+        self.late, self.late_logarithm = np.eye(len(self.late)), 0.0
+
+    def move(self, factor: FloatArray) -> None:
+        """Take one step more; nothing but the count changes once errors are gone or out of range."""
+        self.done += 1
+        if self.ended is not None:
+            return
+        self.product = factor @ self.product
+        size = norm_or_bound(self.product)
+        self.growth = max(self.growth, size * float(np.exp(min(self.logarithm, 0.0))))
         if not size < 1.0 / UNDERFLOW:
-            return Contraction(float("inf"), float("inf"), "from the start", _shares(product))
+            self.ended = Contraction(float("inf"), float("inf"), "from the start", _shares(self.product))
+            return
         if size == 0.0:
-            return Contraction(0.0, growth, "from the start", _shares(product))
+            self.ended = Contraction(0.0, self.growth, "from the start", _shares(self.product))
+            return
         if size < UNDERFLOW:
-            product, logarithm = product / size, logarithm + float(np.log(size))
-        if k == steps // 2:
-            middle = logarithm + float(np.log(np.linalg.norm(product, 2)))
-        elif k > steps // 2:
-            late = factor @ late
-            late_size = float(np.linalg.norm(late, 2))
-            late, late_logarithm = late / late_size, late_logarithm + float(np.log(late_size))
-    last = logarithm + float(np.log(np.linalg.norm(product, 2)))
-    whole = float(np.exp(last / steps))
-    # In units far apart, or where errors grow before they shrink, a slow mode may take longer than the horizon to make
-    # an error smaller than it was: then errors must shrink over the second half, as a whole and along every mode.
-    radius = spectral_radius(late)
-    slowest = max(last - middle, late_logarithm + float(np.log(radius)) if radius else -np.inf)
-    second = float(np.exp(slowest / (steps - steps // 2)))
-    if whole >= 1.0 and second < 1.0 - BOUNDARY_TOLERANCE:
-        return Contraction(second, growth, "over the second half", _shares(product))
-    return Contraction(whole, growth, "from the start", _shares(product))
+            self.product, self.logarithm = self.product / size, self.logarithm + float(np.log(size))
+        if self.done == self.steps // 2:
+            self.middle = self._length()
+        elif self.done > self.steps // 2:
+            self.late = factor @ self.late
+            late_size = norm_or_bound(self.late)
+            self.late, self.late_logarithm = self.late / late_size, self.late_logarithm + float(np.log(late_size))
+
+    def _length(self) -> float:
+        return self.logarithm + float(np.log(np.linalg.norm(self.product, 2)))
+
+    def contraction(self) -> Contraction:
+        """Return what the product says."""
+        if self.ended is not None:
+            return self.ended
+        steps = self.steps
+        last = self._length()
+        whole = float(np.exp(last / steps))
+        # In units far apart, or where errors grow before they shrink, a slow mode may take longer than the horizon to
+        # make an error smaller than it was: then errors must shrink over the second half, as a whole and in every mode.
+        radius = spectral_radius(self.late) if whole >= 1.0 else 1.0
+        slowest = max(last - self.middle, self.late_logarithm + float(np.log(radius)) if radius else -np.inf)
+        second = float(np.exp(slowest / (steps - steps // 2)))
+        if whole >= 1.0 and second < 1.0 - BOUNDARY_TOLERANCE:
+            return Contraction(second, self.growth, "over the second half", _shares(self.product))
+        return Contraction(whole, self.growth, "from the start", _shares(self.product))
+
+
+def norm_or_bound(matrix: FloatArray) -> float:
+    """Return the 2-norm of a matrix; of a large one a bound on it, which takes no singular values."""
+    if len(matrix) <= MANY_STATES:
+        return float(np.linalg.norm(matrix, 2))
+    return float(np.sqrt(np.linalg.norm(matrix, 1) * np.linalg.norm(matrix, np.inf)))
 
 
 def _shares(product: FloatArray) -> FloatArray:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
+from obsynth.numerics.arguments import is_whole
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.dae.estimates import GatheredRows
 from obsynth.observers.dae.observer import DAEObserver
@@ -132,7 +133,7 @@ def checked_lag(lag: Any) -> int | None:
     """Return the lag of a smoother in samples, or ``None`` for the whole record."""
     if lag is None:
         return None
-    if isinstance(lag, bool) or not isinstance(lag, (int, np.integer)) or lag < 1:
+    if not is_whole(lag) or lag < 1:
         raise SpecError(f"lag is {lag!r}: give how many samples are waited for, 1 or more, or None for the whole "
                         "record.", path="lag")  # fmt: skip
     return int(lag)

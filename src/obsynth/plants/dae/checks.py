@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from obsynth.errors import SpecError
+from obsynth.numerics.arguments import is_finite_number, real_array
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.expressions import CONSTANTS, DECIDING_WORDS, FUNCTIONS, FUNCTIONS_OF_TWO
 from obsynth.plants.dae.symbols import DAESymbols, symbols_of
@@ -30,8 +31,7 @@ def checked_signals(values: Mapping[str, float] | None, what: str) -> dict[str, 
     for name, value in (values or {}).items():
         if not isinstance(name, str) or not name.isidentifier() or not name.isascii() or name in RESERVED:
             raise SpecError(f"{what} names {name!r}: use letters, digits and '_', and no function's name.", path=what)
-        number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
-        if not number or not np.isfinite(value):
+        if not is_finite_number(value):
             raise SpecError(f"{what}.{name} is {value!r}: give a finite number.", path=f"{what}.{name}")
         checked[name] = float(value)
     if what == "states" and not checked:
@@ -169,8 +169,7 @@ def _every_output_sees(model: DAEModel, symbols: DAESymbols) -> None:
 
 def step_length(dt: Any) -> float:
     """Return the seconds between samples; raise `SpecError` unless they are a positive number."""
-    number = isinstance(dt, (int, float, np.integer, np.floating)) and not isinstance(dt, bool)
-    if not number or not (np.isfinite(dt) and dt > 0.0):
+    if not is_finite_number(dt) or not dt > 0.0:
         raise SpecError(f"dt is {dt!r}: give the seconds between samples, a positive number.", path="dt")
     return float(dt)
 
@@ -207,8 +206,8 @@ def finite_vector(value: Any, names: Sequence[str], default: FloatArray, what: s
     if value is None:
         return np.array(default)
     try:
-        vector = np.atleast_1d(np.asarray(value, dtype=np.float64))
-    except (TypeError, ValueError):
+        vector = np.atleast_1d(real_array(value, what))
+    except SpecError:
         raise SpecError(f"{what} must be {len(names)} finite number(s).", path=what) from None
     if vector.shape != (len(names),):
         raise SpecError(f"{what} must be {len(names)} finite number(s): {', '.join(names)}.", path=what)

@@ -11,7 +11,7 @@ import numpy as np
 
 from obsynth.analysis.time_varying import HorizonRanks, horizon_ranks
 from obsynth.errors import ObsynthError
-from obsynth.methods.recursive.checks.batch import batch_residuals
+from obsynth.methods.recursive.checks.batch import BATCH_STEPS, batch_residuals, batch_steps
 from obsynth.methods.recursive.conditions import recursive_conditions
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.observer import DAEObserver
@@ -104,10 +104,14 @@ def _dynamic_rows(design: ObserverDesign, observer: RecursiveObserver, stated: R
         "residual directions", "least rank E_k + ny - nx: what (18f) can see", float(ranks.directions),
         source="our finding", detail=f"at k = {ranks.directions_k}",
     )  # fmt: skip
+    in_batch = batch_steps(stated)
+    said = f"{in_batch} steps at once" + (
+        ", which the size of the plant allows" if in_batch < min(BATCH_STEPS, looked_at(stated)) else ""
+    )
     for name, found in batch_residuals(stated, observer).items():
         yield upper_bound_check(
             f"batch: {name}", "the recursion equals the least-squares solution of the whole record", found,
-            BATCH_TOLERANCE * ranks.condition, source=f"{_SOURCE}, (6)-(10)", kind="equality",
+            BATCH_TOLERANCE * ranks.condition, source=f"{_SOURCE}, (6)-(10)", kind="equality", detail=said,
         )  # fmt: skip
     yield from _contraction_rows(facts)
     if observer.adaptation is not None:
