@@ -24,8 +24,7 @@ exclude_patterns = ["_build", "**.ipynb_checkpoints", "site_sources.py", "make_p
 myst_enable_extensions = ["colon_fence", "dollarmath", "deflist"]
 myst_heading_anchors = 3
 nb_execution_mode = "off"
-# The notes of the designs and the notebooks point to files of the repository, which are no pages.
-suppress_warnings = ["myst.xref_missing", "myst.header"]
+suppress_warnings = ["myst.header"]
 
 templates_path = ["_templates"]
 autosummary_generate = True

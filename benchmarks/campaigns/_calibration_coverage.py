@@ -19,6 +19,7 @@ from obsynth.calibration.innovations_fit import guarded_maximum
 from obsynth.calibration.intervals import deviance_root, quantile
 from obsynth.calibration.logs import Log
 from obsynth.calibration.maximum import Objective
+from obsynth.calibration.plants import NonlinearPlant
 from obsynth.calibration.problem import Problem, calibration_problem
 from obsynth.calibration.simulation_error import simulation_fits
 from obsynth.plants.dae.model import DAEModel
@@ -64,8 +65,8 @@ def asked(rows: int, quantum: float) -> tuple[DAEModel, Problem]:
     """Return the plant and what is asked of its logs: the same functions serve them all."""
     model = plant(rows)
     problem = calibration_problem(
-        model, simulated(model, rows, SEED, quantum), unknown=BOUNDS, priors=None, noisy=None, Q=None, R=None,
-        initial_state=None, initial_covariance=SPREAD**2, integration="backward-euler", substeps=1,
+        NonlinearPlant(model), simulated(model, rows, SEED, quantum), unknown=BOUNDS, priors=None, noisy=None,
+        Q=None, R=None, initial_state=None, initial_covariance=SPREAD**2, integration="backward-euler", substeps=1,
     )  # fmt: skip
     return model, problem
 

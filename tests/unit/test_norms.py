@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import slycot
 
+from obsynth.numerics import norms
 from obsynth.numerics.norms import (
     STATES_OF_PENCIL,
     frequency_response,
@@ -327,3 +328,14 @@ def test_spectral_radius():
     assert spectral_radius(np.diag([0.5, -0.75])) == 0.75
     assert spectral_radius(rotation(1.0, 0.9)) == pytest.approx(0.9, rel=1e-14)
     assert spectral_radius(np.eye(3, k=1)) == 0.0
+
+
+def test_responses_in_parts_are_those_at_each_point(monkeypatch):
+    rng = np.random.default_rng(3)
+    a, b, c, d = rng.normal(size=(5, 5)) / 3, rng.normal(size=(5, 2)), rng.normal(size=(3, 5)), rng.normal(size=(3, 2))
+    monkeypatch.setattr(norms, "MOST_ENTRIES_AT_ONCE", 60)
+    angles = np.linspace(0.0, 3.0, 7)
+    found = norms.frequency_response(a, b, c, d, angles)
+    for angle, value in zip(angles, found, strict=True):
+        np.testing.assert_allclose(value, c @ np.linalg.inv(np.exp(1j * angle) * np.eye(5) - a) @ b + d, atol=1e-12)
+    assert norms.frequency_response(a, b, c, d, angles[:0]).shape == (0, 3, 2)

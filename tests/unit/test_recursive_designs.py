@@ -14,6 +14,7 @@ from obsynth import DescriptorSystem, PreconditionError, SpecError, TimeVaryingD
 from obsynth.cli.main import main
 from obsynth.methods.designing import check
 from obsynth.observers.recursive.gain_schedule import run_batch
+from obsynth.observers.recursive.gain_schedule_summary import gain_schedule_summary
 from obsynth.spec import load_spec
 
 NOISE = {"Q": 0.1, "R": 0.2}
@@ -269,3 +270,35 @@ class TestSpec:
     def designed(self, path: Path) -> obsynth.ObserverDesign:
         spec = load_spec(path)
         return obsynth.design(spec.plant, spec.method, **spec.options)
+
+
+class TestManyStates:
+    """Above `MANY_STATES` fewer steps are followed, and the rows say which."""
+
+    @pytest.fixture(scope="class")
+    def design(self):
+        rng, n = np.random.default_rng(4), 140
+        a = np.linalg.qr(rng.normal(size=(n, n)))[0] * np.linspace(0.3, 0.9, n)
+        return obsynth.descriptor_kalman(
+            DescriptorSystem(
+                None, a, C=np.eye(n)[:6], Bw=0.1 * np.eye(n, 14) * (np.arange(14) < 8), Dw=np.eye(6, 14, 8), dt=1.0
+            )
+        )
+
+    def test_fewer_steps_and_rows_that_say_so(self, design):
+        rows = {row.name: row for row in design.report.checks}
+        assert design.report.passed
+        assert design.certificate.claims["steps"] < 400
+        assert f"{design.certificate.claims['steps']:.0f} steps" in rows["contraction"].detail
+        assert rows["batch: state"].detail.startswith("6 steps at once")
+
+    def test_as_the_recursion_has_it(self, design, monkeypatch):
+        few = gain_schedule_summary(design.observer)
+        monkeypatch.setattr("obsynth.observers.recursive.gain_schedule_summary.MANY_STATES", 200)
+        monkeypatch.setattr("obsynth.observers.recursive.gain_schedule_summary.STEPS_WITHOUT_HORIZON", few.steps)
+        whole = gain_schedule_summary(design.observer)
+        assert whole.steps == few.steps
+        np.testing.assert_allclose(whole.L, few.L, rtol=0.0, atol=1e-12)
+        assert whole.contraction == pytest.approx(few.contraction, rel=1e-9)
+        # Of many states the growth is a bound.
+        assert whole.growth <= few.growth <= 20.0 * whole.growth

@@ -44,3 +44,51 @@ def test_every_page_is_in_a_list():
     listed = "".join(path.read_text(encoding="utf-8") for path in DOCS.rglob("index.md"))
     pages = [path for path in DOCS.rglob("*.md") if "_build" not in path.parts and "made" not in path.parts]
     assert [page.name for page in pages if page.stem != "index" and page.stem not in listed] == []
+
+
+@pytest.fixture
+def battery(tmp_path, monkeypatch):
+    """The how-to page's files, alone in a folder."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("spec.yaml", "log.csv"):
+        (tmp_path / name).write_bytes((DOCS / "examples/battery" / name).read_bytes())
+    return tmp_path
+
+
+def test_a_stranger_with_a_thermal_plant_gets_to_an_alarm(battery, capsys):
+    """Semicolons, decimal commas, dates and a column of another name; only commands that the page shows."""
+    commands = re.findall(r"^obsynth .*$", (DOCS / "howto/thermal.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert [command.split()[1] for command in commands] == ["check", "compare", "design", "plot"]
+    for command in (command for command in commands if "compare" not in command):
+        assert main(shlex.split(command)[1:]) == 0
+    printed = capsys.readouterr().out
+    assert "90 % is shown after: heater fault 730 s" in printed
+    assert "Alarm: fhat[heater fault] first above its threshold at 2026-01-12T07:16:00." in printed
+    assert (battery / "battery.png").stat().st_size > 10_000
+
+
+def test_what_a_stranger_gets_wrong_is_told_with_what_was_meant(battery, capsys):
+    def told(old: str, new: str, verb: str = "check") -> str:
+        text = (DOCS / "examples/battery/spec.yaml").read_text(encoding="utf-8")
+        assert old in text
+        (battery / "spec.yaml").write_text(text.replace(old, new), encoding="utf-8")
+        code = main([verb, "--system", "spec.yaml"])
+        printed = capsys.readouterr()
+        return f"{code} {printed.err}"
+
+    names = told("{outputs: [cell, plate, housing]}", "{outputs: [T cell, T plate, housing]}")
+    assert names.startswith("2 ")
+    assert "'T cell'. Did you mean 'cell'?" in names
+    assert "'T plate'. Did you mean 'plate'?" in names
+    both = told("heater: 60, cell: 80,", "heating: 60, cel: 80,")
+    assert "'heating', which is no signal of the plant. Did you mean 'heater'" in both
+    assert "'cel', which is no signal of the plant. Did you mean 'cell'" in both
+    point = told("heater: 60, cell: 80, plate: 80, housing: 20, pad: 80, ambient: -10", "heater: 60, ambient: -10")
+    assert "but not cell, plate, housing" in point
+    assert "rests there at cell 80, plate 80, housing 20" in point
+    nothing = told("name: battery-heater", "name: battery heater\nmehtod: {}")
+    assert "unknown method" not in nothing
+    assert "use letters" in nothing
+    assert main(["design", "--system", str(DOCS / "examples/battery/spec.yaml"), "--quiet"]) == 0
+    assert main(["plot", "--gains", "battery-heater.gains.json", "--data", "log.csv", "--out", "a.png"]) == 2
+    assert "If 'Zeit' is the time: --time-column 'Zeit'" in capsys.readouterr().err

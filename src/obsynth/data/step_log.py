@@ -129,7 +129,8 @@ class SteppingEngine:
         if fresh and self.is_recursive:
             heard = np.ones_like(heard)
         status = self._status(time, known[:nu], heard, spoiled=spoiled)
-        evidence = Evidence(found.theta, found.parameter_covariance, found.whitened, found.regressor)
+        evidence = Evidence(found.theta, found.parameter_covariance, found.whitened, found.regressor, found.score,
+                            found.information)  # fmt: skip
         return Row(status, self._values(found), missing, evidence)
 
     def _refused(self) -> np.ndarray:

@@ -143,6 +143,9 @@ def _bound_of(monitor: OnlineMonitor, found: Realisation) -> AdaptiveBound:
     bound: AdaptiveBound | None = monitor.bound
     if bound is None:
         raise SpecError("The monitor has no thresholds over tolerances: make it with constants.", path="monitor")
+    if bound.first is not None:
+        raise SpecError("Thresholds of continuous designs are not written as C: sample the plant first.",
+                        path="monitor")  # fmt: skip
     return bound
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +11,8 @@ from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.doubling import compared_gain, gain_is_below
 from obsynth.numerics.modal_response import ModalResponse, Modes, level_crossings
 
+#: Entries of the matrices (complex, 16 bytes each) that responses are computed with at once.
+MOST_ENTRIES_AT_ONCE = 2_000_000
 #: Relative gap between the attained value and the certified level of an H-infinity norm.
 NORM_TOLERANCE = 1e-9
 #: Points of the starting frequency grid.
@@ -53,12 +56,23 @@ def spectral_radius(a: FloatArray) -> float:
 
 def frequency_response(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, angles: FloatArray) -> ComplexArray:
     """Return ``C (e^{jw} I - A)^{-1} B + D`` for each angle, ``(len(angles), rows, cols)``."""
-    points = np.exp(1j * np.atleast_1d(angles))
+    return response(a, b, c, d, np.exp(1j * np.atleast_1d(angles)))
+
+
+def response(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, points: ComplexArray) -> ComplexArray:
+    """Return ``C (s I - A)^-1 B + D`` at each point s (z in discrete time), ``(len(points), rows, cols)``."""
     if a.shape[0] == 0:
         return np.broadcast_to(d.astype(complex), (len(points), *d.shape)).copy()
-    resolvents = points[:, None, None] * np.eye(a.shape[0]) - a
-    right_sides = np.broadcast_to(b.astype(complex), (len(points), *b.shape))
-    return np.asarray(c @ np.linalg.solve(resolvents, right_sides) + d)
+    parts = [c @ states for states in resolved(np.eye(a.shape[0]), a, b, points)]
+    return np.asarray(np.concatenate(parts) + d) if parts else np.zeros((0, *d.shape), dtype=complex)
+
+
+def resolved(e: FloatArray, a: FloatArray, b: FloatArray, points: ComplexArray) -> Iterator[ComplexArray]:
+    """Yield ``(s E - A)^-1 B`` at the points, as many at once as take little memory, ``(count, n, m)`` each."""
+    at_once = max(1, MOST_ENTRIES_AT_ONCE // max(a.size, 1))
+    for start in range(0, len(points), at_once):
+        pencils = np.asarray(points)[start : start + at_once, None, None] * e - a
+        yield np.asarray(np.linalg.solve(pencils, np.broadcast_to(b.astype(complex), (len(pencils), *b.shape))))
 
 
 def hinf_norm(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, *, modes: Modes | None = None) -> HinfNorm:
@@ -218,10 +232,10 @@ def balancing_factors(matrix: FloatArray) -> FloatArray:
 
 def _peak(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, angles: FloatArray) -> tuple[float, float]:
     with np.errstate(over="ignore", invalid="ignore"):
-        response = frequency_response(a, b, c, d, angles)
-    if not np.all(np.isfinite(response)):
+        found = frequency_response(a, b, c, d, angles)
+    if not np.all(np.isfinite(found)):
         return np.inf, np.nan
-    gains = np.linalg.svd(response, compute_uv=False)[:, 0]
+    gains = np.linalg.svd(found, compute_uv=False)[:, 0]
     top = int(np.argmax(gains))
     return float(gains[top]), float(angles[top])
 

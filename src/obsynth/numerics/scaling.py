@@ -255,10 +255,14 @@ class LogBalance:
         n = self.count
         normal, right = RIDGE * np.eye(n), np.zeros(n)
         for term, weight in zip(self._terms, weights, strict=True):
-            for p, sign in zip(term.unknowns, term.signs, strict=True):
+            known = [*zip(term.unknowns, term.signs, strict=True)]
+            for k, (p, sign) in enumerate(known):
                 right -= sign * np.bincount(p, weight * term.sizes, n)
-                for q, other in zip(term.unknowns, term.signs, strict=True):
-                    normal += sign * other * np.bincount(p * n + q, weight, n * n).reshape(n, n)
+                normal.reshape(-1)[:: n + 1] += np.bincount(p, weight, n)
+                for q, other in known[:k]:
+                    both = sign * other * np.bincount(p * n + q, weight, n * n).reshape(n, n)
+                    normal += both
+                    normal += both.T
         for unknown, exponent in self._wishes:
             normal[unknown, unknown] += WISH_WEIGHT
             right[unknown] += WISH_WEIGHT * exponent

@@ -152,15 +152,6 @@ def certain_noise_covariance(a: FloatArray, b: FloatArray, c: FloatArray, d: Flo
     return np.full_like(found, np.nan)
 
 
-def response(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, points: ComplexArray) -> ComplexArray:
-    """Return ``C (s I - A)^-1 B + D`` at each point s (z in discrete time), ``(len(points), rows, cols)``."""
-    if a.shape[0] == 0:
-        return np.broadcast_to(d.astype(complex), (len(points), *d.shape)).copy()
-    resolvents = np.asarray(points)[:, None, None] * np.eye(a.shape[0]) - a
-    right_sides = np.broadcast_to(b.astype(complex), (len(points), *b.shape))
-    return np.asarray(c @ np.linalg.solve(resolvents, right_sides) + d)
-
-
 def boundary_points(frequencies: FloatArray, dt: float) -> ComplexArray:
     """Return ``j w`` or ``exp(j w dt)`` for frequencies in rad/s."""
     return np.asarray(np.exp(1j * frequencies * dt) if dt > 0.0 else 1j * frequencies, dtype=np.complex128)

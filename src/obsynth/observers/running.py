@@ -78,6 +78,16 @@ class ParameterRow(Protocol):
         ...
 
     @property
+    def score(self) -> FloatArray:
+        """What the sample says of the parameters ``(nq,)``; less ``information`` times the true ones it is noise."""
+        ...
+
+    @property
+    def information(self) -> FloatArray:
+        """How much the sample says of the parameters ``(nq, nq)``: the covariance of that noise."""
+        ...
+
+    @property
     def is_finite(self) -> bool:
         """Whether no number has overflown."""
         ...

@@ -87,7 +87,8 @@ def plot_data(
     plans = _plans(run.table, run.measured, show)
     panels = new_panels(axes, len(plans), size=(WIDTH, PANEL_HEIGHT * max(len(plans), 1) + 0.6))
     units = {} if design is None else dict(design.plant.units)
-    told: set[str] = set()
+    # A marked alarm explains the red rows as well.
+    told = {"alarm"} if any(part == "faults" and name in run.alarms for part, name in plans) else set[str]()
     for panel, (part, name) in zip(panels, plans, strict=True):
         _shade(panel, run.table, told, alarms=part != "outputs")
         _DRAWN[part](panel, run, name, units, design)

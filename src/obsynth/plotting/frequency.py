@@ -11,9 +11,10 @@ from obsynth.errors import SpecError
 from obsynth.methods.ui_pi_observer.checks.decoupling import frequency_grid
 from obsynth.methods.ui_pi_observer.pencils import equilibrated
 from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.numerics.norms import resolved, response
 from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.ranks import RANK_TOLERANCE
-from obsynth.numerics.spectra import boundary_points, response
+from obsynth.numerics.spectra import boundary_points
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plotting.panels import WIDTH, new_panels, plain_decades, tidy
@@ -143,10 +144,9 @@ def _delayed(observer: LinearObserver, points: ComplexArray) -> ComplexArray:
 
 def _state_response(plant: DescriptorSystem, b: FloatArray, points: ComplexArray) -> ComplexArray:
     """Return a state for each input: of a plant that is not regular one of many, which its estimates cannot tell."""
-    pencils = points[:, None, None] * plant.E - plant.A
     if pencil_structure(plant.E, plant.A).regular:
-        return np.asarray(np.linalg.solve(pencils, np.broadcast_to(b.astype(complex), (len(points), *b.shape))))
-    return np.stack([_least_state(pencil, b) for pencil in pencils])
+        return np.concatenate([*resolved(plant.E, plant.A, b, points)])
+    return np.stack([_least_state(point * plant.E - plant.A, b) for point in points])
 
 
 def _least_state(pencil: ComplexArray, b: FloatArray) -> ComplexArray:

@@ -105,11 +105,19 @@ def _yes(value: bool) -> str:
 MOST_ROWS = 12
 
 
+#: What the columns of numbers mean.
+_COLUMNS = (
+    "delay: samples, or derivatives in continuous time; residual, filter: states of the smallest residual that shows "
+    "the fault, and of a filter that estimates it."
+)
+
+
 def diagnosis_report(diagnosis: Diagnosis, *, console: Console, everything: bool = True) -> None:
     """Print what can be diagnosed: verdicts and sentences; isolability and banks with ``everything``."""
     if not diagnosis.faults:
         return
     print_section(console, diagnosis.heading, _table(diagnosis.verdict_rows()))
+    console.print(Text(_COLUMNS, style="dim"))
     if everything and len(diagnosis.faults) > 1:
         rows = diagnosis.bank_rows()
         print_section(console, "Which fault can be told from which", _table(diagnosis.isolability_rows()))

@@ -38,6 +38,8 @@ def followed_steps(design: ObserverDesign, horizon: float | None = None) -> Foll
         return nothing
     if not observer.fault_names or plant.nx > MOST_STATES or set(observer.fault_names) - set(plant.fault_names):
         return nothing
+    if (observer.Bu.shape[1], observer.By.shape[1]) != (plant.nu, plant.ny):
+        return nothing
     step = plant.dt if plant.dt > 0.0 else settling_time(plant) / SAMPLES
     length = horizon if horizon is not None else SETTLING_TIMES * settling_time(plant)
     steps = int(min(max(length / step, 20), MOST_STEPS))

@@ -111,8 +111,8 @@ def _without_idle_variables(plant: DescriptorSystem, refusal: PreconditionError)
 
     active = active_variables(plant)
     if not active.dropped:
-        equations, variables = culprits(plant)
-        said = f" Equations {equations} do not determine {', '.join(map(repr, variables))}." if variables else ""
+        cause, variables = culprits(plant)
+        said = f" {cause[0].upper()}{cause[1:]}." if variables else ""
         raise PreconditionError(f"{refusal}{said}", condition=refusal.condition, signals=variables) from refusal
     part = active_part(plant, active)
     try:

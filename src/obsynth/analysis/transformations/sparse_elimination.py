@@ -208,7 +208,7 @@ def _scales(e: Any, a: Any) -> tuple[FloatArray, FloatArray]:
 
 
 def culprits(plant: DescriptorSystem) -> tuple[str, tuple[str, ...]]:
-    """Return equations, in words, and variables that keep a plant from having index 1; nothing for one that has.
+    """Return what keeps a plant from having index 1, in words, and its variables; nothing for one that has.
 
     Raises
     ------
@@ -230,8 +230,10 @@ def culprits(plant: DescriptorSystem) -> tuple[str, tuple[str, ...]]:
     else:
         null = generic[0].null_vectors()
         equations, variables = _named(null.rows), _named(null.columns)
+    names = tuple(plant.state_names[i] for i in variables)
     said = listed([equation_name(plant, i) for i in equations], quoted=False)
-    return said, tuple(plant.state_names[i] for i in variables)
+    does = f"equation {said} does" if len(equations) == 1 else f"equations {said} do"
+    return f"{does} not determine {listed(list(names))}", names
 
 
 def _generic_factors(plant: DescriptorSystem) -> list[SparseFactor]:
@@ -242,8 +244,7 @@ def _require_index_one(plant: DescriptorSystem, factor: SparseFactor) -> None:
     """Refuse a plant whose algebraic equations cannot be solved for its algebraic states; say which, and why."""
     if not factor.singular:
         return
-    equations, names = culprits(plant)
-    said = f"equations {equations} do not determine {listed(list(names))}"
+    said, names = culprits(plant)
     if all(found.singular for found in _generic_factors(plant)):
         raise PreconditionError(
             f"The plant is not regular: det(A - zE) is zero for every z, and {said}. Check for a missing or repeated "

@@ -24,14 +24,17 @@ COARSE_LEVEL_TOLERANCE = 1e-5
 COARSE_NOISES = (1e-6, 1e-4)
 #: Distance below the best gain, in tolerances, at which another noise is tried.
 PROBE = 10.0
-#: The first level tried, relative to the start.
+#: The first level tried, relative to the start, for few and for many states: the margin near the start leads far down.
 START_SHARE = 0.5
+COARSE_START_SHARE = 0.99
 #: Weights of the noise beside the disturbance, relative to their sizes, and levels of both together, relative to the
 #: gain of the disturbance alone.
 NOISE_WEIGHTS = np.logspace(-6.0, 3.0, 31)
 LEVEL_FACTORS = (1.0, 1.5)
-#: Above so many states the higher level, which makes gains up to a quarter smaller, would cost up to half of the time.
+#: Above so many states the higher level, which makes gains up to a quarter smaller, would cost up to half of the time;
+#: and one weight in so many is enough.
 MOST_STATES_FOR_LEVELS = 200
+COARSE_WEIGHTS = 4
 WEIGHT_STEPS = 4
 #: A disturbance that does less than this share of what it does to the starting filter is decoupled; the levels at which
 #: such a filter is looked for in turn, relative to the same; a point without meaning; and the share of rows xi that
@@ -88,7 +91,8 @@ def search_central_filter(
         close = start_is_good or best is not start
         equation = CentralEquation.of(problem, noise=noise)
         descent = Descent(equation, low, gain, tolerance, wary=close)
-        descent.run(max(low, gain * (1.0 - PROBE * tolerance if close else START_SHARE)))
+        share = START_SHARE if problem.order <= FEW_STATES else COARSE_START_SHARE
+        descent.run(max(low, gain * (1.0 - PROBE * tolerance if close else share)))
         found = descent.best()
         if found is None and descent.reached and descent.reached[0].level < gain * (1.0 - NEXT_TO):
             descent = descent.judged_again(gain)
@@ -161,6 +165,7 @@ def noise_weighted_filters(
     if work.order == 0 or work.measured == 0 or not min(sizes) > 0.0:
         return
     weights, last = NOISE_WEIGHTS * sizes[0] / sizes[1], 0
+    weights = weights if work.order <= MOST_STATES_FOR_LEVELS else weights[::COARSE_WEIGHTS]
     for factor in LEVEL_FACTORS if work.order <= MOST_STATES_FOR_LEVELS else LEVEL_FACTORS[:1]:
         # More weight than at a lower level, and not more than can be hoped for.
         low, high = last, len(weights) if factor == 1.0 else min(last + WEIGHT_STEPS, len(weights))

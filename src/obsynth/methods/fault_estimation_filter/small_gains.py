@@ -13,6 +13,7 @@ import numpy as np
 from obsynth.errors import SolverError
 from obsynth.methods.fault_estimation_filter.central_filter import (
     FEW_STATES,
+    MOST_STATES_FOR_LEVELS,
     least_noise_filter,
     noise_weighted_filters,
 )
@@ -85,7 +86,9 @@ def small_gain_design(
     found = min(fast or candidates, key=goal.cost)
     if quick is not None and goal.cost(quick) <= PRICE_OF_SPEED * goal.cost(found):
         found = quick
-    return (_towards(goal, found, target) if goal.noisy and quick is None else found), records
+    # Among many states what was moved towards the target once is not moved again: each judgement is an equation.
+    moved = problem.order > MOST_STATES_FOR_LEVELS and len(candidates) == 1
+    return (_towards(goal, found, target) if goal.noisy and quick is None and not moved else found), records
 
 
 def _lively_filters(goal: Goal) -> list[Injection]:

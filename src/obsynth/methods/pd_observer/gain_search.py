@@ -174,7 +174,7 @@ def _solved(
     unit = float(np.exp2(np.round(np.log2(TIME_UNITS / fastest_mode(plant.A)))))
     task = _task(plant, asked, delta, decay, states, outputs, unit)
     if engine == "riccati":
-        found, used = closed_form(task, free_delta=asked.delta is None)
+        found, used = closed_form(task, free_delta=asked.delta is None, once=most is not None)
         delta = delta if used == task.delta else used * unit
     else:
         found = (solve if engine == "lmi" else reduced_lmi)(task, solver=asked.solver)

@@ -42,6 +42,8 @@ SHARE = 0.5
 MOST_NORMALISATIONS = 4
 #: With more states the Riccati equation is solved by doubling first.
 MANY_STATES = 60
+#: With more still, the QZ algorithm would take minutes.
+MOST_STATES_FOR_QZ = 200
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +87,7 @@ def reduced_lmi(task: PdTask, *, solver: str) -> PdSolution:
     return _lifted(task, plant, found.J, found.P1[0], found.P3, found.record)
 
 
-def closed_form(task: PdTask, *, free_delta: bool) -> tuple[PdSolution, float]:
+def closed_form(task: PdTask, *, free_delta: bool, once: bool = False) -> tuple[PdSolution, float]:
     """Return gains from a Riccati equation, with their certificate, and the delta that it is for.
 
     The gain J is that of a Kalman filter for unit noise on all states and outputs, and L = 0.  Where modes show so
@@ -94,7 +96,7 @@ def closed_form(task: PdTask, *, free_delta: bool) -> tuple[PdSolution, float]:
     try:
         return _closed_form(task, free_delta=free_delta)
     except SolverError as error:
-        if "delta_limit" in error.record:
+        if once or "delta_limit" in error.record:
             raise
         failure = error
     a, c = task.plants[0]
@@ -121,6 +123,8 @@ def _normalising(a: FloatArray, c: FloatArray) -> tuple[FloatArray, FloatArray] 
     one = np.eye(len(a))
     try:
         p = _doubled(a, c)
+        if p is None and len(a) > MOST_STATES_FOR_QZ:
+            return None
         p = solve_continuous_are(a.T, c.T, one, np.eye(len(c))) if p is None else p
         sizes, directions = np.linalg.eigh(0.5 * (p + p.T))
     except (np.linalg.LinAlgError, ValueError):
@@ -179,6 +183,8 @@ def _riccati_gain(a: FloatArray, c: FloatArray, record: Mapping[str, Any]) -> Fl
             return gain
     except np.linalg.LinAlgError:
         pass
+    if n > MOST_STATES_FOR_QZ:
+        raise SolverError("The Riccati equation was not solved: nothing is known.", record=record)
     try:
         p = solve_continuous_are(a.T, c.T, one, np.eye(len(c)))
     except (np.linalg.LinAlgError, ValueError) as error:

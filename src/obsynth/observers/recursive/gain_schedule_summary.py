@@ -25,6 +25,8 @@ STEPS_TO_CONTRACT = 50
 MANY_STATES = 100
 FEWEST_STEPS = 60
 FOLLOW_FURTHER = 3
+#: Spectral radius below which gains that are kept make errors die out, whatever rounding did to it.
+CLEARLY_STABLE = 1.0 - 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,17 +82,18 @@ def gain_schedule_summary(observer: RecursiveObserver) -> GainScheduleSummary:
         plain = replace(observer, adaptation=replace(observer.adaptation, form="innovation", forgetting=1.0))
     whole = steps + int(observer.early_constraints)
     product, regressors, last = ErrorProduct(observer.plant.nx, _first_end(observer, whole)), [], None
+    kept: Contraction | None = None
     for found in gain_steps(plain, steps):
-        last = found
+        last, kept = found, None
         regressors.append(found.G)
         product.move(found.gain[:, : len(found.step.A)] @ found.step.A)
         if product.done == product.steps < whole:
-            if product.contraction().mean < 1.0:
+            if product.contraction().mean < 1.0 or (kept := product.contraction_of_kept_gains()) is not None:
                 break
             product.go_on_to(min(whole, FOLLOW_FURTHER * product.steps))
     if last is None:
         raise SpecError("The plant has no steps.", path="horizon")
-    errors, ne = product.contraction(), len(last.step.A)
+    errors, ne = kept if kept is not None else product.contraction(), len(last.step.A)
     window = observer.adaptation.window if observer.adaptation is not None else 1
     levels = excitation_levels(regressors, window)[window - 1 :]
     deviations, state_deviations = _lengths(last.spread), _lengths(last.factor)
@@ -132,6 +135,7 @@ class ErrorProduct:
     def __init__(self, nx: int, steps: int) -> None:
         self.steps, self.done = steps, 0
         self.product, self.logarithm, self.growth = np.eye(nx), 0.0, 1.0
+        self.factor = np.eye(nx)
         self.late, self.late_logarithm, self.middle = np.eye(nx), 0.0, 0.0
         self.ended: Contraction | None = None
 
@@ -145,6 +149,7 @@ class ErrorProduct:
         self.done += 1
         if self.ended is not None:
             return
+        self.factor = factor
         self.product = factor @ self.product
         size = norm_or_bound(self.product)
         self.growth = max(self.growth, size * float(np.exp(min(self.logarithm, 0.0))))
@@ -165,6 +170,12 @@ class ErrorProduct:
 
     def _length(self) -> float:
         return self.logarithm + float(np.log(np.linalg.norm(self.product, 2)))
+
+    def contraction_of_kept_gains(self) -> Contraction | None:
+        """Return the contraction of one step with the last gains, were they kept; ``None`` where errors stay then."""
+        radius = 1.0 if self.ended is not None else spectral_radius(self.factor)
+        span = "of one step with the last gains, were they kept: errors have not shrunk as a whole yet"
+        return Contraction(radius, self.growth, span, _shares(self.product)) if radius < CLEARLY_STABLE else None
 
     def contraction(self) -> Contraction:
         """Return what the product says."""

@@ -84,6 +84,16 @@ class RawEstimate(NamedTuple):
         return float(self.gap @ self.gap)
 
     @property
+    def score(self) -> FloatArray:
+        """What the sample says of the parameters ``(nq,)``."""
+        return np.asarray(self.regressor.T @ self.innovation)
+
+    @property
+    def information(self) -> FloatArray:
+        """How much it says of them ``(nq, nq)``."""
+        return np.asarray(self.regressor.T @ self.regressor)
+
+    @property
     def is_finite(self) -> bool:
         """Whether no number has overflown; an undetermined state has a finite factor."""
         arrays = (self.x, self.factor, self.theta, self.parameters.spread, self.innovation)
