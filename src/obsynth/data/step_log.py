@@ -125,7 +125,7 @@ class SteppingEngine:
             self.settled_at = time + self.warm_up
             self.phase = WARM_UP if self.phase == WARM_UP else RECOVERING
         # A filter that begins with y(1) does not miss y(0).
-        heard = known[nu:] & ~self._refused()
+        heard = (known[nu:] & ~self._refused()) | ~self.observer.timing.expected(self.state.k - 1)
         if fresh and self.is_recursive:
             heard = np.ones_like(heard)
         status = self._status(time, known[:nu], heard, spoiled=spoiled)

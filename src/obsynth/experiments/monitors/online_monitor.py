@@ -91,12 +91,13 @@ def online_monitor(
     sample_time : float, optional, seconds
         Continuous designs: between the rows of the data; the scenario's by default.
     constants : mapping, ConstantsBox, Uncertainty or DescriptorSystem, optional
-        ``pointwise``, discrete linear designs: tolerances as `obsynth.uncertain_system` takes them; those of the
+        ``pointwise``, linear designs: tolerances as `obsynth.uncertain_system` takes them; those of the
         design's plant by ``plant.uncertainty``.  The threshold adapts to the signals and holds for every plant within
-        them; without, it assumes an exact model (but ``obsynth run`` takes the plant's own).  Columns of `run_on_data`
-        tell thresholds, guaranteed intervals of faults, and shares of the constants.
+        them; without, it assumes an exact model (but ``obsynth run`` takes the plant's own).  Continuous designs need
+        rows ``sample_time`` apart and known inputs that are held between them.  Columns of `run_on_data` tell
+        thresholds, guaranteed intervals of faults, and shares of the constants.
     initial_set : mapping, optional
-        ``pointwise``, discrete linear designs: bounds of the plant's states at the first row (deviations), each a
+        ``pointwise``, linear designs: bounds of the plant's states at the first row (deviations), each a
         number or ``[low, high]``; the threshold then holds from the first row on, for the plant's own tolerances where
         no others are given.
 
@@ -163,7 +164,7 @@ def online_monitor(
             driven=driven,
         )  # fmt: skip
         if adaptive:
-            return _adaptive(design, scenario, norm, model, bounds, noise_bound, initial_error, initial_set)
+            return _adaptive(design, scenario, norm, model, bounds, noise_bound, initial_error, initial_set, dt)
         rule = norm
         ending = _FORGOTTEN if initial_error is None else _AFTER_A_GAP
     else:
@@ -187,7 +188,7 @@ def online_monitor(
 
 def _adaptive(
     design: ObserverDesign, scenario: Scenario | None, norm: NormRule, model: ResidualModel, bounds: FloatArray,
-    noise_bound: float | None, initial_error: float | None, initial_set: Mapping[str, Any] | None,
+    noise_bound: float | None, initial_error: float | None, initial_set: Mapping[str, Any] | None, dt: float,
 ) -> OnlineMonitor:  # fmt: skip
     """Return the monitor whose threshold holds for every plant within its tolerances."""
     first, later = adaptive_plan(
@@ -196,6 +197,7 @@ def _adaptive(
         noise_bound or 0.0,
         initial_error=initial_error,
         initial_set=initial_set,
+        sample_time=dt,
     )
     start = _FORGOTTEN if initial_error is None and initial_set is None else _AFTER_A_GAP if initial_set is None else (
         "; it holds from the first row on, and after a gap once the error there is forgotten"
