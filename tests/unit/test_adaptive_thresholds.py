@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.linalg import expm
 from uncertain_plants import drive, wang
 
 import obsynth
@@ -185,7 +186,7 @@ def test_refusals_name_their_reason() -> None:
         design, noise_bound=1.0, disturbance_bounds={"load": 0.1}, constants={name: "30 %" for name in ("J2", "k")}
     )
     assert "may grow" in loud.statement
-    with pytest.raises(PreconditionError, match="not proved regular"):
+    with pytest.raises(PreconditionError, match="singular, or not of index 1, inside the box"):
         obsynth.online_monitor(design, noise_bound=1.0, disturbance_bounds={"load": 0.1}, constants={"J2": "150 %"})
 
 
@@ -231,3 +232,72 @@ def test_what_an_evaluation_counts_does_not_depend_on_what_is_left_out(design, s
         assert np.array_equal(some[:onset].any(axis=0), whole[:onset].any(axis=0))
         assert np.array_equal(some[onset:].any(axis=0), whole[onset:].any(axis=0))
         assert np.array_equal(np.argmax(some[onset:], axis=0), np.argmax(whole[onset:], axis=0))
+
+
+PIECES, STEP = 5, 0.05
+
+
+def switching_log(design: Any, q: np.ndarray, seed: int, steps: int = 120) -> pd.DataFrame:
+    """Simulate an exact continuous plant of the box whose disturbance switches between samples, its input held."""
+    plant = plant_at(design.linear[0], design.linear[0].uncertainty.box.values(q))
+    smooth = obsynth.eliminate_algebraic_states(plant).plant
+    rng = np.random.default_rng(seed)
+    block = np.zeros((5, 5))
+    block[:3] = np.hstack([smooth.A, smooth.B, smooth.Bd])
+    piece = expm(block * STEP / PIECES)[:3]
+    x, rows = rng.uniform(-START, START, 3), []
+    inputs = rng.choice([-1.0, 1.0], steps)
+    for k in range(steps):
+        rows.append([k * STEP, inputs[k], *(smooth.C @ x)])
+        for _ in range(PIECES):
+            # Bang-bang at about the speed of the plant, in some runs faster.
+            load = 0.1 * np.sign(np.sin(0.4 * k)) if seed % 2 else 0.1 * rng.choice([-1.0, 1.0])
+            x = piece @ np.array([*x, inputs[k], load])
+    return pd.DataFrame(rows, columns=["time", "torque", "w1", "w2"])
+
+
+@pytest.fixture(scope="module")
+def continuous() -> Any:
+    written = {
+        "E": [["J1", 0, 0], [0, "J2", 0], [0, 0, 1]], "A": [["-c - b", "c", "-k"], ["c", "-c - b", "k"], [1, -1, 0]],
+        "B": [[1], [0], [0]], "C": [[1, 0, 0], [0, 1, 0]], "Bf": [[1], [0], [0]], "Bd": [[0], [1], [0]],
+        "input_names": ["torque"], "output_names": ["w1", "w2"], "disturbance_names": ["load"],
+    }  # fmt: skip
+    sizes = {"J1": 0.5, "J2": 1.0, "k": 20.0, "c": 0.2, "b": 0.3}
+    constants = {name: {"nominal": value, "tolerance": "2 %"} for name, value in sizes.items()}
+    return obsynth.pd_observer(obsynth.uncertain_system(written, constants))
+
+
+def test_continuous_designs_hold_for_disturbances_that_move_between_samples(continuous) -> None:
+    plant, _ = continuous.linear
+    monitor = obsynth.online_monitor(
+        continuous, constants=plant, disturbance_bounds={"load": 0.1}, sample_time=STEP,
+        initial_set=dict.fromkeys(plant.state_names, START),
+    )  # fmt: skip
+    assert "disturbances may move in between" in monitor.statement
+    largest = 0.0
+    for seed, q in enumerate(drawn_points(5, 6, 4, vertices=0.8)):
+        found = obsynth.run_on_data(continuous, switching_log(continuous, q, seed), monitor=monitor, warm_up=0.0)
+        assert not found.alarms
+        table = found.table
+        for name in ("fhat[f1]", "r[w1]", "r[w2]"):
+            assert (table[name].abs() <= table[f"threshold {name}"]).all()
+            largest = max(largest, float((table[name].abs() / table[f"threshold {name}"]).max()))
+    assert largest > 0.3
+    late = switching_log(continuous, np.zeros(5), 1)
+    late.loc[60:, "time"] += 0.4 * STEP
+    found = obsynth.run_on_data(continuous, late, monitor=monitor, warm_up=0.0, gap=1.0)
+    assert found.table["threshold"][60:].isna().all()
+    wave = {"torque": obsynth.Sine(amplitude=1.0, frequency=2.0)}
+    with pytest.raises(PreconditionError, match="held"):
+        obsynth.monitor(
+            continuous, obsynth.Scenario(horizon=2, sample_time=STEP, inputs=wave), constants=plant,
+            disturbance_bounds={"load": 0.1},
+        )  # fmt: skip
+
+
+def test_records_and_rows_of_continuous_designs_agree(continuous) -> None:
+    plant, _ = continuous.linear
+    scenario = obsynth.Scenario(horizon=3, sample_time=STEP, disturbances={"load": obsynth.Uniform(low=-0.1, high=0.1)})
+    watched = obsynth.monitor(continuous, scenario, constants=plant)
+    assert obsynth.evaluate(continuous, scenario, runs=20, plants=20, monitor=watched).false_alarm_rate.value == 0.0

@@ -60,12 +60,15 @@ def numbers_of(pairs: list[tuple[str, str]]) -> Mapping[str, float]:
 
 
 def own_tolerances(design: ObserverDesign, kind: str | None) -> Uncertainty | None:
-    """Return the tolerances of a sampled design's plant, which its pointwise threshold holds for."""
+    """Return the tolerances of a design's plant, which its pointwise threshold holds for.
+
+    Continuous designs with known inputs must be asked for it: the inputs have to be held between rows.
+    """
     from obsynth.observers.linear.observer import LinearObserver
     from obsynth.plants.descriptor import DescriptorSystem
 
     plant = design.plant
-    if kind != "pointwise" or not isinstance(plant, DescriptorSystem) or not plant.is_discrete:
+    if kind != "pointwise" or not isinstance(plant, DescriptorSystem) or (plant.nu and not plant.is_discrete):
         return None
     return plant.uncertainty if isinstance(design.observer, LinearObserver) else None
 

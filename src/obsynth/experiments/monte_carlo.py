@@ -19,6 +19,7 @@ from obsynth.experiments.progress import Progress, shown_progress
 from obsynth.experiments.simulation import aligned_errors
 from obsynth.numerics.arguments import is_finite_number, is_whole, require_kind
 from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.decisions import ParameterMonitor
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.recursive.observer import RecursiveObserver
@@ -126,8 +127,8 @@ def evaluate(
     runs : int, optional
         How many.
     monitor : Monitor or ParameterMonitor, optional
-        From `obsynth.monitor`, or how a recursive design decides on its parameters; without one only errors of the
-        estimates are counted.
+        From `obsynth.monitor`, or how a recursive or nonlinear design decides on its parameters; without one only
+        errors of the estimates are counted.
     executor : concurrent.futures.Executor, optional
         Where batches of runs go; by default they run here.  The result does not depend on it.
     progress : callable or bool, optional
@@ -185,12 +186,7 @@ def _require_fit(bench: Bench, monitor: Monitor | ParameterMonitor | None, plant
     if plants is not None:
         raise SpecError("plants are drawn for linear designs of a plant with tolerances.", path="plants")
     if isinstance(monitor, Monitor):
-        raise SpecError("This design is recursive: give monitor=obsynth.ParameterMonitor(...).", path="monitor")
-    if monitor is not None and not isinstance(bench.observer, RecursiveObserver):
-        raise SpecError(
-            "Decisions are for time-varying plants: the innovations of a nonlinear one are only nearly white. Leave "
-            "monitor out, and read the errors.", path="monitor",
-        )  # fmt: skip
+        raise SpecError("This design estimates parameters: give monitor=obsynth.ParameterMonitor(...).", path="monitor")
 
 
 def _drawn_benches(design: ObserverDesign, scenario: Scenario, plants: int) -> list[Bench]:
@@ -243,7 +239,7 @@ def _judged_residuals(watched: Monitor, bench: Bench, runs: Runs) -> FloatArray:
 
 def _judged_parameters(watched: ParameterMonitor, bench: Bench, estimates: Estimates) -> tuple[float, float, float]:
     """Return the same of one run of an observer of parameters."""
-    decision = watched.watch(cast(RecursiveObserver, bench.observer), estimates)
+    decision = watched.watch(cast("RecursiveObserver | DAEObserver", bench.observer), estimates)
     passed = decision.values > decision.thresholds
     begin = len(passed) if bench.onset is None else bench.onset
     false, later = float(passed[:begin].any()), np.flatnonzero(passed[begin:])

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from obsynth.errors import SpecError
 from obsynth.exporting.c_words import c_identifier, comment, included, quoted
+from obsynth.exporting.realisation import require_plain_steps
 from obsynth.files.outputs import write_together
 from obsynth.observers.dae.c_code import observer_code
 from obsynth.plants.dae.model import DAEModel
@@ -72,6 +73,7 @@ def require_no_sample_time(design: ObserverDesign, sample_time: float | None) ->
 def dae_c_texts(design: ObserverDesign, prefix: str, header: str) -> tuple[str, str, str]:
     """Return source, header and the digest of the gain set."""
     _, observer = design.nonlinear
+    require_plain_steps(design.name, observer.outside_graph)
     digest = gain_set_digest(design)
     source = "\n".join([
         comment(f"sha256 of the gain set: {digest}"), f'#include "{included(header)}"', "",

@@ -15,11 +15,14 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arguments import chosen, real_array, real_number, real_vector
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.alarms import Alarm, Decision, alone, quantile, tail
+from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.recursive.likelihood_ratio import likelihood_ratio, pull_of_the_start
 from obsynth.observers.recursive.observer import RecursiveObserver
 
 STATISTICS = ("chi-square", "cusum", "glr", "nis")
+#: Forms whose parameters are states: their samples say nothing of parameters that stay as they are.
+WALKING_FORMS = ("random-walk", "augmented-kalman")
 #: Samples that the NIS sums up: the choice that its threshold was tried with.
 NIS_WINDOW = 20
 #: Correlated looks count as this share of independent ones: measured false-alarm rates stay below what is asked.
@@ -27,7 +30,7 @@ NIS_LOOKS = 1.0 / 2.0
 
 
 def decide(
-    observer: RecursiveObserver,
+    observer: RecursiveObserver | DAEObserver,
     estimates: Estimates,
     *,
     statistic: str = "chi-square",
@@ -39,13 +42,15 @@ def decide(
 
     Parameters
     ----------
-    observer : RecursiveObserver
-        That gave the estimates, with parameters (a filter without any knows the ``nis`` alone).
+    observer : RecursiveObserver or DAEObserver
+        That gave the estimates, with parameters (a filter without any knows the ``nis`` alone).  Of a nonlinear one
+        thresholds hold to first order in the errors.
     estimates : Estimates
         Of a whole run.
     statistic : {"chi-square", "cusum", "glr", "nis"}, optional
         ``chi-square`` on theta against its nominal value, with its honest covariance (default); ``cusum`` for small
-        changes; ``glr`` with restarted signatures for abrupt ones; ``nis`` for all that the model does not explain.
+        changes; ``glr`` with restarted signatures for abrupt ones (recursive observers); ``nis`` for all that the model
+        does not explain.
     nominal : array_like, optional
         ``(nq,)``: nominal parameters; the observer's initial ones by default.
     false_alarms : float, optional, dimensionless
@@ -64,20 +69,22 @@ def decide(
         The statistic is unknown or does not go with the observer's form, an option is out of range, or the estimates
         are of another observer.
     """
-    adaptation = observer.adaptation
+    nonlinear = isinstance(observer, DAEObserver)
     chosen(statistic, "statistic", STATISTICS)
-    if adaptation is None and statistic != "nis":
+    start, form = _start_and_form(observer)
+    if not len(start) and statistic != "nis":
         raise SpecError("A decision on parameters needs an observer that estimates them; of a filter alone, statistic "
                         "'nis' tells whether the model still explains the data.", path="observer")  # fmt: skip
     false_alarms = real_number(false_alarms, "false_alarms", "a probability between 0 and 1")
     if not 0.0 < false_alarms < 1.0:
         raise SpecError(f"false_alarms is {false_alarms}: give a probability between 0 and 1.", path="false_alarms")
-    form = "" if adaptation is None else adaptation.form
-    if form == "random-walk" and statistic in ("cusum", "glr"):
-        raise SpecError(f"{statistic} needs regressors, which the random walk does not have: use form 'innovation'.",
+    if form in WALKING_FORMS and statistic in ("cusum", "glr"):
+        raise SpecError(f"{statistic} needs regressors, which form {form!r} does not have: use a form that forgets.",
                         path="statistic")  # fmt: skip
-    nq = 0 if adaptation is None else len(adaptation.initial_parameters)
-    start = np.zeros(0) if adaptation is None else adaptation.initial_parameters
+    if nonlinear and statistic == "glr":
+        raise SpecError("glr restarts signatures, which nonlinear observers do not carry: use chi-square, cusum or "
+                        "nis.", path="statistic")  # fmt: skip
+    nq = len(start)
     theta = start if nominal is None else real_vector(nominal, nq, "nominal")
     size = real_array(change, "change")
     size = np.broadcast_to(size, (nq,)) if size.ndim == 0 else size
@@ -90,14 +97,29 @@ def decide(
         return Decision(statistic, read_only(np.zeros(0)), read_only(np.zeros(0)), None)
     if statistic == "chi-square":
         return _chi_square(observer, estimates, theta, false_alarms)
+    if isinstance(observer, DAEObserver):
+        if statistic == "nis":
+            return _nis(estimates, np.array(estimates.nis), false_alarms)
+        along = estimates.scores - estimates.informations @ theta
+        return _cusum(estimates, along, np.einsum("kqq->kq", estimates.informations), size, false_alarms)
     gaps = estimates.innovations
     if nq and form != "random-walk":
         gaps = gaps - estimates.regressors @ theta
     if statistic == "nis":
-        return _nis(estimates, gaps, false_alarms)
+        return _nis(estimates, np.nansum(gaps**2, axis=1), false_alarms)
     if statistic == "cusum":
-        return _cusum(estimates, gaps, size, false_alarms)
+        regressors = np.nan_to_num(estimates.regressors)
+        along = np.einsum("kmq,km->kq", regressors, np.nan_to_num(gaps))
+        return _cusum(estimates, along, np.einsum("kmq,kmq->kq", regressors, regressors), size, false_alarms)
     return likelihood_ratio(observer, estimates, gaps, false_alarms)
+
+
+def _start_and_form(observer: RecursiveObserver | DAEObserver) -> tuple[FloatArray, str]:
+    """Return the parameters at the start, and how they are estimated."""
+    if isinstance(observer, DAEObserver):
+        return observer.initial_parameters, observer.form
+    adaptation = observer.adaptation
+    return (np.zeros(0), "") if adaptation is None else (adaptation.initial_parameters, adaptation.form)
 
 
 @dataclass(frozen=True)
@@ -130,12 +152,12 @@ class ParameterMonitor:
         if self.statistic not in STATISTICS:
             raise SpecError(f"statistic is {self.statistic!r}: use one of {', '.join(STATISTICS)}.", path="statistic")
 
-    def watch(self, observer: RecursiveObserver, estimates: Estimates) -> Decision:
+    def watch(self, observer: RecursiveObserver | DAEObserver, estimates: Estimates) -> Decision:
         """Return the decision on one run.
 
         Parameters
         ----------
-        observer : RecursiveObserver
+        observer : RecursiveObserver or DAEObserver
             That gave the estimates.
         estimates : Estimates
             Of a whole run.
@@ -152,12 +174,15 @@ class ParameterMonitor:
 
 
 def _chi_square(
-    observer: RecursiveObserver, estimates: Estimates, nominal: FloatArray, false_alarms: float
+    observer: RecursiveObserver | DAEObserver, estimates: Estimates, nominal: FloatArray, false_alarms: float
 ) -> Decision:
     gaps, nq = estimates.parameters - nominal, len(nominal)
-    start = np.zeros(nq) if observer.adaptation is None else observer.adaptation.initial_parameters - nominal
+    start = _start_and_form(observer)[0] - nominal
     if start.any():
         # Where the observer starts is no evidence: only what data have said since may raise an alarm.
+        if isinstance(observer, DAEObserver):
+            raise SpecError("chi-square of a nonlinear observer asks about the parameters that it starts from: design "
+                            "it with initial_parameters at what is nominal.", path="nominal")  # fmt: skip
         gaps = gaps - pull_of_the_start(observer, estimates, start)
     values = np.einsum("ki,kij,kj->k", gaps, _inverses(estimates.parameter_covariances), gaps)
     looks = len(values)
@@ -184,8 +209,7 @@ def _inverses(covariances: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.pinv(covariances, hermitian=True))
 
 
-def _nis(estimates: Estimates, gaps: FloatArray, false_alarms: float) -> Decision:
-    squares = np.nansum(gaps**2, axis=1)
+def _nis(estimates: Estimates, squares: FloatArray, false_alarms: float) -> Decision:
     samples = len(squares)
     window = np.ones(min(NIS_WINDOW, samples))
     values = np.convolve(squares, window)[:samples]
@@ -204,12 +228,15 @@ def _nis(estimates: Estimates, gaps: FloatArray, false_alarms: float) -> Decisio
     return Decision("nis", read_only(values), read_only(thresholds), alarm)
 
 
-def _cusum(estimates: Estimates, gaps: FloatArray, change: FloatArray, false_alarms: float) -> Decision:
-    samples, nq = len(gaps), len(change)
+def _cusum(
+    estimates: Estimates, along: FloatArray, squares: FloatArray, change: FloatArray, false_alarms: float
+) -> Decision:
+    """Decide by sums of log likelihood ratios.
+
+    Shapes: ``along (samples, nq)``: scores at the nominal parameters; ``squares (samples, nq)``: their variances.
+    """
+    samples, nq = along.shape
     signs = np.concatenate([change, -change])
-    regressors = np.nan_to_num(estimates.regressors)
-    along = np.einsum("kmq,km->kq", regressors, np.nan_to_num(gaps))
-    squares = np.einsum("kmq,kmq->kq", regressors, regressors)
     steps = np.hstack([along, along]) * signs - 0.5 * np.hstack([squares, squares]) * signs**2
     threshold = float(np.log(2.0 * nq * samples / false_alarms))
     level, started, values, alarm = np.zeros(2 * nq), np.zeros(2 * nq, dtype=int), np.zeros(samples), None

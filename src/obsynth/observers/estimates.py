@@ -58,6 +58,9 @@ class Estimates:
     regressors : FloatArray
         ``(samples, m, nq)``, recursive observers: innovations minus regressors times the true parameters are white,
         N(0, I).
+    scores, informations : FloatArray
+        ``(samples, nq)`` and ``(samples, nq, nq)``, nonlinear observers that forget: what each sample says of the
+        parameters; to first order scores minus informations times the true parameters are white, N(0, informations).
     innovation_covariances : FloatArray
         ``(samples, ny, ny)``, nonlinear observers: what is expected of the innovations; rows and columns of missing
         samples are those of the identity.
@@ -94,6 +97,8 @@ class Estimates:
     cross_covariances: FloatArray = field(default_factory=nothing)
     innovations: FloatArray = field(default_factory=nothing)
     regressors: FloatArray = field(default_factory=nothing)
+    scores: FloatArray = field(default_factory=nothing)
+    informations: FloatArray = field(default_factory=nothing)
     innovation_covariances: FloatArray = field(default_factory=nothing)
     nis: FloatArray = field(default_factory=nothing)
     nis_degrees: FloatArray = field(default_factory=nothing)

@@ -19,6 +19,7 @@ import numpy as np
 from obsynth.analysis.transformations.uncertain_plant import AffinePlant
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.ranks import EFFECT_RANK_SHARE
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.proofs.affine import AffineMatrix, affine_block
 from obsynth.proofs.balls import gamma, rounded_up
@@ -26,8 +27,6 @@ from obsynth.tolerances.tracking import IDENTITY_SHARE, Tracking
 
 #: Remainders below this share of their row's terms are rounding: one common channel is enough for them.
 ROUNDING_SHARE = 1e-9
-#: Singular values of a constant's effect below this share count as zero; what is left out goes into the remainder.
-RANK_SHARE = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,9 +84,12 @@ class ErrorStructure:
 
 def error_structure(
     observer: LinearObserver, affine: AffinePlant, tracking: Tracking, bounds: FloatArray, noise_bound: float, *,
-    faults: bool = False, states: bool = False,
+    faults: bool = False, states: bool = False, reading: FloatArray | None = None,
 ) -> ErrorStructure:  # fmt: skip
     """Return the error system of an observer over a box.
+
+    With ``reading (n, states of the observer)`` the observer is that of a continuous design on samples: its identities
+    need not hold there, and what they miss counts as one more constant, the last one, whose value is known.
 
     ``bounds (nd,)`` of the disturbances; ``noise_bound`` in standard deviations.  With ``faults``, faults are unknown
     signals that are estimated like states, and the outputs are the errors of their estimates; else there is no fault,
@@ -101,7 +103,7 @@ def error_structure(
     watched = list(range(shown.start, shown.stop if faults else len(observer.Cz)))
     watched = list(range(n)) if states else watched
     picked = np.zeros((n + nf + len(watched), len(observer.Cz)))
-    picked[:n, observer.state_rows] = back
+    picked[:n, observer.state_rows] = back if reading is None else reading
     if faults:
         picked[n : n + nf, shown] = np.eye(nf)
     picked[n + nf :, watched] = back if states else np.eye(len(watched))
@@ -118,22 +120,29 @@ def error_structure(
     state = stacked(affine.A, affine.C) + affine_block([[followed.after(observer.Az)], [followed.after(c)]]) + (-target)
     known = stacked(affine.B, affine.D) + np.vstack([observer.Bu, du])
     sizes = _sizes(observer, affine, t, c, dy)
-    require_identities(state, known, sizes, affine.offsets)
+    offsets = affine.offsets
+    if reading is None:
+        require_identities(state, known, sizes, offsets)
     noise = AffineMatrix.exact(plant.Bw, count), AffineMatrix.exact(plant.Dw, count)
     disturbances = affine_block([[stacked(affine.Bd, affine.Dd), stacked(*noise)]])
     if faults:
         direct = stacked(affine.Bf, affine.Df)
         state = affine_block([[state, _fault_columns(direct, observer, c, n)]])
-    parts, rest = _about_nominal(state, affine.offsets)
-    rows, effects, owner, left = _channels(parts, affine.offsets)
+    if reading is not None:
+        state, known = _with_missed(state, offsets), _with_missed(known, offsets)
+        more_parts = np.concatenate([disturbances.parts, np.zeros((1, *disturbances.shape))])
+        disturbances = AffineMatrix(disturbances.center, more_parts, disturbances.radius)
+        offsets = np.append(offsets, 0.0)
+    parts, rest = _about_nominal(state, offsets)
+    rows, effects, owner, left = _channels(parts, offsets)
     rest = rounded_up(rest + left, 3)
     more, single, remainders = _remainder_channels(rest, sizes)
-    input_parts, input_rest = _about_nominal(known, affine.offsets)
+    input_parts, input_rest = _about_nominal(known, offsets)
     return ErrorStructure(
         observer.Az, c[: n + nf], c[n + nf :], AffineMatrix(np.zeros_like(rest), parts, rest),
         AffineMatrix(np.zeros_like(input_rest), input_parts, input_rest), disturbances,
         np.concatenate([bounds, np.full(plant.nw, noise_bound)]), np.vstack([rows, more]), len(rows) + single,
-        np.hstack([effects, remainders]), tuple(owner), affine.offsets, picked[: n + nf],
+        np.hstack([effects, remainders]), tuple(owner), offsets, picked[: n + nf],
         picked[n + nf :],
     )  # fmt: skip
 
@@ -174,7 +183,7 @@ def _fault_columns(direct: AffineMatrix, observer: LinearObserver, c: FloatArray
     into = direct[:nz, :]
     moved = affine_block([[into.after(observer.Az)], [into.after(c)]])
     reached = direct.magnitude[nz:, late == 1]
-    if reached.size and reached.max() > RANK_SHARE:
+    if reached.size and reached.max() > EFFECT_RANK_SHARE:
         raise PreconditionError(
             "A fault that is estimated one sample late reaches the estimates at once: its estimate has no guaranteed "
             "interval.", condition="fault interval",
@@ -187,6 +196,15 @@ def _fault_columns(direct: AffineMatrix, observer: LinearObserver, c: FloatArray
             "interval (a filter that estimates each sample of a fault on its own has one).", condition="fault interval",
         )  # fmt: skip
     return found
+
+
+def _with_missed(matrix: AffineMatrix, offsets: FloatArray) -> AffineMatrix:
+    """Return a matrix with what is left at the nominal plant as the part of one more constant."""
+    missed = matrix.at(offsets)
+    rounding = gamma(matrix.count + 3) * matrix.magnitude
+    return AffineMatrix(
+        matrix.center - missed, np.concatenate([matrix.parts, missed[None]]), rounded_up(matrix.radius + rounding, 3)
+    )
 
 
 def _about_nominal(matrix: AffineMatrix, offsets: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -205,12 +223,12 @@ def _channels(parts: FloatArray, offsets: FloatArray) -> tuple[FloatArray, Float
         if not len(columns):
             continue
         u, values, v = np.linalg.svd(part, full_matrices=False)
-        rank = int(np.sum(values > RANK_SHARE * values[0]))
+        rank = int(np.sum(values > EFFECT_RANK_SHARE * values[0]))
         if len(columns) <= rank:
             b, c = part[:, columns], np.eye(n)[columns]
         else:
             b, c = u[:, :rank] * values[:rank], v[:rank]
-            c = np.where(np.abs(c) < RANK_SHARE, 0.0, c)
+            c = np.where(np.abs(c) < EFFECT_RANK_SHARE, 0.0, c)
             missed = np.abs(part - b @ c) + gamma(2 * rank + 4) * (np.abs(b) @ np.abs(c))
             left += (1.0 + abs(offsets[i])) * missed
         rows.append(c)

@@ -26,7 +26,7 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.constants import ConstantsBox
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.uncertain_system import uncertain_system
-from obsynth.plants.uncertainty import Uncertainty
+from obsynth.plants.uncertainty import Uncertainty, matrices_of
 from obsynth.proofs.affine import AffineMatrix
 from obsynth.results.design import ObserverDesign
 from obsynth.tolerances.directions import told_from_faults
@@ -205,6 +205,15 @@ def _of_plant(design: ObserverDesign, given: DescriptorSystem) -> tuple[Observer
         and np.allclose(getattr(plant, name), getattr(given, name), rtol=1e-9, atol=1e-12)
         for name in ("E", "A", "B", "C", "D", "Bd", "Dd", "Bf", "Df")
     )
+    own, other = plant.uncertainty, given.uncertainty
+    if not same and own is not None and other is not None and own.written is not None:
+        # The design is for a plant that was made from the one that is given.
+        before = matrices_of(given) if other.written is None else other.written
+        if dict(own.entries) == dict(other.entries) and all(
+            np.array_equal(own.written[name], before[name]) for name in own.written
+        ):
+            changed = plant.replace(uncertainty=own.with_box(other.box))
+            return design.replace(plant=changed), changed
     if not same or plant.dt != given.dt:
         raise SpecError("constants is another plant than the design's: its nominal matrices differ.", path="constants")
     changed = plant.replace(uncertainty=given.uncertainty)

@@ -26,6 +26,8 @@ MOST_BOXES = 150
 Build: TypeAlias = Callable[[FloatArray, FloatArray], AffineMatrix]
 
 
+#: Halvings of the way to a point that fails.
+BISECTIONS = 50
 #: With more constants than this, not all vertices are looked at first.
 MOST_VERTEX_CONSTANTS = 10
 
@@ -107,7 +109,19 @@ def proved_regular(build: Build, count: int, exact_at: Callable[[FloatArray], Fl
         found = np.linalg.slogdet(point)[0]
         return bool(found * sign <= 0.0)
 
-    return subdivided(build, count, invertible, singular, exact_at)
+    found = subdivided(build, count, invertible, singular, exact_at)
+    if found.at is None:
+        return found
+    return BoxVerdict(found.verdict, found.boxes, _nearest_failure(found.at, lambda q: singular(exact_at(q))))
+
+
+def _nearest_failure(point: FloatArray, fails: Callable[[FloatArray], bool]) -> FloatArray:
+    """Return where, between the middle of the box and a point that fails, it begins to fail."""
+    low, high = 0.0, 1.0
+    for _ in range(BISECTIONS):
+        middle = (low + high) / 2.0
+        low, high = (low, middle) if fails(middle * point) else (middle, high)
+    return np.asarray(high * point)
 
 
 def proved_stable(

@@ -12,7 +12,7 @@ from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.constants import ConstantsBox
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.uncertainty import SAMPLED, UNCERTAIN_MATRICES, matrices_of
+from obsynth.plants.uncertainty import SAMPLED, UNCERTAIN_MATRICES, Uncertainty, matrices_of
 from obsynth.proofs.affine import AffineMatrix, affine_block, affine_inverse, affine_zero_order_hold
 
 #: Directions of the state that no constant touches are found down to this share of the others.
@@ -93,6 +93,15 @@ def moving_family(plant: DescriptorSystem, box: ConstantsBox, basis: FloatArray 
         return AffineMatrix.exact(plant.A, 0)
     written: Mapping[str, FloatArray] = matrices_of(plant) if uncertain.written is None else uncertain.written
     return _reduced(written, uncertain.affine(written, box), basis)["A"]
+
+
+def reduced_family(plant: DescriptorSystem, uncertain: Uncertainty) -> tuple[dict[str, AffineMatrix], FloatArray]:
+    """Return a continuous plant over its box, algebraic states eliminated and E inverted, and its coordinates."""
+    written: Mapping[str, FloatArray] = matrices_of(plant) if uncertain.written is None else uncertain.written
+    matrices = uncertain.affine(written, uncertain.box)
+    first = _reduced(written, matrices, None)
+    basis = untouched_coordinates(_touched(first), _moved(first))
+    return (first if np.array_equal(basis, np.eye(len(basis))) else _reduced(written, matrices, basis)), basis
 
 
 def moving_basis(plant: DescriptorSystem, box: ConstantsBox) -> FloatArray:

@@ -43,6 +43,7 @@ class AdaptiveBound:
     remainder.  ``kernels (L w, m + no + nz)``, oldest sample first: what it adds to the next channels (solved for the
     loop at one sample), to the outputs and to the bound of eps.  ``same (w, m + no)``: what inputs and estimates at the
     same sample add.  ``rounding (m + no, nu + ny + n + 1)``: what rounding adds, for the largest signals so far.
+    ``first (nz, nu)``: what the first inputs do to the sensitivity to the last constant, for continuous designs.
     """
 
     structure: ErrorStructure
@@ -61,6 +62,7 @@ class AdaptiveBound:
     start_later: tuple[float, FloatArray]
     spans: FloatArray
     remainder_inputs: tuple[int, ...]
+    first: FloatArray | None = None
 
     @property
     def length(self) -> int:

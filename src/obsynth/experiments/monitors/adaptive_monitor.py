@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,29 +12,37 @@ from obsynth.analysis.transformations.uncertain_plant import AffinePlant, affine
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.experiments.monitors.adaptive_bound import Start, adaptive_bound
 from obsynth.experiments.monitors.adaptive_rule import AdaptivePlan
+from obsynth.experiments.monitors.adaptive_sampling import SAMPLING, sampled_problem
 from obsynth.experiments.monitors.residual_model import watches_estimates
 from obsynth.numerics.arguments import is_finite_number, require_mapping
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.uncertainty import SAMPLED
 from obsynth.results.design import ObserverDesign
+from obsynth.tolerances.error_structure import error_structure
 from obsynth.tolerances.responses import loop_radius
 from obsynth.tolerances.robustness import EXACT_MODEL, structure_of, with_tolerances
+from obsynth.tolerances.subdivision import index_one_on_box
 from obsynth.tolerances.tracking import Tracking, tracking_of
 
+#: Radii of a set are made larger by this share: more than the rounding of their sums.
+OUTWARD = 1e-12
 #: What a statement adds where no tolerance is known.
 EXACT = f"; {EXACT_MODEL}"
 
 
 def adaptive_plan(
     design: ObserverDesign, bounds: FloatArray, noise_bound: float, *, initial_error: float | None,
-    initial_set: Mapping[str, Any] | None, observer_state: FloatArray | None = None,
+    initial_set: Mapping[str, Any] | None, observer_state: FloatArray | None = None, sample_time: float | None = None,
 ) -> tuple[AdaptivePlan, AdaptivePlan]:  # fmt: skip
     """Return the plan from the first start on, and the one after a later start; the design's plant has the tolerances.
 
     Raises `PreconditionError` where there is no bound, with the reason.
     """
     plant, observer = design.linear
+    require_regular(plant)
+    if not plant.is_discrete:
+        return _sampled_plan(design, bounds, noise_bound, initial_error, initial_set, observer_state, sample_time)
     affine = affine_plant(plant)
     tracking = tracking_of(design, affine)
     varying = affine.box.variation == "varying"
@@ -66,6 +75,53 @@ def adaptive_plan(
     return plan(start), plan(later)
 
 
+def _sampled_plan(
+    design: ObserverDesign, bounds: FloatArray, noise_bound: float, initial_error: float | None,
+    initial_set: Mapping[str, Any] | None, observer_state: FloatArray | None, sample_time: float | None,
+) -> tuple[AdaptivePlan, AdaptivePlan]:  # fmt: skip
+    """Return the plans of a continuous design, whose observer runs on samples."""
+    plant, observer = design.linear
+    if sample_time is None:
+        raise SpecError("A continuous design needs the sample_time of its data.", path="sample_time")
+    noise = noise_bound if plant.nw else 0.0
+    problem = sampled_problem(design, sample_time, np.where(np.isfinite(bounds), bounds, 0.0), noise)
+    structure = error_structure(
+        problem.observer, problem.affine, problem.tracking, problem.bounds, noise, reading=problem.reading
+    )
+    reached = structure.disturbances.magnitude.max(axis=0, initial=0.0)[: len(problem.bounds)] > 0.0
+    if np.any(reached.reshape(-1, plant.nd).any(axis=0) & ~np.isfinite(bounds)):
+        raise SpecError("A disturbance has no bound: give disturbance_bounds (--disturbance).",
+                        path="disturbance_bounds")  # fmt: skip
+    z = np.zeros(observer.order) if observer_state is None else observer_state
+    box = None if initial_set is None else initial_box(plant, initial_set)
+    stated = Start(observer.order, norm=initial_error, state=z)
+    why = "the fault is estimated through the dynamics of a continuous design, which a change of it takes time to pass"
+
+    def plan(begin: Start) -> AdaptivePlan:
+        bound = adaptive_bound(structure, problem.observer, begin, varying=False)
+        return AdaptivePlan(
+            replace(bound, first=problem.first), None, False, why, True, watches_estimates(design),
+            (*problem.affine.box.names, SAMPLING), observer.fault_names, observer.residual_names, sample_time,
+        )  # fmt: skip
+
+    return plan(problem.start(stated, box)), plan(problem.start(stated, None))
+
+
+def require_regular(plant: DescriptorSystem) -> None:
+    """Refuse a box with a plant that is singular, or not of index 1."""
+    uncertain = plant.uncertainty
+    if uncertain is None or not uncertain.box.names:
+        return
+    found = index_one_on_box(plant)
+    if found.verdict == "refuted" and found.at is not None:
+        values = uncertain.box.values(found.at)
+        where = ", ".join(f"{name} = {values[name]:.6g}" for name in uncertain.box.names)
+        raise PreconditionError(
+            f"The plant is singular, or not of index 1, inside the box: at {where}. Give smaller tolerances.",
+            condition="regularity",
+        )
+
+
 def start_of(
     affine: AffinePlant, tracking: Tracking, initial_error: float | None, initial_set: Mapping[str, Any] | None,
     z: FloatArray,
@@ -79,7 +135,7 @@ def start_of(
     followed = affine.E.after(tracking.T) @ back
     offset = followed.center @ center
     size = np.abs(followed.center) @ radius + (followed.spread + followed.radius) @ (np.abs(center) + radius)
-    return Start(len(z), center=z - offset, radius=size * (1.0 + 1e-12), state=z)
+    return Start(len(z), center=z - offset, radius=size * (1.0 + OUTWARD), state=z)
 
 
 def initial_box(plant: DescriptorSystem, given: Mapping[str, Any]) -> tuple[FloatArray, FloatArray]:
@@ -136,6 +192,8 @@ def adaptive_statement(plan: AdaptivePlan, design: ObserverDesign) -> str:
     )  # fmt: skip
     steps = () if uncertain is None else uncertain.steps
     held = "; inputs and disturbances are held between samples" if any(kind == SAMPLED for kind, _ in steps) else ""
+    if plan.sample_time is not None:
+        held = "; known inputs are held between rows, which are the sample time apart, disturbances may move in between"
     missing = "" if plan.intervals or not plan.fault_names else f"; no guaranteed interval of faults: {plan.reason}"
     return f"{text}; {kept}{held}{ever}{missing}"
 
@@ -152,10 +210,5 @@ def tolerances_of(
         raise SpecError("Give initial_set or initial_error, not both.", path="initial_set")
     found, plant = with_tolerances(design, constants)
     if not plant.is_discrete:
-        if asked:
-            raise PreconditionError(
-                "The design is continuous in time: thresholds over tolerances are for sampled designs. Sample the "
-                "plant first (transform: sample_time, or obsynth.discretise).", condition="discrete time",
-            )  # fmt: skip
-        return design, False
+        return found, bool(asked)
     return found, bool(asked)

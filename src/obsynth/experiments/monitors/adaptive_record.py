@@ -73,7 +73,10 @@ def _first_of_some(bound: AdaptiveBound, v: FloatArray) -> tuple[FloatArray, Flo
     flat = np.ascontiguousarray(v).reshape(-1, nv)
     into = flat @ np.ascontiguousarray(bound.drive[:, :nz]).reshape(-1, nv).T
     seen = (flat @ np.ascontiguousarray(bound.drive[:, nz:]).reshape(-1, nv).T).reshape(-1, rows + no)
-    psi = filtered(bound.structure.Az, into.reshape(runs, steps, p, nz))
+    begin = np.zeros((runs, 1, p, nz))
+    if bound.first is not None:
+        begin[:, 0, -1] = v[:, 0, nv - bound.first.shape[1] :] @ bound.first.T
+    psi = filtered(bound.structure.Az, np.concatenate([begin, into.reshape(runs, steps, p, nz)], axis=1))[:, 1:]
     seen += psi.reshape(-1, nz) @ bound.shown.T
     whole = seen.reshape(runs, steps, p, rows + no)
     offsets = bound.structure.offsets

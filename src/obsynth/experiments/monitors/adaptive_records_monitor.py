@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.errors import SpecError
+from obsynth.errors import PreconditionError, SpecError
 from obsynth.experiments.batch_simulation import Runs
 from obsynth.experiments.monitors.adaptive_bound import THRESHOLD_ROUNDING
 from obsynth.experiments.monitors.adaptive_monitor import adaptive_plan, adaptive_statement
@@ -92,7 +92,7 @@ class AdaptiveMonitor(Monitor):
         begun = np.linalg.norm(start[:, plan.residuals], axis=1) if plan.start_beyond_nominal else 0.0
         candidates = (values > (plan.bound.nominal[m:] + start)[:, None]).any(axis=2)
         candidates |= norm > (self.threshold + begun)[:, None] + self.floor
-        if onset is None or plan.bound.varying:
+        if onset is None or plan.bound.varying or plan.bound.first is not None:
             return self._all_passed(runs, values, norm, candidates, len(values))
         passed = np.zeros(norm.shape, dtype=bool)
         chosen = np.flatnonzero(candidates.any(axis=0))
@@ -127,6 +127,9 @@ class AdaptiveMonitor(Monitor):
             parts.append(found.start[..., at])
         beside = sum(np.linalg.norm(part, axis=2) for part in parts) + np.linalg.norm(plan.bound.more[at])
         limit = (self.threshold[:length, None] + self.floor + np.asarray(beside).T) * THRESHOLD_ROUNDING
+        if plan.sample_time is not None:
+            # Where the norm passes, one of the rows does.
+            limit = np.full_like(limit, np.inf)
         beyond = (values[:length, chosen] > np.moveaxis(found.total, 0, 1)).any(axis=2)
         passed[:length, chosen] = (norm[:length, chosen] > limit) | beyond
         return np.asarray(passed & candidates)
@@ -167,6 +170,12 @@ def with_box(
     The start is the scenario's own, unless its error or a set is given.
     """
     plant, observer = design.linear
+    if not plant.is_discrete and scenario.inputs:
+        raise PreconditionError(
+            "The design is continuous in time, and the inputs of a scenario move between its samples: thresholds over "
+            "tolerances need inputs that are held. Sample the plant first (transform: sample_time).",
+            condition="discrete time",
+        )
     state = None if scenario.observer_state is None else np.array(scenario.observer_state)
     if initial_set is None and initial_error is None:
         initial_set = {
@@ -174,7 +183,7 @@ def with_box(
         }
     first, _ = adaptive_plan(
         noisy_design(design, scenario), bounds, noise_bound or 0.0, initial_error=initial_error,
-        initial_set=initial_set, observer_state=state,
+        initial_set=initial_set, observer_state=state, sample_time=None if plant.is_discrete else scenario.sample_time,
     )  # fmt: skip
     del observer
     values = {name: getattr(nominal, name) for name in Monitor.__dataclass_fields__}

@@ -15,7 +15,7 @@ import numpy as np
 from obsynth.experiments.monitors.adaptive_bound import THRESHOLD_ROUNDING, AdaptiveBound
 from obsynth.experiments.monitors.adaptive_record import thresholds_of_records
 from obsynth.experiments.monitors.online import LinearSample
-from obsynth.experiments.monitors.residual_rules import NormRule, require_same
+from obsynth.experiments.monitors.residual_rules import FITTING_SHARE, NormRule, require_same
 from obsynth.numerics.arrays import FloatArray
 
 
@@ -76,6 +76,8 @@ def adaptive_step(
     """Take one sample: ``estimates (n,)`` as `ErrorStructure.reading` gives them; the state is changed."""
     _, nz, rows, m, no = bound.counts
     v = np.concatenate([estimates, inputs])
+    if bound.first is not None and state.k == 0:
+        state.psi[-1] = bound.first @ inputs
     moved, first, shift = (_varying if bound.varying else _constant)(bound, state, v)
     sizes = np.abs(np.concatenate([inputs, outputs, estimates]))
     np.maximum(state.largest[:-1], sizes, out=state.largest[:-1])
@@ -125,6 +127,10 @@ def _varying(bound: AdaptiveBound, state: AdaptiveState, v: FloatArray) -> tuple
     return sizes[:, :rows].sum(axis=0) + tail, first, np.zeros(no)
 
 
+#: Rings after which an error that nothing is known of is forgotten to a millionth.
+FORGETTING_RINGS = 3
+
+
 @dataclass(frozen=True, eq=False)
 class AdaptivePlan:
     """What an adaptive monitor of a design is made of; nothing in it changes online.
@@ -142,6 +148,7 @@ class AdaptivePlan:
     names: tuple[str, ...]
     fault_names: tuple[str, ...]
     residual_names: tuple[str, ...]
+    sample_time: float | None = None
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -185,6 +192,14 @@ class AdaptiveRule:
         self._state = AdaptiveState.of(self._bound)
         self._fault_state = None if self._faults is None else AdaptiveState.of(self._faults)
         self.cells: tuple[float, ...] = (math.nan,) * len(plan.columns)
+        self._last: float | None = None
+        self._waiting = 0
+
+    def _irregular(self, time: float) -> bool:
+        """Whether a row of a continuous design is not where its sampled observer expects it."""
+        dt, last = self.plan.sample_time, self._last
+        self._last = time
+        return dt is not None and last is not None and abs(time - last - dt) > FITTING_SHARE * dt
 
     def take(
         self, time: float, residuals: FloatArray, evidence: Any, *, deciding: bool
@@ -194,17 +209,28 @@ class AdaptiveRule:
             self.restart()
             self.cells = (math.nan,) * len(self.plan.columns)
             return math.nan, math.nan, None
+        if self._irregular(time):
+            # What the observer did over another interval is an error of its own, which must be forgotten first.
+            self.restart()
+            self._waiting = FORGETTING_RINGS * self._bound.length
+        self._waiting = max(self._waiting - 1, 0)
         reading = self._bound.structure.reading
         found = adaptive_step(self._bound, self._state, reading @ evidence.rows, evidence.inputs, evidence.outputs)
         error = found
         if self._faults is not None and self._fault_state is not None:
             estimates = self._faults.structure.reading @ evidence.rows
             error = adaptive_step(self._faults, self._fault_state, estimates, evidence.inputs, evidence.outputs)
-        statistic, nominal, _ = self._nominal.take(time, residuals, evidence, deciding=deciding)
-        threshold = (nominal + norm_beyond_nominal(self.plan, found)) * THRESHOLD_ROUNDING
+        if self.plan.sample_time is None:
+            statistic, nominal, _ = self._nominal.take(time, residuals, evidence, deciding=deciding)
+            threshold = (nominal + norm_beyond_nominal(self.plan, found)) * THRESHOLD_ROUNDING
+        else:
+            watched = evidence.rows[len(evidence.rows) - len(found.total) :][self.plan.residuals]
+            statistic, threshold = math.hypot(*watched), math.hypot(*found.total[self.plan.residuals])
         nf = len(self.plan.fault_names)
         values = evidence.rows[len(evidence.rows) - len(found.total) :]
         self.cells = self._cells(values[:nf], found, error)
+        if self._waiting:
+            return math.nan, math.nan, None
         if not deciding:
             return math.nan, threshold, None
         ratios = np.abs(values) / found.total
@@ -239,6 +265,7 @@ class AdaptiveRule:
         return {
             "nominal": self._nominal.as_dict(), "first": first, "state": self._state.as_dict(),
             "faults": None if self._fault_state is None else self._fault_state.as_dict(),
+            "last": self._last, "waiting": self._waiting,
             "options": [list(self.plan.names), self._bound.varying, float(self._bound.nominal.sum())],
         }  # fmt: skip
 
@@ -249,6 +276,7 @@ class AdaptiveRule:
         if not data["first"]:
             self._bound, self._faults = self._restarted
         self._nominal.resume(data["nominal"])
+        self._last, self._waiting = data["last"], int(data["waiting"])
         self._state = AdaptiveState.from_dict(data["state"])
         if data["faults"] is not None:
             self._fault_state = AdaptiveState.from_dict(data["faults"])

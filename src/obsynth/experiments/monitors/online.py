@@ -30,13 +30,16 @@ class Evidence(NamedTuple):
     """What a recursive observer learnt from a sample.
 
     Fields: theta, covariance: Parameters ``(nq,)`` and their covariance ``(nq, nq)``; innovation, regressor: ``(m,)``
-    and ``(m, nq)``: innovation less regressor times the true parameters is white, N(0, I).
+    and ``(m, nq)``: innovation less regressor times the true parameters is white, N(0, I); score, information: what
+    the sample says of the parameters, ``(nq,)`` and ``(nq, nq)``.
     """
 
     theta: FloatArray
     covariance: FloatArray
     innovation: FloatArray
     regressor: FloatArray
+    score: FloatArray
+    information: FloatArray
 
 
 class LinearSample(NamedTuple):

@@ -23,6 +23,7 @@ from obsynth.numerics.arguments import is_finite_number, require_kind, require_m
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.holds import first_order_hold
 from obsynth.observers.dae.observer import DAEObserver
+from obsynth.observers.decisions import WALKING_FORMS
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.plants.names import index_of
 from obsynth.results.design import ObserverDesign
@@ -90,12 +91,13 @@ def online_monitor(
     sample_time : float, optional, seconds
         Continuous designs: between the rows of the data; the scenario's by default.
     constants : mapping, ConstantsBox, Uncertainty or DescriptorSystem, optional
-        ``pointwise``, discrete linear designs: tolerances as `obsynth.uncertain_system` takes them; those of the
+        ``pointwise``, linear designs: tolerances as `obsynth.uncertain_system` takes them; those of the
         design's plant by ``plant.uncertainty``.  The threshold adapts to the signals and holds for every plant within
-        them; without, it assumes an exact model (but ``obsynth run`` takes the plant's own).  Columns of `run_on_data`
-        tell thresholds, guaranteed intervals of faults, and shares of the constants.
+        them; without, it assumes an exact model (but ``obsynth run`` takes the plant's own).  Continuous designs need
+        rows ``sample_time`` apart and known inputs that are held between them.  Columns of `run_on_data` tell
+        thresholds, guaranteed intervals of faults, and shares of the constants.
     initial_set : mapping, optional
-        ``pointwise``, discrete linear designs: bounds of the plant's states at the first row (deviations), each a
+        ``pointwise``, linear designs: bounds of the plant's states at the first row (deviations), each a
         number or ``[low, high]``; the threshold then holds from the first row on, for the plant's own tolerances where
         no others are given.
 
@@ -162,7 +164,7 @@ def online_monitor(
             driven=driven,
         )  # fmt: skip
         if adaptive:
-            return _adaptive(design, scenario, norm, model, bounds, noise_bound, initial_error, initial_set)
+            return _adaptive(design, scenario, norm, model, bounds, noise_bound, initial_error, initial_set, dt)
         rule = norm
         ending = _FORGOTTEN if initial_error is None else _AFTER_A_GAP
     else:
@@ -186,7 +188,7 @@ def online_monitor(
 
 def _adaptive(
     design: ObserverDesign, scenario: Scenario | None, norm: NormRule, model: ResidualModel, bounds: FloatArray,
-    noise_bound: float | None, initial_error: float | None, initial_set: Mapping[str, Any] | None,
+    noise_bound: float | None, initial_error: float | None, initial_set: Mapping[str, Any] | None, dt: float,
 ) -> OnlineMonitor:  # fmt: skip
     """Return the monitor whose threshold holds for every plant within its tolerances."""
     first, later = adaptive_plan(
@@ -195,6 +197,7 @@ def _adaptive(
         noise_bound or 0.0,
         initial_error=initial_error,
         initial_set=initial_set,
+        sample_time=dt,
     )
     start = _FORGOTTEN if initial_error is None and initial_set is None else _AFTER_A_GAP if initial_set is None else (
         "; it holds from the first row on, and after a gap once the error there is forgotten"
@@ -251,7 +254,9 @@ def _whitened(
 def _whole_record(observer: RecursiveObserver | DAEObserver) -> str:
     """Return why a likelihood ratio is not among the monitors, and what to use instead."""
     why = " glr compares every time at which a change may have begun, which takes a whole record"
-    if isinstance(observer, DAEObserver) or observer.adaptation is None or observer.adaptation.form == "random-walk":
+    if isinstance(observer, DAEObserver):
+        return f"{why}, and regressors, which a nonlinear design does not have: chi-square, cusum or nis serve here."
+    if observer.adaptation is None or observer.adaptation.form == "random-walk":
         return f"{why}, and regressors, which this design does not have: chi-square or nis serve here."
     return f"{why}: obsynth.decide(..., statistic='glr') has it for recorded estimates; row by row, use cusum."
 
@@ -268,7 +273,7 @@ def _of_parameters(
         )
     names = observer.fault_names
     if isinstance(observer, DAEObserver):
-        start, residuals, form = observer.initial_parameters, observer.model.ny, "nonlinear"
+        start, residuals, form = observer.initial_parameters, observer.model.ny, observer.form
     else:
         adaptation, plant = observer.adaptation, observer.plant
         start = np.zeros(0) if adaptation is None else adaptation.initial_parameters
@@ -281,7 +286,7 @@ def _of_parameters(
         theta[place] = float(value)
     if kind != "nis" and not len(theta):
         raise SpecError(f"{kind} watches parameters, and this design estimates none: use nis.", path="kind")
-    if kind == "cusum" and form in ("random-walk", "nonlinear"):
+    if kind == "cusum" and form in WALKING_FORMS:
         raise SpecError(f"cusum needs regressors, which a {form} design does not have: use chi-square or nis.",
                         path="kind")  # fmt: skip
     rule = ParameterRule(kind, theta, np.full(len(theta), float(change)), false_alarms)

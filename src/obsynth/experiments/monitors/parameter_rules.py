@@ -45,7 +45,7 @@ class ParameterRule:
             gap = gap - evidence.regressor @ self._nominal
         if self._kind == "chi-square":
             return self._chi_square(evidence)
-        return self._nis(gap) if self._kind == "nis" else self._cusum(gap, evidence.regressor)
+        return self._nis(gap) if self._kind == "nis" else self._cusum(evidence)
 
     def _share(self) -> float:
         self._looks += 1
@@ -70,8 +70,8 @@ class ParameterRule:
             return math.nan, math.nan, None
         return sum(value for value, _ in self._squares), float(chdtri(degrees, self._share())), None
 
-    def _cusum(self, gap: FloatArray, regressor: FloatArray) -> tuple[float, float, int | None]:
-        along, squares = regressor.T @ gap, np.einsum("mq,mq->q", regressor, regressor)
+    def _cusum(self, found: Evidence) -> tuple[float, float, int | None]:
+        along, squares = found.score - found.information @ self._nominal, np.diag(found.information)
         rise = np.concatenate([along, along]) * self._signs
         rise -= 0.5 * np.concatenate([squares, squares]) * self._signs**2
         self._levels = np.maximum(self._levels + rise, 0.0)

@@ -69,6 +69,9 @@ def tracked_errors(design: ObserverDesign, plant: DescriptorSystem) -> TrackedEr
         raise SpecError(f"Design {design.name!r} has no tracking map: its residual has no model.", path="observer")
     # A fault model's states come after the plant's own in the map; they track no fault here.
     tracking = matrices["tracking"][:, : plant.nx] if "Phi" in matrices else matrices["tracking"]
+    if tracking.shape[1] < plant.nx:
+        # Without a state of its own a filter follows nothing.
+        tracking = np.zeros((observer.order, plant.nx))
     lag = tracking.shape[1] // plant.nx - 1
     return TrackedErrors(ErrorSystem.of(plant, observer, tracking, lag), tracking[:, : plant.nx])
 

@@ -15,6 +15,7 @@ import numpy as np
 from obsynth.analysis.transformations import eliminate_algebraic_states
 from obsynth.analysis.transformations.recovery import Transformation, linear_plant
 from obsynth.errors import PreconditionError, SolverError, SpecError
+from obsynth.methods.functional_filter.detection_proofs import Transfer, gain_is_proved, sensitivity_is_proved
 from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.norms import response
@@ -23,11 +24,14 @@ from obsynth.numerics.spectra import abscissa
 from obsynth.numerics.threads import on_one_thread_if_small
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.proofs.balls import Enclosed, block
-from obsynth.proofs.definiteness import prove_positive_definite
+from obsynth.proofs.balls import Ball
+from obsynth.results.report import Check, VerificationReport
+from obsynth.verification.identities import Identity, equality
 
-#: The proved gain is this much above one, and the equation that proves it is this strict.
-MARGIN, STRICTNESS = 1e-6, 1e-9
+#: The grid of frequencies begins at this share of its end, where the band begins at zero.
+LEAST_FREQUENCY = 1e-6
+#: The proved gain is this much above one, and the proved sensitivity this much below what a grid finds.
+MARGIN, SENSITIVITY_MARGIN = 1e-6, 1e-4
 #: Frequencies of the grid, and how often the least value is refined between its neighbours.
 GRID, REFINEMENTS = 400, 40
 
@@ -43,13 +47,18 @@ class DetectionFilter:
     disturbance_gain : float
         Bound on the H-infinity norm from unknown inputs and noise to the residuals.
     proved : bool
-        Whether that bound is proved on the stored numbers, rounding included.
+        Whether both norms are proved on the stored numbers, rounding included: every row of the report holds.
     fault_sensitivity : float
-        H-minus: least singular value of the transfer from the faults to the residuals on the range of frequencies.
+        H-minus: the least singular value of the transfer from the faults to the residuals on the range of frequencies
+        is at least this.
     frequency : float, rad/s
         Where it is least.
     band : tuple of float, rad/s
         The range of frequencies.
+    plant : DescriptorSystem
+        What it is for.
+    report : VerificationReport
+        What `verify` found when it was made.
     """
 
     observer: LinearObserver
@@ -58,10 +67,17 @@ class DetectionFilter:
     fault_sensitivity: float
     frequency: float
     band: tuple[float, float]
+    plant: DescriptorSystem
+    report: VerificationReport
+
+    def verify(self) -> VerificationReport:
+        """Prove both norms again, from the plant and the shipped observer alone; every row is a claim of its own."""
+        claims = self.disturbance_gain, self.fault_sensitivity
+        return _verified(eliminate_algebraic_states(self.plant).plant, self.observer, *claims, self.band)
 
     @property
     def ratio(self) -> float:
-        """H-minus over H-infinity, the largest that any filter has."""
+        """H-minus over H-infinity: the largest that any filter has, but for the margins of the proofs."""
         return self.fault_sensitivity / self.disturbance_gain
 
 
@@ -82,7 +98,7 @@ def detection_filter(
     Returns
     -------
     DetectionFilter
-        ``observer`` with ``ny`` residuals, its gain from the unknown inputs proved.
+        ``observer`` with ``ny`` residuals; both norms are proved, see ``report``.
 
     Raises
     ------
@@ -97,7 +113,7 @@ def detection_filter(
     ----------
     .. [Ding] S. X. Ding, T. Jeinsch, P. M. Frank, E. L. Ding, "A unified approach to the optimization of fault
        detection systems", Int. J. Adaptive Control and Signal Processing 14, 2000.
-       Ours: the gain is proved on stored numbers.
+       Ours: both norms are proved on the stored numbers, at every frequency of the range.
     """
     plant = linear_plant(plant)
     if plant.dt > 0.0 or plant.nf == 0:
@@ -120,11 +136,63 @@ def detection_filter(
         state_names=(), fault_names=(), residual_names=tuple(f"r{i + 1}" for i in range(smooth.ny)), state_delays=(),
         fault_delays=(),
     )  # fmt: skip
-    least, where = _sensitivity(smooth, observer, listed[0], listed[1])
-    bound = 1.0 + MARGIN
-    return DetectionFilter(
-        observer, bound, _gain_is_proved(smooth, observer, b, d, bound), least, where, (listed[0], listed[1])
+    range_of = listed[0], listed[1]
+    least, where = _sensitivity(smooth, observer, *range_of)
+    claims = 1.0 + MARGIN, least * (1.0 - SENSITIVITY_MARGIN)
+    report = _verified(smooth, observer, *claims, range_of)
+    return DetectionFilter(observer, claims[0], report.passed, claims[1], where, range_of, plant, report)
+
+
+def _verified(
+    smooth: DescriptorSystem, observer: LinearObserver, gain: float, sensitivity: float, band: tuple[float, float]
+) -> VerificationReport:
+    """Return the rows that prove a detection filter on a plant without algebraic states."""
+    source = "Ding et al. 2000; proofs ours"
+    weight, injected = observer.Dy, observer.By
+
+    def into(b: FloatArray, d: FloatArray) -> tuple[Ball, Ball]:
+        direct = Ball.exact(d)
+        return Ball.exact(b) - Ball.exact(injected) @ direct, Ball.exact(weight) @ direct
+
+    shown = Ball.exact(weight) @ Ball.exact(smooth.C)
+    felt = Transfer(
+        observer.Az, *_in_order(into(np.hstack([smooth.Bd, smooth.Bw]), np.hstack([smooth.Dd, smooth.Dw])), shown)
     )
+    faults = Transfer(observer.Az, *_in_order(into(smooth.Bf, smooth.Df), shown))
+    proved = gain_is_proved(felt, gain)
+    sensed = sensitivity == 0.0 or sensitivity_is_proved(faults, sensitivity, *band)
+    terms = ((observer.Az,), (injected, smooth.C), (smooth.A,))
+    return VerificationReport.of([
+        equality(
+            "state in the error", "Az = A - By C",
+            Identity((observer.Az, injected @ smooth.C, -smooth.A), terms).residual(), source,
+        ),
+        equality(
+            "inputs in the error", "Bu = B - By D",
+            Identity((observer.Bu, injected @ smooth.D, -smooth.B), ((injected, smooth.D), (smooth.B,))).residual(),
+            source,
+        ),
+        equality(
+            "state in the residuals", "Cz = -Dy C",
+            Identity((observer.Cz, weight @ smooth.C), ((weight, smooth.C),)).residual(), source,
+        ),
+        equality(
+            "inputs in the residuals", "Du = -Dy D",
+            Identity((observer.Du, weight @ smooth.D), ((weight, smooth.D),)).residual(), source,
+        ),
+        Check(
+            "disturbance gain", "the error dies out, and the H-infinity norm from unknown inputs and noise to the "
+            "residuals is at most the claimed one", gain, gain, 0.0, proved, source, "proved",
+        ),
+        Check(
+            "fault sensitivity", "the least singular value from the faults to the residuals is at least the claimed "
+            f"one from {band[0]:g} to {band[1]:g} rad/s", sensitivity, sensitivity, 0.0, sensed, source, "proved",
+        ),
+    ])  # fmt: skip
+
+
+def _in_order(entering: tuple[Ball, Ball], shown: Ball) -> tuple[Ball, Ball, Ball]:
+    return entering[0], shown, entering[1]
 
 
 def _gains(plant: DescriptorSystem, b: FloatArray, d: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -160,7 +228,9 @@ def _sensitivity(plant: DescriptorSystem, observer: LinearObserver, low: float, 
         found = response(observer.Az, entering, shown, direct, np.asarray(1j * points, dtype=np.complex128))
         return np.asarray(np.linalg.svd(found, compute_uv=False)[:, -1])
 
-    grid = np.unique(np.concatenate([np.linspace(low, high, GRID), np.geomspace(max(low, 1e-6 * high), high, GRID)]))
+    grid = np.unique(
+        np.concatenate([np.linspace(low, high, GRID), np.geomspace(max(low, LEAST_FREQUENCY * high), high, GRID)])
+    )
     values = least(grid)
     at = int(np.argmin(values))
     left, right = grid[max(at - 1, 0)], grid[min(at + 1, len(grid) - 1)]
@@ -171,38 +241,3 @@ def _sensitivity(plant: DescriptorSystem, observer: LinearObserver, low: float, 
     place = 0.5 * (left + right)
     value = float(least(np.array([place]))[0])
     return (value, float(place)) if value < values[at] else (float(values[at]), float(grid[at]))
-
-
-def _gain_is_proved(
-    plant: DescriptorSystem, observer: LinearObserver, b: FloatArray, d: FloatArray, bound: float
-) -> bool:
-    """Prove the H-infinity norm from the unknown inputs to the residuals, errors of stored gains included."""
-    from scipy.linalg import solve_continuous_are
-
-    a, gain, weight = observer.Az, observer.By, observer.Dy
-    entering, direct, shown = b - gain @ d, weight @ d, weight @ plant.C
-    gap = bound**2 * np.eye(len(shown)) - direct @ direct.T
-    cross = entering @ direct.T
-    slack = STRICTNESS * max(float(np.linalg.norm(entering @ entering.T, 2)), np.finfo(np.float64).tiny)
-    try:
-        with warnings.catch_warnings():
-            # What a badly conditioned equation gives is judged by whether it proves anything.
-            warnings.simplefilter("ignore")
-            p = solve_continuous_are(a.T, shown.T, entering @ entering.T + slack * np.eye(len(a)), -gap, s=cross)
-    except (np.linalg.LinAlgError, ValueError):
-        return False
-    p = 0.5 * (p + p.T)
-    if not np.all(np.isfinite(p)):
-        return False
-
-    def inequality(kind: type[Enclosed]) -> Enclosed:
-        exact = kind.exact
-        closed = exact(plant.A) - exact(gain) @ exact(plant.C)
-        into = exact(b) - exact(gain) @ exact(d)
-        through, out = exact(weight) @ exact(d), exact(weight) @ exact(plant.C)
-        moved = closed @ exact(p)
-        corner = exact(bound**2 * np.eye(len(shown))) - through @ through.T
-        side = exact(p) @ out.T + into @ through.T
-        return block([[-(moved + moved.T) - into @ into.T, -side], [-side.T, corner]])
-
-    return prove_positive_definite(inequality).proved and prove_positive_definite(p).proved

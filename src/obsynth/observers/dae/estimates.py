@@ -94,6 +94,16 @@ class DAERow:
         return np.zeros((self.degrees, 0))
 
     @property
+    def score(self) -> FloatArray:
+        """What the sample says of the parameters ``(nq,)``, see `row_layout`."""
+        return self.part("score")
+
+    @property
+    def information(self) -> FloatArray:
+        """How much it says of them ``(nq, nq)``."""
+        return self.part("information")
+
+    @property
     def state_deviations(self) -> FloatArray:
         """Standard deviations of `x` ``(nx,)``."""
         return np.asarray(np.sqrt(np.maximum(np.einsum("...ii->...i", self.covariance), 0.0)))
@@ -167,7 +177,7 @@ class GatheredRows:
         Shapes: ``informations (any, nq, nq)``.
         """
         whole = {name: np.concatenate([part[name] for part in self.parts]) for name in self.parts[0]}
-        seen = whole.pop("information")
+        seen = whole["informations"]
         levels = _excitation(self.observer, seen if informations is None else informations)
         whole["excitation"] = levels[len(levels) - len(whole["nis"]) :]
         received = ~np.isnan(whole["innovations"])
@@ -200,7 +210,8 @@ def _columns(rows: DAERow) -> dict[str, FloatArray]:
         "faults": rows.theta, "fault_covariances": rows.parameter_covariance,
         "innovations": rows.innovation, "innovation_covariances": rows.part("expected"), "nis": rows.nis,
         "nis_degrees": rows.seen.sum(axis=1).astype(np.float64), "residuals": rows.part("residual"),
-        "conditions": rows.conditions, "contraction": rows.contractions, "information": rows.part("information"),
+        "conditions": rows.conditions, "contraction": rows.contractions, "informations": rows.information,
+        "scores": rows.score,
     }  # fmt: skip
 
 

@@ -103,6 +103,8 @@ def memory_layout(observer: DAESettings) -> Layout:
 def row_layout(observer: DAESettings) -> Layout:
     """Return what is said of one sample besides what is remembered.
 
+    ``score`` and ``information``: to first order the score less the information times the true parameters has mean zero
+    and covariance ``information``, of parameters that stay as they are.
     ``expected`` is the covariance of the innovation, that of the identity for what is not seen; ``noise`` is the
     derivative by what is added to the equations, ``kept`` F (I - K H) with K and H of the sample before, ``scaled`` the
     equilibrated matrix of (7), and ``trusted`` one where the step of the compiled graph was solved.
@@ -110,9 +112,9 @@ def row_layout(observer: DAESettings) -> Layout:
     nx, ny, nq = observer.model.nx, observer.model.ny, observer.model.nq
     n = nx * len(BUTCHER[observer.integration])
     return Layout({
-        "innovation": (ny, 1), "expected": (ny, ny), "nis": (1, 1), "information": (nq, nq), "covariance": (nx, nx),
-        "F": (nx, nx), "G": (nx, nq), "noise": (nx, nx), "kept": (nx, nx), "scaled": (n, n), "residual": (1, 1),
-        "trusted": (1, 1),
+        "innovation": (ny, 1), "expected": (ny, ny), "nis": (1, 1), "information": (nq, nq), "score": (nq, 1),
+        "covariance": (nx, nx), "F": (nx, nx), "G": (nx, nq), "noise": (nx, nx), "kept": (nx, nx), "scaled": (n, n),
+        "residual": (1, 1), "trusted": (1, 1),
     })  # fmt: skip
 
 

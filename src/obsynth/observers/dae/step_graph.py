@@ -162,7 +162,8 @@ class _Update:
         return {
             **found, "innovation": e, "expected": covariance, "nis": e.T @ definite_solved(covariance, e),
             "Sigma": Sigma, "Omega": Omega,
-            "information": Omega.T @ definite_solved(Sigma, Omega), "seen H": H, "seen L": L,
+            "information": Omega.T @ definite_solved(Sigma, Omega),
+            "score": Omega.T @ definite_solved(Sigma, e + Omega @ found["theta"]), "seen H": H, "seen L": L,
         }  # fmt: skip
 
     def _learnt(self, found: Arrays) -> Arrays:
