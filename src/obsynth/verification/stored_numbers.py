@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.numerics.arrays import SMALLEST, ComplexArray, FloatArray
 from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.spectra import boundary_points
 from obsynth.observers.linear.observer import LinearObserver
@@ -206,7 +206,7 @@ def _when_it_matters(system: _Composite, level: float, unit: float, slow: float)
     if outside.any():
         rate = float(np.max(np.log(np.abs(poles[outside])) / dt if dt > 0.0 else poles[outside].real))
         left = max(float(np.max(np.abs(system.K), initial=0.0)), float(np.max(np.abs(system.J), initial=0.0)))
-        seconds = float(np.log(max(level / max(left, 1e-300), 1.0)) / rate)
+        seconds = float(np.log(max(level / max(left, SMALLEST), 1.0)) / rate)
         return (
             "the plant has a pole outside the region of stability: no finite gain exists for stored numbers; where its "
             f"state is not held down, they matter after about {seconds:.3g} s"
