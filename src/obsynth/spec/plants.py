@@ -73,6 +73,8 @@ def read_value(value: Any, folder: Path, where: str, problems: DocumentProblems,
             return None
     if hasattr(value, "outputs") or hasattr(value, "states"):
         return getattr(value, "outputs", getattr(value, "states", None))
+    if isinstance(value, dict):
+        return {name: entry.model_dump() if hasattr(entry, "model_dump") else entry for name, entry in value.items()}
     return value.model_dump(exclude_unset=True) if hasattr(value, "model_dump") else value
 
 
