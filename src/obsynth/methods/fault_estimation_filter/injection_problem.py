@@ -20,6 +20,8 @@ from obsynth.methods.riccati import bounded_real_matrix, normalising_change, sta
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.norms import highest_gain_found, hinf_norm, norm_is_at_most, output_covariance, spectral_radius
 
+#: Slack of the bounded real matrix that normalises, relative to the squared norm of what is shown.
+NORMALISING_SLACK = 1e-6
 #: The normalising Riccati solution is taken at this multiple of the starting filter's norm.
 NORMALISING_LEVEL = 1.3
 #: A share that norms are certain to, and no one misses.
@@ -195,7 +197,7 @@ def normalise(
     gain = highest_gain_found(*problem.closed_loop(start)) if gain is None else gain
     size = gain if np.isfinite(gain) and gain > 0.0 else 1.0
     a, b, z, zd = problem.closed_loop(start)
-    tail = 1e-6 * max(float(np.linalg.norm(z, 2)) ** 2, np.finfo(np.float64).tiny)
+    tail = NORMALISING_SLACK * max(float(np.linalg.norm(z, 2)) ** 2, np.finfo(np.float64).tiny)
     p = bounded_real_matrix(a, b, z, zd, NORMALISING_LEVEL * size, slack=tail)
     if p is None:
         p = bounded_real_matrix(a, b[:, :0], z, zd[:, :0], 1.0, slack=tail)
