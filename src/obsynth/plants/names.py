@@ -13,8 +13,6 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray
 
-#: So many names are listed where none is close.
-_FEW_NAMES = 6
 #: Control characters, halves of pairs, separators of lines and paragraphs: no table can hold them in a name.
 _UNWRITABLE = frozenset({"Cc", "Cs", "Zl", "Zp"})
 
@@ -50,12 +48,9 @@ def index_of(name: str, names: Sequence[str], *, what: str) -> int:
 
 
 def suggestion(name: str, names: Iterable[str]) -> str:
-    """Return a question with the names closest to a wrong one, or all of a few; it begins with a space."""
-    known = list(names)
-    close = difflib.get_close_matches(name, known, n=3)
-    if close:
-        return f" Did you mean {' or '.join(map(repr, close))}?"
-    return f" There are: {', '.join(known)}." if 0 < len(known) <= _FEW_NAMES else ""
+    """Return a question with the names closest to a wrong one, beginning with a space; empty where none is close."""
+    close = difflib.get_close_matches(name, list(names), n=3)
+    return f" Did you mean {' or '.join(map(repr, close))}?" if close else ""
 
 
 def require_known(given: Iterable[Any], known: Iterable[str], *, what: str, kind: str) -> None:

@@ -134,7 +134,7 @@ def matlab_plant(reference: PlantReference, spec: Path) -> DescriptorSystem | No
         return _placed(lambda: from_matlab(spec.parent / reference.file, **arguments), spec, "plant")
     if arguments:
         raise SpecError(
-            f"{spec}: plant.{next(iter(arguments))}: unknown key beside a file that is no .mat file: what it says belongs "
+            f"{spec}: plant.{next(iter(arguments))}: unknown key beside a file that is no .mat file: it belongs "
             f"into {reference.file}.", path=f"plant.{next(iter(arguments))}",
         )  # fmt: skip
     return None
