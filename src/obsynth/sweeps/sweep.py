@@ -5,12 +5,12 @@ from __future__ import annotations
 import io
 import json
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, as_completed
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -214,7 +214,7 @@ def sweep(
         The cases or parameters are malformed, or the folder cannot be written.
     """
     made = _cases(cases, parameters or {}, method)
-    place = None if folder is None else _folder(Path(folder))
+    place = None if folder is None else folder_for(Path(folder))
     found: dict[str, SweepResult] = {}
     if place is not None:
         found = {case.key: known for case in made if (known := _known(case, place)) is not None}
@@ -222,7 +222,7 @@ def sweep(
         waiting = [case for case in made if case.key not in found]
         if told is not None:
             told(len(found), len(made))
-        for case, result in _made(waiting, executor):
+        for case, result in each(run_case, waiting, executor):
             found[case.key] = result if place is None else _kept(case, result, place)
             if told is not None:
                 told(len(found), len(made))
@@ -251,13 +251,19 @@ def _cases(cases: Any, parameters: Mapping[str, Sequence[Any]], method: str | No
     return spec_cases([Path(path) for path in paths], parameters, __version__)
 
 
-def _made(cases: Sequence[SweepCase], executor: Executor | None) -> Iterator[tuple[SweepCase, SweepResult]]:
-    """Yield each case with its result, as they come."""
+_Item = TypeVar("_Item")
+_Outcome = TypeVar("_Outcome")
+
+
+def each(
+    work: Callable[[_Item], _Outcome], items: Sequence[_Item], executor: Executor | None
+) -> Iterator[tuple[_Item, _Outcome]]:
+    """Yield each item with what comes of it, as they come."""
     if executor is None:
-        for case in cases:
-            yield case, run_case(case)
+        for item in items:
+            yield item, work(item)
         return
-    waiting = {executor.submit(run_case, case): case for case in cases}
+    waiting = {executor.submit(work, item): item for item in items}
     try:
         for future in as_completed(waiting):
             yield waiting[future], future.result()
@@ -303,7 +309,8 @@ def _designed(case: SweepCase) -> ObserverDesign:
     return found.replace(notes=(*notes, *found.notes)) if notes else found
 
 
-def _folder(folder: Path) -> Path:
+def folder_for(folder: Path) -> Path:
+    """Return a folder for results, made where there is none."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
