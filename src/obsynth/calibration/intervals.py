@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from obsynth.calibration.maximum import Maximum, Objective, at_bounds, descent, polished
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import SMALLEST, FloatArray
 
 #: A direction whose deviation exceeds this share of the bounds' width is not determined by the log.
 UNDETERMINED = 1.0 / 6.0
@@ -46,7 +46,7 @@ def information(hessian: FloatArray, objective: Objective, z: FloatArray) -> Inf
     found = hessian[:nt, :nt]
     if nuisance:
         values, vectors = np.linalg.eigh(hessian[np.ix_(nuisance, nuisance)])
-        kept = values > LEAST_INFORMATION * max(float(values.max()), 1e-300)
+        kept = values > LEAST_INFORMATION * max(float(values.max()), SMALLEST)
         across = hessian[:nt, nuisance] @ vectors[:, kept]
         found = found - (across / values[kept]) @ across.T
     return covariance_of(found, widths, objective.problem.unknown)
@@ -130,11 +130,11 @@ class _Profile:
         self.objective, self.maximum, self.i = objective, maximum, i
         self.others = [j for j in range(len(maximum.z)) if j != i]
         values, vectors = np.linalg.eigh(maximum.hessian)
-        values = np.maximum(values, 1e-8 * max(float(values.max()), 1e-300))
+        values = np.maximum(values, 1e-8 * max(float(values.max()), SMALLEST))
         self.covariance = (vectors / values) @ vectors.T
         inner = maximum.hessian[np.ix_(self.others, self.others)]
         values, vectors = np.linalg.eigh(inner)
-        values = np.maximum(values, 1e-8 * max(float(values.max(initial=0.0)), 1e-300))
+        values = np.maximum(values, 1e-8 * max(float(values.max(initial=0.0)), SMALLEST))
         spread = np.sqrt(np.diag((vectors / values) @ vectors.T))
         # Variables that the log does not determine move by no more than their search does.
         self.scale = np.minimum(spread, np.where(np.arange(len(maximum.z))[self.others] < objective.nt, 1.0, 3.0))

@@ -13,6 +13,7 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arguments import Count, ForgettingFactor, Probability, checked_value, real_vector, truth
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.covariances import covariance_factor
+from obsynth.numerics.ranks import rounding_rank
 from obsynth.observers.estimates import Undelayed
 from obsynth.observers.outliers import Outliers, checked_limit
 from obsynth.observers.sensor_timing import SensorTiming, checked_sensors
@@ -79,7 +80,7 @@ class Adaptation:
                 raise SpecError(f"{option} is {matrix.shape}, but {(q, q)} is needed.", path=option)
             object.__setattr__(self, field, matrix)
             factor = covariance_factor(matrix, option)
-            if field == "initial_covariance" and (np.diag(matrix) <= 0.0).any() | (np.linalg.matrix_rank(factor) < q):
+            if field == "initial_covariance" and (np.diag(matrix) <= 0.0).any() | (rounding_rank(factor) < q):
                 raise SpecError(f"{option} (S_0) must be positive definite.", path=option)
 
 

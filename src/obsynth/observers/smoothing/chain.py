@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.ranks import UNDETERMINED_SHARE
 from obsynth.numerics.square_root_smoothing import Gaussian, WayBack, nothing_later, stepped_back
-from obsynth.observers.recursive.recursion import UNDETERMINED_SHARE
 from obsynth.observers.state_bounds import projected
 
 
