@@ -23,7 +23,7 @@ from flint import fmpq, fmpq_mat
 
 import obsynth as ob
 
-CASES = 12_000
+CASES = 300
 LIMIT = 120.0  # s
 
 #: Relative error of a settled estimate above which a design is coarse, and above which it is wrong.
