@@ -17,7 +17,7 @@ import numpy as np
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.progress import Progress, shown_progress
 from obsynth.files.inputs import read_json
-from obsynth.files.outputs import FileKind, write_atomically
+from obsynth.files.outputs import write_atomically
 from obsynth.files.tables import TableWriter
 from obsynth.methods.designing import Plant, design
 from obsynth.plants.dae.model import DAEModel
@@ -35,7 +35,6 @@ if TYPE_CHECKING:
 #: What a case came to, by the exit code of its error.
 STATUSES = {0: "designed", 2: "malformed", 3: "impossible", 4: "infeasible", 5: "unknown", 6: "unverified"}
 _KIND = "obsynth sweep result"
-RESULT = FileKind("a result of a sweep", rb'"kind":\s*"obsynth sweep result"', ending=".result.json")
 #: Digits of the digest of a case in the names of its files.
 DIGITS = 16
 _PLANTS = (DescriptorSystem, TimeVaryingDescriptorSystem, DAEModel)
