@@ -65,7 +65,7 @@ def _reference() -> str:
     lines = ["API reference", "=============", "", "Every public name, from its docstring.", ""]
     for title in (title for title in ORDER if title in found):
         names = sorted(found[title], key=lambda name: (not _is_function(name), name.lower()))
-        lines += [title, "-" * len(title), "", ".. autosummary::", "   :toctree: api", ""]
+        lines += [title, "-" * len(title), "", ".. autosummary::", "   :toctree: api", "   :nosignatures:", ""]
         lines += [*(f"   {name}" for name in names), ""]
     return "\n".join(lines)
 

@@ -225,7 +225,8 @@ def test_the_designs_are_made_from_their_specs() -> None:
     [
         ({"dt": None}, "dt is missing"), ({"Q": None}, "Q is missing"), ({"R": {"pressure": 1e4}}, "positive definite"),
         ({"R": {"presure": 1e4}}, "Did you mean 'pressure'"), ({"bounds": {"phi": [1.0]}}, "bounds.phi"),
-        ({"random_walk": 1.0}, "random_walk belongs"), ({"initial_parameter_covariance": None}, "'psi' is zero"),
+        ({"random_walk": 1.0, "form": "forgetting"}, "random_walk belongs"),
+        ({"initial_parameter_covariance": None}, "'psi' is zero"),
         ({"bounds": [[0.0, 1.0]]}, "bounds must be 2 pairs"), ({"initial_state": "x"}, "initial_state"),
     ],
 )  # fmt: skip

@@ -212,6 +212,46 @@ def test_verify_and_run_need_no_solver(tmp_path: Path) -> None:
     assert done.stdout.splitlines() == [f"True {SAMPLES}"] * len(REGISTRY), done.stderr
 
 
+@EACH
+def test_a_record_is_smoothed_or_the_reason_is_said(method: str) -> None:
+    """A method gets this by stating deviations; its last sample has nothing after it."""
+    design = design_of(method)
+    y, u = record_of(design)
+    if isinstance(design.observer, LinearObserver):
+        with pytest.raises(obsynth.SpecError, match="covariances"):
+            obsynth.smooth(design, y, u)
+        with pytest.raises(obsynth.SpecError, match="covariances"):
+            obsynth.run_on_data(design, log_of(design), smooth=True)
+        return
+    found, filtered = obsynth.smooth(design, y, u), design.observer.run(y, u)
+    np.testing.assert_allclose(found.states[-1], filtered.states[-1], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(found.state_deviations[-1], filtered.state_deviations[-1], rtol=1e-9)
+    assert np.mean(found.state_deviations) < np.mean(filtered.state_deviations)
+    table = obsynth.run_on_data(design, log_of(design), lag=SAMPLES, outliers="none").table
+    np.testing.assert_allclose(
+        table[[f"xhat[{name}]" for name in found.state_names]], found.states, rtol=1e-9, atol=1e-12
+    )
+
+
+@EACH
+def test_sensors_of_their_own_times_are_taken_or_refused_by_name(method: str, tmp_path: Path) -> None:
+    plant, options = plant_of(method), OPTIONS.get(method, {})
+    name = plant.output_names[0]
+    sensors = {name: {"every": 3, "delay": 2}}
+    if isinstance(design_of(method).observer, LinearObserver):
+        with pytest.raises(obsynth.SpecError, match="sensors"):
+            obsynth.design(plant, method, sensors=sensors, **options)
+        return
+    design = obsynth.design(plant, method, sensors=sensors, **options)
+    again = obsynth.load(design.save(tmp_path / "gains.json"))
+    assert obsynth.verify(again).passed
+    y, u = record_of(design)
+    due = again.observer.timing.expected
+    silent = np.array([[value if due(k)[i] else np.nan for i, value in enumerate(row)] for k, row in enumerate(y)])
+    # What is not due is not used.
+    np.testing.assert_array_equal(again.observer.run(y, u).states, again.observer.run(silent, u).states)
+
+
 NO_NUMBERS = (True, np.True_, [True], {"leak": True}, object())
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from obsynth.calibration.maximum import Maximum, Objective, at_bounds, descent, polished
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import SMALLEST, FloatArray
 
 #: A direction whose deviation exceeds this share of the bounds' width is not determined by the log.
 UNDETERMINED = 1.0 / 6.0
@@ -46,7 +46,7 @@ def information(hessian: FloatArray, objective: Objective, z: FloatArray) -> Inf
     found = hessian[:nt, :nt]
     if nuisance:
         values, vectors = np.linalg.eigh(hessian[np.ix_(nuisance, nuisance)])
-        kept = values > LEAST_INFORMATION * max(float(values.max()), 1e-300)
+        kept = values > LEAST_INFORMATION * max(float(values.max()), SMALLEST)
         across = hessian[:nt, nuisance] @ vectors[:, kept]
         found = found - (across / values[kept]) @ across.T
     return covariance_of(found, widths, objective.problem.unknown)
@@ -130,11 +130,11 @@ class _Profile:
         self.objective, self.maximum, self.i = objective, maximum, i
         self.others = [j for j in range(len(maximum.z)) if j != i]
         values, vectors = np.linalg.eigh(maximum.hessian)
-        values = np.maximum(values, 1e-8 * max(float(values.max()), 1e-300))
+        values = np.maximum(values, 1e-8 * max(float(values.max()), SMALLEST))
         self.covariance = (vectors / values) @ vectors.T
         inner = maximum.hessian[np.ix_(self.others, self.others)]
         values, vectors = np.linalg.eigh(inner)
-        values = np.maximum(values, 1e-8 * max(float(values.max(initial=0.0)), 1e-300))
+        values = np.maximum(values, 1e-8 * max(float(values.max(initial=0.0)), SMALLEST))
         spread = np.sqrt(np.diag((vectors / values) @ vectors.T))
         # Variables that the log does not determine move by no more than their search does.
         self.scale = np.minimum(spread, np.where(np.arange(len(maximum.z))[self.others] < objective.nt, 1.0, 3.0))
@@ -206,13 +206,15 @@ def _side_along_valley(objective: Objective, maximum: Maximum, i: int, sign: flo
     end = float(objective.low[i] if sign < 0 else objective.high[i])
     inner = maximum.hessian[np.ix_(others, others)]
     slope = -np.linalg.lstsq(inner, maximum.hessian[others, i], rcond=LEAST_INFORMATION)[0]
-    step, reached = VALLEY_STEP, 0.0
+    step, reached, curvature = VALLEY_STEP, 0.0, maximum.hessian
     while abs(end - place) > 1e-9:
         new = place + sign * min(step, abs(end - place))
         z = np.empty(len(maximum.z))
         z[others], z[i] = rest + slope * (new - place), new
         z = np.clip(z, objective.low, objective.high)
-        least, z, _ = polished(objective, z, fixed=i, most=VALLEY_NEWTON_STEPS, tolerance=VALLEY_TOLERANCE)
+        least, z, after = polished(
+            objective, z, fixed=i, most=VALLEY_NEWTON_STEPS, tolerance=VALLEY_TOLERANCE, near=curvature
+        )
         found = math.sqrt(max(2.0 * (least - maximum.value), 0.0))
         if found >= target:
             if step <= LEAST_VALLEY_STEP * VALLEY_STEP:
@@ -221,4 +223,5 @@ def _side_along_valley(objective: Objective, maximum: Maximum, i: int, sign: flo
             step *= 0.25
             continue
         slope, place, rest, reached = (z[others] - rest) / (new - place), new, z[others].copy(), found
+        curvature = after
     return Side(end, True)

@@ -15,7 +15,8 @@ import numpy as np
 
 from obsynth.calibration.logs import Log, refused
 from obsynth.errors import SpecError
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import SMALLEST, FloatArray
+from obsynth.numerics.ranks import rounding_rank
 from obsynth.plants.dae.functions import BUTCHER
 from obsynth.plants.dae.symbols import symbolic_value
 from obsynth.plants.descriptor import DescriptorSystem
@@ -229,14 +230,16 @@ class LinearPlant:
         for i, row in enumerate(signals[:SIZED_SAMPLES]):
             if i:
                 J, before = (np.array(part) for part in both(row))
-                if not np.isfinite(J).all() or np.linalg.matrix_rank(J / np.maximum(np.abs(J).max(), 1e-300)) < self.nx:
+                if not np.isfinite(J).all() or rounding_rank(J / np.maximum(np.abs(J).max(), SMALLEST)) < self.nx:
                     raise refused("undetermined-step", "The equations of a step do not determine the state: a discrete "
                                   "plant needs its algebraic equations as rows without x(k+1), and index one. "
                                   "Eliminate algebraic states first.", signals=list(self.state_names))  # fmt: skip
                 reach = -np.linalg.solve(J, before) @ reach
             H = np.array(outputs(np.zeros(self.nx), row, np.zeros(0))[1])
             effects = np.maximum(effects, (np.abs(H @ reach) / large).max(axis=0, initial=0.0))
-        effects = np.maximum(np.nan_to_num(effects), LEAST_EFFECT * max(float(np.nanmax(effects, initial=0.0)), 1e-300))
+        effects = np.maximum(
+            np.nan_to_num(effects), LEAST_EFFECT * max(float(np.nanmax(effects, initial=0.0)), SMALLEST)
+        )
         return np.asarray(1.0 / effects)
 
 

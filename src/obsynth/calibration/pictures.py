@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from obsynth.numerics.arrays import SMALLEST
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
@@ -51,7 +53,7 @@ def _boxes(panel: object, found: Calibration) -> None:
         return
     opened = set(found.box.open_sides)
     for i, (name, value) in enumerate(found.nominal.items()):
-        size = abs(value) or max(abs(found.box.low[name]), abs(found.box.high[name]), 1e-300)
+        size = abs(value) or max(abs(found.box.low[name]), abs(found.box.high[name]), SMALLEST)
         low, high = (found.box.low[name] - value) / size * 100.0, (found.box.high[name] - value) / size * 100.0
         panel.plot([low, high], [i, i], color="0.5", linewidth=3.0, solid_capstyle="butt")
         for side, end in (("low", low), ("high", high)):

@@ -12,7 +12,7 @@ from obsynth.calibration.likelihood import LARGEST_RESIDUAL
 from obsynth.calibration.logs import refused
 from obsynth.calibration.plants import NonlinearPlant
 from obsynth.calibration.problem import Problem
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.plants.dae.functions import Compiled
 
 #: Rounds in which the sensors' weights are estimated again; the first is robust against single wrong values.
@@ -49,7 +49,7 @@ class SimulationError:
 
     def __init__(self, problem: Problem) -> None:
         self.problem, graphs = problem, problem.graphs
-        self.spread = np.sqrt(np.maximum(np.diag(problem.P0), 1e-300))
+        self.spread = np.sqrt(np.maximum(np.diag(problem.P0), SMALLEST))
         self.scale = np.concatenate([problem.widths, self.spread])
         self.run = Compiled(_simulated(problem))
         self.nt, self.ny, self.size = graphs.nt, graphs.ny, graphs.nt + graphs.nx
@@ -146,7 +146,7 @@ def _require_explained(problem: Problem, left: FloatArray) -> None:
     """Refuse a model whose best fit leaves as much as there was: its units, scales or sample time are wrong."""
     y = problem.y
     deviations = np.nanstd(y, axis=0)
-    share = left / np.maximum(deviations, 1e-300)
+    share = left / np.maximum(deviations, SMALLEST)
     with np.errstate(invalid="ignore"):
         roughness = np.nan_to_num(np.nanstd(np.diff(y, axis=0), axis=0)) / np.sqrt(2.0)
     moves = deviations > MOVING * np.maximum(roughness, np.sqrt(problem.floors))
@@ -168,7 +168,7 @@ def _require_levels(problem: Problem, fit: Fit, error: SimulationError) -> None:
         return
     y = problem.y
     simulated = error.simulated(np.concatenate([fit.t, fit.x0]) / error.scale)[0]
-    levels = np.sqrt(np.nanmean(simulated**2, axis=0)) / np.maximum(np.sqrt(np.nanmean(y**2, axis=0)), 1e-300)
+    levels = np.sqrt(np.nanmean(simulated**2, axis=0)) / np.maximum(np.sqrt(np.nanmean(y**2, axis=0)), SMALLEST)
     far = (levels > OTHER_LEVEL) | (levels < 1.0 / OTHER_LEVEL)
     far &= fit.deviations > UNEXPLAINED * np.nanstd(y, axis=0)
     if far.any():

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.calibration.plants import CalibrationPlant
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.numerics.symbolic_solve import largest_entries
 from obsynth.observers.dae.compiled_library import compiler
 
@@ -55,8 +55,8 @@ ITERATIONS, FURTHER = 3, 8
 SOLVED = 1e-11
 
 
-#: Operations in one evaluation above which functions are compiled: some seconds, before thousands of evaluations.
-COMPILED_OPERATIONS = 2_000_000
+#: Operations in one evaluation above which functions are compiled: a second or so, before a thousand evaluations.
+COMPILED_OPERATIONS = 200_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +157,7 @@ class _Substep:
         values = np.array([plant.values[name] for name in unknown])
         self.order = _pivots(ca.Function("J", [X, x, u, t], [ca.densify(J)]), plant, self.stages, values)
         step = eliminated(J, -equations, self.order)
-        weights = 1.0 / ca.fmax(largest_entries(ca.densify(J) @ ca.diag(sizes)), 1e-300)
+        weights = 1.0 / ca.fmax(largest_entries(ca.densify(J) @ ca.diag(sizes)), SMALLEST)
         left = ca.mmax(ca.fabs(weights * equations)) if self.size > 1 else ca.fabs(weights * equations)
         # The residual is that before the iteration, so that the last one is better than it says.
         self.newton = ca.Function("newton", [X, x, u, t], [X + step, left])

@@ -8,7 +8,7 @@ The innovations of a design along a log, with what the design expects of them.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.robustness import with_all_sensors
 from obsynth.results.design import ObserverDesign
 
 
@@ -48,10 +49,13 @@ class RecordedInnovations:
 def recorded_innovations(design: ObserverDesign, log: Log) -> RecordedInnovations:
     """Run a design over a log."""
     observer = design.observer
+    if isinstance(observer, (DAEObserver, RecursiveObserver)) and observer.sensors is not None:
+        # Afterwards every value is known at its own time.
+        log = replace(log, y=observer.timing.in_order(log.y))
     if isinstance(observer, DAEObserver):
-        return _nonlinear(observer, log)
+        return _nonlinear(with_all_sensors(observer), log)
     if isinstance(observer, RecursiveObserver):
-        return _recursive(observer, log, dict(getattr(design.plant, "operating_point", {})))
+        return _recursive(with_all_sensors(observer), log, dict(getattr(design.plant, "operating_point", {})))
     raise TypeError(f"{type(observer).__name__} has no innovations with a covariance")
 
 

@@ -73,7 +73,8 @@ class LaterRows:
             ready = self.waiting.pop(0)
             found = chain.smoothed(self.keeping.links, ready.k, ready.k + self.lag)[0]
             yield self._shown(ready, found)
-        chain.drop_before(self.waiting[0].k)
+        # A late value changes what is known since its own time.
+        chain.drop_before(min(self.waiting[0].k, chain.last - self.keeping.observer.timing.longest))
 
     def flush(self) -> Iterator[tuple[Entry, Any, Smoothed]]:
         """Yield the rows that wait, smoothed by as many samples as there are."""
@@ -161,7 +162,7 @@ def smooth(
 
     Nonlinear designs are linearised along the filter's estimates (the extended smoother), which is exact for linear
     plants; forms ``random-walk`` and ``augmented-kalman`` take states and parameters together.  Bounds of parameters
-    cut the estimates and leave covariances as they are.
+    cut the estimates, bounds of states project them, and both leave covariances as they are.
 
     References
     ----------

@@ -50,7 +50,9 @@ class SteppingEngine:
         self.columns = estimate_columns(self.state_names, self.fault_names, residuals, deviations=True)
         self.directions = len(residuals)
         self.dt, self.warm_up = self.observer.dt, checked_warm_up(warm_up, 0.0)
-        self.notes: tuple[str, ...] = ()
+        late = ", ".join(name for name, entry in (self.observer.sensors or {}).items() if entry["delay"])
+        told = "their innovations stand in no row, so that monitors see them in the estimates only."
+        self.notes: tuple[str, ...] = (f"Values of {late} arrive late: {told}",) if late else ()
         self.clock = Clock(self.dt, None)
         self.state: Any = self.observer.init()
         self.u: FloatArray | None = None
@@ -125,7 +127,7 @@ class SteppingEngine:
             self.settled_at = time + self.warm_up
             self.phase = WARM_UP if self.phase == WARM_UP else RECOVERING
         # A filter that begins with y(1) does not miss y(0).
-        heard = known[nu:] & ~self._refused()
+        heard = (known[nu:] & ~self._refused()) | ~self.observer.timing.expected(self.state.k - 1)
         if fresh and self.is_recursive:
             heard = np.ones_like(heard)
         status = self._status(time, known[:nu], heard, spoiled=spoiled)

@@ -56,7 +56,7 @@ class ParameterBench(Bench):
             observer.plant, parameters=self.parameters, inputs=self.inputs, initial_state=self.initial_state,
             equation_noise=mu, output_noise=nu,
         )  # fmt: skip
-        outputs = self.drive.measured(clean)
+        outputs = np.moveaxis(observer.timing.arriving(np.moveaxis(self.drive.measured(clean), 1, 0)), 0, 1)
         return self._runs(states, outputs, self._watched(observer, outputs))
 
     def _watched(self, observer: RecursiveObserver, outputs: FloatArray) -> tuple[Estimates, ...]:
@@ -65,7 +65,8 @@ class ParameterBench(Bench):
         They depend on no data: the other runs are one matrix product a step for all of them.
         """
         runs = outputs.shape[1]
-        if runs == 1 or (observer.adaptation is not None and observer.adaptation.reset):
+        resets = observer.adaptation is not None and bool(observer.adaptation.reset)
+        if runs == 1 or resets or not observer.is_plain:
             return tuple(observer.run(outputs[:, run], self.inputs, compiled=False) for run in range(runs))
         first = observer.run(outputs[:, 0], self.inputs, compiled=False)
         others = run_batch(observer, np.swapaxes(outputs[:, 1:], 0, 1), self.inputs)
@@ -86,7 +87,7 @@ class ParameterBench(Bench):
                 initial_state=self.initial_state, Q=share * observer.Q if share else None,
                 R=share * observer.R + np.diag(self.drive.deviations**2), seed=seed,
             )  # fmt: skip
-            measured = self.drive.measured(truth.outputs[:, None])[:, 0]
+            measured = observer.timing.arriving(self.drive.measured(truth.outputs[:, None])[:, 0])
             states.append(truth.states)
             outputs.append(measured)
             estimates.append(observer.run(measured, self.inputs))

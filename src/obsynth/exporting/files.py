@@ -17,6 +17,8 @@ from obsynth.exporting.realisation import Realisation
 from obsynth.files.outputs import FileKind, write_atomically, write_together
 from obsynth.numerics.arguments import require_kind
 from obsynth.observers.dae.observer import DAEObserver
+from obsynth.observers.running import StepObserver
+from obsynth.observers.sensor_timing import require_plain
 from obsynth.results.design import ObserverDesign
 
 SUFFIXES = (".mat", ".npz", ".c", ".fmu")
@@ -100,6 +102,8 @@ def export(
     suffix = target.suffix.lower()
     if suffix not in SUFFIXES:
         raise SpecError(f"{target} has an unknown suffix: use one of {', '.join(SUFFIXES)}.", path=str(target))
+    if isinstance(design, ObserverDesign) and isinstance(design.observer, StepObserver):
+        require_plain(design.observer, "An export")
     if suffix == ".fmu":
         from obsynth.exporting.fmu.archive import write_fmu
 

@@ -12,12 +12,14 @@ from itertools import chain, product
 
 import numpy as np
 
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.numerics.doubling import REFUTED, doubled_riccati_solution, is_clearly_negative, is_positive
 from obsynth.numerics.norms import balancing_factors, spectral_radius
 from obsynth.numerics.spectra import abscissa
 from obsynth.verification.certificates import prove_stable
 
+#: Process noise is taken to be at least this much, relative to the squared norm of A or one.
+LEAST_PROCESS = 1e-8
 #: Relative sizes of the fictitious process and measurement noise, tried in turn, that make the equation regular.
 REGULARISATIONS = (1e-6, 1e-4, 1e-2, 1.0)
 
@@ -42,7 +44,9 @@ def stabilising_gain(a: FloatArray, c: FloatArray, noise_a: FloatArray, noise_c:
         return np.zeros((n, 0)) if spectral_radius(a) < 1.0 else None
     process, cross, measured = noise_a @ noise_a.T, noise_a @ noise_c.T, noise_c @ noise_c.T
     best, least = None, 1.0
-    process_size = max(float(np.linalg.norm(noise_a, 2)) ** 2, 1e-8 * float(np.linalg.norm(a, 2)) ** 2, 1e-8)
+    process_size = max(
+        float(np.linalg.norm(noise_a, 2)) ** 2, LEAST_PROCESS * float(np.linalg.norm(a, 2)) ** 2, LEAST_PROCESS
+    )
     for epsilon in REGULARISATIONS:
         q = process + epsilon * process_size * np.eye(n)
         size = float(np.linalg.norm(c @ q @ c.T, 2)) + float(np.linalg.norm(measured, 2))
@@ -221,7 +225,7 @@ def _factor(a: FloatArray, dt: float, share: float, rounds: int, edge: float) ->
                 # What a badly conditioned equation gives is judged by whether it proves anything.
                 warnings.simplefilter("ignore")
                 if dt > 0.0:
-                    p = solve_discrete_lyapunov((moved / max(edge, 1e-300) ** share).T, np.eye(n))
+                    p = solve_discrete_lyapunov((moved / max(edge, SMALLEST) ** share).T, np.eye(n))
                 else:
                     p = solve_continuous_lyapunov((moved - share * edge * np.eye(n)).T, -np.eye(n))
         except (np.linalg.LinAlgError, ValueError):

@@ -12,6 +12,9 @@ from obsynth.errors import SpecError
 FloatArray: TypeAlias = NDArray[np.float64]
 ComplexArray: TypeAlias = NDArray[np.complex128]
 
+#: Stands for a size that may be zero, where something is divided by it.
+SMALLEST = 1e-300
+
 
 def read_only(array: FloatArray) -> FloatArray:
     """Return a private copy of ``array`` that nobody can write to."""

@@ -16,7 +16,7 @@ import numba
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.ranks import OUTGROWN
+from obsynth.numerics.least_squares_step import OUTGROWN
 
 Function = TypeVar("Function", bound=Callable[..., object])
 

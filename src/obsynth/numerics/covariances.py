@@ -6,11 +6,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray
-
-#: Entries (i, j) and (j, i) may differ by this much, relative to the standard deviations: rounding of products.
-SYMMETRY_TOLERANCE = 1e-10
-#: An eigenvalue of a correlation matrix above minus this is a rounded zero.
-DEFINITENESS_TOLERANCE = 1e-12
+from obsynth.numerics.ranks import DEFINITENESS_TOLERANCE, SYMMETRY_TOLERANCE, rounding_rank
 
 
 def covariance_factor(covariance: FloatArray, name: str) -> FloatArray:
@@ -60,4 +56,4 @@ def is_definite(covariance: FloatArray, factor: FloatArray) -> bool:
     variances = np.diag(covariance)
     if not np.all(variances > 0.0):
         return False
-    return not len(factor) or bool(np.linalg.matrix_rank(factor / np.sqrt(variances)[:, None]) == len(factor))
+    return not len(factor) or bool(rounding_rank(factor / np.sqrt(variances)[:, None]) == len(factor))

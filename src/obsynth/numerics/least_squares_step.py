@@ -13,8 +13,10 @@ import numpy as np
 
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.ranks import OUTGROWN, RANK_TOLERANCE
+from obsynth.numerics.ranks import RANK_TOLERANCE
 
+#: Standard deviations above this outgrow double precision soon: their squares overflow at 1e154.
+OUTGROWN = 1e100
 #: A column of H that keeps less than this of its length beside the others goes to the rank-revealing step: far below
 #: what a condition number of 1e12 does, far above rounding.
 DEPENDENT_COLUMN = 1e-14

@@ -1,4 +1,4 @@
-"""Rank decisions and every tolerance of the package, in one place.
+"""Rank decisions, and the tolerances of every decision on rank and sign; other constants stand with their algorithm.
 
 A rank is a decision, not a fact: each one reports the singular values on both sides of the cut, so
 that a reader sees how clear it was.
@@ -39,10 +39,25 @@ NAMED_SHARE = 1e-3
 CANCELLATION_TOLERANCE = 1e-14
 #: Largest eigenvalue, relative to the norm of the balanced matrix, below which all of them are rounding errors of zero.
 NEGLIGIBLE_MODE = 1e-6
-#: Standard deviations above this outgrow double precision soon: their squares overflow at 1e154.
-OUTGROWN = 1e100
-#: Fault zeros of a sampled plant between this radius and 1 make the fault estimate ring for long.
-SLOW_ZERO_RADIUS = 0.98
+#: Entries (i, j) and (j, i) of a covariance may differ by this much, relative to the standard deviations.
+SYMMETRY_TOLERANCE = 1e-10
+#: An eigenvalue of a correlation matrix above minus this is a rounded zero.
+DEFINITENESS_TOLERANCE = 1e-12
+#: Share of a diffuse direction below which a state is held to be determined: rounding of an orthonormal basis.
+UNDETERMINED_SHARE = 1e-8
+#: Singular values of a scaled exact Jacobian below this share of the largest are zero.
+JACOBIAN_RANK_TOLERANCE = 1e-9
+#: Directions of a Riccati solution below this share are not told from zero.
+NEGLIGIBLE_SHARE = 1e-12
+#: Singular values of a set of directions below this share of the largest are no direction of their own.
+DIRECTION_SHARE = 1e-9
+#: Singular values of a constant's effect below this share count as zero; what is left out goes into the remainder.
+EFFECT_RANK_SHARE = 1e-12
+
+
+def rounding_rank(matrix: FloatArray) -> int:
+    """Return the rank to working precision: what rounding alone leaves of it."""
+    return int(np.linalg.matrix_rank(matrix))
 
 
 @dataclass(frozen=True, eq=False)

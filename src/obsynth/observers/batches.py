@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
 from numpy.typing import ArrayLike
 
+from obsynth.errors import SpecError
+from obsynth.numerics.arrays import read_only
 from obsynth.observers.dae.batch import run_dae_batch
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.estimates import Estimates
@@ -47,6 +51,28 @@ def run_batch(
     SolverError
         A step of a DAE has no solution; the trial, k and the worst equation are named.
     """
+    if not observer.is_plain:
+        return _one_by_one(observer, y, u)
     if isinstance(observer, DAEObserver):
         return run_dae_batch(observer, y, u, **options)
     return gain_schedule.run_batch(observer, y, u, **options)
+
+
+def _one_by_one(observer: RecursiveObserver | DAEObserver, y: ArrayLike, u: ArrayLike | None) -> Estimates:
+    """Run trials one after another, as sensors of their own times and bounds on states need it."""
+    outputs, inputs = np.asarray(y, dtype=np.float64), None if u is None else np.asarray(u, dtype=np.float64)
+    if outputs.ndim != 3 or not len(outputs):
+        raise SpecError(f"y has shape {outputs.shape}, but (trials, samples, ny) is needed.", path="y")
+    if inputs is not None and inputs.ndim == 3 and len(inputs) != len(outputs):
+        raise SpecError(f"u has {len(inputs)} trials and y has {len(outputs)}: give the same number.", path="u")
+    found = [
+        observer.run(outputs[i], inputs if inputs is None or inputs.ndim == 2 else inputs[i])
+        for i in range(len(outputs))
+    ]
+    names = ("states", "faults", "fault_covariances", "state_deviations", "nis", "nis_degrees", "residuals")
+    stacked = {name: read_only(np.stack([getattr(each, name) for each in found])) for name in names}
+    width = max(each.innovations.shape[1] for each in found)
+    wide = [np.pad(each.innovations, ((0, 0), (0, width - each.innovations.shape[1])), constant_values=np.nan)
+            for each in found]  # fmt: skip
+    changes: dict[str, Any] = {**stacked, "innovations": read_only(np.stack(wide))}
+    return replace(found[0], **changes)

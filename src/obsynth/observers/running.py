@@ -127,9 +127,25 @@ class StepObserver(Undelayed, Generic[State, Known]):
     def _estimates(self, state: State, row: Known) -> Estimates:
         """Return the estimates of one sample."""
 
+    @property
+    @abstractmethod
+    def timing(self) -> Any:
+        """When each sensor is sampled, and how late its values are: `obsynth.observers.sensor_timing.SensorTiming`."""
+
+    def shown(self, row: Known) -> Known:
+        """Return a row as it is shown, within the bounds of the states.
+
+        Parameters
+        ----------
+        row : NamedTuple
+            What is known at a sample.
+        """
+        return row
+
     def init(self) -> State:
         """Return the state before the first sample, k = 0."""
-        return self._steps.first
+        found: State = self.timing.begun(self._steps.first)
+        return found
 
     def advance(self, state: State, y: FloatArray, u: FloatArray) -> tuple[State, Known]:
         """Return the next state and what is known at a sample, without checking it.
@@ -141,7 +157,8 @@ class StepObserver(Undelayed, Generic[State, Known]):
         y, u : FloatArray
             ``(ny,)``, NaN for what is missing, and ``(nu,)``.
         """
-        return self._steps.advance(state, y, u)
+        after, row = self.timing.advance(self._steps.advance, state, y, u)
+        return after, self.shown(row)
 
     def accept(self, state: State, y: FloatArray, u: FloatArray) -> tuple[State, Known]:
         """Return the same as `advance`, where the step is one that can be trusted.
@@ -159,6 +176,24 @@ class StepObserver(Undelayed, Generic[State, Known]):
             The horizon of a time-varying plant is passed.
         SolverError
             The step of a nonlinear plant has no solution, or more than one.
+        """
+        after, row = self.timing.advance(self.in_order, state, y, u)
+        return after, self.shown(row)
+
+    def in_order(self, state: State, y: FloatArray, u: FloatArray) -> tuple[State, Known]:
+        """Take a sample whose values are all of its own time, as `accept` takes it.
+
+        Parameters
+        ----------
+        state : NamedTuple
+            Before the sample, of an observer without late sensors.
+        y, u : FloatArray
+            ``(ny,)``, NaN for what is missing, and ``(nu,)``.
+
+        Raises
+        ------
+        SpecError, SolverError
+            As `accept` does.
         """
         self._allow(state)
         after, row = self._steps.advance(state, y, u)
@@ -187,7 +222,7 @@ class StepObserver(Undelayed, Generic[State, Known]):
             The step has no solution; k, iteration and worst equation are named (nonlinear observers).
         """
         after, row = self.accept(state, *self._sample(state, y, u))
-        return after, self._estimates(after, row)
+        return after, self._estimates(getattr(after, "latest", after), row)
 
     def start(self) -> RunningObserver[State, Known]:
         """Return a running observer, at k = 0."""
@@ -252,6 +287,9 @@ def state_as_data(state: tuple[Any, ...]) -> dict[str, Any]:
 
 def state_from_data(like: Kept, data: dict[str, Any]) -> Kept:
     """Return the state of the same kind as ``like`` that `state_as_data` described."""
+    if hasattr(like, "from_data"):
+        restored: Kept = like.from_data(data)
+        return restored
     values = {name: _from_data(own, data[name]) for name, own in like._asdict().items()}  # type: ignore[attr-defined]
     return type(like)(**values)
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from obsynth.errors import PreconditionError
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.proofs.balls import gamma, rounded_up
 from obsynth.proofs.contraction import inverse_bound, spectral_radius_bound
 
@@ -169,7 +169,7 @@ def affine_exponential(matrix: AffineMatrix, terms: int = 14) -> AffineMatrix:
     largest = float(matrix.magnitude.sum(axis=1).max(initial=0.0))
     if not np.isfinite(largest):
         raise PreconditionError("A matrix is not bounded on the box.", condition="boundedness")
-    doublings = max(0, int(np.ceil(np.log2(max(largest, 1e-300) * 2.0))))
+    doublings = max(0, int(np.ceil(np.log2(max(largest, SMALLEST) * 2.0))))
     small, identity = matrix.scaled(2.0**-doublings), np.eye(size)
     series = AffineMatrix.exact(identity, matrix.count)
     for k in range(terms, 0, -1):

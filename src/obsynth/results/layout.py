@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     from obsynth.results.report import Check
 from obsynth.numerics.arguments import is_number
 
+#: Two values this near to each other, relative to their size or one, are shown as conjugates.
+SAME_NUMBER = 1e-9
+
 
 def number(value: float, *, digits: int = 4) -> str:
     """Return ``value`` with a few significant digits; a dash for "not a number", whatever a changed file may hold."""
@@ -43,7 +46,7 @@ def complex_numbers(values: Iterable[complex], *, limit: int = 8) -> str:
     shown: list[str] = []
     while waiting:
         value = waiting.pop(0)
-        partner = next((w for w in waiting if abs(w - value.conjugate()) <= 1e-9 * max(1.0, abs(value))), None)
+        partner = next((w for w in waiting if abs(w - value.conjugate()) <= SAME_NUMBER * max(1.0, abs(value))), None)
         if value.imag == 0.0 or partner is None:
             shown.append(complex_number(value))
         else:

@@ -14,7 +14,7 @@ from pydantic import Field, create_model
 
 from obsynth.methods.method_spec import option_types
 from obsynth.methods.registry import REGISTRY, method_spec
-from obsynth.numerics.arguments import NonNegative, OpenUnitInterval, Positive, WrittenAs
+from obsynth.numerics.arguments import Count, NonNegative, OpenUnitInterval, Positive, WrittenAs
 from obsynth.spec.schema_values import Covariance, Matrix, Section, Text, VaryingCovariance
 
 Two = Annotated[list[float], Field(min_length=2, max_length=2)]
@@ -34,6 +34,13 @@ class NoiseSection(Section):
     measurement: Positive | list[Positive] | dict[Text, Positive] | None = None
     process: Positive = 1.0
     fault: Positive = 1.0
+
+
+class SensorTimes(Section):
+    """When a sensor is sampled, and how late its values are, in rows."""
+
+    every: Count = 1
+    delay: Annotated[int, Field(ge=0)] = 0
 
 
 #: What a document may write for an option that is no plain number, text or truth.
@@ -56,6 +63,7 @@ KINDS: Mapping[str, Any] = {
     "named numbers": Positive | dict[Text, Positive] | None,
     "named vector": list[float] | dict[Text, float] | None,
     "named pairs": dict[Text, Two] | None,
+    "sensor times": dict[Text, SensorTimes] | None,
 }
 
 

@@ -10,12 +10,10 @@ import numpy as np
 from obsynth.analysis.zeros import zeros_of_system
 from obsynth.errors import ObsynthError
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.ranks import DIRECTION_SHARE
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.uncertainty import matrices_of
 from obsynth.tolerances.exact_plant import is_sampled
-
-#: Singular values below this share of the largest are no direction of their own.
-DIRECTION_SHARE = 1e-9
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ import numpy as np
 from obsynth.analysis.transformations.uncertain_plant import AffinePlant
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.ranks import EFFECT_RANK_SHARE
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.proofs.affine import AffineMatrix, affine_block
 from obsynth.proofs.balls import gamma, rounded_up
@@ -26,8 +27,6 @@ from obsynth.tolerances.tracking import IDENTITY_SHARE, Tracking
 
 #: Remainders below this share of their row's terms are rounding: one common channel is enough for them.
 ROUNDING_SHARE = 1e-9
-#: Singular values of a constant's effect below this share count as zero; what is left out goes into the remainder.
-RANK_SHARE = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,7 +183,7 @@ def _fault_columns(direct: AffineMatrix, observer: LinearObserver, c: FloatArray
     into = direct[:nz, :]
     moved = affine_block([[into.after(observer.Az)], [into.after(c)]])
     reached = direct.magnitude[nz:, late == 1]
-    if reached.size and reached.max() > RANK_SHARE:
+    if reached.size and reached.max() > EFFECT_RANK_SHARE:
         raise PreconditionError(
             "A fault that is estimated one sample late reaches the estimates at once: its estimate has no guaranteed "
             "interval.", condition="fault interval",
@@ -224,12 +223,12 @@ def _channels(parts: FloatArray, offsets: FloatArray) -> tuple[FloatArray, Float
         if not len(columns):
             continue
         u, values, v = np.linalg.svd(part, full_matrices=False)
-        rank = int(np.sum(values > RANK_SHARE * values[0]))
+        rank = int(np.sum(values > EFFECT_RANK_SHARE * values[0]))
         if len(columns) <= rank:
             b, c = part[:, columns], np.eye(n)[columns]
         else:
             b, c = u[:, :rank] * values[:rank], v[:rank]
-            c = np.where(np.abs(c) < RANK_SHARE, 0.0, c)
+            c = np.where(np.abs(c) < EFFECT_RANK_SHARE, 0.0, c)
             missed = np.abs(part - b @ c) + gamma(2 * rank + 4) * (np.abs(b) @ np.abs(c))
             left += (1.0 + abs(offsets[i])) * missed
         rows.append(c)

@@ -10,6 +10,9 @@ from obsynth.numerics.pencils import FiniteZeros, PencilStructure, pencil_struct
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.report import Check, information
 
+#: Imaginary parts below this are not shown.
+SHOWN_AS_REAL = 1e-12
+
 
 def plant_information(plant: DescriptorSystem, structure: PencilStructure | None = None) -> Iterator[Check]:
     """Yield rows on regularity, index, eigenvalues and stability of the plant; they inform and never fail."""
@@ -51,7 +54,7 @@ def plant_information(plant: DescriptorSystem, structure: PencilStructure | None
 
 def _eigenvalue_text(values: Iterable[complex], most: int = 6) -> str:
     listed = sorted((complex(value) for value in values), key=abs, reverse=True)
-    shown = [f"{v.real:.4g}" if abs(v.imag) < 1e-12 else f"{v.real:.4g}{v.imag:+.4g}j" for v in listed[:most]]
+    shown = [f"{v.real:.4g}" if abs(v.imag) < SHOWN_AS_REAL else f"{v.real:.4g}{v.imag:+.4g}j" for v in listed[:most]]
     return ", ".join(shown) + (f", and {len(listed) - most} more" if len(listed) > most else "")
 
 

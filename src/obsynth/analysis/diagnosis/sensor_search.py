@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from obsynth.analysis.diagnosis.additions import Sensor, with_sensors
 from obsynth.analysis.diagnosis.columns import Question
 from obsynth.analysis.diagnosis.reduction import PencilUnits
-from obsynth.numerics.arrays import ComplexArray
+from obsynth.numerics.arrays import SMALLEST, ComplexArray
 from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.plants.descriptor import DescriptorSystem
 
@@ -94,7 +94,7 @@ def _outside(span: ComplexArray, vector: ComplexArray) -> NDArray[np.float64]:
     if span.shape[2] == 0:
         return np.asarray(np.linalg.norm(vector, axis=1))
     left, values, _ = np.linalg.svd(span, full_matrices=False)
-    kept = left * (values > RANK_TOLERANCE * np.maximum(values[:, :1], 1e-300))[:, None, :]
+    kept = left * (values > RANK_TOLERANCE * np.maximum(values[:, :1], SMALLEST))[:, None, :]
     for _ in range(2):
         vector = vector - np.einsum("nij,nj->ni", kept, np.einsum("nij,ni->nj", kept.conj(), vector))
     return np.asarray(np.linalg.norm(vector, axis=1))

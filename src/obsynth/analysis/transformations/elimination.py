@@ -19,7 +19,7 @@ from obsynth.analysis.transformations.recovery import (
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.pencils import pencil_structure
-from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
+from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, rounding_rank
 from obsynth.numerics.scaling import equilibrate_pencil, power_of_two_below
 from obsynth.numerics.sparse import is_sparse
 from obsynth.numerics.threads import one_thread_if_small
@@ -160,7 +160,7 @@ def eliminated_exactly(plant: DescriptorSystem, basis: FloatArray | None = None)
 
 def dynamic_coordinates(plant: DescriptorSystem) -> FloatArray | None:
     """Return the basis ``(nx, count)`` of dynamic states that elimination takes; ``None`` for given states."""
-    count = int(np.linalg.matrix_rank(equilibrate_pencil(plant.E, plant.A).E))
+    count = rounding_rank(equilibrate_pencil(plant.E, plant.A).E)
     return None if int(np.sum(plant.E.any(axis=0))) == count else _coordinates(plant, count)[1]
 
 

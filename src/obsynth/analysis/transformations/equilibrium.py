@@ -12,13 +12,12 @@ from obsynth.analysis.transformations.equations_at_a_point import local_equation
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.ranks import JACOBIAN_RANK_TOLERANCE
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.names import index_of
 
 #: Largest scaled residual of what counts as a root.
 ROOT = 1e-9
-#: Singular values of the scaled Jacobian below this share of the largest are zero: the rank of an exact Jacobian.
-RANK = 1e-9
 #: Entries of a direction, and of a combination of equations, below this share of the largest are not named.
 NAMED = 1e-6
 #: Newton steps after the least squares; they square the error, so that a few reach rounding.
@@ -67,7 +66,7 @@ def equilibrium(
     z = problem.solved()
     residual, jacobian = problem.scaled(z)
     left, values, right = np.linalg.svd(jacobian)
-    rank = int((values > RANK * values.max()).sum()) if values.size else 0
+    rank = int((values > JACOBIAN_RANK_TOLERANCE * values.max()).sum()) if values.size else 0
     if not np.abs(residual).max(initial=0.0) <= ROOT:
         raise problem.without_root(residual, left[:, rank:])
     if rank < len(problem.names):
@@ -148,7 +147,7 @@ class _Problem:
             residual, jacobian = self.scaled(z)
             if not (np.isfinite(residual).all() and np.isfinite(jacobian).all()):
                 break
-            after = z - np.linalg.lstsq(jacobian, residual, rcond=RANK)[0]
+            after = z - np.linalg.lstsq(jacobian, residual, rcond=JACOBIAN_RANK_TOLERANCE)[0]
             if not np.abs(self.scaled(after)[0]).max() < np.abs(residual).max():
                 break
             z = after
@@ -209,14 +208,14 @@ def consistent_point(model: DAEModel, point: Point, fixed: Collection[str] = ())
         weights = _row_weights(np.hstack([local.E * sizes, local.by_state * sizes]))
         E = weights[:, None] * (local.E * sizes)
         left, values, _ = np.linalg.svd(E)
-        rank = int((values > RANK * values.max()).sum()) if values.any() else 0
+        rank = int((values > JACOBIAN_RANK_TOLERANCE * values.max()).sum()) if values.any() else 0
         null = left[:, rank:]
         x = x + sizes * _algebraic_step(null.T @ (weights[:, None] * local.by_state * sizes),
                                         -null.T @ (weights * local.value), E, movable)  # fmt: skip
         local = local_equations(model, rates, x, point.u, point.theta)
         if not local.is_defined:
             break
-        rates = rates - sizes * np.linalg.lstsq(E, weights * local.value, rcond=RANK)[0]
+        rates = rates - sizes * np.linalg.lstsq(E, weights * local.value, rcond=JACOBIAN_RANK_TOLERANCE)[0]
         local = local_equations(model, rates, x, point.u, point.theta)
         if local.is_defined and np.abs(weights * local.value).max() < ROOT * 1e-3:
             return Point(x, point.u, point.theta, rates)
@@ -235,7 +234,7 @@ def _algebraic_step(constraint: FloatArray, right: FloatArray, E: FloatArray, mo
     for first, kept in ((True, (np.abs(E).max(axis=0) == 0.0) & movable), (False, movable)):
         if first or np.abs(constraint @ move - right).max() > ROOT * max(1.0, np.abs(right).max()):
             move = np.zeros(E.shape[1])
-            move[kept] = np.linalg.lstsq(constraint[:, kept], right, rcond=RANK)[0]
+            move[kept] = np.linalg.lstsq(constraint[:, kept], right, rcond=JACOBIAN_RANK_TOLERANCE)[0]
     return move
 
 

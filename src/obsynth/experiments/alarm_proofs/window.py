@@ -17,6 +17,8 @@ import numpy as np
 from obsynth.analysis.transformations.uncertain_plant import AffinePlant
 from obsynth.numerics.arrays import FloatArray
 
+#: What rounding may take from a computed right side, relative to its terms.
+SUM_ROUNDING = 1e-15
 #: The largest value of t that is of interest, in bounds of the variables.
 LARGEST_RELAXATION = 1e3
 #: Bounds of the state are widened by this share: more than rounding can take from them.
@@ -209,7 +211,7 @@ class _Builder:
                 entries[at.disturbance(k, i)] = -self.bd[r, i]
             right = float(plant.B.center[r] @ data.u[k])
             # The right side is computed: what rounding may have taken from it counts as remainder.
-            loose += 1e-15 * float(plant.B.magnitude[r] @ np.abs(data.u[k]))
+            loose += SUM_ROUNDING * float(plant.B.magnitude[r] @ np.abs(data.u[k]))
             self._between(equal, below, entries, right, loose)
 
     def outputs(self, k: int, below: Rows) -> None:
@@ -222,7 +224,7 @@ class _Builder:
             entries |= {at.constant(k, i): float(plant.D.parts[i][r] @ data.u[k]) for i in range(at.p)}
             right = float(data.y[k, r] - plant.D.center[r] @ data.u[k])
             loose = float(self.seen[r] + plant.C.radius[r] @ self.size[k] + plant.D.radius[r] @ np.abs(data.u[k]))
-            loose += 1e-15 * float(abs(data.y[k, r]) + plant.D.magnitude[r] @ np.abs(data.u[k]))
+            loose += SUM_ROUNDING * float(abs(data.y[k, r]) + plant.D.magnitude[r] @ np.abs(data.u[k]))
             for sign in (1.0, -1.0):
                 row = {column: sign * value for column, value in entries.items()}
                 below.add(row, sign * right + loose, relaxed=True)

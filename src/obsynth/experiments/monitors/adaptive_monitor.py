@@ -25,6 +25,8 @@ from obsynth.tolerances.robustness import EXACT_MODEL, structure_of, with_tolera
 from obsynth.tolerances.subdivision import index_one_on_box
 from obsynth.tolerances.tracking import Tracking, tracking_of
 
+#: Radii of a set are made larger by this share: more than the rounding of their sums.
+OUTWARD = 1e-12
 #: What a statement adds where no tolerance is known.
 EXACT = f"; {EXACT_MODEL}"
 
@@ -133,7 +135,7 @@ def start_of(
     followed = affine.E.after(tracking.T) @ back
     offset = followed.center @ center
     size = np.abs(followed.center) @ radius + (followed.spread + followed.radius) @ (np.abs(center) + radius)
-    return Start(len(z), center=z - offset, radius=size * (1.0 + 1e-12), state=z)
+    return Start(len(z), center=z - offset, radius=size * (1.0 + OUTWARD), state=z)
 
 
 def initial_box(plant: DescriptorSystem, given: Mapping[str, Any]) -> tuple[FloatArray, FloatArray]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 from numpy.typing import ArrayLike
 
 from obsynth.analysis.transformations.recovery import Transformation
@@ -28,6 +30,8 @@ def adaptive_observer(
     early_constraints: bool = False,
     outliers: str = "none",
     outlier_limit: float | None = None,
+    sensors: Mapping[str, Mapping[str, int]] | None = None,
+    state_bounds: Mapping[str, Sequence[float]] | ArrayLike | None = None,
     window: int = 50,
     reset: float = 0.0,
     name: str = "design",
@@ -70,6 +74,13 @@ def adaptive_observer(
         of one sensor; or taken at the limit (Huber's weight).
     outlier_limit : float, optional
         In standard deviations of the prediction: 6 for ``gate`` and 3 for ``huber`` by default.
+    sensors : mapping, optional
+        ``{name: {"every": N, "delay": D}}``: a sensor that is sampled every N rows (k = 0, N, 2 N, ...; what a log
+        holds in the other rows is not used), or whose values arrive D rows late: the value in row k is then that of
+        ``k - D``, where the observer puts it, taking the rows after it again.
+    state_bounds : mapping or array_like, optional
+        ``{name: [low, high]}``, or ``(nx, 2)``: estimates are projected onto these bounds in the metric of their
+        covariance, which stays as it is without them. The recursion goes on without them.
     name : str, optional
         Name of the design.
 
@@ -104,5 +115,5 @@ def adaptive_observer(
         random_walk=random_walk, initial_parameters=initial_parameters,
         initial_parameter_covariance=initial_parameter_covariance, initial_state=initial_state,
         initial_covariance=initial_covariance, early_constraints=early_constraints, outliers=outliers,
-        outlier_limit=outlier_limit, window=window, reset=reset,
+        outlier_limit=outlier_limit, sensors=sensors, state_bounds=state_bounds, window=window, reset=reset,
     )  # fmt: skip

@@ -39,6 +39,8 @@ class DaeAdaptiveObserverOptions(MethodOptions):
     window: Count = 50
     outliers: Outliers = "none"
     outlier_limit: Positive | None = None
+    sensors: Annotated[Any, WrittenAs("sensor times")] = None
+    state_bounds: Annotated[Any, WrittenAs("named pairs")] = None
     reset: Probability = 0.0
 
     def conflicts(self) -> Iterator[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from numpy.typing import ArrayLike
 
@@ -32,6 +32,8 @@ def dae_adaptive_observer(
     window: int = 50,
     outliers: str = "none",
     outlier_limit: float | None = None,
+    sensors: Mapping[str, Mapping[str, int]] | None = None,
+    state_bounds: Mapping[str, Sequence[float]] | ArrayLike | None = None,
     reset: float = 0.0,
     name: str = "design",
 ) -> ObserverDesign:
@@ -85,6 +87,13 @@ def dae_adaptive_observer(
         of one sensor; or taken at the limit (Huber's weight).
     outlier_limit : float, optional
         In standard deviations of the prediction: 6 for ``gate`` and 3 for ``huber`` by default.
+    sensors : mapping, optional
+        ``{name: {"every": N, "delay": D}}``: a sensor that is sampled every N rows (k = 0, N, 2 N, ...; what a log
+        holds in the other rows is not used), or whose values arrive D rows late: the value in row k is then that of
+        ``k - D``, where the observer puts it, taking the rows after it again.
+    state_bounds : mapping or array_like, optional
+        ``{name: [low, high]}``, or ``(nx, 2)``: estimates are projected onto these bounds in the metric of their
+        covariance, which stays as it is without them. The next step begins at the projected states.
     reset : float, optional, dimensionless
         Detect and reset: when the innovations of 20 samples pass a threshold (with this probability per sample where
         nothing has changed), the covariance of the parameters starts again from S_0.  Zero never resets.
@@ -122,5 +131,6 @@ def dae_adaptive_observer(
         weight=weight, integration=integration, random_walk=random_walk, initial_state=initial_state,
         initial_covariance=initial_covariance, initial_parameters=initial_parameters,
         initial_parameter_covariance=initial_parameter_covariance, bounds=bounds, largest_move=largest_move,
-        window=window, outliers=outliers, outlier_limit=outlier_limit, reset=reset,
+        window=window, outliers=outliers, outlier_limit=outlier_limit, sensors=sensors, state_bounds=state_bounds,
+        reset=reset,
     )  # fmt: skip

@@ -30,6 +30,7 @@ from obsynth.observers.dae.building import LARGEST_TURN, dae_observer_from_optio
 from obsynth.observers.dae.nominal_run import NOMINAL_STEPS, DAEFacts, dae_facts
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.dae.steps import PROJECTION_NOTICE
+from obsynth.observers.robustness import plain_recursion
 from obsynth.plants.dae.model import DAEModel
 from obsynth.results.design import Certificate
 
@@ -45,7 +46,7 @@ def synthesise(plant: DAEModel, asked: DaeAdaptiveObserverOptions, *, progress: 
     progress("checking index and parameters")
     require_all(conditions(plant, dt=observer.dt))
     progress("running the observer on its own model")
-    facts = dae_facts(observer)
+    facts = dae_facts(plain_recursion(observer))
     claims = {
         "index": float(facts.index.index), "condition": facts.condition, "contraction": facts.contraction,
         "steps": float(NOMINAL_STEPS),

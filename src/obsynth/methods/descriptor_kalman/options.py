@@ -23,3 +23,5 @@ class DescriptorKalmanOptions(MethodOptions):
     early_constraints: bool = False
     outliers: Outliers = "none"
     outlier_limit: Positive | None = None
+    sensors: Annotated[Any, WrittenAs("sensor times")] = None
+    state_bounds: Annotated[Any, WrittenAs("named pairs")] = None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 from numpy.typing import ArrayLike
 
 from obsynth.analysis.transformations.recovery import Transformation
@@ -22,6 +24,8 @@ def descriptor_kalman(
     early_constraints: bool = False,
     outliers: str = "none",
     outlier_limit: float | None = None,
+    sensors: Mapping[str, Mapping[str, int]] | None = None,
+    state_bounds: Mapping[str, Sequence[float]] | ArrayLike | None = None,
     name: str = "design",
 ) -> ObserverDesign:
     r"""Design the Kalman filter of a descriptor plant, time-varying or not.
@@ -52,6 +56,13 @@ def descriptor_kalman(
         of one sensor; or taken at the limit (Huber's weight).
     outlier_limit : float, optional
         In standard deviations of the prediction: 6 for ``gate`` and 3 for ``huber`` by default.
+    sensors : mapping, optional
+        ``{name: {"every": N, "delay": D}}``: a sensor that is sampled every N rows (k = 0, N, 2 N, ...; what a log
+        holds in the other rows is not used), or whose values arrive D rows late: the value in row k is then that of
+        ``k - D``, where the observer puts it, taking the rows after it again.
+    state_bounds : mapping or array_like, optional
+        ``{name: [low, high]}``, or ``(nx, 2)``: estimates are projected onto these bounds in the metric of their
+        covariance, which stays as it is without them. The recursion goes on without them.
     name : str, optional
         Name of the design.
 
@@ -86,5 +97,5 @@ def descriptor_kalman(
     return design(
         plant, "descriptor-kalman", name=name, Q=Q, R=R, initial_state=initial_state,
         initial_covariance=initial_covariance, early_constraints=early_constraints, outliers=outliers,
-        outlier_limit=outlier_limit,
+        outlier_limit=outlier_limit, sensors=sensors, state_bounds=state_bounds,
     )  # fmt: skip

@@ -20,6 +20,8 @@ from obsynth.methods.riccati import bounded_real_matrix, normalising_change, sta
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.norms import highest_gain_found, hinf_norm, norm_is_at_most, output_covariance, spectral_radius
 
+#: Slack of the bounded real matrix that normalises, relative to the squared norm of what is shown.
+NORMALISING_SLACK = 1e-6
 #: The normalising Riccati solution is taken at this multiple of the starting filter's norm.
 NORMALISING_LEVEL = 1.3
 #: A share that norms are certain to, and no one misses.
@@ -180,11 +182,6 @@ class NormalisedProblem:
         inverse = np.linalg.inv(self.measurements) if self.measurements.size else self.measurements
         return Injection(np.linalg.solve(self.states, solution.R) @ inverse, solution.V @ inverse)
 
-    def restore_matrix(self, p: FloatArray) -> FloatArray:
-        """Return the Lyapunov matrix for the original coordinates and the original gain level."""
-        inverse = np.linalg.inv(self.states)
-        return np.asarray(inverse.T @ p @ inverse)
-
 
 def normalise(
     problem: GainProblem, *, start: Injection | None = None, gain: float | None = None, rotate: bool = True
@@ -195,7 +192,7 @@ def normalise(
     gain = highest_gain_found(*problem.closed_loop(start)) if gain is None else gain
     size = gain if np.isfinite(gain) and gain > 0.0 else 1.0
     a, b, z, zd = problem.closed_loop(start)
-    tail = 1e-6 * max(float(np.linalg.norm(z, 2)) ** 2, np.finfo(np.float64).tiny)
+    tail = NORMALISING_SLACK * max(float(np.linalg.norm(z, 2)) ** 2, np.finfo(np.float64).tiny)
     p = bounded_real_matrix(a, b, z, zd, NORMALISING_LEVEL * size, slack=tail)
     if p is None:
         p = bounded_real_matrix(a, b[:, :0], z, zd[:, :0], 1.0, slack=tail)

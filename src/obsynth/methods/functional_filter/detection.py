@@ -28,6 +28,8 @@ from obsynth.proofs.balls import Ball
 from obsynth.results.report import Check, VerificationReport
 from obsynth.verification.identities import Identity, equality
 
+#: The grid of frequencies begins at this share of its end, where the band begins at zero.
+LEAST_FREQUENCY = 1e-6
 #: The proved gain is this much above one, and the proved sensitivity this much below what a grid finds.
 MARGIN, SENSITIVITY_MARGIN = 1e-6, 1e-4
 #: Frequencies of the grid, and how often the least value is refined between its neighbours.
@@ -226,7 +228,9 @@ def _sensitivity(plant: DescriptorSystem, observer: LinearObserver, low: float, 
         found = response(observer.Az, entering, shown, direct, np.asarray(1j * points, dtype=np.complex128))
         return np.asarray(np.linalg.svd(found, compute_uv=False)[:, -1])
 
-    grid = np.unique(np.concatenate([np.linspace(low, high, GRID), np.geomspace(max(low, 1e-6 * high), high, GRID)]))
+    grid = np.unique(
+        np.concatenate([np.linspace(low, high, GRID), np.geomspace(max(low, LEAST_FREQUENCY * high), high, GRID)])
+    )
     values = least(grid)
     at = int(np.argmin(values))
     left, right = grid[max(at - 1, 0)], grid[min(at + 1, len(grid) - 1)]

@@ -11,6 +11,8 @@ from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.spectra import speeds
 from obsynth.plants.descriptor import DescriptorSystem
 
+#: Modes slower than this share of the fastest one never settle.
+STANDING = 1e-6
 #: A step is to be seen to 90 % after so many time constants of the plant, but no sooner than so many samples.
 TIME_CONSTANTS, LEAST_SAMPLES = 7.0, 4.0
 #: Estimates of a step within this of one count as there; asked at these multiples of the time.
@@ -23,7 +25,7 @@ def settling_time(plant: DescriptorSystem) -> float:
     """Return the time in seconds after which a step of a fault should be seen."""
     values = pencil_structure(plant.E, plant.A).finite_eigenvalues
     found = speeds(values, plant.dt)
-    alive = found[np.isfinite(found) & (found > 1e-6 * np.max(found, initial=0.0))]
+    alive = found[np.isfinite(found) & (found > STANDING * np.max(found, initial=0.0))]
     wanted = TIME_CONSTANTS / float(np.median(alive)) if alive.size else max(plant.dt, 1.0) * 10.0
     return max(wanted, LEAST_SAMPLES * plant.dt)
 

@@ -35,6 +35,7 @@ from obsynth.methods.placement.eigenstructure import place
 from obsynth.methods.riccati import lyapunov_factor
 from obsynth.methods.ui_pi_observer.options import checked_poles, plain
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.ranks import rounding_rank
 from obsynth.numerics.spectra import decay_rates, eigenvalues
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.exosystems import Exosystem, exosystem
@@ -190,7 +191,7 @@ def _placed_filter(
     wanted = checked_poles(poles, len(model.A), fixed, plant.dt, of="functional-filter")
     gain = place(model.A, model.C, wanted, dt=plant.dt).K if len(model.A) else np.zeros((0, len(model.C)))
     lag = (np.zeros_like(gain),) if plant.dt > 0.0 else ()
-    noise = model.M @ model.M.T if plant.nw and np.linalg.matrix_rank(model.M) == len(model.M) else np.eye(len(model.C))
+    noise = model.M @ model.M.T if plant.nw and rounding_rank(model.M) == len(model.M) else np.eye(len(model.C))
     return filter_part(model, KalmanGain(gain, lag, noise, 0.0), whitening(noise), delay=0, mean=asked.mean)
 
 

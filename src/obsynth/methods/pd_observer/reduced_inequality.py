@@ -34,14 +34,12 @@ from obsynth.methods.pd_observer.inequalities import PdSolution, PdTask, solve
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import spectral_abscissa
 from obsynth.numerics.doubling import EQUATION_TOLERANCE, continuous_riccati_solution
-from obsynth.numerics.ranks import decide_rank
+from obsynth.numerics.ranks import NEGLIGIBLE_SHARE, decide_rank
 
 #: Share of its limit at which p, and delta where it is free, is taken.
 SHARE = 0.5
 #: Times that states are changed to those in which a Riccati solution is near one.
 MOST_NORMALISATIONS = 4
-#: Directions of a Riccati solution below this share are not told from zero.
-NEGLIGIBLE_SHARE = 1e-12
 #: With more states the Riccati equation is solved by doubling first.
 MANY_STATES = 60
 #: With more still, the QZ algorithm would take minutes.

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SolverError
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.numerics.spectra import SAME_POLE, spectrum_error
 
 #: Objectives of the choice among all gains with the same poles.
@@ -63,7 +63,7 @@ def jordan_form(poles: Sequence[complex]) -> FloatArray:
     upper = [pole for pole in poles if pole.imag >= 0.0]
     groups: list[list[complex]] = []
     for pole in sorted(upper, key=lambda value: (value.real, value.imag)):
-        home = next((group for group in groups if abs(group[0] - pole) <= SAME_POLE * max(abs(pole), 1e-300)), None)
+        home = next((group for group in groups if abs(group[0] - pole) <= SAME_POLE * max(abs(pole), SMALLEST)), None)
         if home is not None and (pole.imag > 0.0) == (home[0].imag > 0.0):
             home.append(pole)
         else:
@@ -100,11 +100,11 @@ def place(
         return Placement(np.zeros((0, outputs)), 1.0, 0.0)
     target = jordan_form(poles)
     rng = np.random.default_rng(SEED)
-    size = max(float(np.linalg.norm(f, 2)), 1e-300)
+    size = max(float(np.linalg.norm(f, 2)), SMALLEST)
     distance = np.min(np.abs(np.linalg.eigvals(f)[:, None] - np.asarray(poles)[None, :]))
     first = np.zeros((n, outputs))
     if distance <= OVERLAP * size:
-        first = rng.standard_normal((n, outputs)) * size / max(float(np.linalg.norm(c, 2)), 1e-300)
+        first = rng.standard_normal((n, outputs)) * size / max(float(np.linalg.norm(c, 2)), SMALLEST)
     scale = np.eye(n) if weight is None else weight
     problem = _Sylvester.of((f - first @ c).T, c.T, target, first.T, objective, scale.T @ scale)
     best: tuple[float, FloatArray] | None = None

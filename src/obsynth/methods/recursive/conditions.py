@@ -25,12 +25,11 @@ from obsynth.analysis.time_varying import (
 from obsynth.analysis.zeros import are_outside, leading_names
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.least_squares_step import least_squares_step, rank_revealing_step
+from obsynth.numerics.least_squares_step import OUTGROWN, least_squares_step, rank_revealing_step
 from obsynth.numerics.pencils import finite_zeros
 from obsynth.numerics.ranks import (
     CANCELLATION_TOLERANCE,
     NAMED_SHARE,
-    OUTGROWN,
     RANK_TOLERANCE,
     RankDecision,
     decide_rank,

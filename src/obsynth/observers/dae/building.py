@@ -58,7 +58,7 @@ DEFAULT_PARAMETER_SHARE = 0.1
 OPTIONS = (
     "dt", "Q", "R", "form", "forgetting", "guard", "weight", "integration", "random_walk", "initial_state",
     "initial_covariance", "initial_parameters", "initial_parameter_covariance", "bounds", "largest_move", "window",
-    "outliers", "outlier_limit", "reset",
+    "outliers", "outlier_limit", "sensors", "state_bounds", "reset",
 )  # fmt: skip
 
 
@@ -87,6 +87,7 @@ def dae_observer_from_options(model: DAEModel, options: Mapping[str, Any]) -> DA
         guard=options["guard"], weight=options["weight"], integration=_integration(model, options),
         largest_move=options["largest_move"], window=options["window"],
         outliers=options.get("outliers", "none"), outlier_limit=options.get("outlier_limit"),
+        sensors=options.get("sensors"), state_bounds=options.get("state_bounds"),
         reset=options.get("reset", 0.0),
     )  # fmt: skip
 

@@ -17,6 +17,7 @@ from obsynth.observers.dae.settings import DAESettings
 from obsynth.observers.dae.step_graph import ObserverGraph
 from obsynth.observers.dae.steps import DAEState, Steps
 from obsynth.observers.estimates import Estimates
+from obsynth.observers.progress import shown_progress
 from obsynth.observers.records import measured_record
 from obsynth.observers.running import StepObserver
 from obsynth.plants.dae.checks import checked_inputs, require_known
@@ -63,6 +64,11 @@ class DAEObserver(DAESettings, StepObserver[DAEState, DAERow]):
         of one sensor; or taken at the limit.
     outlier_limit : float or None
         In standard deviations of the prediction: 6 for ``gate`` and 3 for ``huber`` by default.
+    sensors : mapping or None
+        ``{name: {"every": rows, "delay": rows}}`` of the sensors that are sampled every so many rows, at k = 0, every,
+        2 every, ..., or whose values arrive so many rows late.
+    state_bounds : FloatArray or None
+        ``(nx, 2)``: lower and upper bounds of the states, infinite where there are none.
     reset : float
         Detect and reset: probability, per sample, that innovations which no change has made larger pass the threshold
         above which the covariance of the parameters starts again from S_0.  Zero never resets.
@@ -156,5 +162,26 @@ class DAEObserver(DAESettings, StepObserver[DAEState, DAERow]):
             raise SpecError(f"compiled is {compiled!r}: give True, False or None.", path="compiled")
         outputs = measured_record(y, self.model.ny)
         inputs = checked_inputs(self.model, u, len(outputs))
+        if not self.is_plain:
+            return self._run_in_rows(outputs, inputs, compiled=compiled, progress=progress)
         library = self.library if compiled else None
         return run_record(self.steps, outputs, inputs, compiled=compiled, library=library, progress=progress)
+
+    def _run_in_rows(
+        self, y: FloatArray, u: FloatArray, *, compiled: bool | None, progress: bool | Callable[[int], None] | None
+    ) -> Estimates:
+        """Run sample by sample, with sensors of their own times or bounds on states.
+
+        Shapes: ``y (samples, ny)``, ``u (samples, nu)``.
+        """
+        if compiled:
+            raise SpecError("The C knows neither sensors of their own times nor state_bounds: leave compiled=True out.",
+                            path="compiled")  # fmt: skip
+        found, state = GatheredRows(self), self.init()
+        with shown_progress(progress, len(y), "samples") as note:
+            for k in range(len(y)):
+                state, row = self.accept(state, y[k], u[k])
+                found.add(row)
+                note(k + 1)
+        return found.estimates() if len(y) else run_record(self.steps, y, u, compiled=False, library=None,
+                                                           progress=False)  # fmt: skip

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Any, Literal, Self, TypeAlias
 
 import numpy as np
@@ -14,6 +15,8 @@ from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.covariances import covariance_factor, is_definite
 from obsynth.observers.estimates import Undelayed
 from obsynth.observers.outliers import Outliers, checked_limit
+from obsynth.observers.sensor_timing import SensorTiming, checked_sensors
+from obsynth.observers.state_bounds import checked_state_bounds
 from obsynth.plants.dae.checks import finite_vector, step_length
 from obsynth.plants.dae.model import DAEModel
 
@@ -53,6 +56,8 @@ class DAESettings(Undelayed):
     window: int = 50
     outliers: Outliers = "none"
     outlier_limit: float | None = None
+    sensors: Mapping[str, Mapping[str, int]] | None = None
+    state_bounds: FloatArray | None = None
     reset: float = 0.0
 
     def __post_init__(self) -> None:
@@ -60,6 +65,8 @@ class DAESettings(Undelayed):
         for name, kind in _KINDS.items():
             checked_value(getattr(self, name), name, kind)
         checked_limit(self.outliers, self.outlier_limit)
+        object.__setattr__(self, "sensors", checked_sensors(self.sensors, self.model.output_names))
+        object.__setattr__(self, "state_bounds", checked_state_bounds(self.state_bounds, self.state_names))
         self._check_arrays()
 
     def __getstate__(self) -> dict[str, Any]:
@@ -114,10 +121,22 @@ class DAESettings(Undelayed):
         """The parameters that are estimated, in order."""
         return self.model.parameter_names
 
+    @cached_property
+    def timing(self) -> SensorTiming:
+        """When each sensor is sampled, and how late its values are."""
+        return SensorTiming.of(self.sensors, self.model.output_names, self.model.nu)
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether every sensor is sampled at each row, at once, and no state has bounds."""
+        return self.timing.is_plain and self.state_bounds is None
+
     @property
     def outside_graph(self) -> str:
         """An option in use that stands outside of the compiled steps, by name; empty without one."""
-        return "outliers" if self.outliers != "none" else "reset" if self.reset else ""
+        if self.outliers != "none":
+            return "outliers"
+        return "reset" if self.reset else "" if self.state_bounds is None else "state_bounds"
 
     @property
     def order(self) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cached_property, lru_cache
 from typing import NamedTuple
 
@@ -10,11 +11,13 @@ import numpy as np
 
 from obsynth.errors import SolverError
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.covariances import covariance_factor
 from obsynth.observers.dae.estimates import DAERow
 from obsynth.observers.dae.memory_layout import initial_memory
 from obsynth.observers.dae.settings import DAESettings
 from obsynth.observers.dae.step_graph import ObserverGraph, observer_graph
 from obsynth.observers.outliers import checked_limit, no_refusals, robust_advance
+from obsynth.observers.state_bounds import projected
 from obsynth.plants.dae.functions import Compiled, DAEFunctions
 from obsynth.plants.dae.step import ImplicitStep
 
@@ -73,8 +76,22 @@ class Steps:
         """
         take = self.watched if self.settings.reset else self.plain
         if self.settings.outliers == "none":
-            return take(state, y, u)
-        return robust_advance(self.settings.outliers, self.limit, take, self.predicted, state, y, u)
+            after, row = take(state, y, u)
+        else:
+            after, row = robust_advance(self.settings.outliers, self.limit, take, self.predicted, state, y, u)
+        return (after, row) if self.settings.state_bounds is None else self.within_bounds(after, row)
+
+    def within_bounds(self, state: DAEState, row: DAERow) -> tuple[DAEState, DAERow]:
+        """Project the states after a measurement onto their bounds; the next step begins there."""
+        bounds = self.settings.state_bounds
+        if bounds is None or ((bounds[:, 0] <= row.x) & (row.x <= bounds[:, 1])).all():
+            return state, row
+        root = covariance_factor(0.5 * (row.covariance + row.covariance.T), "covariance")
+        memory, layout = state.memory.copy(), self.graph.memory
+        memory[layout.slices["posterior"]] = projected(row.x, root, bounds)
+        if self.settings.form == "augmented-kalman":
+            memory[layout.slices["x"]] = memory[layout.slices["posterior"]]
+        return state._replace(memory=memory), replace(row, memory=memory)
 
     def watched(self, state: DAEState, y: FloatArray, u: FloatArray) -> tuple[DAEState, DAERow]:
         """Take a sample; where innovations have become too large, again with parameters known no better than at first.

@@ -15,13 +15,6 @@ from obsynth.observers.recursive.settings import Adaptation
 from obsynth.plants.sequences import MatrixSequence
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 
-#: Options of the filter, and of the parameters besides.
-FILTER_OPTIONS = ("Q", "R", "initial_state", "initial_covariance", "early_constraints", "outliers", "outlier_limit")
-PARAMETER_OPTIONS = (
-    "form", "forgetting", "guard", "initial_parameters", "initial_parameter_covariance", "random_walk", "window",
-    "reset",
-)  # fmt: skip
-
 
 def observer_from_options(plant: TimeVaryingDescriptorSystem, options: Mapping[str, Any]) -> RecursiveObserver:
     """Return the observer that options stand for."""
@@ -45,6 +38,7 @@ def observer_from_options(plant: TimeVaryingDescriptorSystem, options: Mapping[s
         _vector(options["initial_state"], plant.nx, "initial_state"),
         _square(options["initial_covariance"], plant.nx, 1.0, "initial_covariance"), adaptation,
         options["early_constraints"], options.get("outliers", "none"), options.get("outlier_limit"),
+        options.get("sensors"), options.get("state_bounds"),
     )  # fmt: skip
 
 
@@ -55,7 +49,9 @@ def plain_options(options: Mapping[str, Any]) -> dict[str, Any]:
         value = given.item() if isinstance(given, np.generic) else given
         if isinstance(value, MatrixSequence):
             plain[name] = value.as_data() if value.is_data else value.function
-        elif value is None or callable(value) or isinstance(value, (bool, int, float, str)) or _has_text(value):
+        elif (
+            value is None or callable(value) or isinstance(value, (bool, int, float, str, Mapping)) or _has_text(value)
+        ):
             plain[name] = value
         else:
             plain[name] = np.array(value, dtype=np.float64)

@@ -54,7 +54,8 @@ def gain_steps(
 
     Shapes: ``received (samples, ny)``.
     """
-    start, recursion = observer.init(), observer.recursion
+    recursion = observer.recursion
+    start = recursion.first
     factor, Upsilon, parameters, diffuse = start.factor, start.Upsilon, start.parameters, start.diffuse
     adaptation, model = observer.adaptation, recursion.model
     first = [model.first()] if isinstance(model, EarlyConstraintSteps) else []

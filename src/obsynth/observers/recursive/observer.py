@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
+from obsynth.errors import SpecError
 from obsynth.numerics.arguments import real_array, real_vector
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.estimates import Estimates
@@ -16,6 +17,7 @@ from obsynth.observers.recursive.estimates import recursive_estimates
 from obsynth.observers.recursive.recursion import RawEstimate, Recursion, RecursiveState
 from obsynth.observers.recursive.settings import RecursiveSettings
 from obsynth.observers.running import StepObserver
+from obsynth.observers.state_bounds import projected
 
 
 class RecursiveObserver(RecursiveSettings, StepObserver[RecursiveState, RawEstimate]):
@@ -40,6 +42,11 @@ class RecursiveObserver(RecursiveSettings, StepObserver[RecursiveState, RawEstim
         of one sensor; or taken at the limit.
     outlier_limit : float or None
         In standard deviations of the prediction: 6 for ``gate`` and 3 for ``huber`` by default.
+    sensors : mapping or None
+        ``{name: {"every": rows, "delay": rows}}`` of the sensors that are sampled every so many rows, at k = 0, every,
+        2 every, ..., or whose values arrive so many rows late.
+    state_bounds : FloatArray or None
+        ``(nx, 2)``: lower and upper bounds of the states, infinite where there are none.
 
     Raises
     ------
@@ -98,4 +105,25 @@ class RecursiveObserver(RecursiveSettings, StepObserver[RecursiveState, RawEstim
         """
         outputs, inputs = whole_record(y, u, self.plant.ny, self.plant.nu)
         require_horizon(self.plant.horizon, len(outputs), early=self.early_constraints)
-        return run_record(self.recursion, outputs, inputs, compiled)
+        if self.is_plain:
+            return run_record(self.recursion, outputs, inputs, compiled)
+        if compiled:
+            raise SpecError("compiled=True: the kernel knows neither sensors of their own times nor state_bounds: "
+                            "leave it out.", path="compiled")  # fmt: skip
+        rows, state = [], self.init()
+        for y_k, u_k in zip(outputs, inputs, strict=True):
+            state, row = self.advance(state, y_k, u_k)
+            rows.append(row)
+        return recursive_estimates(self, rows)
+
+    def shown(self, row: RawEstimate) -> RawEstimate:
+        """Return a row with its states within their bounds; the recursion goes on without them.
+
+        Parameters
+        ----------
+        row : RawEstimate
+            What is known at a sample.
+        """
+        if self.state_bounds is None:
+            return row
+        return row._replace(x=projected(row.x, row.factor, self.state_bounds))

@@ -16,6 +16,7 @@ from obsynth.numerics.least_squares_step import (
     least_squares_step,
     rank_revealing_step,
 )
+from obsynth.numerics.ranks import UNDETERMINED_SHARE
 from obsynth.numerics.recursive_least_squares import ParameterState, start_of, update
 from obsynth.observers.outliers import checked_limit, no_refusals, robust_advance
 from obsynth.observers.recursive.parameter_steps import (
@@ -33,9 +34,6 @@ from obsynth.observers.recursive.step_model import (
     StepModel,
     require_in_range,
 )
-
-#: Share of a diffuse direction below which a state is held to be determined: rounding of an orthonormal basis.
-UNDETERMINED_SHARE = 1e-8
 
 
 class RawEstimate(NamedTuple):

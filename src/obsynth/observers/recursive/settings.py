@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Any, Literal, Self, TypeAlias
 
 import numpy as np
@@ -12,8 +13,11 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arguments import Count, ForgettingFactor, Probability, checked_value, real_vector, truth
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.covariances import covariance_factor
+from obsynth.numerics.ranks import rounding_rank
 from obsynth.observers.estimates import Undelayed
 from obsynth.observers.outliers import Outliers, checked_limit
+from obsynth.observers.sensor_timing import SensorTiming, checked_sensors
+from obsynth.observers.state_bounds import checked_state_bounds
 from obsynth.plants.sequences import MatrixSequence
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 
@@ -76,7 +80,7 @@ class Adaptation:
                 raise SpecError(f"{option} is {matrix.shape}, but {(q, q)} is needed.", path=option)
             object.__setattr__(self, field, matrix)
             factor = covariance_factor(matrix, option)
-            if field == "initial_covariance" and (np.diag(matrix) <= 0.0).any() | (np.linalg.matrix_rank(factor) < q):
+            if field == "initial_covariance" and (np.diag(matrix) <= 0.0).any() | (rounding_rank(factor) < q):
                 raise SpecError(f"{option} (S_0) must be positive definite.", path=option)
 
 
@@ -93,9 +97,13 @@ class RecursiveSettings(Undelayed):
     early_constraints: bool = False
     outliers: Outliers = "none"
     outlier_limit: float | None = None
+    sensors: Mapping[str, Mapping[str, int]] | None = None
+    state_bounds: FloatArray | None = None
 
     def __post_init__(self) -> None:
         checked_limit(self.outliers, self.outlier_limit)
+        object.__setattr__(self, "sensors", checked_sensors(self.sensors, self.plant.output_names))
+        object.__setattr__(self, "state_bounds", checked_state_bounds(self.state_bounds, self.state_names))
         plant = self.plant
         for name, size in (("Q", plant.ne), ("R", plant.ny)):
             shape = getattr(self, name).shape
@@ -127,6 +135,16 @@ class RecursiveSettings(Undelayed):
         """The parameters that are estimated, in order."""
         return () if self.adaptation is None else self.plant.parameter_names
 
+    @cached_property
+    def timing(self) -> SensorTiming:
+        """When each sensor is sampled, and how late its values are."""
+        return SensorTiming.of(self.sensors, self.plant.output_names, self.plant.nu)
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether every sensor is sampled at each row, at once, and no state has bounds."""
+        return self.timing.is_plain and self.state_bounds is None
+
     @property
     def order(self) -> int:
         """Number of states and parameters in its state."""
@@ -148,7 +166,7 @@ class RecursiveSettings(Undelayed):
             "noise_constants": {**(self.Q.constants or {}), **(self.R.constants or {})},
             "initial_state": self.initial_state, "initial_covariance": self.initial_covariance,
             "adaptation": adaptation, "early_constraints": self.early_constraints, "outliers": self.outliers,
-            "outlier_limit": self.outlier_limit,
+            "outlier_limit": self.outlier_limit, "sensors": self.sensors, "state_bounds": self.state_bounds,
         }  # fmt: skip
 
     @classmethod
@@ -167,7 +185,7 @@ class RecursiveSettings(Undelayed):
             MatrixSequence.of(data["R"], "R", constants=constants),
             data["initial_state"], data["initial_covariance"],
             None if data["adaptation"] is None else Adaptation(**data["adaptation"]), data["early_constraints"],
-            data.get("outliers", "none"), data.get("outlier_limit"),
+            data.get("outliers", "none"), data.get("outlier_limit"), data.get("sensors"), data.get("state_bounds"),
         )  # fmt: skip
 
     def __getstate__(self) -> dict[str, Any]:

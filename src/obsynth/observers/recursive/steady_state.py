@@ -22,6 +22,7 @@ from obsynth.numerics.spectra import abscissa
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.recursive.gain_schedule import GainStep, gain_steps
 from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.sensor_timing import require_plain
 
 #: The gains have settled when what is left of their way is below this share of them.
 SETTLED = 1e-13
@@ -50,6 +51,7 @@ class SteadyObserver:
 
 def steady_observer(observer: RecursiveObserver) -> SteadyObserver:
     """Return the steady state of a recursive observer."""
+    require_plain(observer, "A steady filter")
     _require_constant(observer)
     settled, steps = _settled(observer)
     realisation, start = _realised(observer, settled)

@@ -18,8 +18,7 @@ from obsynth.analysis.zeros import leading_names
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.covariances import covariance_factor
-from obsynth.numerics.least_squares_step import LeastSquaresStep, Projection, projected_step, projection_of
-from obsynth.numerics.ranks import OUTGROWN
+from obsynth.numerics.least_squares_step import OUTGROWN, LeastSquaresStep, Projection, projected_step, projection_of
 from obsynth.plants.sequences import MatrixSequence
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 

@@ -9,8 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.ranks import UNDETERMINED_SHARE
 from obsynth.numerics.square_root_smoothing import Gaussian, WayBack, nothing_later, stepped_back
-from obsynth.observers.recursive.recursion import UNDETERMINED_SHARE
+from obsynth.observers.state_bounds import projected
 
 
 class Lesson(NamedTuple):
@@ -105,15 +106,17 @@ class Links:
 
     Fields: first: From the state after the first sample and its row to its node; next: From the node before, the states
     before and after a sample, its row and its input to its node; begun: From the state at which a run went on to the
-    node it stands for; forgetting: lambda of constant parameters; limits: Lower and upper bounds of the states and of
-    the parameters ``(2, n)`` and ``(2, nq)``.
+    node it stands for; forgetting: lambda of constant parameters; bounds:
+    ``(nx, 2)``, of the states; lower, upper: ``(nq,)``, of the parameters.
     """
 
     first: Callable[[Any, Any, FloatArray], Node]
     next: Callable[[Node, Any, Any, Any, FloatArray], Node]
     begun: Callable[[Any], Node]
     forgetting: float = 1.0
-    limits: tuple[FloatArray, FloatArray] | None = None
+    bounds: FloatArray | None = None
+    lower: FloatArray | None = None
+    upper: FloatArray | None = None
 
 
 def smoothed_from(links: Links, nodes: Sequence[Node], begin: int, end: int) -> list[Smoothed]:
@@ -141,11 +144,15 @@ def _smoothed(links: Links, node: Node, known: Gaussian, later: LaterLessons) ->
         theta, spread = later.beside(node.lesson)
     if x.shape[1] > 1:
         factor = np.hstack((factor, x[:, 1:] @ spread))
-    estimate = x[:, 0] + x[:, 1:] @ theta if x.shape[1] > 1 else x[:, 0]
-    if links.limits is not None:
-        of_states, of_parameters = links.limits
-        estimate = np.clip(estimate, *of_states)
-        theta = np.clip(theta, *of_parameters) if len(theta) else theta
+    estimate = x[:, 0] + x[:, 1:] @ theta if x.shape[1] > 1 else x[:, 0].copy()
+    if links.lower is not None and links.upper is not None and node.lesson is not None:
+        theta = np.clip(theta, links.lower, links.upper)
+    elif links.lower is not None and links.upper is not None and len(links.lower):
+        walking = slice(len(estimate) - len(links.lower), None)
+        estimate[walking] = np.clip(estimate[walking], links.lower, links.upper)
+    if links.bounds is not None:
+        states = slice(0, len(links.bounds))
+        estimate[states] = projected(estimate[states], factor[states], links.bounds)
     return Smoothed(estimate, factor, diffuse, theta, spread)
 
 

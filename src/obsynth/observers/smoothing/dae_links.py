@@ -1,8 +1,7 @@
 """The chain of an observer of a nonlinear plant: linearised along what the observer found, as the observer is itself.
 
 Constant parameters (form ``forgetting``): states at given parameters, which are estimated from both sides.  Parameters
-that walk are states of the chain.  Form ``random-walk`` estimates them beside the states in two stages; its chain takes
-both together, which is what its equations say, so that its last sample is not quite the observer's.
+that walk are states of the chain.
 """
 
 from __future__ import annotations
@@ -24,15 +23,12 @@ from obsynth.observers.smoothing.chain import Lesson, Links, Node
 def dae_links(steps: Steps) -> Links:
     """Return how a chain is made of the steps of an observer of a nonlinear plant."""
     settings = steps.settings
-    of_parameters = np.stack((settings.lower, settings.upper))
-    of_states = np.tile([[-np.inf], [np.inf]], (1, settings.model.nx))
     own: _DAELinks
     if settings.form == "forgetting":
         own, forgetting = _ConstantLinks(steps), settings.forgetting
     else:
         own, forgetting = _WalkingLinks(steps), 1.0
-        of_states = np.hstack((of_states, of_parameters))
-    return Links(own.first, own.next, own.begun, forgetting, (of_states, of_parameters))
+    return Links(own.first, own.next, own.begun, forgetting, settings.state_bounds, settings.lower, settings.upper)
 
 
 class _Sample(NamedTuple):
@@ -127,14 +123,14 @@ class _ConstantLinks(_DAELinks):
         offset = found.back.offset.copy()
         offset[:, 0] -= offset[:, 1:] @ theta
         return Node(self._origin(after), found.factor, found.diffuse, found.back._replace(offset=offset),
-                    self._learnt(after, at, node.factor))  # fmt: skip
+                    self._learnt(before, after, at, node.factor))  # fmt: skip
 
     def _origin(self, state: DAEState) -> FloatArray:
         through = self.through(state)
         return np.column_stack((self.steps.part(state, "posterior") - through @ self.steps.part(state, "theta"),
                                 through))  # fmt: skip
 
-    def _learnt(self, after: DAEState, at: _Sample, factor: FloatArray) -> Lesson | None:
+    def _learnt(self, before: DAEState, after: DAEState, at: _Sample, factor: FloatArray) -> Lesson | None:
         """Return what a sample says of the parameters: its innovation at parameters zero, and how it follows them."""
         Omega = at.H @ self.steps.part(after, "Upsilon") + at.L
         spread = at.H @ np.hstack((at.F @ factor, at.noise))
@@ -145,7 +141,8 @@ class _ConstantLinks(_DAELinks):
         root = np.linalg.cholesky(weight)
         noise = np.linalg.solve(root, np.linalg.cholesky(Sigma))
         v, G = np.linalg.solve(root, at.e + Omega @ at.theta), np.linalg.solve(root, Omega)
-        return self._lesson(after, v, G, noise)
+        found = self._lesson(after, v, G, noise)
+        return found if found is None else found._replace(is_reset=after.resets > before.resets)
 
     def _lesson(self, after: DAEState, v: FloatArray, G: FloatArray, noise: FloatArray) -> Lesson | None:
         if not self.nq:
@@ -187,13 +184,17 @@ class _WalkingLinks(_DAELinks):
         noise = stacked_noise(at.noise, self.walk)
         # The parameters of a sample act in the step that leads there.
         noise[:nx, at.noise.shape[1] :] = at.G @ self.walk
-        away = node.origin[:, 0] - self._posterior(before)
-        right = np.concatenate((F @ away, at.e))[:, None]
+        factor = node.factor
+        if after.resets > before.resets:
+            # Nothing is known of the parameters from before: they begin anew, beside the states.
+            begun = np.vstack((np.zeros((nx, nq)), covariance_factor(
+                self.steps.settings.initial_parameter_covariance, "initial_parameter_covariance")))  # fmt: skip
+            factor = np.vstack((factor[:nx], np.zeros((nq, factor.shape[1]))))
+            noise = np.hstack((noise, F @ begun))
+        right = np.concatenate((np.zeros(nx + nq), at.e))[:, None]
         root = covariance_factor(at.R, "R") if count else np.zeros((0, 0))
-        known = np.vstack((F @ node.factor, np.zeros((count, node.factor.shape[1]))))
+        known = np.vstack((F @ factor, np.zeros((count, factor.shape[1]))))
         rows = np.vstack((np.eye(nx + nq), np.hstack((at.H, at.L))))
         found = joint_step(rows, known, stacked_noise(noise, root), right, np.zeros((len(rows), 0)))
-        own = np.concatenate((at.x, at.theta)) + found.estimate[:, 0]
-        # The observer's own estimate, which keeps to the bounds, where the chain follows the same equations.
-        own = self._posterior(after) if self._is_joint else own
-        return Node(own[:, None], found.factor, found.diffuse, found.back)
+        # The observer's own estimate, which keeps to the bounds.
+        return Node(self._posterior(after)[:, None], found.factor, found.diffuse, found.back)

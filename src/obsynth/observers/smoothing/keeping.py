@@ -91,7 +91,11 @@ class KeepingObserver:
 
     def accept(self, state: Any, y: FloatArray, u: FloatArray) -> tuple[Any, Any]:
         """Take a sample as the observer does, and keep it."""
-        after, row = self.observer.accept(state, y, u)
+        after, row = self.observer.timing.advance(self._kept, state, y, u)
+        return after, self.observer.shown(row)
+
+    def _kept(self, state: Any, y: FloatArray, u: FloatArray) -> tuple[Any, Any]:
+        after, row = self.observer.in_order(state, y, u)
         self.chain.add(self.links, state, after, row, u)
         return after, row
 
@@ -148,7 +152,15 @@ def smoothed_record(observer: SmoothedObserver, y: ArrayLike, u: ArrayLike | Non
     if not len(outputs):
         return observer.run(outputs, inputs)
     kept = KeepingObserver(observer)
-    state = kept.init()
+    state, found = kept.init(), []
+    is_late = lag is not None and observer.timing.longest > 0
     for k in range(len(outputs)):
         state, _ = kept.accept(state, outputs[k], inputs[k])
-    return smoothed_estimates(observer, kept.chain.rows, all_smoothed(kept.links, kept.chain.nodes, lag))
+        if is_late and lag is not None and k >= lag:
+            # Values that come later than that change the samples behind them.
+            found.append(kept.chain.smoothed(kept.links, k - lag, k)[0])
+    if is_late:
+        found += kept.chain.smoothed(kept.links, len(found), len(outputs) - 1)
+    else:
+        found = all_smoothed(kept.links, kept.chain.nodes, lag)
+    return smoothed_estimates(observer, kept.chain.rows, found)

@@ -21,7 +21,13 @@ def recursive_links(recursion: Recursion) -> Links:
         )  # fmt: skip
     adaptation = recursion.settings.adaptation
     own = _RecursiveLinks(recursion)
-    return Links(own.first, own.next, own.begun, 1.0 if adaptation is None else adaptation.forgetting)
+    return Links(
+        own.first,
+        own.next,
+        own.begun,
+        1.0 if adaptation is None else adaptation.forgetting,
+        recursion.settings.state_bounds,
+    )
 
 
 class _RecursiveLinks:

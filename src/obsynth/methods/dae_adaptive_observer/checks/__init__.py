@@ -12,7 +12,7 @@ import numpy as np
 from obsynth.analysis.dae_index import SINGULAR_CONDITION
 from obsynth.errors import ObsynthError
 from obsynth.methods.dae_adaptive_observer.conditions import dae_conditions
-from obsynth.methods.recursive.checks import listed_gains
+from obsynth.methods.recursive.checks import listed_gains, refinement_rows
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.covariances import covariance_factor
 from obsynth.numerics.newton import LARGEST_RESIDUAL
@@ -20,7 +20,7 @@ from obsynth.observers.dae.batch import run_dae_batch
 from obsynth.observers.dae.building import OPTIONS, dae_observer_from_options, resolved_options
 from obsynth.observers.dae.nominal_run import NOMINAL_STEPS, DAEFacts, dae_facts
 from obsynth.observers.dae.observer import DAEObserver
-from obsynth.observers.robustness import with_outliers
+from obsynth.observers.robustness import plain_recursion
 from obsynth.results.design import ObserverDesign
 from obsynth.results.report import Check, information, upper_bound_check
 from obsynth.simulation.dae import simulate_dae
@@ -35,6 +35,8 @@ DERIVATIVE_TOLERANCE = 1e-6
 #: Runs and steps of the Monte Carlo: with one parameter the mean of 48 squares is wrong by the factor below one time in
 #: several hundred.
 TRIALS = 48
+#: So many where those seem to refute the covariances.
+MORE_TRIALS = 240
 STEPS = 40
 SEED = 20130206
 #: A mean of normalised squares may be off by this factor: covariances of a nonlinear plant are first-order ones.  Less
@@ -56,8 +58,9 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
         "fits the plant", "observer, options and plant hold the same model and numbers", float(bool(problem)), 0.0,
         source="shipped observer", kind="equality", detail=problem,
     )  # fmt: skip
+    yield from refinement_rows(observer)
     # What is checked is the recursion; records that no plant made would seem full of outliers.
-    observer = with_outliers(observer, "none")
+    observer = plain_recursion(observer)
     try:
         facts = dae_facts(observer)
         yield from _model_rows(observer, facts)
@@ -167,6 +170,35 @@ def _consistency_rows(design: ObserverDesign, shipped: DAEObserver) -> Iterator[
     """Run the shipped observer on noise, starts and parameters as they are stated in the options."""
     stated = dae_observer_from_options(design.nonlinear[0], design.options)
     rng = np.random.default_rng(SEED)
+    errors, squares, degrees = np.zeros(0), 0.0, 0.0
+    # What a few runs seem to refute, more of them decide: a right filter is not refused for its draws.
+    for trials in (range(TRIALS), range(TRIALS, MORE_TRIALS)):
+        more, nis, counted = _trials(stated, shipped, rng, trials)
+        errors, squares, degrees = np.concatenate([errors, more]), squares + nis, degrees + counted
+        if max(_ratio(float(np.mean(errors))), _ratio(squares / degrees)) <= CONSISTENCY_FACTOR:
+            break
+    for name, claim, mean, count in (
+        ("NEES", "squared errors of the parameters per degree of freedom are one, within a factor",
+         float(np.mean(errors)), float(errors.size * stated.model.nq)),
+        ("NIS", "squared innovations per degree of freedom are one, within a factor", squares / degrees, degrees),
+    ):  # fmt: skip
+        low, high = _band(count)
+        yield upper_bound_check(
+            name, claim, _ratio(mean), CONSISTENCY_FACTOR, source="recomputed, Monte Carlo with a fixed seed",
+            detail=f"mean {mean:.3f} of {errors.size} runs of {STEPS} steps at nominal inputs; 95 % band of exact "
+            f"covariances {low:.3f} to {high:.3f}",
+        )  # fmt: skip
+
+
+def _ratio(mean: float) -> float:
+    """Return how far a mean is from one, as a factor above one."""
+    return float(np.exp(abs(np.log(mean))))
+
+
+def _trials(
+    stated: DAEObserver, shipped: DAEObserver, rng: np.random.Generator, trials: range
+) -> tuple[FloatArray, float, float]:
+    """Return squared errors of the parameters per degree of freedom, and squared innovations with their number."""
     roots = [covariance_factor(stated.initial_parameter_covariance, "initial_parameter_covariance"),
              covariance_factor(stated.initial_covariance, "initial_covariance")]  # fmt: skip
     u = np.tile(stated.model.nominal_input, (STEPS + 1, 1))
@@ -174,7 +206,7 @@ def _consistency_rows(design: ObserverDesign, shipped: DAEObserver) -> Iterator[
     if stated.form != "forgetting":
         walk = covariance_factor(stated.random_walk, "random_walk")
     parameters, outputs = [], []
-    for trial in range(TRIALS):
+    for trial in trials:
         theta = stated.initial_parameters + roots[0] @ rng.standard_normal(stated.model.nq)
         path = np.tile(theta, (STEPS + 1, 1))
         if walk.any():
@@ -191,19 +223,7 @@ def _consistency_rows(design: ObserverDesign, shipped: DAEObserver) -> Iterator[
     gaps = found.parameters[:, -1] - np.array(parameters)
     weighted = np.linalg.solve(found.parameter_covariances[:, -1], gaps[:, :, None])[:, :, 0]
     errors = np.sum(gaps * weighted, axis=1) / gaps.shape[1]
-    squares, degrees = float(found.nis[:, 1:].sum()), float(found.nis_degrees[:, 1:].sum())
-    for name, claim, mean, count in (
-        ("NEES", "squared errors of the parameters per degree of freedom are one, within a factor", np.mean(errors),
-         float(gaps.size)),
-        ("NIS", "squared innovations per degree of freedom are one, within a factor", squares / degrees, degrees),
-    ):  # fmt: skip
-        ratio = float(np.exp(abs(np.log(mean))))
-        low, high = _band(count)
-        yield upper_bound_check(
-            name, claim, ratio, CONSISTENCY_FACTOR, source="recomputed, Monte Carlo with a fixed seed",
-            detail=f"mean {mean:.3f} of {TRIALS} runs of {STEPS} steps at nominal inputs; 95 % band of exact "
-            f"covariances {low:.3f} to {high:.3f}",
-        )  # fmt: skip
+    return errors, float(found.nis[:, 1:].sum()), float(found.nis_degrees[:, 1:].sum())
 
 
 def _band(count: float) -> tuple[float, float]:

@@ -6,7 +6,6 @@ Source of the claims: Moussa Ali, Zhang 2013, (6), (13), (26) and Lemma 3.1; the
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 
 import numpy as np
 
@@ -15,6 +14,7 @@ from obsynth.errors import ObsynthError
 from obsynth.methods.recursive.checks.batch import BATCH_STEPS, batch_residuals, batch_steps
 from obsynth.methods.recursive.conditions import recursive_conditions
 from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.recursive.building import observer_from_options
 from obsynth.observers.recursive.gain_schedule_summary import (
     STEPS_TO_CONTRACT,
@@ -23,6 +23,7 @@ from obsynth.observers.recursive.gain_schedule_summary import (
     looked_at,
 )
 from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.robustness import plain_recursion
 from obsynth.plants.sequences import MatrixSequence
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.results.design import ObserverDesign
@@ -59,15 +60,37 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
         "fits the plant", "observer, options and plant hold the same matrices at every k", float(bool(problem)), 0.0,
         source="shipped observer", kind="equality", detail=problem,
     )  # fmt: skip
+    yield from refinement_rows(observer)
     stated = _stated(design)
     if stated is None or observer.plant.nx != plant.nx or observer.plant.ne != plant.ne:
         return
     try:
         # What is checked is the recursion; records that no plant made would seem full of outliers.
-        yield from _dynamic_rows(design, replace(observer, outliers="none"), replace(stated, outliers="none"))
+        yield from _dynamic_rows(design, plain_recursion(observer), plain_recursion(stated))
     except (ObsynthError, np.linalg.LinAlgError, ValueError) as error:
         yield upper_bound_check("runs", "the observer runs on its own model", 1.0, 0.0, source="shipped observer",
                                 detail=str(error))  # fmt: skip
+
+
+def refinement_rows(observer: RecursiveObserver | DAEObserver) -> Iterator[Check]:
+    """Yield what holds besides the recursion that is checked: bounds of states, and sensors of their own times."""
+    if observer.state_bounds is not None:
+        pairs = zip(observer.state_names, observer.state_bounds, strict=True)
+        bounded = [name for name, pair in pairs if np.isfinite(pair).any()]
+        is_fed_back = isinstance(observer, DAEObserver)
+        goes_on = "the next step begins there" if is_fed_back else "the recursion goes on without them"
+        yield information(
+            "state bounds", "estimates are projected onto bounds in the metric of their covariance, which stays that "
+            "without bounds", float(len(bounded)), source="options: state_bounds", status="assumed",
+            detail=f"active for {', '.join(bounded)}; {goes_on}. That the true states keep the bounds is assumed: then "
+            "no projection makes a squared error larger in units of the covariance",
+        )  # fmt: skip
+    for name, entry in (observer.sensors or {}).items():
+        yield information(
+            f"sensor {name}", "rows between its samples", float(entry["every"]), source="options: sensors",
+            detail=f"its values arrive {entry['delay']} row(s) late; the other rows of this report are about samples "
+            "of every sensor at once",
+        )  # fmt: skip
 
 
 def _dynamic_rows(design: ObserverDesign, observer: RecursiveObserver, stated: RecursiveObserver) -> Iterator[Check]:
@@ -174,6 +197,10 @@ def misfit(design: ObserverDesign) -> str:
         return "early_constraints"
     if (stated.outliers, stated.outlier_limit) != (observer.outliers, observer.outlier_limit):
         return "outliers"
+    if stated.sensors != observer.sensors:
+        return "sensors"
+    if not np.array_equal(_bounds(stated), _bounds(observer)):
+        return "state_bounds"
     for field in ("state_names", "input_names", "output_names", "parameter_names", "dt", "horizon"):
         if getattr(plant, field) != getattr(observer.plant, field):
             return field
@@ -197,6 +224,10 @@ def misfit(design: ObserverDesign) -> str:
         if not np.array_equal(getattr(stated, field), getattr(observer, field)):
             return field
     return _different_matrix(plant, observer, stated)
+
+
+def _bounds(observer: RecursiveObserver) -> FloatArray:
+    return np.zeros((0, 2)) if observer.state_bounds is None else observer.state_bounds
 
 
 def _different_matrix(
