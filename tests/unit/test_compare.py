@@ -68,6 +68,16 @@ def test_tolerances_make_a_bias() -> None:
     assert off.methods[0].faults[0].bias > 3.0 * exact.methods[0].faults[0].bias
 
 
+def test_the_bicycle_drives_with_its_lateral_speed() -> None:
+    spec = load_spec(DESIGNS / "bicycle" / "spec.yaml")
+    log = pd.read_csv(DESIGNS / "bicycle" / "log_with_vy.csv")
+    log["steering"] = pd.read_csv(DESIGNS / "bicycle" / "true_log.csv")["f"]
+    found = obsynth.compare(
+        spec.plant, scenario=spec.scenario, options={spec.method: spec.options}, methods=[spec.method], data=log, runs=2
+    )
+    assert found.methods[0].rms < 0.0015
+
+
 def pendulum(**changes: object) -> obsynth.DescriptorSystem:
     # Unstable, with an actuator and an algebraic force.
     given = {"B": [[0], [0], [5], [0]], "Bf": [[0], [1], [0], [0]], "Dw": 0.001 * np.eye(2)} | changes

@@ -299,5 +299,5 @@ def test_a_spec_may_have_its_plant_in_a_mat_file(tmp_path):
     assert str(error.value).startswith(str(spec))
     (tmp_path / "plant.yaml").write_text("schema_version: 1\ndt: 0\nA: [[-1]]\nC: [[1]]\n")
     spec.write_text("schema_version: 1\nname: mat\nplant: {file: plant.yaml, faults: [u3]}\n")
-    with pytest.raises(obsynth.SpecError, match=r"plant\.faults is for plants in \.mat files"):
+    with pytest.raises(obsynth.SpecError, match=r"plant\.faults: unknown key beside a file that is no \.mat"):
         obsynth.load_spec(spec)

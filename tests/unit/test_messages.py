@@ -76,3 +76,19 @@ scenario: {horizon: 9, faults: {f1: {kind: sine, size: 1, rate: 2, period: 3, am
 
 def test_what_a_solver_did_is_separated_run_by_run():
     assert value_text([{"what": "a", "gain": 1}, {"what": "b"}]) == "what: a, gain: 1; what: b"
+
+
+def test_every_wrong_name_and_shape_of_a_plant_is_told_at_once():
+    """Each with what was meant: a name that is close, or that a column was written as a row."""
+    with pytest.raises(obsynth.SpecError) as found:
+        obsynth.DescriptorSystem(
+            A=[[-1, 0], [0, -2]], C=["x1"], Bf=[[1, 0]], state_names=["x1", "x2"], sensor_noise={"w": 1.0, "v": 1.0},
+            operating_point={"x11": 1.0}, units={"zz": "m", "x22": "m"},
+        )  # fmt: skip
+    told = found.value.problems
+    assert "sensor_noise has no signal named 'w'." in told
+    assert "sensor_noise has no signal named 'v'." in told
+    assert any(text.endswith("Is it transposed?") for text in told if text.startswith("Bf "))
+    assert any("'x11'" in text and "Did you mean 'x1'" in text for text in told)
+    assert any("'x22'" in text and "Did you mean 'x2'" in text for text in told)
+    assert len(told) == 6

@@ -140,6 +140,19 @@ def test_which_sensors_may_fail() -> None:
     found = obsynth.sensor_sets(load_spec(DESIGNS / "motor" / "spec.yaml").plant)
     assert found.sets[0].sensors == ()
     assert found.may_be_lost == ("i",)
+    assert found.lost_without == {"theta m": ("torque",), "theta l": ("torque",), "i": ()}
+    assert "Without theta l: torque lost." in str(found)
+
+
+def test_which_sensor_is_needed_for_which_fault() -> None:
+    # Two faults in two paths: each needs its own sensor, until a third one shows the sum.
+    plant = obsynth.DescriptorSystem(
+        None, np.diag([-1.0, -2.0]), None, [[1, 0], [0, 1]], Bf=np.eye(2), fault_names=["a", "b"],
+    )  # fmt: skip
+    assert obsynth.sensor_sets(plant).lost_without == {"y1": ("a",), "y2": ("b",)}
+    assert obsynth.sensor_sets(plant, faults=["b"]).lost_without == {"y1": (), "y2": ("b",)}
+    three = plant.replace(C=[[1, 0], [0, 1], [1, 1]], D=None, Dd=None, Df=None, Dw=None, output_names=None)
+    assert obsynth.sensor_sets(three).may_be_lost == ("y1", "y2", "y3")
 
 
 @pytest.mark.parametrize("method", ["functional-filter", "ui-pi-observer"])

@@ -115,8 +115,8 @@ def add_data_verbs(verbs: Any) -> None:
     _add_data(plot, required=True, what="text (.csv, .tsv), Parquet, TDMS or MDF file; - for text on standard input")
     plot.add_argument("--out", type=Path, metavar="FILE", help="picture (.png, .svg or .pdf); without it, a window")
     plot.add_argument(
-        "--show", metavar="PARTS", default="outputs,faults,residuals,statistic",
-        help="what is drawn, of outputs,faults,residuals,statistic (default: all there is)",
+        "--show", metavar="PARTS", default="outputs,faults,residuals,statistic,shares",
+        help="what is drawn, of outputs,faults,residuals,statistic,shares (default: all there is)",
     )  # fmt: skip
     _add_data_options(plot)
     _add_scenario(plot)

@@ -59,6 +59,9 @@ class SensorSets:
         What not even all candidates together reach, in words.
     may_be_lost : tuple of str
         Outputs of the plant that may fail, one at a time, without losing the goal (with no sensor added).
+    lost_without : mapping of str to tuple of str
+        The reverse question: by output of the plant, the faults for which the goal is lost when that sensor fails, of
+        those that the plant reaches with no sensor added.
     notes : tuple of str
         What was searched; where no set is small enough, one that does it.
     """
@@ -68,6 +71,7 @@ class SensorSets:
     exact: bool
     out_of_reach: tuple[str, ...]
     may_be_lost: tuple[str, ...]
+    lost_without: Mapping[str, tuple[str, ...]]
     notes: tuple[str, ...]
 
     @property
@@ -88,7 +92,8 @@ class SensorSets:
         """Return the result as plain data."""
         return {
             "goal": self.goal, "exact": self.exact, "out_of_reach": list(self.out_of_reach),
-            "may_be_lost": list(self.may_be_lost), "notes": list(self.notes),
+            "may_be_lost": list(self.may_be_lost),
+            "lost_without": {name: list(lost) for name, lost in self.lost_without.items()}, "notes": list(self.notes),
             "sets": [
                 {"sensors": list(found.sensors), "cost": found.cost, "deviation": found.deviation}
                 for found in self.sets
@@ -99,13 +104,19 @@ class SensorSets:
         rows = self.rows()
         widths = [max(len(row[j]) for row in rows) for j in range(3)]
         lines = ["  ".join(text.ljust(w) for text, w in zip(row, widths, strict=True)).rstrip() for row in rows]
-        return "\n".join([f"Sensors to {self.goal}:", *lines, *self.out_of_reach, *self.notes])
+        return "\n".join([f"Sensors to {self.goal}:", *lines, *self.out_of_reach, *self.failures(), *self.notes])
+
+    def failures(self) -> tuple[str, ...]:
+        """Return a sentence for each output whose failure loses a fault, and one for those that may fail."""
+        lost = [f"Without {name}: {', '.join(faults)} lost." for name, faults in self.lost_without.items() if faults]
+        free = [name for name, faults in self.lost_without.items() if not faults]
+        return (*lost, *([f"May fail, one at a time, without losing any fault: {', '.join(free)}."] if free else []))
 
     def _repr_html_(self) -> str:
         rows = self.rows()
         body = "".join("<tr>" + "".join(f"<td>{escape(text)}</td>" for text in row) + "</tr>" for row in rows[1:])
         head = "".join(f"<th>{escape(text)}</th>" for text in rows[0])
-        texts = "".join(f"<p>{escape(text)}</p>" for text in (*self.out_of_reach, *self.notes))
+        texts = "".join(f"<p>{escape(text)}</p>" for text in (*self.out_of_reach, *self.failures(), *self.notes))
         return f"<table><tr>{head}</tr>{body}</table>{texts}"
 
 
@@ -205,8 +216,10 @@ def sensor_sets(
             found, exact = ([], exact) if one is None else ([one], False)
     report_stage("designing for each set")
     ranked = _ranked(search, found, costs, noise is not None and goal.startswith("estimate"))
-    kept = tuple(name for i, name in enumerate(plant.output_names) if _kept_without(search, wanted, i))
-    return SensorSets(goal, ranked, exact, tuple(_in_words(plant, lost)), kept, tuple(notes))
+    had = [task for task in wanted if reached(plant, task)]
+    failing = {name: _lost_without(plant, had, i) for i, name in enumerate(plant.output_names)} if had else {}
+    kept = tuple(name for name, faults in failing.items() if len(had) == len(wanted) and not faults)
+    return SensorSets(goal, ranked, exact, tuple(_in_words(plant, lost)), kept, failing, tuple(notes))
 
 
 def _candidates(
@@ -287,9 +300,8 @@ def _deviation(
     return float(np.max(made.certificate.matrices["deviations"][:, 1])), rates
 
 
-def _kept_without(search: SensorSearch, wanted: Sequence[Task], output: int) -> bool:
-    """Whether the plant as it is reaches what is wanted without one of its outputs."""
-    plant = search.plant
+def _lost_without(plant: DescriptorSystem, had: Sequence[Task], output: int) -> tuple[str, ...]:
+    """Return the faults of what the plant reaches that are lost without one of its outputs."""
     rest = [i for i in range(plant.ny) if i != output]
     fewer = plant.replace(
         C=plant.C[rest], D=plant.D[rest], Dd=plant.Dd[rest], Df=plant.Df[rest], Dw=plant.Dw[rest],
@@ -297,7 +309,7 @@ def _kept_without(search: SensorSearch, wanted: Sequence[Task], output: int) -> 
         scales={name: value for name, value in plant.scales.items() if name != plant.output_names[output]},
         units={}, operating_point={},
     )  # fmt: skip
-    return all(reached(fewer, task) for task in wanted)
+    return tuple(dict.fromkeys(plant.fault_names[task.fault] for task in had if not reached(fewer, task)))
 
 
 def _in_words(plant: DescriptorSystem, lost: Sequence[Task]) -> list[str]:

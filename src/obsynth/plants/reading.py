@@ -129,7 +129,9 @@ def plant_fields(
             first = checked_names(stated, sizes[signal] - len(extra), prefix=signal, what=field)
             stated = (*first, *extra)
         values[field] = problems.collect(partial(checked_names, stated, sizes[signal], prefix=signal, what=field))
-    problems.raise_if_any()
+    if any(values.get(field) is None for field in _SIGNALS):
+        # What refers to signals by name cannot be judged.
+        problems.raise_if_any()
     known = {name for field in ("state_names", *_SIGNALS) for name in values[field]}
     values["operating_point"] = problems.collect(lambda: checked_point(operating_point, known))
     measured = {*values["input_names"], *values["output_names"]}

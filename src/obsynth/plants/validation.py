@@ -50,7 +50,8 @@ class Problems:
         if value is None or (0 in value.shape and 0 in shape):
             return np.zeros(shape)
         if value.shape != shape:
-            hint = " Is it transposed?" if value.shape == shape[::-1] else ""
+            turned = value.shape[1] == shape[0] != value.shape[0]
+            hint = " Is it transposed?" if turned or value.shape == shape[::-1] else ""
             self._note(f"{name} is {_by(value.shape)}, but {_by(shape)} is needed.{hint}", name)
         return value
 

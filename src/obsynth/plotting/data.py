@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from obsynth.results.design import ObserverDesign
 
 #: Kinds of panels, in their order.
-PARTS = ("outputs", "faults", "residuals", "statistic")
+PARTS = ("outputs", "faults", "residuals", "statistic", "shares")
 #: Signals of a kind that are drawn.
 MOST = 6
 #: A statistic this many times above its threshold gets a logarithmic axis.
@@ -61,17 +61,19 @@ def plot_data(
         From `obsynth.run_on_data` without ``out``, so that it holds its table.
     design : ObserverDesign, optional
         Which was run: gives units, and the standard deviations of the fault estimates of linear designs.
-    show : sequence of {"outputs", "faults", "residuals", "statistic"}, optional
+    show : sequence of {"outputs", "faults", "residuals", "statistic", "shares"}, optional
         What is drawn, of what there is: measured outputs with their estimates, fault estimates with 95 % intervals of
-        the stated noise, residuals with the thresholds of the run, and the statistic of its monitor.
+        the stated noise (with adaptive thresholds: their threshold and the guaranteed interval of the fault), residuals
+        with the thresholds of the run, the statistic of its monitor, and how much of an adaptive threshold each
+        constant with a tolerance makes.
     axes : iterable of Axes, optional
         As many as there are panels; new ones, one above the other, by default.
 
     Returns
     -------
     list of Axes
-        One for each of the first six outputs and faults, one for all residuals, one for the statistic.  Rows in which
-        nothing is decided (warm-up, gaps) lie in grey, rows with an alarm in red.
+        One for each of the first six outputs and faults, one for all residuals, one for the statistic, one for the
+        shares.  Rows in which nothing is decided (warm-up, gaps) lie in grey, rows with an alarm in red.
 
     Raises
     ------
@@ -117,6 +119,7 @@ def _plans(table: pd.DataFrame, measured: pd.DataFrame, show: Sequence[str]) -> 
     plans += [("faults", name) for name in [name for name in columns if name.startswith("fhat[")][:MOST]]
     plans += [("residuals", "")] if any(name.startswith("r[") for name in columns) else []
     plans += [("statistic", "")] if "statistic" in columns else []
+    plans += [("shares", "")] if any(name.startswith("share ") for name in columns) else []
     return [plan for plan in plans if plan[0] in show]
 
 
@@ -134,10 +137,18 @@ def _draw_fault(panel: Axes, run: DataRun, column: str, units: dict[str, str], d
     table: Any = run.table
     name, times = column[5:-1], _times(table, column)
     values, deviation = table[column].to_numpy(float), _deviation(table, column, design)
-    if deviation is not None:
+    guaranteed, adaptive = f"lowest {name}" in table, f"threshold {column}" in table
+    if guaranteed:
+        low, high = table[f"lowest {name}"].to_numpy(float), table[f"highest {name}"].to_numpy(float)
+        panel.fill_between(times, low, high, label="guaranteed interval", **BAND_STYLE)
+    elif deviation is not None and not adaptive:
         low, high = values - BAND_WIDTH * deviation, values + BAND_WIDTH * deviation
         panel.fill_between(times, low, high, label="95 % interval of the stated noise", **BAND_STYLE)
     panel.plot(times, values, label="estimate", **{**ESTIMATE_STYLE, "linestyle": "-"})
+    if adaptive:
+        limit = table[f"threshold {column}"].to_numpy(float)
+        for side, label in ((limit, "threshold without a fault"), (-limit, None)):
+            panel.plot(table["time"], side, label=label, **THRESHOLD_STYLES[0])
     level = run.thresholds.get(column)
     if level is not None:
         biases = () if design is None else getattr(design.plant, "sensor_faults", ())
@@ -187,8 +198,23 @@ def _draw_statistic(panel: Axes, run: DataRun, _: str, __: dict[str, str], ___: 
     panel.set_ylabel("statistic")
 
 
+def _draw_shares(panel: Axes, run: DataRun, _: str, __: dict[str, str], ___: Any) -> None:
+    """Stack what each constant makes of the threshold; those that make least count together."""
+    table: Any = run.table
+    names = [name for name in table.columns if name.startswith("share ")]
+    values = 100.0 * np.nan_to_num(table[names].to_numpy(float))
+    order = np.argsort(-values.mean(axis=0), kind="stable")
+    shown, others = order[: MOST - 1], order[MOST - 1 :]
+    parts = [values[:, i] for i in shown] + ([values[:, others].sum(axis=1)] if len(others) else [])
+    labels = [names[i].removeprefix("share ") for i in shown] + (["other constants"] if len(others) else [])
+    panel.stackplot(table["time"], parts, labels=labels, colors=LINE_COLOURS[: len(parts)], alpha=0.7, linewidth=0.0)
+    panel.set_ylim(0.0, 100.0)
+    panel.set_ylabel("share of the\nthreshold (%)")
+
+
 _DRAWN = {
     "outputs": _draw_output, "faults": _draw_fault, "residuals": _draw_residuals, "statistic": _draw_statistic,
+    "shares": _draw_shares,
 }  # fmt: skip
 
 

@@ -133,8 +133,10 @@ def matlab_plant(reference: PlantReference, spec: Path) -> DescriptorSystem | No
 
         return _placed(lambda: from_matlab(spec.parent / reference.file, **arguments), spec, "plant")
     if arguments:
-        raise SpecError(f"{spec}: plant.{next(iter(arguments))} is for plants in .mat files; of {reference.file} it is "
-                        "said there.", path=f"plant.{next(iter(arguments))}")  # fmt: skip
+        raise SpecError(
+            f"{spec}: plant.{next(iter(arguments))}: unknown key beside a file that is no .mat file: it belongs "
+            f"into {reference.file}.", path=f"plant.{next(iter(arguments))}",
+        )  # fmt: skip
     return None
 
 
