@@ -2,9 +2,12 @@
 that then fail.
 """
 
+import dataclasses
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
-from obsynth import ObserverDesign, VerificationReport, verify
+import numpy as np
+
+from obsynth import Certificate, ObserverDesign, VerificationReport, verify
 
 Corruption = Callable[[ObserverDesign], ObserverDesign]
 Table = Mapping[str, tuple[str, Corruption, Sequence[str]]]
@@ -35,3 +38,57 @@ def assert_information_does_not_fail(table: Table, good: Maker) -> None:
         report = verify(corrupt(good(name)))
         assert all(check.passed for check in report.checks if check.kind == "information")
         assert len({check.name for check in report.checks}) == len(report.checks)
+
+
+# Ways to corrupt a design, and what then fails.
+
+
+def failed(design: ObserverDesign, **options: int) -> set[str]:
+    return {check.name for check in verify(design, **options).failures}
+
+
+def nudged(matrix: np.ndarray, row: int, column: int, by: float = 1e-6) -> np.ndarray:
+    changed = np.array(matrix)
+    changed[row, column] += by
+    return changed
+
+
+def with_observer(design: ObserverDesign, **changes: object) -> ObserverDesign:
+    return design.replace(observer=dataclasses.replace(design.observer, **changes))
+
+
+def shipped(**changes: object) -> Corruption:
+    """Other fields of the observer."""
+    return lambda design: with_observer(design, **changes)
+
+
+def entry(name: str, row: int, column: int, by: float = 1e-6) -> Corruption:
+    """One entry of the observer."""
+    return lambda design: with_observer(design, **{name: nudged(getattr(design.observer, name), row, column, by)})
+
+
+def with_plant(design: ObserverDesign, **changes: object) -> ObserverDesign:
+    return design.replace(plant=design.plant.replace(**changes))
+
+
+def with_certificate(
+    design: ObserverDesign, claims: Mapping[str, float] | None = None, **matrices: np.ndarray
+) -> ObserverDesign:
+    old = design.certificate
+    return design.replace(certificate=Certificate({**old.matrices, **matrices}, {**old.claims, **(claims or {})}))
+
+
+def claim(name: str, value: float) -> Corruption:
+    return lambda design: with_certificate(design, {name: value})
+
+
+def claim_times(name: str, factor: float) -> Corruption:
+    return lambda design: with_certificate(design, {name: factor * design.certificate.claims[name]})
+
+
+def without_claim(name: str) -> Corruption:
+    def corrupt(design: ObserverDesign) -> ObserverDesign:
+        claims = {key: value for key, value in design.certificate.claims.items() if key != name}
+        return design.replace(certificate=Certificate(design.certificate.matrices, claims))
+
+    return corrupt

@@ -9,12 +9,12 @@ from functools import cache
 import casadi as ca
 import numpy as np
 import pytest
+from corruption_tables import Corruption, claim, failed, shipped
 from dae_plants import DESIGNS, ROD, exchanger, linear, pendulum
 from test_dae_observer import matrices
 
 import obsynth
 from obsynth import (
-    Certificate,
     DAEObserver,
     ObserverDesign,
     PreconditionError,
@@ -36,20 +36,10 @@ OPTIONS = {
     "initial_parameter_covariance": {"phi": 0.01, "psi": 1e6},
 }  # fmt: skip
 
-Corruption = Callable[[ObserverDesign], ObserverDesign]
-
 
 @cache
 def good() -> ObserverDesign:
     return dae_adaptive_observer(exchanger(), **OPTIONS)
-
-
-def failed(design: ObserverDesign) -> set[str]:
-    return {check.name for check in verify(design).failures}
-
-
-def shipped(**changes) -> Corruption:
-    return lambda design: design.replace(observer=dataclasses.replace(design.observer, **changes))
 
 
 def throughout(**changes) -> Corruption:
@@ -58,13 +48,6 @@ def throughout(**changes) -> Corruption:
     def corrupt(design: ObserverDesign) -> ObserverDesign:
         plant = design.plant.replace(**changes)
         return design.replace(plant=plant, observer=dataclasses.replace(design.observer, model=plant))
-
-    return corrupt
-
-
-def claim(name: str, value: float) -> Corruption:
-    def corrupt(design: ObserverDesign) -> ObserverDesign:
-        return design.replace(certificate=Certificate({}, {**design.certificate.claims, name: value}))
 
     return corrupt
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -13,6 +12,14 @@ from corruption_tables import (
     assert_every_row_is_broken,
     assert_exactly_the_untrue_rows_fail,
     assert_information_does_not_fail,
+    claim,
+    entry,
+    failed,
+    nudged,
+    with_certificate,
+    with_observer,
+    with_plant,
+    without_claim,
 )
 
 from obsynth import (
@@ -118,35 +125,7 @@ def good(name: str) -> ObserverDesign:
     return fault_estimation_filter(PLANTS[name](), name=name)
 
 
-def failed(design: ObserverDesign, **options: int) -> set[str]:
-    return {check.name for check in verify(design, **options).failures}
-
-
 # Ways to corrupt a design.
-
-
-def nudged(matrix: np.ndarray, row: int, column: int, by: float = 1e-6) -> np.ndarray:
-    changed = np.array(matrix)
-    changed[row, column] += by
-    return changed
-
-
-def with_observer(design: ObserverDesign, **changes: object) -> ObserverDesign:
-    return design.replace(observer=dataclasses.replace(design.observer, **changes))
-
-
-def with_plant(design: ObserverDesign, **changes: object) -> ObserverDesign:
-    return design.replace(plant=design.plant.replace(**changes))
-
-
-def with_certificate(design: ObserverDesign, claims: dict[str, float] | None = None, **matrices: np.ndarray):
-    old = design.certificate
-    return design.replace(certificate=Certificate({**old.matrices, **matrices}, {**old.claims, **(claims or {})}))
-
-
-def entry(name: str, row: int, column: int, by: float = 1e-6) -> Callable[[ObserverDesign], ObserverDesign]:
-    """One entry of the observer."""
-    return lambda design: with_observer(design, **{name: nudged(getattr(design.observer, name), row, column, by)})
 
 
 def plant_entry(name: str, row: int, column: int, by: float) -> Callable[[ObserverDesign], ObserverDesign]:
@@ -168,18 +147,6 @@ def certificate_times(name: str, factor: float) -> Callable[[ObserverDesign], Ob
 
 def certificate_cut(name: str, *key: object) -> Callable[[ObserverDesign], ObserverDesign]:
     return lambda design: with_certificate(design, **{name: design.certificate.matrices[name][key]})
-
-
-def claim(name: str, value: float) -> Callable[[ObserverDesign], ObserverDesign]:
-    return lambda design: with_certificate(design, {name: value})
-
-
-def without_claim(name: str) -> Callable[[ObserverDesign], ObserverDesign]:
-    def corrupt(design: ObserverDesign) -> ObserverDesign:
-        claims = {key: value for key, value in design.certificate.claims.items() if key != name}
-        return design.replace(certificate=Certificate(design.certificate.matrices, claims))
-
-    return corrupt
 
 
 def claimed_bracket(low: float, high: float) -> Callable[[ObserverDesign], ObserverDesign]:

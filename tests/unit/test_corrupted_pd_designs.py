@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -10,9 +9,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 from corruption_tables import (
+    Corruption,
     assert_every_row_is_broken,
     assert_exactly_the_untrue_rows_fail,
     assert_information_does_not_fail,
+    claim,
+    entry,
+    failed,
+    nudged,
+    with_certificate,
+    with_observer,
+    with_plant,
+    without_claim,
 )
 
 from obsynth import (
@@ -40,7 +48,6 @@ RATE, NOISE, BOUND = (
 )  # fmt: skip
 FITS = "fits the plant"
 
-Corruption = Callable[[ObserverDesign], ObserverDesign]
 
 # The good designs.
 
@@ -89,35 +96,7 @@ def good(name: str) -> ObserverDesign:
     return GOOD[name]()
 
 
-def failed(design: ObserverDesign, **options: int) -> set[str]:
-    return {check.name for check in verify(design, **options).failures}
-
-
 # Ways to corrupt a design.
-
-
-def nudged(matrix: np.ndarray, row: int, column: int, by: float = 1e-6) -> np.ndarray:
-    changed = np.array(matrix)
-    changed[row, column] += by
-    return changed
-
-
-def with_observer(design: ObserverDesign, **changes: object) -> ObserverDesign:
-    return design.replace(observer=dataclasses.replace(design.observer, **changes))
-
-
-def with_plant(design: ObserverDesign, **changes: object) -> ObserverDesign:
-    return design.replace(plant=design.plant.replace(**changes))
-
-
-def with_certificate(design: ObserverDesign, claims: dict[str, float] | None = None, **matrices: np.ndarray):
-    old = design.certificate
-    return design.replace(certificate=Certificate({**old.matrices, **matrices}, {**old.claims, **(claims or {})}))
-
-
-def entry(name: str, row: int, column: int, by: float = 1e-6) -> Corruption:
-    """One entry of the observer."""
-    return lambda design: with_observer(design, **{name: nudged(getattr(design.observer, name), row, column, by)})
 
 
 def plant_entry(name: str, row: int, column: int, by: float = 1e-6) -> Corruption:
@@ -159,18 +138,6 @@ def certificate_times(name: str, factor: float) -> Corruption:
 
 def certificate_cut(name: str, *key: object) -> Corruption:
     return lambda design: with_certificate(design, **{name: design.certificate.matrices[name][key]})
-
-
-def claim(name: str, value: float) -> Corruption:
-    return lambda design: with_certificate(design, {name: value})
-
-
-def without_claim(name: str) -> Corruption:
-    def corrupt(design: ObserverDesign) -> ObserverDesign:
-        claims = {key: value for key, value in design.certificate.claims.items() if key != name}
-        return design.replace(certificate=Certificate(design.certificate.matrices, claims))
-
-    return corrupt
 
 
 def claim_beside(name: str, row: str, factor: float) -> Corruption:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from functools import cache
 
 import numpy as np
 import pytest
+from corruption_tables import Corruption, claim, claim_times, failed, shipped
 from time_varying_plants import varying
 
 import obsynth
@@ -20,8 +20,6 @@ RANK, PARAMETERS, DIRECTIONS = "exists: rank [E; C]", "exists: parameters", "exi
 EARLY_RANK = "exists: rank [E; C; algebraic rows of A]"
 DETECTABLE, IDENTIFIABLE, KNOWN = "exists: detectability", "exists: identifiable parameters", "known directions"
 EVERYTHING = {FITS, STATE, COVARIANCE, REGRESSOR, CLAIMS, NEES, NIS, WHITE, CONTRACTION}
-
-Corruption = Callable[[ObserverDesign], ObserverDesign]
 
 
 GOOD = ("innovation", "literal", "early", "walk", "constant", "exact output")
@@ -42,17 +40,9 @@ def good(name: str = "innovation") -> ObserverDesign:
     return obsynth.adaptive_observer(varying(horizon=60), Q=0.1, R=0.2, window=10, name=name, **options)
 
 
-def failed(design: ObserverDesign) -> set[str]:
-    return {check.name for check in verify(design).failures}
-
-
-def with_observer(**changes) -> Corruption:
-    return lambda design: design.replace(observer=dataclasses.replace(design.observer, **changes))
-
-
 def with_model(**changes) -> Corruption:
     """Another model in the shipped observer than in the plant."""
-    return lambda design: with_observer(plant=design.plant.replace(**changes))(design)
+    return lambda design: shipped(plant=design.plant.replace(**changes))(design)
 
 
 def with_both(**changes) -> Corruption:
@@ -68,25 +58,13 @@ def with_both(**changes) -> Corruption:
 def with_adaptation(**changes) -> Corruption:
     def corrupt(design: ObserverDesign) -> ObserverDesign:
         adaptation = dataclasses.replace(design.observer.adaptation, **changes)
-        return with_observer(adaptation=adaptation)(design)
+        return shipped(adaptation=adaptation)(design)
 
     return corrupt
 
 
 def noise(name: str, size: int, variance: float) -> Corruption:
-    return with_observer(**{name: MatrixSequence.of(variance * np.eye(size), name)})
-
-
-def claim(name: str, value: float) -> Corruption:
-    def corrupt(design: ObserverDesign) -> ObserverDesign:
-        old = design.certificate
-        return design.replace(certificate=Certificate(old.matrices, {**old.claims, name: value}))
-
-    return corrupt
-
-
-def times(name: str, factor: float) -> Corruption:
-    return lambda design: claim(name, factor * design.certificate.claims[name])(design)
+    return shipped(**{name: MatrixSequence.of(variance * np.eye(size), name)})
 
 
 OTHER_A = [["0.8 + 0.1 * cos(0.2 * k)", 0.1, 0.3], [0, 0.7, "0.2 * sin(k)"], [1, "0.6 + 0.1 * sin(k)", -1]]
@@ -110,8 +88,8 @@ TABLE: dict[str, tuple[str, Corruption, set[str]]] = {
     "too little R": ("innovation", noise("R", 2, 0.02), {FITS, STATE, COVARIANCE, NEES, NIS, CLAIMS}),
     "too little R, literal": ("literal", noise("R", 2, 0.02), {FITS, STATE, COVARIANCE, NEES, NIS, CLAIMS}),
     "too little Q, walk": ("walk", noise("Q", 3, 0.03), {FITS, STATE, COVARIANCE, NEES, NIS}),
-    "another P0": ("innovation", with_observer(initial_covariance=9.0 * np.eye(3)), {FITS, STATE, COVARIANCE}),
-    "another x0": ("innovation", with_observer(initial_state=np.ones(3)), {FITS, STATE}),
+    "another P0": ("innovation", shipped(initial_covariance=9.0 * np.eye(3)), {FITS, STATE, COVARIANCE}),
+    "another x0": ("innovation", shipped(initial_state=np.ones(3)), {FITS, STATE}),
     "another lambda": ("innovation", with_adaptation(forgetting=0.9), {FITS}),
     "another S0": ("innovation", with_adaptation(initial_covariance=4.0 * np.eye(2)), {FITS}),
     "another theta0": ("innovation", with_adaptation(initial_parameters=np.ones(2)), {FITS}),
@@ -119,8 +97,8 @@ TABLE: dict[str, tuple[str, Corruption, set[str]]] = {
     "a reset": ("innovation", with_adaptation(reset=1e-6), {FITS}),
     "another window": ("innovation", with_adaptation(window=20), {FITS, CLAIMS}),
     "another walk": ("walk", with_adaptation(walk=np.eye(2)), {FITS, STATE, COVARIANCE}),
-    "no adaptation": ("innovation", with_observer(adaptation=None), {FITS}),
-    "early after all": ("innovation", with_observer(early_constraints=True), {FITS, STATE, COVARIANCE}),
+    "no adaptation": ("innovation", shipped(adaptation=None), {FITS}),
+    "early after all": ("innovation", shipped(early_constraints=True), {FITS, STATE, COVARIANCE}),
     "another dt": ("innovation", with_model(dt=2.0), {FITS}),
     "another name": ("innovation", with_model(state_names=["a", "b", "c"]), {FITS}),
     "another horizon": ("innovation", with_model(horizon=59), {FITS, CLAIMS}),
@@ -145,11 +123,11 @@ TABLE: dict[str, tuple[str, Corruption, set[str]]] = {
         "literal", with_both(E=np.diag([1.0, 0, 0]), C=[[0, 1, 0], [0, 0, 1]]), {DIRECTIONS},
     ),
     "a singular R, literal": ("literal", noise("R", 2, 0.0), {FITS, RUNS}),
-    "claim: condition": ("innovation", times("condition", 1.001), {CLAIMS}),
-    "claim: contraction": ("innovation", times("contraction", 1.001), {CLAIMS}),
-    "claim: excitation": ("innovation", times("excitation", 1.001), {CLAIMS}),
-    "claim: directions": ("innovation", times("residual_directions", 2.0), {CLAIMS}),
-    "claim: steps": ("innovation", times("steps", 2.0), {CLAIMS}),
+    "claim: condition": ("innovation", claim_times("condition", 1.001), {CLAIMS}),
+    "claim: contraction": ("innovation", claim_times("contraction", 1.001), {CLAIMS}),
+    "claim: excitation": ("innovation", claim_times("excitation", 1.001), {CLAIMS}),
+    "claim: directions": ("innovation", claim_times("residual_directions", 2.0), {CLAIMS}),
+    "claim: steps": ("innovation", claim_times("steps", 2.0), {CLAIMS}),
     "claim: sample of the condition": ("innovation", claim("condition_k", 3.5), {CLAIMS}),
     "a listed gain": ("innovation", lambda d: d.replace(gains={**d.gains, "K": 1.001 * d.gains["K"]}), {"gains"}),
     "claim: a gain": ("innovation", claim("gamma", 1e-9), {"claims covered"}),

@@ -14,6 +14,8 @@ from typing import Any, get_args
 import numpy as np
 import pandas as pd
 import pytest
+from test_dae_c_export import run_c
+from test_export import through_c
 
 import obsynth
 from obsynth.errors import SpecError
@@ -23,6 +25,7 @@ from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.recursive.steady_state import steady_observer
 
 SAMPLES = 24
 EACH = pytest.mark.parametrize("method", REGISTRY)
@@ -111,13 +114,11 @@ def test_a_run_is_its_steps(method: str) -> None:
     whole, state, kept = observer.run(y, u), observer.init(), observer.init()
     for k in range(SAMPLES):
         state, row = observer.step(state, y[k], u[k])
-        same = whole.states[k], getattr(whole, "parameters", whole.states)[k]
-        ours = row.states[0], getattr(row, "parameters", row.states)[0]
-        for expected, found in zip(same, ours, strict=True):
-            np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
+        for name in ("states", "faults", "state_deviations", "fault_covariances"):
+            np.testing.assert_allclose(getattr(row, name)[0], getattr(whole, name)[k], rtol=1e-9, atol=1e-12)
     # The first state was not touched: a state is a value.
     np.testing.assert_equal(kept, observer.init())
-    assert isinstance(whole, Estimates | obsynth.RecursiveEstimates | obsynth.DAEEstimates)
+    assert isinstance(whole, Estimates)
 
 
 @EACH
@@ -180,11 +181,24 @@ def test_a_claim_that_the_method_does_not_know_fails(method: str) -> None:
 
 
 @EACH
-def test_the_observer_is_exported(method: str, tmp_path: Path) -> None:
+def test_c_says_what_python_says(method: str, tmp_path: Path) -> None:
+    """The exported source, compiled with warnings as errors; a recursive design as its steady state."""
     design = design_of(method)
+    y, u = record_of(design)
+    if isinstance(design.observer, DAEObserver):
+        said, run = run_c(design, y, u, tmp_path), design.observer.run(y, u)
+        for name in ("states", "parameters", "state_deviations", "parameter_deviations"):
+            np.testing.assert_allclose(said[name], getattr(run, name), rtol=1e-9, atol=1e-12)
+        return
     sampling = {"sample_time": 0.1} if design.observer.dt == 0.0 else {}
-    for path in obsynth.export(design, tmp_path / "observer.c", **sampling):
-        assert path.read_text(encoding="utf-8").strip()
+    source, _ = obsynth.export(design, tmp_path / "observer.c", **sampling)
+    observer, start = stepping(design), None
+    if isinstance(observer, RecursiveObserver):
+        steady = steady_observer(observer)
+        observer, start = steady.observer, steady.start
+    run = observer.run(y, u, initial_state=start)
+    wanted = np.hstack([run.states, run.faults, run.residuals])
+    np.testing.assert_allclose(through_c(observer, source, np.hstack([u, y])), wanted, rtol=1e-9, atol=1e-10)
 
 
 WITHOUT_SOLVERS = """
