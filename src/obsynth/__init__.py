@@ -124,6 +124,7 @@ if TYPE_CHECKING:
     from obsynth.simulation.trajectory import Trajectory
     from obsynth.simulation.trajectory import Trajectory as DAETrajectory
     from obsynth.spec.loader import Spec, load_spec
+    from obsynth.sweeps.fleet import Fleet, FleetRun, run_fleet
     from obsynth.tolerances.robustness import Robustness, robustness
 
 __version__ = "0.1.0"
@@ -132,6 +133,9 @@ __version__ = "0.1.0"
 _HOMES = {
     "DetectionFilter": "obsynth.methods.functional_filter.detection",
     "detection_filter": "obsynth.methods.functional_filter.detection",
+    "Fleet": "obsynth.sweeps.fleet",
+    "FleetRun": "obsynth.sweeps.fleet",
+    "run_fleet": "obsynth.sweeps.fleet",
     "ComparedMethod": "obsynth.comparison.result",
     "Comparison": "obsynth.comparison.result",
     "FaultComparison": "obsynth.comparison.result",
@@ -299,6 +303,8 @@ __all__ = [
     "FaultDiagnosis",
     "FaultFigures",
     "FaultModel",
+    "Fleet",
+    "FleetRun",
     "Gaussian",
     "Identifiability",
     "InfeasibleError",
@@ -385,6 +391,7 @@ __all__ = [
     "prove_alarm",
     "robustness",
     "run_batch",
+    "run_fleet",
     "run_on_data",
     "sample_observer",
     "sensor_sets",

@@ -204,3 +204,39 @@ def test_bad_arguments_are_refused(arguments, told):
     model = first_order()
     with pytest.raises(SpecError, match=told):
         calibrate(model, record(model), **{"unknown": {"T": (0.5, 10.0)}, **arguments})
+
+
+def exchanger_log(n: int, *, moving: bool):
+    from dae_plants import exchanger
+
+    model, rng = exchanger(), np.random.default_rng(2)
+    u = np.tile(model.nominal_input, (n, 1))
+    if moving:
+        u *= 1.0 + np.array([0.08, 0.02, 0.06, 0.08]) * np.repeat(rng.uniform(-1.0, 1.0, (n // 15, 4)), 15, axis=0)
+    # Fifth order in the truth, whatever the fit takes.
+    true = simulate_dae(model, u, dt=1.0, R=np.diag([1e4, 0.25]), seed=2)
+    log = {"time": np.arange(float(n)), **dict(zip(model.input_names, u.T, strict=True)),
+           **dict(zip(model.output_names, true.outputs.T, strict=True))}  # fmt: skip
+    return model, log
+
+
+EXCHANGER = {"v1": (0.2, 5.0), "v2": (0.2, 5.0), "Cv": (1e-5, 4e-5), "phi": (0.5, 1.5), "psi": (-2e4, 2e4)}
+OF_THE_DESIGN = {"noisy": ["mass", "energy", "cell"], "input_delay": 0, "starts": 1,
+                 "initial_covariance": {"p1": 4.0e6, "p2": 4.0e6, "T1": 25.0, "T2": 25.0}}  # fmt: skip
+
+
+def test_five_constants_of_a_heat_exchanger_are_in_their_boxes():
+    model, log = exchanger_log(150, moving=True)
+    found = calibrate(model, log, EXCHANGER, **OF_THE_DESIGN)
+    assert found.box.holds({"v1": 1.0, "v2": 1.0, "Cv": 1.936e-5, "phi": 1.0, "psi": 0.0})
+    assert found.integration == "radau"
+    assert not found.undetermined
+    assert not found.box.open_sides
+
+
+def test_inputs_that_stay_name_the_volumes_of_a_heat_exchanger():
+    model, log = exchanger_log(150, moving=False)
+    found = calibrate(model, log, EXCHANGER, **OF_THE_DESIGN)
+    assert {name for direction in found.undetermined for name in direction} == {"v1", "v2"}
+    assert {"v1", "v2"} <= {name for name, _ in found.box.open_sides} <= {"v1", "v2"}
+    assert found.box.holds({"Cv": 1.936e-5, "phi": 1.0, "psi": 0.0, "v1": 1.0, "v2": 1.0})

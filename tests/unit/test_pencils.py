@@ -248,3 +248,27 @@ def test_where_there_are_no_zeros_the_staircase_may_end_early(seed):
             assert whole.normal_rank == early.normal_rank == min(E.shape)
             if eigenvalues:
                 assert len(whole.decisions) == len(early.decisions)
+
+
+@pytest.mark.parametrize("extra", [0, 3])
+def test_planted_zeros_of_many_states_are_neither_lost_nor_joined_by_others(extra):
+    channels, rng = 50, np.random.default_rng(11)
+    zeros = np.sort(np.linspace(-3.0, 3.0, channels) + rng.uniform(-0.02, 0.02, channels))
+    a, b, c = np.zeros((3 * channels,) * 2), np.zeros((3 * channels, channels)), np.zeros((channels, 3 * channels))
+    for k, zero in enumerate(zeros):
+        # (s - zero) over a polynomial whose roots are all over the place
+        own = slice(3 * k, 3 * k + 3)
+        a[own, own] = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], rng.uniform(-3.0, 3.0, 3)])
+        b[3 * k + 2, k], c[k, own] = 1.0, (-zero, 1.0, 0.0)
+    turn = np.linalg.qr(rng.normal(size=a.shape))[0]
+    mixed = np.linalg.qr(rng.normal(size=(channels + extra, channels)))[0]
+    a, b, c = turn @ a @ turn.T, turn @ b, mixed @ c @ turn.T
+    E = np.zeros((len(a) + len(c), len(a) + channels))
+    E[: len(a), : len(a)] = np.eye(len(a))
+    A = np.block([[a, b], [c, np.zeros((len(c), channels))]])
+    found = finite_zeros(E, A)
+    np.testing.assert_allclose(np.sort(found.values.real), zeros, atol=1e-8)
+    assert np.max(np.abs(found.values.imag)) < 1e-8
+    # Outputs of their own, random ones, see every one of them.
+    seen = np.vstack([A, np.hstack([rng.normal(size=(2, len(a))), np.zeros((2, channels))])])
+    assert finite_zeros(np.vstack([E, np.zeros((2, E.shape[1]))]), seen).values.size == 0

@@ -276,7 +276,8 @@ class TestManyStates:
     """Above `MANY_STATES` fewer steps are followed, and the rows say which."""
 
     @pytest.fixture(scope="class")
-    def design(self):
+    @classmethod
+    def design(cls):
         rng, n = np.random.default_rng(4), 140
         a = np.linalg.qr(rng.normal(size=(n, n)))[0] * np.linspace(0.3, 0.9, n)
         return obsynth.descriptor_kalman(

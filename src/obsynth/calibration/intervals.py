@@ -206,13 +206,15 @@ def _side_along_valley(objective: Objective, maximum: Maximum, i: int, sign: flo
     end = float(objective.low[i] if sign < 0 else objective.high[i])
     inner = maximum.hessian[np.ix_(others, others)]
     slope = -np.linalg.lstsq(inner, maximum.hessian[others, i], rcond=LEAST_INFORMATION)[0]
-    step, reached = VALLEY_STEP, 0.0
+    step, reached, curvature = VALLEY_STEP, 0.0, maximum.hessian
     while abs(end - place) > 1e-9:
         new = place + sign * min(step, abs(end - place))
         z = np.empty(len(maximum.z))
         z[others], z[i] = rest + slope * (new - place), new
         z = np.clip(z, objective.low, objective.high)
-        least, z, _ = polished(objective, z, fixed=i, most=VALLEY_NEWTON_STEPS, tolerance=VALLEY_TOLERANCE)
+        least, z, after = polished(
+            objective, z, fixed=i, most=VALLEY_NEWTON_STEPS, tolerance=VALLEY_TOLERANCE, near=curvature
+        )
         found = math.sqrt(max(2.0 * (least - maximum.value), 0.0))
         if found >= target:
             if step <= LEAST_VALLEY_STEP * VALLEY_STEP:
@@ -221,4 +223,5 @@ def _side_along_valley(objective: Objective, maximum: Maximum, i: int, sign: flo
             step *= 0.25
             continue
         slope, place, rest, reached = (z[others] - rest) / (new - place), new, z[others].copy(), found
+        curvature = after
     return Side(end, True)

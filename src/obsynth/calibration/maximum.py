@@ -185,14 +185,14 @@ def greatest_likelihood(objective: Objective, fits: Sequence[Fit], note: Callabl
 
 def polished(
     objective: Objective, z: FloatArray, *, fixed: int | None = None, most: int = MOST_NEWTON_STEPS,
-    tolerance: float = NEWTON_TOLERANCE,
+    tolerance: float = NEWTON_TOLERANCE, near: FloatArray | None = None,
 ) -> tuple[float, FloatArray, FloatArray]:  # fmt: skip
     """Return value, place and Hessian after Newton steps: a quiet log makes valleys that other searches end beside.
 
-    One variable may be fixed; the Hessian is then that of a place nearby.
+    One variable may be fixed; the Hessian is then that of a place nearby.  ``near`` is a Hessian to begin with.
     """
     value, gradient = objective(z)
-    curvature = hessian(objective, z)
+    curvature = hessian(objective, z) if near is None else near
     for _ in range(most):
         before = value
         for damping in NEWTON_DAMPINGS:

@@ -55,8 +55,8 @@ ITERATIONS, FURTHER = 3, 8
 SOLVED = 1e-11
 
 
-#: Operations in one evaluation above which functions are compiled: some seconds, before thousands of evaluations.
-COMPILED_OPERATIONS = 2_000_000
+#: Operations in one evaluation above which functions are compiled: a second or so, before a thousand evaluations.
+COMPILED_OPERATIONS = 200_000
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,14 +17,8 @@ if TYPE_CHECKING:
 class SensorValidation:
     """What the innovations of one sensor say.
 
-    Parameters
-    ----------
-    nis : Consistency
-        Mean square in units of the expected variance, with its 95 % interval.
-    mean : float
-        Of the innovations, in standard deviations of such a mean for white ones; beyond 3 it is an offset.
-    whiteness : Whiteness
-        Test of Ljung and Box.
+    Fields: nis: Mean square in units of the expected variance, with its 95 % interval; mean: Of the innovations, in
+    standard deviations of such a mean for white ones; beyond 3 it is an offset; whiteness: Test of Ljung and Box.
     """
 
     nis: Consistency

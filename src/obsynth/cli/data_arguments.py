@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from obsynth.cli.arguments import add_force, add_gains, add_json, add_quiet
+from obsynth.cli.sweep import add_executors
 
 _RUN = "Run a design on measured data: a log, or a stream on standard input, a row in, a row out."
 _EXPORT = (
@@ -37,6 +38,10 @@ however long the data are. KIND is one of
   chi-square  linear: a window of the residual against its covariance; recursive: the parameters against theirs
   cusum       small changes of the residual, or of a parameter
   nis         recursive and nonlinear designs: innovations that the model does not explain
+Where --gains is a folder, every gain set in it is run on --data, a log or a folder of logs, on --jobs processes or a
+cluster; a log with the name of a gain set is for that one alone.  --out is a folder then, with the estimates, table.csv
+and fleet.png; the same command goes on where another was stopped.
+
 What disturbances and noise are to be expected comes from the scenario of --system, or from the options.
 """
 
@@ -49,10 +54,14 @@ def add_data_verbs(verbs: Any) -> None:
     add_gains(run)
     _add_data(run, required=True, what="text (.csv, .tsv), Parquet, TDMS or MDF file; - for text on standard input")
     run.add_argument(
-        "--out", default="-", metavar="FILE", help="CSV or Parquet file for the estimates (default: - for stdout)"
+        "--out",
+        default="-",
+        metavar="FILE",
+        help="CSV or Parquet file for the estimates (default: - for stdout); a folder for many gain sets",
     )
     _add_data_options(run)
     _add_scenario(run)
+    add_executors(run)
     run.add_argument(
         "--outliers", choices=("gate", "huber", "none"),
         help="recursive and nonlinear designs: leave out samples that their prediction excludes (default), pull them "

@@ -37,6 +37,10 @@ def run_run(options: argparse.Namespace) -> int:
     """Run ``run``: gain set and data in, estimates out."""
     from obsynth.results.gain_sets import load
 
+    if options.gains.is_dir():
+        from obsynth.cli.sweep import run_many
+
+        return run_many(options)
     if options.json and options.out == STREAM:
         raise SpecError("--json and the estimates cannot both go to stdout: give --out a file.", path="--json")
     out = _target(options)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,6 +23,7 @@ A value list is a YAML list: --set gamma='[0.1, 0.2]' --set plant.transform.samp
 its method.  The folder keeps every gain set and result: the same command goes on where another was stopped.
 """
 TABLE = FileKind("the table of a sweep", rb"\Acase,")
+RUNS_TABLE = FileKind("the table of many runs", rb"\Arun,status,")
 PICTURE = FileKind("a picture", rb"\A\x89PNG")
 
 
@@ -69,7 +70,7 @@ def run_sweep(options: argparse.Namespace) -> int:
         )  # fmt: skip
         contents: dict[Path, str | bytes] = {table: found.csv()}
         if any(result.claims for result in found.results):
-            contents[picture] = _png(found, options.claim)
+            contents[picture] = _png_of(lambda: found.plot(options.claim))
         files = write_together(contents)
     if options.json:
         header, rows = found.rows()
@@ -81,6 +82,47 @@ def run_sweep(options: argparse.Namespace) -> int:
     console = stdout_console()
     console.print(_shown(found))
     console.print(f"Written: {', '.join(map(str, files))}", soft_wrap=True)
+    return 0
+
+
+def run_many(options: argparse.Namespace) -> int:
+    """Run ``run`` for a folder of gain sets: a table, a picture, and the estimates of each design on each log."""
+    from obsynth.cli.data_run import numbers_of
+    from obsynth.sweeps.fleet import run_fleet
+
+    alone = ("system", "state", "prove", "monitor", "smooth", "lag")
+    given = [name for name in alone if getattr(options, name)]
+    if given:
+        names = ", ".join(f"--{name}" for name in given)
+        raise SpecError(f"{names}: for one gain set; --gains is a folder of many.", path=f"--{given[0]}")
+    folder = Path(options.out)
+    if options.out == "-" or (folder.exists() and not folder.is_dir()):
+        raise SpecError("Many designs need a folder for their estimates: give one to --out.", path="--out")
+    folder.mkdir(parents=True, exist_ok=True)
+    table = output_file(folder / "table.csv", RUNS_TABLE, options)
+    picture = output_file(folder / "fleet.png", PICTURE, options)
+    asked = {
+        "columns": dict(options.map) or None, "time_column": options.time_column, "outliers": options.outliers,
+        "scales": numbers_of(options.scale) or None, "thresholds": numbers_of(options.threshold) or None,
+        "gap": options.gap, "warm_up": options.warm_up, "recovered": options.recovered,
+    }  # fmt: skip
+    with progress(quiet=options.quiet) as report_stage, chosen_executor(options.jobs, options.cluster) as executor:
+        found = run_fleet(
+            options.gains, options.data, folder, executor=executor,
+            progress=lambda done, total: report_stage(f"{done} of {total} runs"),
+            **{name: value for name, value in asked.items() if value is not None},
+        )  # fmt: skip
+        contents: dict[Path, str | bytes] = {table: found.csv()}
+        if "run" in found.counts:
+            contents[picture] = _png_of(found.plot)
+        files = write_together(contents)
+    if options.json:
+        header, rows = found.rows()
+        cases = [dict(zip(header, row, strict=True)) for row in rows]
+        print_json({"command": "run", "counts": found.counts, "runs": cases, "files": [str(file) for file in files]})
+    elif not options.quiet:
+        stdout_console().print(_shown_runs(found))
+        print(f"Written: {', '.join(map(str, files))}")
     return 0
 
 
@@ -129,7 +171,7 @@ def _value_list(text: str) -> tuple[str, list[Any]]:
     return name.strip(), values
 
 
-def _png(found: Any, claim: str | None) -> bytes:
+def _png_of(plot: Callable[[], Any]) -> bytes:
     import io
 
     import matplotlib
@@ -137,7 +179,7 @@ def _png(found: Any, claim: str | None) -> bytes:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, stream = found.plot(claim), io.BytesIO()
+    figure, stream = plot(), io.BytesIO()
     figure.savefig(stream, format="png", dpi=150)
     plt.close(figure)
     return stream.getvalue()
@@ -154,4 +196,18 @@ def _shown(found: Any) -> Any:
         table.add_column(header[i], overflow="fold")
     for row in rows:
         table.add_row(*(f"{row[i]:.4g}" if isinstance(row[i], float) else str(row[i]) for i in kept))
+    return table
+
+
+def _shown_runs(found: Any) -> Any:
+    """Return the table of runs for people: the first alarm of each, and why one was not made."""
+    from rich.table import Table
+
+    table = Table(title=", ".join(f"{count} {status}" for status, count in found.counts.items()), title_justify="left")
+    for name in ("run", "status", "rows", "ok", "first alarm", "why not"):
+        table.add_column(name)
+    for run in found.runs:
+        first = min(run.alarms, key=lambda name: run.alarms[name], default="")
+        alarm = f"{first} at {run.alarms[first]:g} s" if first else "-"
+        table.add_row(run.name, run.status, str(run.rows), str(run.statuses.get("ok", 0)), alarm, run.message)
     return table

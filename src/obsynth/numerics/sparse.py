@@ -73,14 +73,9 @@ Indices = NDArray[np.int64]
 class CoarseStructure:
     """The Dulmage-Mendelsohn parts of a pattern.
 
-    Parameters
-    ----------
-    row_of_column : Indices
-        ``(columns,)``: the row that a maximum matching gives to each column, -1 for none.
-    over_rows, over_columns : Indices
-        The overdetermined part: more rows than columns, or empty.
-    under_rows, under_columns : Indices
-        The underdetermined part: more columns than rows, or empty.
+    Fields: row_of_column: ``(columns,)``: the row that a maximum matching gives to each column, -1 for none; over_rows,
+    over_columns: The overdetermined part: more rows than columns, or empty; under_rows, under_columns: The
+    underdetermined part: more columns than rows, or empty.
     """
 
     row_of_column: Indices
@@ -129,15 +124,7 @@ def _alternating(matrix: Any, start: Indices, back: Indices) -> tuple[Indices, I
 
 
 def blocks_of(pattern: Any, row_of_column: Indices) -> tuple[int, Indices]:
-    """Return the number of diagonal blocks of the block triangular form, and the block of each column.
-
-    Parameters
-    ----------
-    pattern : sparse matrix
-        Square.
-    row_of_column : Indices
-        A perfect matching.
-    """
+    """Return the number of diagonal blocks of the block triangular form, and the block of each column."""
     from scipy.sparse.csgraph import connected_components
 
     count, labels = connected_components(csr(pattern)[row_of_column], directed=True, connection="strong")

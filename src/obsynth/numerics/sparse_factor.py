@@ -30,12 +30,8 @@ SAMPLES, SAMPLED = 8, 8.0
 class SolutionBounds:
     """How well a sparse system was solved.
 
-    Parameters
-    ----------
-    condition : float
-        Estimate of the 1-norm condition number of the scaled matrix.
-    backward_error : float
-        Largest componentwise backward error that refinement left.
+    Fields: condition: Estimate of the 1-norm condition number of the scaled matrix; backward_error: Largest
+    componentwise backward error that refinement left.
     """
 
     condition: float

@@ -20,14 +20,9 @@ DECISIVE = ("E", "A", "Bf", "Bd", "C", "Df", "Dd")
 class PlantOrigin:
     """Rational matrices of a plant in some coordinates of its states, or of the continuous plant that was sampled.
 
-    Parameters
-    ----------
-    exact : mapping of str to rows of Fraction
-        The `DECISIVE` matrices.
-    sample_time : Fraction or None, seconds
-        Where ``exact`` is a continuous plant and the plant itself is that one sampled with a zero-order hold.
-    computed : bool
-        Whether some of the numbers behind them were computed in floating point.
+    Fields: exact: The `DECISIVE` matrices; sample_time: Where ``exact`` is a continuous plant and the plant itself is
+    that one sampled with a zero-order hold; computed: Whether some of the numbers behind them were computed in floating
+    point.
     """
 
     exact: Mapping[str, tuple[tuple[Fraction, ...], ...]]

@@ -70,7 +70,8 @@ class Contraction:
     def gain(self, rows: FloatArray, columns: FloatArray, radius: FloatArray | None = None) -> FloatArray:
         """Return ``(p, m)``: upper bounds on ``sum_j |c A^j b|`` of each row and column, from ``j = 0``."""
         sizes = self.sizes(columns, radius)
-        shown = np.array([self.seen(rows[i : i + 1]) for i in range(len(rows))])
+        product = Ball.exact(rows) @ Ball.exact(self.inverse)
+        shown = rounded_up(column_norms(product.T) / (1.0 - self.defect), 4)
         return rounded_up(shown[:, None] * sizes[None, :] * self.factor, 4)
 
 

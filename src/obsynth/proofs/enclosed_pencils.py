@@ -78,14 +78,7 @@ def rank_to_digits(rows: Rows) -> int:
 class EnclosedPencil:
     """The pencil ``A - z E``; E is rational, A enclosed.
 
-    Parameters
-    ----------
-    E : fmpq_mat
-        ``(m, n)``.
-    A : list of rows of arb
-        ``(m, n)``.
-    bits : int
-        Precision of A.
+    Fields: E: ``(m, n)``; A: ``(m, n)``; bits: Precision of A.
     """
 
     E: fmpq_mat

@@ -46,10 +46,7 @@ __all__ = ["ExactPencil", "blocks", "identity", "null_basis", "pivot_columns", "
 class ExactPencil:
     """The pencil ``A - s E`` with rational matrices ``(m, n)``; its parts are computed once and kept.
 
-    Parameters
-    ----------
-    E, A : fmpq_mat
-        ``(m, n)``.
+    Fields: E, A: ``(m, n)``.
     """
 
     E: fmpq_mat

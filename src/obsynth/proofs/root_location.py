@@ -8,7 +8,6 @@ any such root, and all others are told from the boundary by isolating them in en
 from __future__ import annotations
 
 from dataclasses import dataclass
-from fractions import Fraction
 from typing import Any
 
 import flint
@@ -70,11 +69,6 @@ def primitive(polynomial: fmpq_poly) -> fmpz_poly:
     content = numerator.content()
     sign = -1 if int(numerator.leading_coefficient()) < 0 else 1
     return fmpz_poly([sign * coefficient // content for coefficient in numerator.coeffs()])
-
-
-def rational_root(value: Fraction) -> fmpz_poly:
-    """Return the polynomial whose only root is this number."""
-    return fmpz_poly([-value.numerator, value.denominator])
 
 
 def _isolated(polynomial: fmpz_poly, *, discrete: bool, may_lie_on_boundary: bool) -> list[Root]:

@@ -81,17 +81,7 @@ def _nonlinear_facts(plant: DAEModel) -> Iterator[tuple[str, str]]:
 
 
 def design_report(design: ObserverDesign, *, console: Console, file: Path | None = None) -> None:
-    """Print a design with its report.
-
-    Parameters
-    ----------
-    design : ObserverDesign
-        A finished design.
-    console : Console
-        Where to print; its width decides the layout.
-    file : Path, optional
-        Where the gain set was written, or read from.
-    """
+    """Print a design with its report."""
     print_section(console, f"Design '{design.name}' by {design.method}", facts_table(plant_facts(design.plant)))
     print_section(console, "What is promised", facts_table(promises(design)))
     if design.observer.fault_names:

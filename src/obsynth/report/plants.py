@@ -38,21 +38,7 @@ def check_report(
     console: Console,
     transformation: str = "",
 ) -> None:
-    """Print the structure of a plant, and for each method whether it can serve this plant.
-
-    Parameters
-    ----------
-    plant : DescriptorSystem, TimeVaryingDescriptorSystem or DAEModel
-        The plant as the methods see it.
-    structures : mapping of str to Structure
-        Structures to compare, by a heading such as ``as written``; none for a plant that changes with k.
-    methods : mapping of str to VerificationReport
-        The existence conditions of each method, by its identifier.
-    console : Console
-        Where to print; its width decides the layout.
-    transformation : str, optional
-        What was done to the plant as written.
-    """
+    """Print the structure of a plant, and for each method whether it can serve this plant."""
     facts = list(plant_facts(plant))
     if transformation:
         facts.insert(0, ("transformed", transformation))

@@ -93,14 +93,6 @@ def report_text(report: VerificationReport, *, width: int = 120) -> str:
 
 
 def verification_report(report: VerificationReport, *, console: Console) -> None:
-    """Print a verification report.
-
-    Parameters
-    ----------
-    report : VerificationReport
-        The report.
-    console : Console
-        Where to print; its width decides the layout.
-    """
+    """Print a verification report."""
     print_section(console, "Verification", checks_table(report.checks, width=console.width))
     console.print(verdict_line(report))

@@ -26,12 +26,8 @@ MOST_EXACT = 64
 class PlantSource:
     """A plant as it was written, and what was done to it.
 
-    Parameters
-    ----------
-    plant : DescriptorSystem
-        As written.
-    sample_time : float or None, seconds
-        With which it was sampled, after its algebraic states were eliminated; ``None`` where it was not.
+    Fields: plant: As written; sample_time: With which it was sampled, after its algebraic states were eliminated;
+    ``None`` where it was not.
     """
 
     plant: DescriptorSystem
@@ -55,13 +51,7 @@ class PlantSource:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> PlantSource:
-        """Return the source that `as_dict` described.
-
-        Parameters
-        ----------
-        data : mapping
-            Its entries.
-        """
+        """Return the source that `as_dict` described."""
         matrices: dict[str, Any] = {name: _matrix(entries) for name, entries in data["matrices"].items()}
         time = data["sample_time"]
         return cls(DescriptorSystem(**matrices, **data["signals"]), None if time is None else float(time))

@@ -5,19 +5,19 @@ from __future__ import annotations
 import io
 import json
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, as_completed
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.progress import Progress, shown_progress
 from obsynth.files.inputs import read_json
-from obsynth.files.outputs import FileKind, write_atomically
+from obsynth.files.outputs import write_atomically
 from obsynth.files.tables import TableWriter
 from obsynth.methods.designing import Plant, design
 from obsynth.plants.dae.model import DAEModel
@@ -35,7 +35,6 @@ if TYPE_CHECKING:
 #: What a case came to, by the exit code of its error.
 STATUSES = {0: "designed", 2: "malformed", 3: "impossible", 4: "infeasible", 5: "unknown", 6: "unverified"}
 _KIND = "obsynth sweep result"
-RESULT = FileKind("a result of a sweep", rb'"kind":\s*"obsynth sweep result"', ending=".result.json")
 #: Digits of the digest of a case in the names of its files.
 DIGITS = 16
 _PLANTS = (DescriptorSystem, TimeVaryingDescriptorSystem, DAEModel)
@@ -215,7 +214,7 @@ def sweep(
         The cases or parameters are malformed, or the folder cannot be written.
     """
     made = _cases(cases, parameters or {}, method)
-    place = None if folder is None else _folder(Path(folder))
+    place = None if folder is None else folder_for(Path(folder))
     found: dict[str, SweepResult] = {}
     if place is not None:
         found = {case.key: known for case in made if (known := _known(case, place)) is not None}
@@ -223,7 +222,7 @@ def sweep(
         waiting = [case for case in made if case.key not in found]
         if told is not None:
             told(len(found), len(made))
-        for case, result in _made(waiting, executor):
+        for case, result in each(run_case, waiting, executor):
             found[case.key] = result if place is None else _kept(case, result, place)
             if told is not None:
                 told(len(found), len(made))
@@ -252,13 +251,19 @@ def _cases(cases: Any, parameters: Mapping[str, Sequence[Any]], method: str | No
     return spec_cases([Path(path) for path in paths], parameters, __version__)
 
 
-def _made(cases: Sequence[SweepCase], executor: Executor | None) -> Iterator[tuple[SweepCase, SweepResult]]:
-    """Yield each case with its result, as they come."""
+_Item = TypeVar("_Item")
+_Outcome = TypeVar("_Outcome")
+
+
+def each(
+    work: Callable[[_Item], _Outcome], items: Sequence[_Item], executor: Executor | None
+) -> Iterator[tuple[_Item, _Outcome]]:
+    """Yield each item with what comes of it, as they come."""
     if executor is None:
-        for case in cases:
-            yield case, run_case(case)
+        for item in items:
+            yield item, work(item)
         return
-    waiting = {executor.submit(run_case, case): case for case in cases}
+    waiting = {executor.submit(work, item): item for item in items}
     try:
         for future in as_completed(waiting):
             yield waiting[future], future.result()
@@ -304,7 +309,8 @@ def _designed(case: SweepCase) -> ObserverDesign:
     return found.replace(notes=(*notes, *found.notes)) if notes else found
 
 
-def _folder(folder: Path) -> Path:
+def folder_for(folder: Path) -> Path:
+    """Return a folder for results, made where there is none."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

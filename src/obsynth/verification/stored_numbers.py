@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from obsynth.numerics.arrays import SMALLEST, ComplexArray, FloatArray
+from obsynth.numerics.norms import resolved
 from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.spectra import boundary_points
 from obsynth.observers.linear.observer import LinearObserver
@@ -137,7 +138,7 @@ def _gain_rows(
     unit = 1.0 if plant.dt > 0.0 else system.fastest
     points = POINTS if plant.nx + observer.order <= MANY_STATES else FEWER_POINTS
     frequencies = unit * np.geomspace(SLOWEST, np.pi if plant.dt > 0.0 else 10.0, points)
-    gains = np.array([system.gain(frequency) for frequency in frequencies])
+    gains = system.gains(frequencies)
     worst = int(np.argmax(gains))
     verdict, seconds = _when_it_matters(system, NOTICED if gamma is None else float(gamma), unit, gains[0])
     if gamma is not None:
@@ -177,6 +178,20 @@ class _Composite:
         self.poles: ComplexArray = np.asarray(values, dtype=np.complex128)
         own = np.abs(np.linalg.eigvals(observer.Az)) if observer.order else np.ones(1)
         self.fastest = float(max(np.max(own, initial=0.0), np.finfo(np.float64).tiny))
+
+    def gains(self, frequencies: FloatArray) -> FloatArray:
+        """Return `gain` at many frequencies, those that take little memory at once."""
+        dt, order = self.plant.dt, self.observer.order
+        points = boundary_points(frequencies / dt if dt > 0.0 else frequencies, dt)
+        try:
+            x = np.concatenate([*resolved(self.plant.E, self.plant.A, self.plant.Bd, points)])
+            left = np.concatenate([*resolved(np.eye(order), self.observer.Az.T, self.shown.T, points)])
+        except np.linalg.LinAlgError:
+            return np.array([self.gain(float(frequency)) for frequency in frequencies])
+        stacked = np.concatenate([x * points[:, None, None] ** -age for age in range(self.lags)], axis=1)
+        whole = left.transpose(0, 2, 1) @ (self.K @ stacked + self.driven) + self.J @ stacked + self.direct
+        finite = np.all(np.isfinite(whole), axis=(1, 2))
+        return np.where(finite, np.linalg.norm(np.where(finite[:, None, None], whole, 0.0), 2, axis=(1, 2)), 0.0)
 
     def gain(self, frequency: float) -> float:
         """Return the largest singular value at a frequency (rad per sample, or rad/s); zero at a pole of the plant."""

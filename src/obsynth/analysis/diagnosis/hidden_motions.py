@@ -23,18 +23,9 @@ MOST_NAMED = 6
 class HiddenMotion:
     """States, unknown inputs and other faults that, with a fault of 1, leave every output at zero.
 
-    Parameters
-    ----------
-    fault : str
-        The fault.
-    point : complex
-        All signals go like ``exp(point t)`` (``point^k`` for sampled plants).
-    values : dict of str to complex
-        The amplitudes that are not zero: unknown inputs and other faults first, then states.
-    causes : int
-        How many of them, from the first, are unknown inputs or other faults.
-    dt : float
-        Of the plant, seconds.
+    Fields: fault: The fault; point: All signals go like ``exp(point t)`` (``point^k`` for sampled plants); values: The
+    amplitudes that are not zero: unknown inputs and other faults first, then states; causes: How many of them, from the
+    first, are unknown inputs or other faults; dt: Of the plant, seconds.
     """
 
     fault: str

@@ -30,16 +30,10 @@ COMPUTED_STATES = 24
 class SystemFacts:
     """What was decided about a pencil ``[A - s E, B; C, D]``; ``exact`` or to hundreds of digits.
 
-    Parameters
-    ----------
-    normal_rank, columns : int
-        They are equal when no combination of inputs and initial states is hidden at all times.
-    outside, zeros : tuple of complex
-        Finite zeros on or outside the stability boundary, the most unstable first, and all of them.
-    exact : bool
-        Whether all was decided in rational arithmetic.
-    computed : bool
-        Whether some of the data were computed in floating point.
+    Fields: normal_rank, columns: They are equal when no combination of inputs and initial states is hidden at all
+    times; outside, zeros: Finite zeros on or outside the stability boundary, the most unstable first, and all of them;
+    exact: Whether all was decided in rational arithmetic; computed: Whether some of the data were computed in floating
+    point.
     """
 
     normal_rank: int

@@ -42,14 +42,6 @@ def local_equations(
     return LocalEquations(value[:, 0], E, by_state, by_input, by_parameter, y[:, 0], C, outputs_by_parameter)
 
 
-def stores_parameters(model: DAEModel) -> bool:
-    """Return whether a derivative is taken of something that contains a parameter."""
-    import casadi as ca
-
-    symbols = symbols_of(model)
-    return bool(ca.jacobian(symbols.stored, symbols.theta).nnz())
-
-
 def _function(model: DAEModel) -> Any:
     import casadi as ca
 

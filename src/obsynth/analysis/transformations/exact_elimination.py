@@ -35,16 +35,9 @@ _DIRECT = ("D", "Df", "Dd", "Dw")
 class ExactElimination:
     """The reduced plant and the recovery of its states, in rational coordinates.
 
-    Parameters
-    ----------
-    matrices : mapping of str to fmpq_mat
-        ``A, B, Bf, Bd, Bw, C, D, Df, Dd, Dw`` of the reduced plant.
-    recovery : mapping of str to fmpq_mat
-        ``x`` from the new states (``A``) and from the signals (``B, Bf, Bd, Bw``).
-    pivots : tuple of int
-        States that stand for the dynamic ones.
-    computed : bool
-        Whether some of the data were computed in floating point.
+    Fields: matrices: ``A, B, Bf, Bd, Bw, C, D, Df, Dd, Dw`` of the reduced plant; recovery: ``x`` from the new states
+    (``A``) and from the signals (``B, Bf, Bd, Bw``); pivots: States that stand for the dynamic ones; computed: Whether
+    some of the data were computed in floating point.
     """
 
     matrices: Mapping[str, fmpq_mat]

@@ -29,14 +29,8 @@ SUBSPACE_STEPS = 3
 class ActiveVariables:
     """What is left of a plant without its idle variables.
 
-    Parameters
-    ----------
-    rows, columns : Indices
-        Equations and variables that stay.
-    dropped : tuple of str
-        Names of the variables that do not.
-    equations : tuple of int
-        Numbers, from 1, of the equations that do not.
+    Fields: rows, columns: Equations and variables that stay; dropped: Names of the variables that do not; equations:
+    Numbers, from 1, of the equations that do not.
     """
 
     rows: Indices

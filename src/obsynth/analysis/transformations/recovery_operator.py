@@ -22,20 +22,10 @@ SIGNALS = ("state", "input", "fault", "disturbance", "noise")
 class RecoveryOperator:
     """``x = dynamic xi + algebraic z`` with ``coupling z + right [xi; u; f; d; w] = 0``, all sparse.
 
-    Parameters
-    ----------
-    dynamic, algebraic : sparse matrix
-        ``(nx, count)`` and ``(nx, nx - count)``.
-    coupling : sparse matrix
-        ``(nx - count, nx - count)``, nonsingular.
-    right : sparse matrix
-        ``(nx - count, count + nu + nf + nd + nw)``.
-    counts : tuple of int
-        Numbers of states, inputs, faults, disturbances and noise inputs.
-    states : mapping of str to FloatArray
-        Signal of the plant now -> ``(count, n)``: ``xi`` from its signals, where later transformations changed them.
-    noise_kept : FloatArray
-        ``(nw, nw now)``.
+    Fields: dynamic, algebraic: ``(nx, count)`` and ``(nx, nx - count)``; coupling: ``(nx - count, nx - count)``,
+    nonsingular; right: ``(nx - count, count + nu + nf + nd + nw)``; counts: Numbers of states, inputs, faults,
+    disturbances and noise inputs; states: Signal of the plant now -> ``(count, n)``: ``xi`` from its signals, where
+    later transformations changed them; noise_kept: ``(nw, nw now)``.
     """
 
     dynamic: Any

@@ -27,14 +27,9 @@ NAMED_SHARE = 1e-3
 class SparseCoordinates:
     """Equations and states of a plant, split into dynamic and algebraic ones by what E does.
 
-    Parameters
-    ----------
-    dynamic_rows, algebraic_rows : sparse matrix
-        ``(count, nx)`` and ``(nx - count, nx)``: combinations of equations; E has none of the latter.
-    dynamic, algebraic : sparse matrix
-        ``(nx, count)`` and ``(nx, nx - count)``: bases of states; E maps the latter to zero.
-    names : tuple of str
-        Of the dynamic states: their own, where these are whole states of the plant.
+    Fields: dynamic_rows, algebraic_rows: ``(count, nx)`` and ``(nx - count, nx)``: combinations of equations; E has
+    none of the latter; dynamic, algebraic: ``(nx, count)`` and ``(nx, nx - count)``: bases of states; E maps the latter
+    to zero; names: Of the dynamic states: their own, where these are whole states of the plant.
     """
 
     dynamic_rows: Any
@@ -48,16 +43,8 @@ class SparseCoordinates:
 class SparseReduction:
     """A plant without its algebraic states: its matrices, and how the others follow from the states that are left.
 
-    Parameters
-    ----------
-    matrices : dict of str to FloatArray
-        ``A, B, Bf, Bd, Bw, C, D, Df, Dd, Dw``.
-    names : tuple of str
-        Of the states.
-    operator : RecoveryOperator
-        All states from these.
-    bounds : SolutionBounds
-        How well the algebraic equations were solved.
+    Fields: matrices: ``A, B, Bf, Bd, Bw, C, D, Df, Dd, Dw``; names: Of the states; operator: All states from these;
+    bounds: How well the algebraic equations were solved.
     """
 
     matrices: dict[str, FloatArray]

@@ -18,7 +18,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.proofs.affine import AffineMatrix
 from obsynth.proofs.balls import gamma
-from obsynth.tolerances.error_structure import ROUNDING_SHARE, ErrorStructure
+from obsynth.tolerances.error_structure import ErrorStructure
 from obsynth.tolerances.responses import (
     OUTWARD,
     Responses,
@@ -265,8 +265,3 @@ def _rounding(
         ):
             total[:, order] += spread(left, direct + absolute(left) @ largest_psi, into)
     return np.vstack([structure.seen(channels), found]) * OUTWARD
-
-
-def is_rounding(bound: AdaptiveBound) -> bool:
-    """Whether no constant has an effect: what is left is the bound of an exact model, and rounding."""
-    return bound.counts[0] == 0 and bool((bound.structure.state.radius <= ROUNDING_SHARE).all())

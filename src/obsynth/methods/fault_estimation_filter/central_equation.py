@@ -27,7 +27,7 @@ import numpy as np
 
 from obsynth.methods.fault_estimation_filter.injection_problem import GainProblem, Injection
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.doubling import doubled_riccati_solution, is_positive
+from obsynth.numerics.doubling import MOST_JUMPS, doubled_riccati_solution, is_positive
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +103,13 @@ class CentralEquation:
         """Return Y ``(n, n)`` at ``level``, or ``None``; its signs are not looked at."""
         lowered = self.weight - level**2 * self.last
         s = doubled_riccati_solution(
-            self.a, self.h, self.process, lowered, self.cross, possible=lambda y: self._is_possible(y, level)
+            self.a,
+            self.h,
+            self.process,
+            lowered,
+            self.cross,
+            possible=lambda y: self._is_possible(y, level),
+            most_jumps=MOST_JUMPS,
         )
         return None if s is None else self._in_all_states(s, level)
 

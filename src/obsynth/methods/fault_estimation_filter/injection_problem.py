@@ -182,11 +182,6 @@ class NormalisedProblem:
         inverse = np.linalg.inv(self.measurements) if self.measurements.size else self.measurements
         return Injection(np.linalg.solve(self.states, solution.R) @ inverse, solution.V @ inverse)
 
-    def restore_matrix(self, p: FloatArray) -> FloatArray:
-        """Return the Lyapunov matrix for the original coordinates and the original gain level."""
-        inverse = np.linalg.inv(self.states)
-        return np.asarray(inverse.T @ p @ inverse)
-
 
 def normalise(
     problem: GainProblem, *, start: Injection | None = None, gain: float | None = None, rotate: bool = True

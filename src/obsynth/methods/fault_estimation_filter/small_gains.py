@@ -30,9 +30,10 @@ MOST_STATES_FOR_WHOLE = 12
 #: than the least of such filters that may cost.
 STATE_NOISE = (1e-4, 1e-3, 1e-2, 1e-1)
 PRICE_OF_SPEED = 1.04
-#: Halvings of the step towards the filter of least noise, for few and for many states.
+#: Halvings of the step towards the filter of least noise, for few, for many, and for still more states.
 LINE_STEPS = 7
 COARSE_LINE_STEPS = 3
+COARSEST_LINE_STEPS = 2
 
 
 def small_gain_design(
@@ -119,7 +120,8 @@ def _towards(goal: Goal, injection: Injection, target: Injection | None, *, slow
     few = goal.problem.order <= FEW_STATES
     if not few and not goal.noisy:
         step = 0.5  # without noise the target is no filter of this gain
-    for _ in range(LINE_STEPS if few else COARSE_LINE_STEPS):
+    many = COARSE_LINE_STEPS if goal.problem.order <= MOST_STATES_FOR_LEVELS else COARSEST_LINE_STEPS
+    for _ in range(LINE_STEPS if few else many):
         tried = share + step
         mixed = Injection(*((1.0 - tried) * a + tried * b for a, b in zip(injection.parts, target.parts, strict=True)))
         if tried <= 1.0 and judge(mixed) and (cost := goal.cost(mixed)) <= least:

@@ -15,8 +15,6 @@ from obsynth.numerics.arguments import Count, NonNegative, WrittenAs, is_finite_
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
 
-#: What residuals may be asked for by one word.
-RESIDUAL_SETS = ("detect", "isolate")
 _PATH = "method.options"
 
 

@@ -15,23 +15,6 @@ from obsynth.observers.recursive.settings import Adaptation
 from obsynth.plants.sequences import MatrixSequence
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 
-#: Options of the filter, and of the parameters besides.
-FILTER_OPTIONS = (
-    "Q",
-    "R",
-    "initial_state",
-    "initial_covariance",
-    "early_constraints",
-    "outliers",
-    "outlier_limit",
-    "sensors",
-    "state_bounds",
-)
-PARAMETER_OPTIONS = (
-    "form", "forgetting", "guard", "initial_parameters", "initial_parameter_covariance", "random_walk", "window",
-    "reset",
-)  # fmt: skip
-
 
 def observer_from_options(plant: TimeVaryingDescriptorSystem, options: Mapping[str, Any]) -> RecursiveObserver:
     """Return the observer that options stand for."""

@@ -1,0 +1,295 @@
+"""Many designs on many logs: every gain set of a folder on the logs that are for it, on any executor."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from obsynth.data.run import run_on_data
+from obsynth.errors import ObsynthError, SpecError
+from obsynth.files.inputs import read_json
+from obsynth.files.outputs import FileKind, write_atomically
+from obsynth.files.tables import TableWriter
+from obsynth.results.gain_sets import load
+from obsynth.sweeps.sweep import STATUSES, each, folder_for
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+_KIND = "obsynth fleet result"
+RESULT = FileKind("a result of a fleet", rb'"kind":\s*"obsynth fleet result"', ending=".result.json")
+#: What ends the name of a gain set; logs by their suffix.
+GAINS_ENDING = ".gains.json"
+LOG_ENDINGS = (".csv", ".tsv", ".parquet", ".tdms", ".mf4", ".mdf", ".dat")
+#: Runs that a picture shows.
+MOST_SHOWN = 12
+
+
+@dataclass(frozen=True)
+class FleetRun:
+    """One design on one log.
+
+    Parameters
+    ----------
+    name : str
+        ``design on log``, by the names of their files.
+    status : str
+        ``run``, or ``malformed`` and its like where the design could not be run on the log.
+    message : str
+        Why not; empty otherwise.
+    rows : int
+        Rows of data.
+    statuses : mapping of str to int
+        How many rows were ``ok``, ``warm-up``, ``partial``, ``gap`` and ``recovering``.
+    alarms : mapping of str to float
+        Time in seconds at which each column first passed its threshold.
+    largest : mapping of str to float
+        Largest absolute value of each fault estimate and residual, the warm-up left out.
+    file : Path or None
+        The estimates.
+    """
+
+    name: str
+    status: str
+    message: str = ""
+    rows: int = 0
+    statuses: Mapping[str, int] = field(default_factory=dict)
+    alarms: Mapping[str, float] = field(default_factory=dict)
+    largest: Mapping[str, float] = field(default_factory=dict)
+    file: Path | None = None
+
+
+@dataclass(frozen=True)
+class Fleet:
+    """All runs of a fleet, in the order of designs and logs.
+
+    Parameters
+    ----------
+    runs : tuple of FleetRun
+        One for each design and log.
+    """
+
+    runs: tuple[FleetRun, ...]
+
+    def __len__(self) -> int:
+        return len(self.runs)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Number of runs by status."""
+        statuses = sorted({run.status for run in self.runs})
+        return {status: sum(run.status == status for run in self.runs) for status in statuses}
+
+    def rows(self) -> tuple[list[str], list[list[Any]]]:
+        """Return the table as a header and rows: one column for each alarm and each largest value of any run."""
+        alarms = list(dict.fromkeys(name for run in self.runs for name in run.alarms))
+        largest = list(dict.fromkeys(name for run in self.runs for name in run.largest))
+        header = ["run", "status", "rows", "ok", *(f"alarm {n}, s" for n in alarms), *(f"largest {n}" for n in largest),
+                  "file", "message"]  # fmt: skip
+        body = [
+            [
+                run.name, run.status, run.rows, run.statuses.get("ok", 0), *(run.alarms.get(n, "") for n in alarms),
+                *(run.largest.get(n, "") for n in largest), "" if run.file is None else run.file.name, run.message,
+            ]
+            for run in self.runs
+        ]  # fmt: skip
+        return header, body
+
+    def table(self) -> pd.DataFrame:
+        """Return the table as a data frame."""
+        import pandas as pd
+
+        header, body = self.rows()
+        return pd.DataFrame(body, columns=header)
+
+    def csv(self) -> str:
+        """Return the table as CSV."""
+        header, body = self.rows()
+        stream = io.StringIO()
+        TableWriter(stream, header).write(body)
+        return stream.getvalue()
+
+    def plot(self) -> Figure:
+        """Draw the estimates (of residual filters the residuals) of the first runs over time, one panel each."""
+        import matplotlib.pyplot as plt
+        import pandas as pd
+
+        shown = [(run, run.file) for run in self.runs if run.file is not None][:MOST_SHOWN]
+        if not shown:
+            raise SpecError("No design was run on any log: there is nothing to draw.", path="runs")
+        figure, axes = plt.subplots(
+            len(shown), 1, figsize=(8.0, 1.2 + 1.3 * len(shown)), squeeze=False, layout="constrained"
+        )
+        for axis, (run, file) in zip(axes[:, 0], shown, strict=True):
+            table = pd.read_csv(file)
+            times = table["time"] if pd.api.types.is_numeric_dtype(table["time"]) else np.arange(len(table))
+            estimates = [name for name in run.largest if not name.startswith("r[")]
+            for name in estimates or run.largest:
+                axis.plot(times, table[name], label=name, linewidth=0.9)
+            for time in run.alarms.values():
+                axis.axvline(time, color="0.4", linestyle="--", linewidth=0.8)
+            axis.set_title(run.name, fontsize=9, loc="left")
+            axis.legend(fontsize=7, loc="upper left")
+            axis.tick_params(labelsize=8)
+        axes[-1, 0].set_xlabel("time, s", fontsize=9)
+        return figure
+
+
+@dataclass(frozen=True)
+class _Pair:
+    name: str
+    gains: Path
+    log: Path
+    options: Mapping[str, Any]
+    key: str
+
+
+def run_fleet(
+    gains: str | Path | Sequence[str | Path],
+    data: str | Path | Sequence[str | Path],
+    folder: str | Path,
+    *,
+    executor: Executor | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    **options: Any,
+) -> Fleet:
+    """Run many designs on many logs: here, on processes, or on a cluster; results are the same everywhere.
+
+    A log with the name of a gain set (``pump.csv`` beside ``pump.gains.json``) is for that one alone; every other log
+    is for every gain set, so that one stream can be watched by many designs.  The folder keeps estimates and results:
+    the same call goes on where another was stopped.
+
+    Parameters
+    ----------
+    gains : path or sequence of paths
+        Gain sets, or folders of them (``*.gains.json``).
+    data : path or sequence of paths
+        Logs as for `run_on_data`, or folders of them.
+    folder : path
+        For the estimates (CSV) and results.
+    executor : concurrent.futures.Executor, optional
+        Processes, threads, or ``dask.distributed.Client(...).get_executor()``; workers must see the files.
+    progress : callable, optional
+        Called with the number of runs done and their total.
+    **options
+        As for `run_on_data`: ``columns, time_column, scales, thresholds, gap, warm_up, recovered, outliers``.
+
+    Returns
+    -------
+    Fleet
+        One row for each run; a log that does not fit a design is a row that says why.
+
+    Raises
+    ------
+    SpecError
+        There is no gain set or no log, an option is unknown, or the folder cannot be used.
+    """
+    known = ("columns", "time_column", "scales", "thresholds", "gap", "warm_up", "recovered", "outliers")
+    wrong = sorted(set(options) - set(known))
+    if wrong:
+        raise SpecError(f"{', '.join(wrong)}: use some of {', '.join(known)}.", path=wrong[0])
+    place = folder_for(Path(folder))
+    pairs = _pairs(_files(gains, (GAINS_ENDING,), "gains"), _files(data, LOG_ENDINGS, "data"), options)
+    found: dict[str, FleetRun] = {}
+    for pair in pairs:
+        if (run := _known(pair, place)) is not None:
+            found[pair.key] = run
+    waiting = [pair for pair in pairs if pair.key not in found]
+    for done, (pair, (run, text)) in enumerate(each(_run, waiting, executor), start=len(found) + 1):
+        found[pair.key] = _kept(pair, run, text, place)
+        if progress is not None:
+            progress(done, len(pairs))
+    return Fleet(tuple(found[pair.key] for pair in pairs))
+
+
+def _files(given: Any, endings: tuple[str, ...], what: str) -> list[Path]:
+    listed = [given] if isinstance(given, (str, Path)) else list(given)
+    found: list[Path] = []
+    for path in map(Path, listed):
+        inside = sorted(p for p in path.iterdir() if p.name.endswith(endings)) if path.is_dir() else [path]
+        found += inside
+    if not found:
+        raise SpecError(f"{', '.join(map(str, listed))}: there is no file *{' or *'.join(endings)}.", path=what)
+    missing = [str(path) for path in found if not path.is_file()]
+    if missing:
+        raise SpecError(f"{', '.join(missing)}: no such file.", path=what)
+    return found
+
+
+def _pairs(gains: Sequence[Path], logs: Sequence[Path], options: Mapping[str, Any]) -> list[_Pair]:
+    names = {path: path.name.removesuffix(GAINS_ENDING).removesuffix(".json") for path in gains}
+    digests = {path: hashlib.sha256(path.read_bytes()).hexdigest() for path in (*gains, *logs)}
+    own = {log: log.stem for log in logs if log.stem in names.values()}
+    said = json.dumps(options, sort_keys=True, default=str)
+    return [
+        _Pair(
+            f"{names[gain]} on {log.stem}", gain, log, options,
+            hashlib.sha256(f"{digests[gain]} {digests[log]} {said}".encode()).hexdigest(),
+        )
+        for gain in gains for log in logs if own.get(log, names[gain]) == names[gain]
+    ]  # fmt: skip
+
+
+def _run(pair: _Pair) -> tuple[FleetRun, str]:
+    """Return what a run comes to, and its estimates as CSV; errors of the package are results."""
+    stream = io.StringIO()
+    try:
+        design = load(pair.gains)
+        found = run_on_data(design, pair.log, stream, **dict(pair.options))
+    except ObsynthError as error:
+        return FleetRun(pair.name, STATUSES[error.exit_code], str(error)), ""
+    text = stream.getvalue()
+    return FleetRun(pair.name, "run", "", found.rows, dict(found.statuses), dict(found.alarms), _largest(text)), text
+
+
+def _largest(text: str) -> dict[str, float]:
+    """Return the largest absolute value of each fault estimate and residual after the warm-up."""
+    import pandas as pd
+
+    table = pd.read_csv(io.StringIO(text))
+    settled = table if "status" not in table else table[table["status"] != "warm-up"]
+    chosen = [name for name in table.columns if name.startswith(("fhat[", "thetahat[", "r["))]
+    values = {name: pd.to_numeric(settled[name], errors="coerce").abs().max() for name in chosen}
+    return {name: float(value) for name, value in values.items() if np.isfinite(value)}
+
+
+def _targets(pair: _Pair, folder: Path) -> tuple[Path, Path]:
+    stem = "".join(letter if letter.isalnum() or letter in "-_." else "-" for letter in pair.name)[:80]
+    return folder / f"{stem}-{pair.key[:16]}.csv", folder / f"{stem}-{pair.key[:16]}.result.json"
+
+
+def _kept(pair: _Pair, run: FleetRun, text: str, folder: Path) -> FleetRun:
+    """Write the estimates, then the result."""
+    table, result = _targets(pair, folder)
+    if text:
+        write_atomically(table, text)
+    body = {**{name: value for name, value in vars(run).items() if name != "file"}, "kind": _KIND, "key": pair.key,
+            "sha256": hashlib.sha256(text.encode()).hexdigest() if text else None}  # fmt: skip
+    write_atomically(result, json.dumps(body, indent=1) + "\n")
+    return replace(run, file=table) if text else run
+
+
+def _known(pair: _Pair, folder: Path) -> FleetRun | None:
+    """Return a run that is there already, whole and of the same files; a damaged one is made again."""
+    table, result = _targets(pair, folder)
+    try:
+        body = read_json(result, where=str(result)) if result.is_file() else None
+    except SpecError:
+        return None
+    if not isinstance(body, dict) or body.get("kind") != _KIND or body.get("key") != pair.key:
+        return None
+    if body["sha256"] is not None and (
+        not table.is_file() or hashlib.sha256(table.read_bytes()).hexdigest() != body["sha256"]
+    ):
+        return None
+    kept = {name: body[name] for name in ("name", "status", "message", "rows", "statuses", "alarms", "largest")}
+    return FleetRun(**kept, file=None if body["sha256"] is None else table)
