@@ -23,6 +23,7 @@ from obsynth import (
     smooth,
 )
 from obsynth.cli.main import main
+from obsynth.observers.recursive.building import observer_from_options
 from obsynth.observers.smoothing.keeping import smoothed_record
 
 E = np.diag([1.0, 1.0, 0.0])
@@ -403,3 +404,43 @@ def test_a_nonlinear_record_is_nearer_to_the_truth() -> None:
     states, before, parameters, filtered_parameters = np.mean(errors, axis=0)
     assert states < 0.8 * before
     assert parameters < 0.8 * filtered_parameters
+
+
+@pytest.mark.parametrize("seed", [5, 28, 167])
+def test_random_plants_of_any_rank_and_units_with_missing_samples(seed) -> None:
+    """What is undetermined, and everything else, is what the singular values of the whole problem say."""
+    rng = np.random.default_rng(seed)
+    nx = rng.integers(2, 5)
+    rank, ny = rng.integers(1, nx + 1), rng.integers(1, 4)
+    first = rng.standard_normal((nx, nx))
+    E = first @ np.diag([1.0] * rank + [0.0] * (nx - rank)) @ rng.standard_normal((nx, nx))
+    A, C = 0.7 * rng.standard_normal((nx, nx)), rng.standard_normal((ny, nx))
+    assert np.linalg.matrix_rank(np.vstack([E, C]), 1e-2) == nx
+    units = 10.0 ** rng.integers(-3, 4, nx)
+    E, A, C = E / units, A / units, C / units
+    q, r, spread = rng.random(nx) + 0.1, rng.random(ny) + 0.1, units**2 * (rng.random(nx) + 0.1)
+    y = rng.standard_normal((10, ny))
+    y[rng.random((10, ny)) < 0.35] = np.nan
+    observer = observer_from_options(
+        TimeVaryingDescriptorSystem(E, A, None, C, dt=1.0),
+        {"Q": np.diag(q), "R": np.diag(r), "initial_state": None, "initial_covariance": np.diag(spread),
+         "early_constraints": False},
+    )  # fmt: skip
+    found = smoothed_record(observer, y, np.zeros((10, 0)), None)
+    batch = Batch(10 * nx)
+    batch.add({0: np.eye(nx)}, np.zeros(nx), np.diag(spread))
+    for k in range(9):
+        batch.add({nx * (k + 1): E, nx * k: -A}, np.zeros(nx), np.diag(q))
+        seen = ~np.isnan(y[k + 1])
+        if seen.any():
+            batch.add({nx * (k + 1): C[seen]}, y[k + 1][seen], np.diag(r[seen]))
+    left, values, right = np.linalg.svd(np.vstack(batch.rows) * np.tile(units, 10))
+    count = int(np.sum(values > 1e-9 * values[0]))
+    whole = right[:count].T / values[:count]
+    undetermined = (np.abs(right[count:]) > 1e-7).any(axis=0).reshape(10, nx)
+    states = (whole @ (left[:, :count].T @ np.concatenate(batch.right))).reshape(10, nx) * units
+    deviations = np.sqrt(np.sum(whole**2, axis=1)).reshape(10, nx) * units
+    np.testing.assert_array_equal(np.isinf(found.state_deviations), undetermined)
+    gaps = np.abs(found.states - states) / deviations
+    assert gaps[~undetermined].max() < 1e-8
+    np.testing.assert_allclose(found.state_deviations[~undetermined], deviations[~undetermined], rtol=1e-8)

@@ -20,6 +20,8 @@ OUTGROWN = 1e100
 #: A column of H that keeps less than this of its length beside the others goes to the rank-revealing step: far below
 #: what a condition number of 1e12 does, far above rounding.
 DEPENDENT_COLUMN = 1e-14
+#: The same where samples are missing, so that a rank is likely to be lost: more than rounding leaves of a column.
+SUSPECT_COLUMN = RANK_TOLERANCE
 #: The same for a row of the parity covariance, relative to the whole noise: the rank-revealing step then decides. It
 #: must lie above `PERFECT_PARITY`, or rounding passes for noise.
 SUSPECT_PARITY = 1e-12
@@ -55,10 +57,10 @@ class Projection(NamedTuple):
     lower: FloatArray
 
 
-def projection_of(H: FloatArray) -> Projection | None:
+def projection_of(H: FloatArray, *, least: float = DEPENDENT_COLUMN) -> Projection | None:
     """Return the factorisation of H, or ``None`` where its rank has to be decided.
 
-    Shapes: ``H (rows, n)``.
+    Shapes: ``H (rows, n)``; ``least`` is the share of its length that a column must keep beside the others.
     """
     from scipy.linalg.lapack import dgeqrf, dormqr
 
@@ -67,7 +69,7 @@ def projection_of(H: FloatArray) -> Projection | None:
         return None
     packed, tau, _, _ = dgeqrf(H)
     diagonal = np.abs(packed.diagonal())
-    if (diagonal <= DEPENDENT_COLUMN * np.sqrt(np.einsum("ij,ij->j", H, H))).any():
+    if (diagonal <= least * np.sqrt(np.einsum("ij,ij->j", H, H))).any():
         return None
     transposed = dormqr("L", "T", packed, tau, np.eye(rows), 64 * rows)[0]
     rotation = np.concatenate((transposed[n:], transposed[:n]))
@@ -106,7 +108,9 @@ def projected_step(projection: Projection, noise: FloatArray, data: FloatArray) 
     return LeastSquaresStep(solved[:, :columns], solved[:, columns:], innovation, np.empty((n, 0)))
 
 
-def least_squares_step(H: FloatArray, S: FloatArray, Y: FloatArray) -> LeastSquaresStep | None:
+def least_squares_step(
+    H: FloatArray, S: FloatArray, Y: FloatArray, *, least: float = DEPENDENT_COLUMN
+) -> LeastSquaresStep | None:
     r"""Solve one step by LAPACK alone, or return ``None`` where a rank has to be decided.
 
     .. math::
@@ -116,7 +120,7 @@ def least_squares_step(H: FloatArray, S: FloatArray, Y: FloatArray) -> LeastSqua
 
     Shapes: ``H (rows, n)``, ``S (rows, s)``, ``Y (rows, columns)``.
     """
-    projection = projection_of(H)
+    projection = projection_of(H, least=least)
     if projection is None:
         return None
     return projected_step(projection, (projection.rotation @ S).T, projection.rotation @ Y)

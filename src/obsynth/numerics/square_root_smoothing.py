@@ -19,7 +19,13 @@ from typing import NamedTuple
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.least_squares_step import PERFECT_PARITY, SUSPECT_PARITY, projection_of
+from obsynth.numerics.least_squares_step import (
+    DEPENDENT_COLUMN,
+    PERFECT_PARITY,
+    SUSPECT_COLUMN,
+    SUSPECT_PARITY,
+    projection_of,
+)
 from obsynth.numerics.ranks import RANK_TOLERANCE
 
 
@@ -62,25 +68,32 @@ class JointStep(NamedTuple):
 
 
 def joint_step(
-    H: FloatArray, known: FloatArray, noise: FloatArray, right: FloatArray, unknown: FloatArray
-) -> JointStep:
+    H: FloatArray,
+    known: FloatArray,
+    noise: FloatArray,
+    right: FloatArray,
+    unknown: FloatArray,
+    *,
+    complete: bool = True,
+) -> JointStep:  # fmt: skip
     """Solve ``H x = right + [known noise] e + unknown d``, where known and unknown multiply the coordinates before.
 
     Shapes: ``H (rows, n)``, ``known (rows, c)``, ``noise (rows, any)``, ``right (rows, columns)``, ``unknown (rows,
-    r)``.  The rank of H may be short where samples are missing.
+    r)``.  The rank of H may be short where samples are missing: where the step is not complete.
     """
     S = np.hstack((known, noise))
     if S.shape[1] < len(H):
         S = np.hstack((S, np.zeros((len(H), len(H) - S.shape[1]))))
-    found = None if unknown.shape[1] else _regular(H, S, known.shape[1], right)
+    least = DEPENDENT_COLUMN if complete else SUSPECT_COLUMN
+    found = None if unknown.shape[1] else _regular(H, S, known.shape[1], right, least)
     return _by_rank(H, S, known.shape[1], right, unknown) if found is None else found
 
 
-def _regular(H: FloatArray, S: FloatArray, width: int, right: FloatArray) -> JointStep | None:
+def _regular(H: FloatArray, S: FloatArray, width: int, right: FloatArray, least: float) -> JointStep | None:
     """Solve a step by LAPACK alone, or return ``None`` where a rank has to be decided."""
     from scipy.linalg import solve_triangular
 
-    projection = projection_of(H)
+    projection = projection_of(H, least=least)
     if projection is None:
         return None
     n, rows = len(projection.head), len(H)

@@ -12,6 +12,8 @@ from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.covariances import covariance_factor
 from obsynth.numerics.least_squares_step import (
+    DEPENDENT_COLUMN,
+    SUSPECT_COLUMN,
     LeastSquaresStep,
     least_squares_step,
     rank_revealing_step,
@@ -85,8 +87,8 @@ class RawEstimate(NamedTuple):
 
     @property
     def score(self) -> FloatArray:
-        """What the sample says of the parameters ``(nq,)``."""
-        return np.asarray(self.regressor.T @ self.innovation)
+        """What the sample says of the parameters ``(nq,)``; nothing where they are states and have no regressor."""
+        return np.asarray(self.regressor.T @ self.innovation[: len(self.regressor)])
 
     @property
     def information(self) -> FloatArray:
@@ -276,7 +278,9 @@ class Recursion:
         complete = bool(kept.all())
         if not complete:
             H, S, right, unknown = H[kept], S[kept], right[kept], unknown[kept]
-        found = None if unknown.shape[1] or S.shape[1] < len(S) else least_squares_step(H, S, right)
+        found = None
+        if not unknown.shape[1] and S.shape[1] >= len(S):
+            found = least_squares_step(H, S, right, least=DEPENDENT_COLUMN if complete else SUSPECT_COLUMN)
         if found is None:
             found = rank_revealing_step(H, S, right, unknown)
             if complete and found.diffuse.shape[1] > unknown.shape[1]:

@@ -72,7 +72,8 @@ class _RecursiveLinks:
         known[:ne], unknown[:ne] = step.A @ node.factor, step.A @ node.diffuse
         kept = ~np.isnan(right[:, 0])
         parts = (step.H, known, step.noise, right, unknown)
-        found = joint_step(*(parts if kept.all() else tuple(part[kept] for part in parts)))
+        complete = bool(kept.all())
+        found = joint_step(*(parts if complete else tuple(part[kept] for part in parts)), complete=complete)
         return Node(found.estimate, found.factor, found.diffuse, found.back)
 
     def _lesson(self, before: RecursiveState, after: RecursiveState, row: RawEstimate) -> Lesson | None:
