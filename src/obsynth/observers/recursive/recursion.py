@@ -85,8 +85,8 @@ class RawEstimate(NamedTuple):
 
     @property
     def score(self) -> FloatArray:
-        """What the sample says of the parameters ``(nq,)``."""
-        return np.asarray(self.regressor.T @ self.innovation)
+        """What the sample says of the parameters ``(nq,)``; nothing where they walk, which leaves no regressor."""
+        return np.asarray(self.regressor.T @ self.innovation[: len(self.regressor)])
 
     @property
     def information(self) -> FloatArray:
