@@ -48,6 +48,11 @@ What disturbances and noise are to be expected comes from the scenario of --syst
 
 def add_data_verbs(verbs: Any) -> None:
     """Add the parsers."""
+    _add_run(verbs)
+    _add_what_follows(verbs)
+
+
+def _add_run(verbs: Any) -> None:
     run = verbs.add_parser(
         "run", help=_RUN, description=_RUN, epilog=_RUN_DETAILS, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -92,6 +97,9 @@ def add_data_verbs(verbs: Any) -> None:
     add_quiet(run, "no progress and no summary")
     run.set_defaults(verb="run")
 
+
+def _add_what_follows(verbs: Any) -> None:
+    """Add the verbs that take a gain set further: export, plot and report."""
     export = verbs.add_parser("export", help=_EXPORT, description=_EXPORT)
     add_gains(export)
     export.add_argument(

@@ -192,7 +192,7 @@ def sensor_sets(
     if not chosen:
         raise SpecError("The plant has no faults to place sensors for.", path="faults")
     sensors = _candidates(plant, candidates, noise)
-    costs = _costs(sensors, cost)
+    costs = _costs(sensors, cost or {})
     search = SensorSearch(plant, sensors, goal, chosen, may_fail, copies)
     report_stage("asking what all candidates together reach")
     wanted = search.reachable()
@@ -245,8 +245,7 @@ def _candidates(
     return tuple(replace(sensor, deviation=float(levels[sensor.name])) for sensor in sensors)
 
 
-def _costs(sensors: Sequence[Sensor], cost: Mapping[str, float] | None) -> list[float]:
-    given = cost or {}
+def _costs(sensors: Sequence[Sensor], given: Mapping[str, float]) -> list[float]:
     _require_positive(given, [sensor.name for sensor in sensors], "cost", whole=False)
     return [float(given.get(sensor.name, 1.0)) for sensor in sensors]
 
@@ -313,9 +312,8 @@ def _lost_without(plant: DescriptorSystem, had: Sequence[Task], output: int) -> 
 
 
 def _in_words(plant: DescriptorSystem, lost: Sequence[Task]) -> list[str]:
-    texts = []
-    for task in lost:
-        name = plant.fault_names[task.fault]
-        beside = ", ".join(plant.fault_names[j] for j in task.beside)
-        texts.append(f"{name}: out of reach of all candidates" + (f" (from {beside})." if beside else "."))
-    return texts
+    others = [", ".join(plant.fault_names[j] for j in task.beside) for task in lost]
+    return [
+        f"{plant.fault_names[task.fault]}: out of reach of all candidates" + (f" (from {beside})." if beside else ".")
+        for task, beside in zip(lost, others, strict=True)
+    ]
