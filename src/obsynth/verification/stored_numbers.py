@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from obsynth.numerics.arrays import SMALLEST, ComplexArray, FloatArray
-from obsynth.numerics.norms import resolved
+from obsynth.numerics.norms import MOST_ENTRIES_AT_ONCE, resolved
 from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.spectra import boundary_points
 from obsynth.observers.linear.observer import LinearObserver
@@ -216,13 +216,19 @@ class _Composite:
 
     def gains(self, frequencies: FloatArray) -> FloatArray:
         """Return `gain` at many frequencies, those that take little memory at once."""
-        dt, order = self.plant.dt, self.observer.order
+        dt = self.plant.dt
         points = boundary_points(frequencies / dt if dt > 0.0 else frequencies, dt)
+        at_once = max(1, MOST_ENTRIES_AT_ONCE // max(self.driven.size, self.K.shape[1] * self.plant.nd, 1))
         try:
-            x = np.concatenate([*resolved(self.plant.E, self.plant.A, self.plant.Bd, points)])
-            left = np.concatenate([*resolved(np.eye(order), self.observer.Az.T, self.shown.T, points)])
+            parts = [self._gains_at(points[i : i + at_once]) for i in range(0, len(points), at_once)]
         except np.linalg.LinAlgError:
             return np.array([self.gain(float(frequency)) for frequency in frequencies])
+        return np.concatenate(parts)
+
+    def _gains_at(self, points: ComplexArray) -> FloatArray:
+        x = np.concatenate([*resolved(self.plant.E, self.plant.A, self.plant.Bd, points)])
+        one = np.eye(self.observer.order)
+        left = np.concatenate([*resolved(one, self.observer.Az.T, self.shown.T, points)])
         stacked = np.concatenate([x * points[:, None, None] ** -age for age in range(self.lags)], axis=1)
         whole = left.transpose(0, 2, 1) @ (self.K @ stacked + self.driven) + self.J @ stacked + self.direct
         finite = np.all(np.isfinite(whole), axis=(1, 2))

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from itertools import product
 
 import numpy as np
 
@@ -41,7 +40,10 @@ WEIGHT_STEPS = 4
 #: such a filter is looked for in turn, relative to the same; a point without meaning; and the share of rows xi that
 #: counts as nothing.
 DECOUPLED_GAIN = 1e-7
-DECOUPLING_LEVELS = (1e-4, 1e-2)
+#: Pairs of level and artificial noise: what this noise costs goes with its square, but many states need some.
+DECOUPLING_ATTEMPTS = ((1e-4, 1e-6), (1e-2, 1e-6), (1e-4, 1e-8), (1e-2, 1e-8))
+#: The same share where states are many: no gain that is shipped is smaller than ten times that.
+COARSELY_DECOUPLED = 1e-4
 GENERIC_POINT = 1.3247
 SAME_ROWS = 1e-8
 #: A level this far above anything a disturbance could do is no limit.
@@ -117,11 +119,17 @@ def _decoupling_filter(problem: GainProblem, gain: float) -> tuple[Injection, fl
         return None
     # The artificial noise has a gain of its own, which in many states may be above the first level; next to a zero on
     # the unit circle only little of it leaves the equation a solution.
-    for noise, share in product(NOISES[: 2 if problem.order <= FEW_STATES else 1], DECOUPLING_LEVELS):
+    best = None
+    for share, noise in DECOUPLING_ATTEMPTS:
         found = central_injection(problem, share * gain, noise=noise)
-        if found is not None and (reached := problem.achieved_gain(found)) <= DECOUPLED_GAIN * gain:
+        if found is None:
+            continue
+        reached = problem.achieved_gain(found)
+        if reached <= DECOUPLED_GAIN * gain:
             return found, reached
-    return None
+        best = (found, reached) if best is None or reached < best[1] else best
+    coarsely = best is not None and problem.order > FEW_STATES and best[1] <= COARSELY_DECOUPLED * gain
+    return best if coarsely else None
 
 
 def _follows_from_measurements(problem: GainProblem) -> bool:
