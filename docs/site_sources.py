@@ -19,7 +19,7 @@ SECTIONS = (
     ("obsynth.analysis", "What is possible"),
     ("obsynth.methods", "Designs"),
     ("obsynth.results", "Results"),
-    ("obsynth.compare", "Comparing designs"),
+    ("obsynth.comparison", "Comparing designs"),
     ("obsynth.sweeps", "Comparing designs"),
     ("obsynth.observers", "Observers"),
     ("obsynth.data", "Measured data"),
@@ -27,7 +27,6 @@ SECTIONS = (
     ("obsynth.simulation", "Simulation and monitors"),
     ("obsynth.calibration", "Calibration"),
     ("obsynth.tolerances", "Tolerances"),
-    ("obsynth.robustness", "Tolerances"),
     ("obsynth.exporting", "Handing on"),
     ("obsynth.report", "Handing on"),
 )
