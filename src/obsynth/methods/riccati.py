@@ -85,7 +85,7 @@ def bounded_real_matrix(
     if b.shape[1]:
         p = riccati_solution(a.T, b.T, weight, gap, cross, impossible=_Exceeded(b, gap))
     else:
-        p = _lyapunov_solution(a, weight)
+        p = lyapunov_solution(a, weight)
     if p is None:
         return None
     p = 0.5 * (p + p.T)
@@ -112,7 +112,8 @@ class _Exceeded:
         return bool(shrunk) or is_clearly_negative(left, self.b, p)
 
 
-def _lyapunov_solution(a: FloatArray, weight: FloatArray) -> FloatArray | None:
+def lyapunov_solution(a: FloatArray, weight: FloatArray) -> FloatArray | None:
+    """Return ``P = a' P a + weight``, however badly conditioned; None where there is none."""
     from scipy.linalg import solve_discrete_lyapunov
 
     try:

@@ -13,7 +13,7 @@ from obsynth.experiments.monitors.adaptive_records_monitor import noisy_design
 from obsynth.experiments.monitors.adaptive_rule import AdaptiveRule
 from obsynth.experiments.monitors.monitor import KINDS, statement_of
 from obsynth.experiments.monitors.online import OnlineMonitor, Rule
-from obsynth.experiments.monitors.parameter_rules import PARAMETER_KINDS, ParameterRule
+from obsynth.experiments.monitors.parameter_rules import ANY_LENGTH, parameter_monitor
 from obsynth.experiments.monitors.residual_model import ResidualModel, residual_model, watches_estimates
 from obsynth.experiments.monitors.residual_monitor import bounds_of, require_options
 from obsynth.experiments.monitors.residual_rules import NormRule, WhitenedRule
@@ -23,9 +23,7 @@ from obsynth.numerics.arguments import is_finite_number, require_kind, require_m
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.holds import first_order_hold
 from obsynth.observers.dae.observer import DAEObserver
-from obsynth.observers.decisions import WALKING_FORMS
 from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.plants.names import index_of
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario
 
@@ -33,15 +31,6 @@ _FORGOTTEN = ", once the error at the start, which is not stated, is forgotten (
 _AFTER_A_GAP = " (after a gap, too, while the error there is no larger than stated for the start)"
 _NOT_CLOSER = "; rows must not be closer than the stated sample time, as noise drives the plant itself"
 _REGULAR = ", for rows that are the stated sample time apart (none further apart, where they are not regular)"
-_ANY_LENGTH = " (the run may have any length)"
-_PARAMETER_STATEMENTS = {
-    "chi-square": "distance of the parameters from their nominal values in the metric of their covariance: passed in a "
-    "run without a change with at most the stated probability, for Gaussian noise as stated",
-    "cusum": "cumulative sum of the whitened innovation for a change of the stated size: passed in a run without a "
-    "change with at most the stated probability, for Gaussian noise as stated",
-    "nis": "squared innovations of 20 samples: passed in a run that the model explains with at most the stated "
-    "probability, for Gaussian noise as stated",
-}
 
 
 def online_monitor(
@@ -120,7 +109,35 @@ def online_monitor(
         require_mapping(given, name)
     require_options(noise_bound, initial_error, gamma, window, false_alarms, change, 0)
     if isinstance(design.observer, (RecursiveObserver, DAEObserver)):
-        return _of_parameters(design.observer, kind, nominal or {}, change, false_alarms)
+        return parameter_monitor(design.observer, kind, nominal or {}, change, false_alarms)
+    _require_linear_kind(kind, nominal)
+    design, adaptive = tolerances_of(design, kind, constants, initial_set, initial_error)
+    estimates = watches_estimates(design) and kind in ("pointwise", "window")
+    model, dt = _endless_model(design, scenario, window, sample_time, estimates=estimates)
+    bounds = _expected_bounds(design, model, disturbance_bounds, scenario)
+    rule: Rule
+    if kind in ("pointwise", "window", "paper"):
+        start = 0.0 if initial_error is None else float(initial_error)
+        norm, limit = _norm_rule(
+            design, kind, model, bounds, noise_bound, start, gamma, window, dt, estimates=estimates
+        )
+        if adaptive:
+            return _adaptive(design, scenario, norm, model, bounds, noise_bound, initial_error, initial_set, dt)
+        rule = norm
+        ending = (_FORGOTTEN if initial_error is None else _AFTER_A_GAP) + _more_words(kind, model, limit)
+    else:
+        rule = _whitened(kind, model, bounds if scenario is None else None, window, change, false_alarms, dt)
+        ending = ANY_LENGTH
+    promised = statement_of(
+        kind, continuous=model.flow is not None, sampled=model.sampled is not None, estimates=estimates
+    )
+    return OnlineMonitor(
+        kind, promised + ending + EXACT, rule, residuals=len(design.linear[1].residual_names),
+        fault_names=design.linear[1].fault_names, fault_scales=model.fault_scales(),
+    )  # fmt: skip
+
+
+def _require_linear_kind(kind: str, nominal: Mapping[str, float] | None) -> None:
     if kind not in KINDS:
         hint = " glr is a decision on parameters, which a linear design has none of: cusum is nearest to it."
         raise SpecError(
@@ -129,61 +146,60 @@ def online_monitor(
         )
     if nominal:
         raise SpecError("nominal is for recursive designs, which estimate parameters.", path="nominal")
-    design, adaptive = tolerances_of(design, kind, constants, initial_set, initial_error)
-    estimates = watches_estimates(design) and kind in ("pointwise", "window")
-    model, dt = _endless_model(design, scenario, window, sample_time, estimates=estimates)
-    bounds = bounds_of(design, model, disturbance_bounds)
-    if scenario is None:
-        stated = [name in (disturbance_bounds or {}) for name in design.linear[0].disturbance_names]
-        bounds = np.where(np.array(stated, dtype=bool), bounds, np.inf)
-    start = 0.0 if initial_error is None else float(initial_error)
-    rule: Rule
+
+
+def _expected_bounds(
+    design: ObserverDesign, model: ResidualModel, given: Mapping[str, float] | None, scenario: Scenario | None
+) -> FloatArray:
+    """Return the bound of each disturbance; without a scenario only those given are known."""
+    bounds = bounds_of(design, model, given)
+    if scenario is not None:
+        return bounds
+    stated = [name in (given or {}) for name in design.linear[0].disturbance_names]
+    return np.where(np.array(stated, dtype=bool), bounds, np.inf)
+
+
+def _norm_rule(
+    design: ObserverDesign, kind: str, model: ResidualModel, bounds: FloatArray, noise_bound: float | None,
+    start: float, gamma: float | None, window: int, dt: float, *, estimates: bool,
+) -> tuple[NormRule, float]:  # fmt: skip
+    """Return the rule of a bound on the norm of the residual, or of the fault estimates, and the bound in the end."""
     irregular = None
-    if kind in ("pointwise", "window", "paper"):
-        if kind == "paper":
-            table, limit = unlimited_paper(model, bounds, start, gamma)
-        else:
-            table, limit = unlimited_bound(kind, model, scaled_inputs(model, bounds, noise_bound), start, window)
-            if model.flow is not None:
-                inputs = scaled_inputs(model, bounds, noise_bound, any_stamps=True)
-                irregular = unlimited_bound(kind, model, inputs, start, window)
-        if not limit > 0.0:
-            raise SpecError(
-                "As stated, no disturbance and no noise reaches the residual: its bound would be zero, which rounding "
-                "passes. State noise (noise_bound, sensor_noise of the plant), or give a level of your own "
-                "(thresholds).",
-                path="noise_bound",
-            )  # fmt: skip
-        watched, driven = None, None
-        if estimates:
-            watched = design.linear[1].fault_rows
-        if kind != "paper" and model.continuous is not None and design.linear[0].nu:
-            driven = model.continuous.between.input_response(model.continuous.observer)
-        norm = NormRule(
-            table, limit, window=window if kind == "window" else 1, dt=dt, irregular=irregular, watched=watched,
-            driven=driven,
-        )  # fmt: skip
-        if adaptive:
-            return _adaptive(design, scenario, norm, model, bounds, noise_bound, initial_error, initial_set, dt)
-        rule = norm
-        ending = _FORGOTTEN if initial_error is None else _AFTER_A_GAP
+    if kind == "paper":
+        table, limit = unlimited_paper(model, bounds, start, gamma)
     else:
-        rule = _whitened(kind, model, bounds if scenario is None else None, window, change, false_alarms, dt)
-        ending = _ANY_LENGTH
-    if kind in ("pointwise", "window") and model.sensor_noise is not None:
+        table, limit = unlimited_bound(kind, model, scaled_inputs(model, bounds, noise_bound), start, window)
+        if model.flow is not None:
+            inputs = scaled_inputs(model, bounds, noise_bound, any_stamps=True)
+            irregular = unlimited_bound(kind, model, inputs, start, window)
+    if not limit > 0.0:
+        raise SpecError(
+            "As stated, no disturbance and no noise reaches the residual: its bound would be zero, which rounding "
+            "passes. State noise (noise_bound, sensor_noise of the plant), or give a level of your own (thresholds).",
+            path="noise_bound",
+        )
+    driven = None
+    if kind != "paper" and model.continuous is not None and design.linear[0].nu:
+        driven = model.continuous.between.input_response(model.continuous.observer)
+    rule = NormRule(
+        table, limit, window=window if kind == "window" else 1, dt=dt, irregular=irregular,
+        watched=design.linear[1].fault_rows if estimates else None, driven=driven,
+    )  # fmt: skip
+    return rule, limit
+
+
+def _more_words(kind: str, model: ResidualModel, limit: float) -> str:
+    """Return what else the sentence of a bound must say."""
+    words = ""
+    if kind == "paper":
+        return words
+    if model.sensor_noise is not None and model.Bw[:, model.sensor_noise[0].shape[1] :].any():
         # The noise of the plant itself is what is gathered between samples: the closer they are, the less, but in all
         # the more of it that is of one sign.
-        ending += _NOT_CLOSER if model.Bw[:, model.sensor_noise[0].shape[1] :].any() else ""
-    if kind in ("pointwise", "window") and model.continuous is not None:
-        ending += _REGULAR + model.continuous.between.lasting_words(limit)
-    promised = statement_of(
-        kind, continuous=model.flow is not None, sampled=model.sampled is not None, estimates=estimates
-    )
-    statement = promised + ending + EXACT
-    return OnlineMonitor(
-        kind, statement, rule, residuals=len(design.linear[1].residual_names), fault_names=design.linear[1].fault_names,
-        fault_scales=model.fault_scales(),
-    )  # fmt: skip
+        words += _NOT_CLOSER
+    if model.continuous is not None:
+        words += _REGULAR + model.continuous.between.lasting_words(limit)
+    return words
 
 
 def _adaptive(
@@ -248,49 +264,4 @@ def _whitened(
     return WhitenedRule(
         whitener, steady_mean(model), window=window, change=None if kind == "chi-square" else change,
         false_alarms=false_alarms, dt=dt, white=white,
-    )  # fmt: skip
-
-
-def _whole_record(observer: RecursiveObserver | DAEObserver) -> str:
-    """Return why a likelihood ratio is not among the monitors, and what to use instead."""
-    why = " glr compares every time at which a change may have begun, which takes a whole record"
-    if isinstance(observer, DAEObserver):
-        return f"{why}, and regressors, which a nonlinear design does not have: chi-square, cusum or nis serve here."
-    if observer.adaptation is None or observer.adaptation.form == "random-walk":
-        return f"{why}, and regressors, which this design does not have: chi-square or nis serve here."
-    return f"{why}: obsynth.decide(..., statistic='glr') has it for recorded estimates; row by row, use cusum."
-
-
-def _of_parameters(
-    observer: RecursiveObserver | DAEObserver, kind: str, nominal: Mapping[str, float], change: float,
-    false_alarms: float,
-) -> OnlineMonitor:  # fmt: skip
-    if kind not in PARAMETER_KINDS:
-        hint = _whole_record(observer) if kind == "glr" else ""
-        raise SpecError(
-            f"kind is {kind!r}: for a recursive or nonlinear design use one of {', '.join(PARAMETER_KINDS)}.{hint}",
-            path="kind",
-        )
-    names = observer.fault_names
-    if isinstance(observer, DAEObserver):
-        start, residuals, form = observer.initial_parameters, observer.model.ny, observer.form
-    else:
-        adaptation, plant = observer.adaptation, observer.plant
-        start = np.zeros(0) if adaptation is None else adaptation.initial_parameters
-        residuals, form = plant.ne + plant.ny - plant.nx, "" if adaptation is None else adaptation.form
-    theta = np.array(start, dtype=np.float64)
-    for name, value in nominal.items():
-        place = index_of(name, names, what="nominal")
-        if not is_finite_number(value):
-            raise SpecError(f"The nominal value of {name!r} is {value!r}: give a finite number.", path="nominal")
-        theta[place] = float(value)
-    if kind != "nis" and not len(theta):
-        raise SpecError(f"{kind} watches parameters, and this design estimates none: use nis.", path="kind")
-    if kind == "cusum" and form in WALKING_FORMS:
-        raise SpecError(f"cusum needs regressors, which a {form} design does not have: use chi-square or nis.",
-                        path="kind")  # fmt: skip
-    rule = ParameterRule(kind, theta, np.full(len(theta), float(change)), false_alarms)
-    return OnlineMonitor(
-        kind, _PARAMETER_STATEMENTS[kind] + _ANY_LENGTH, rule, residuals=residuals, fault_names=names,
-        fault_scales=np.ones(len(names)),
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Rules for recursive designs, row by row: their innovations are white, and the covariance of parameters is honest."""
+"""Monitors of recursive and nonlinear designs, row by row: innovations are white, covariances of parameters honest."""
 
 from __future__ import annotations
 
@@ -9,13 +9,28 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.experiments.monitors.online import Evidence, share_of_look
+from obsynth.errors import SpecError
+from obsynth.experiments.monitors.online import Evidence, OnlineMonitor, share_of_look
 from obsynth.experiments.monitors.residual_rules import require_same
+from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.dae.observer import DAEObserver
+from obsynth.observers.decisions import WALKING_FORMS
+from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.plants.names import index_of
 
 PARAMETER_KINDS = ("chi-square", "cusum", "nis")
 #: Samples that the NIS sums up.
 NIS_WINDOW = 20
+ANY_LENGTH = " (the run may have any length)"
+_PARAMETER_STATEMENTS = {
+    "chi-square": "distance of the parameters from their nominal values in the metric of their covariance: passed in a "
+    "run without a change with at most the stated probability, for Gaussian noise as stated",
+    "cusum": "cumulative sum of the whitened innovation for a change of the stated size: passed in a run without a "
+    "change with at most the stated probability, for Gaussian noise as stated",
+    "nis": "squared innovations of 20 samples: passed in a run that the model explains with at most the stated "
+    "probability, for Gaussian noise as stated",
+}
 
 
 class ParameterRule:
@@ -104,3 +119,49 @@ class ParameterRule:
 def _alone(scores: FloatArray, information: FloatArray) -> int:
     """Return the parameter whose change alone explains most."""
     return int(np.argmax(scores**2 / np.maximum(information, np.finfo(np.float64).tiny)))
+
+
+def _whole_record(observer: RecursiveObserver | DAEObserver) -> str:
+    """Return why a likelihood ratio is not among the monitors, and what to use instead."""
+    why = " glr compares every time at which a change may have begun, which takes a whole record"
+    if isinstance(observer, DAEObserver):
+        return f"{why}, and regressors, which a nonlinear design does not have: chi-square, cusum or nis serve here."
+    if observer.adaptation is None or observer.adaptation.form == "random-walk":
+        return f"{why}, and regressors, which this design does not have: chi-square or nis serve here."
+    return f"{why}: obsynth.decide(..., statistic='glr') has it for recorded estimates; row by row, use cusum."
+
+
+def parameter_monitor(
+    observer: RecursiveObserver | DAEObserver, kind: str, nominal: Mapping[str, float], change: float,
+    false_alarms: float,
+) -> OnlineMonitor:  # fmt: skip
+    """Return the monitor of parameters, or of innovations, for data of any length."""
+    if kind not in PARAMETER_KINDS:
+        hint = _whole_record(observer) if kind == "glr" else ""
+        raise SpecError(
+            f"kind is {kind!r}: for a recursive or nonlinear design use one of {', '.join(PARAMETER_KINDS)}.{hint}",
+            path="kind",
+        )
+    names = observer.fault_names
+    if isinstance(observer, DAEObserver):
+        start, residuals, form = observer.initial_parameters, observer.model.ny, observer.form
+    else:
+        adaptation, plant = observer.adaptation, observer.plant
+        start = np.zeros(0) if adaptation is None else adaptation.initial_parameters
+        residuals, form = plant.ne + plant.ny - plant.nx, "" if adaptation is None else adaptation.form
+    theta = np.array(start, dtype=np.float64)
+    for name, value in nominal.items():
+        place = index_of(name, names, what="nominal")
+        if not is_finite_number(value):
+            raise SpecError(f"The nominal value of {name!r} is {value!r}: give a finite number.", path="nominal")
+        theta[place] = float(value)
+    if kind != "nis" and not len(theta):
+        raise SpecError(f"{kind} watches parameters, and this design estimates none: use nis.", path="kind")
+    if kind == "cusum" and form in WALKING_FORMS:
+        raise SpecError(f"cusum needs regressors, which a {form} design does not have: use chi-square or nis.",
+                        path="kind")  # fmt: skip
+    rule = ParameterRule(kind, theta, np.full(len(theta), float(change)), false_alarms)
+    return OnlineMonitor(
+        kind, _PARAMETER_STATEMENTS[kind] + ANY_LENGTH, rule, residuals=residuals, fault_names=names,
+        fault_scales=np.ones(len(names)),
+    )  # fmt: skip

@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from obsynth.methods.fault_estimation_filter.injection_problem import GainProblem
+from obsynth.methods.riccati import lyapunov_solution
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import RANK_TOLERANCE
 
@@ -125,11 +126,12 @@ def _with_growing_pairs(
     point: FloatArray, top: FloatArray, image: FloatArray, reached: FloatArray, outside: FloatArray
 ) -> FloatArray:
     """Add pairs on the growing states, and as many from rest as make up for what those do to the reached states."""
-    from scipy.linalg import solve_discrete_lyapunov
-
     pairs = np.linalg.pinv(outside.T @ top)
     back = np.linalg.inv(outside.T @ image @ pairs)
-    growing = pairs @ solve_discrete_lyapunov(back, back @ back.T) @ pairs.T
+    grown = lyapunov_solution(back.T, back @ back.T)
+    if grown is None or not np.all(np.isfinite(grown)):
+        raise np.linalg.LinAlgError("the growing states are too close to the boundary")
+    growing = pairs @ grown @ pairs.T
     if reached.shape[1] == 0:
         return np.asarray(growing)
     slack = [image @ item @ image.T - top @ item @ top.T for item in (point, growing)]
