@@ -33,6 +33,7 @@ from obsynth import (
     verify,
 )
 from obsynth.analysis.transformations import StateRecovery
+from obsynth.methods.fault_estimation_filter.least_gain_proof import WITNESSES
 from obsynth.spec.loader import load_spec
 from obsynth.verification.claims import WITNESS_CLAIMS
 
@@ -648,7 +649,7 @@ def test_not_a_number_anywhere_is_refused_or_fails(name: str) -> None:
     for key, matrix in design.certificate.matrices.items():
         for row in range(matrix.shape[0]):
             for column in range(matrix.shape[1]):
-                expected = {WITNESS_CLAIMS.get(key, FITS)}
+                expected = {LEAST if key in WITNESSES else WITNESS_CLAIMS.get(key, FITS)}
                 assert failed(certificate_entry(key, row, column, np.nan)(design)) == expected
     needed = {"state_lag": {FITS, CLAIMS}}
     needed["gamma"] = {LMI, NORM, CLAIMS, ORDER} if design.plant.nd else {CLAIMS}
@@ -662,7 +663,7 @@ def test_not_a_number_anywhere_is_refused_or_fails(name: str) -> None:
 def in_units(design: ObserverDesign, powers: np.ndarray) -> ObserverDesign:
     """The same design with the states of plant and observer in other units, powers of two: exact in every digit.
 
-    Bounds that are claimed of stored numbers go, which have units.
+    Bounds that are claimed of stored numbers go, which have units, and the proof of the least gain, which has a basis.
     """
     plant, observer, nx = design.plant, design.observer, design.plant.nx
     lag = int(design.certificate.claims["state_lag"])
@@ -682,7 +683,7 @@ def in_units(design: ObserverDesign, powers: np.ndarray) -> ObserverDesign:
     matrices = design.certificate.matrices
     moved = {letter: design.gains[letter] / own[:core, None] for letter in ("T", "N", "L", "Psi", "R")}
     changed = changed.replace(gains={**design.gains, **moved})
-    kept = {key: value for key, value in matrices.items() if key not in WITNESS_CLAIMS}
+    kept = {key: value for key, value in matrices.items() if key not in WITNESS_CLAIMS and key not in WITNESSES}
     changed = changed.replace(certificate=Certificate(kept, design.certificate.claims))
     return with_certificate(
         changed,
