@@ -177,7 +177,7 @@ def test_a_picture_of_one_s_own_data(design, frame):
     texts = [text.get_text() for text in panels[3].get_legend().get_texts()]
     assert "95 % interval of the stated noise" in texts
     assert "threshold" in texts
-    assert "alarm" in texts
+    assert "alarm at 10.5 s" in texts
     assert len(plot_data(run, show=["faults"], axes=list(Figure().subplots(1, 1, squeeze=False)[0]))) == 1
     with pytest.raises(SpecError, match=r"outputs, faults"):
         plot_data(run, show=["states"])
