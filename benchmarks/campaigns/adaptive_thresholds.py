@@ -5,11 +5,11 @@ by the sign of each constant's effect; disturbances and noise half random, half 
 drives one output at one sample.  The plants are exact (made anew with numpy from the constants, not from the family),
 and a run counts as wrong if any threshold is passed at any sample.  In `varying` the constants are new at each sample,
 half drawn, half by those signs; with `constant, though they vary` the threshold for constants that stay the same must
-be passed (on wang2015; on drive some groups of runs do).  `mean width` compares thresholds with the bound of the nominal plant over 60 runs: 4.31
-and 2.28, 1.07 and 1.73 times, at most 1.01 times that.  `faults` has a step of twice the median threshold: its
-guaranteed intervals must hold at each sample, and for smib and drive it must be found within one.  Of `windows` without
-a fault none may be proved faulty; in the last cases a fault of 0.05 on wang2015 must be proved, and its certificate
-hold.
+be passed (on wang2015; on drive some groups of runs do).  `mean width` compares thresholds with the bound of the
+nominal plant over 60 runs: 4.31 and 2.28, 1.07 and 1.73 times, at most 1.01 times that.  `faults` has a step of twice
+the median threshold: its guaranteed intervals must hold at each sample, and for smib and drive it must be found within
+one.  Of `windows` without a fault none may be proved faulty; in the last cases a fault of 0.05 on wang2015 must be
+proved, and its certificate hold.
 """
 
 from __future__ import annotations

@@ -19,7 +19,8 @@ from obsynth.analysis.existence.distance import (
     drowned_zeros,
     relative_singular_value,
 )
-from obsynth.analysis.existence.numbers import SystemFacts, numbers_of
+from obsynth.analysis.existence.numbers import numbers_of
+from obsynth.analysis.existence.rational import SystemFacts
 from obsynth.analysis.far_zeros import system_zeros
 from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.zeros import are_outside, is_outside

@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from obsynth.analysis.conditions import Condition
-from obsynth.analysis.existence.numbers import PlantNumbers, numbers_of
+from obsynth.analysis.existence.numbers import numbers_of
+from obsynth.analysis.existence.rational import PlantNumbers
 from obsynth.analysis.existence.verdicts import settled_rank
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import DEAD_CHAIN_TOLERANCE, MARKOV_TOLERANCE, RankDecision, decide_rank

@@ -14,7 +14,8 @@ from dataclasses import replace
 import numpy as np
 
 from obsynth.analysis.conditions import Condition, rank_condition
-from obsynth.analysis.existence.numbers import PlantNumbers, WrittenNumbers, numbers_of
+from obsynth.analysis.existence.numbers import numbers_of
+from obsynth.analysis.existence.rational import PlantNumbers, WrittenNumbers
 from obsynth.analysis.existence.verdicts import described_distance, settled_rank, unclear_detail, zero_verdict
 from obsynth.analysis.far_zeros import equilibrated_at
 from obsynth.analysis.plant_units import PlantUnits

@@ -21,7 +21,8 @@ import numpy as np
 
 from obsynth.analysis.conditions import Condition
 from obsynth.analysis.existence.distance import drowned_zeros
-from obsynth.analysis.existence.numbers import SystemFacts, numbers_of
+from obsynth.analysis.existence.numbers import numbers_of
+from obsynth.analysis.existence.rational import SystemFacts
 from obsynth.analysis.existence.verdicts import believed, described_distance, in_own_time, unclear_detail, zero_verdict
 from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.transformations import Transformation

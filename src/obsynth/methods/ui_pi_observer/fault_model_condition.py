@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.analysis.conditions import Condition
-from obsynth.analysis.existence.numbers import PlantNumbers, SystemFacts, WrittenNumbers, numbers_of
+from obsynth.analysis.existence.numbers import numbers_of
+from obsynth.analysis.existence.rational import PlantNumbers, SystemFacts, WrittenNumbers
 from obsynth.analysis.existence.verdicts import settled_rank
 from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.zeros import is_outside, leading_names
