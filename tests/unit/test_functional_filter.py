@@ -248,3 +248,13 @@ def test_saved_file_is_verified_alone_and_exported(tmp_path: Path) -> None:
     obsynth.export(loaded, tmp_path / "filter.mat")
     assert "fhat[tm GENCLS 1]" in obsynth.html_report(loaded, tmp_path / "page.html").read_text(encoding="utf-8")
     assert loaded.to_control().noutputs == len(loaded.observer.Cz)
+
+
+def test_some_of_the_faults_are_judged_against_those() -> None:
+    plant = obsynth.DescriptorSystem(
+        A=[[0.5, 0.1], [0.0, 0.4]], B=[[1.0], [0.0]], C=np.eye(2), Bf=np.eye(2), fault_names=["a", "b"],
+        sensor_noise={"y1": 0.01, "y2": 0.01}, dt=0.1,
+    )  # fmt: skip
+    found = obsynth.functional_filter(plant, faults=["b"])
+    scenario = obsynth.Scenario(horizon=20.0, faults={"b": obsynth.Step(size=1.0, start=2.0)}, noise=0.0)
+    assert abs(obsynth.simulate(found, scenario).fault_errors[-1, 0]) < 1e-3

@@ -186,7 +186,9 @@ def _require_fit(bench: Bench, monitor: Monitor | ParameterMonitor | None, plant
     if plants is not None:
         raise SpecError("plants are drawn for linear designs of a plant with tolerances.", path="plants")
     if isinstance(monitor, Monitor):
-        raise SpecError("This design estimates parameters: give monitor=obsynth.ParameterMonitor(...).", path="monitor")
+        raise SpecError(
+            "This design is recursive or nonlinear: give monitor=obsynth.ParameterMonitor(...).", path="monitor"
+        )
 
 
 def _drawn_benches(design: ObserverDesign, scenario: Scenario, plants: int) -> list[Bench]:
