@@ -138,10 +138,11 @@ def _lyapunov_factor(a: FloatArray, rate: float, *, discrete: bool) -> FloatArra
     """Return an upper triangular Q with ``P = Q'Q`` near a solution; ``None`` where there is none."""
     from scipy.linalg import matrix_balance, qr, solve_continuous_lyapunov, solve_discrete_lyapunov
 
-    balanced, (scale, _) = matrix_balance(a, permute=False, separate=True)
     one = np.eye(len(a))
     with warnings.catch_warnings(), np.errstate(all="ignore"):
+        # Scales of very different units are cast to positions of a permutation that nobody asked for.
         warnings.simplefilter("ignore")
+        balanced, (scale, _) = matrix_balance(a, permute=False, separate=True)
         try:
             if discrete:
                 solution = solve_discrete_lyapunov((balanced / rate).T, one) if rate > 0.0 else None
