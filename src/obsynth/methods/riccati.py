@@ -14,7 +14,8 @@ import numpy as np
 
 from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.numerics.doubling import REFUTED, doubled_riccati_solution, is_clearly_negative, is_positive
-from obsynth.numerics.norms import balancing_factors, spectral_radius
+from obsynth.numerics.norms import spectral_radius
+from obsynth.numerics.scaling import balancing_factors
 from obsynth.numerics.spectra import abscissa
 from obsynth.verification.certificates import prove_stable
 

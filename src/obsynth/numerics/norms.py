@@ -10,6 +10,7 @@ import numpy as np
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.doubling import compared_gain, gain_is_below
 from obsynth.numerics.modal_response import ModalResponse, Modes, level_crossings
+from obsynth.numerics.scaling import balancing_factors
 
 #: Entries of the matrices (complex, 16 bytes each) that responses are computed with at once.
 MOST_ENTRIES_AT_ONCE = 2_000_000
@@ -220,14 +221,6 @@ def _state_units(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
     system = np.zeros((n + inputs + outputs, n + inputs + outputs))
     system[:n, :n], system[:n, n : n + inputs], system[n + inputs :, :n] = a, b, c
     return balancing_factors(system)[:n]
-
-
-def balancing_factors(matrix: FloatArray) -> FloatArray:
-    """Return powers of two ``(n,)`` that balance a matrix ``(n, n)``: ``matrix * s / s[:, None]`` is balanced."""
-    # Not by scipy's matrix_balance, which casts the factors to integers and warns where they are too large for that.
-    from scipy.linalg.lapack import dgebal
-
-    return np.asarray(dgebal(matrix, scale=1, permute=0)[3], dtype=np.float64)
 
 
 def _peak(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, angles: FloatArray) -> tuple[float, float]:

@@ -77,6 +77,22 @@ class EquilibratedPencil:
     columns: FloatArray
 
 
+def balancing_factors(matrix: FloatArray) -> FloatArray:
+    """Return powers of two ``(n,)`` that balance a matrix ``(n, n)``: ``matrix * s / s[:, None]`` is balanced."""
+    # Not by scipy's matrix_balance, which casts the factors to integers and warns where they are too large for that.
+    from scipy.linalg.lapack import dgebal
+
+    if not matrix.size:
+        return np.ones(len(matrix))
+    return np.asarray(dgebal(np.asarray_chkfinite(matrix), scale=1, permute=0)[3], dtype=np.float64)
+
+
+def balanced_matrix(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return a matrix balanced, and the factors ``s`` that did it, as `balancing_factors` has them."""
+    factors = balancing_factors(matrix)
+    return matrix * factors / factors[:, None], factors
+
+
 def power_of_two_below(sizes: FloatArray) -> FloatArray:
     """Return the largest power of two not above each entry of ``sizes``; 1 where that is zero."""
     # frexp is exact where log2 is not, and floor leaves everything between 1 and 2 alone.

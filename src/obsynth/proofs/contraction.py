@@ -20,6 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.scaling import balanced_matrix
 from obsynth.proofs.balls import UNIT_ROUNDOFF, Ball, Enclosed, block, gamma, rounded_up
 from obsynth.proofs.definiteness import prove_positive_definite
 
@@ -136,13 +137,13 @@ def _tried(ball: Ball, rate: float, *, discrete: bool) -> Contraction | None:
 
 def _lyapunov_factor(a: FloatArray, rate: float, *, discrete: bool) -> FloatArray | None:
     """Return an upper triangular Q with ``P = Q'Q`` near a solution; ``None`` where there is none."""
-    from scipy.linalg import matrix_balance, qr, solve_continuous_lyapunov, solve_discrete_lyapunov
+    from scipy.linalg import qr, solve_continuous_lyapunov, solve_discrete_lyapunov
 
     one = np.eye(len(a))
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         # Scales of very different units are cast to positions of a permutation that nobody asked for.
         warnings.simplefilter("ignore")
-        balanced, (scale, _) = matrix_balance(a, permute=False, separate=True)
+        balanced, scale = balanced_matrix(a)
         try:
             if discrete:
                 solution = solve_discrete_lyapunov((balanced / rate).T, one) if rate > 0.0 else None

@@ -11,6 +11,7 @@ import math
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.scaling import balancing_factors
 from obsynth.proofs.balls import UNDERFLOW, UNIT_ROUNDOFF, Ball, rounded_up
 
 #: Digits in which exponentials are formed, in bits.
@@ -77,9 +78,7 @@ class _Doubling:
     """Exponentials over an interval from those over a short one, in states whose units balance the matrix."""
 
     def __init__(self, matrix: FloatArray, time: float) -> None:
-        from scipy.linalg import matrix_balance
-
-        units = matrix_balance(matrix, permute=False, separate=True)[1][0]
+        units = balancing_factors(matrix)
         self.exponents = np.asarray(np.round(np.log2(units)), dtype=np.int64)
         moved = self._moved(matrix, -1)
         balanced = Ball(moved, np.full(moved.shape, UNDERFLOW))

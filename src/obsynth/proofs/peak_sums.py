@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.scaling import balanced_matrix
 from obsynth.proofs.balls import UNDERFLOW, Ball, gamma, rounded_up
 from obsynth.proofs.contraction import Contraction
 from obsynth.proofs.exponentials import exponential
@@ -152,9 +153,7 @@ def interval_pieces(a: FloatArray, b: FloatArray, into: Ball, length: float) -> 
 
 def _natural_norm(a: FloatArray) -> float:
     """Return the norm of a matrix in units that balance it: how fast its motions are, whatever their units."""
-    from scipy.linalg import matrix_balance
-
-    return float(np.linalg.norm(matrix_balance(a, permute=False)[0], 2)) if a.size else 0.0
+    return float(np.linalg.norm(balanced_matrix(a)[0], 2)) if a.size else 0.0
 
 
 def _growth(a: FloatArray, step: float) -> FloatArray:

@@ -13,8 +13,9 @@ from obsynth.analysis.zeros import fault_zeros
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.holds import zero_order_hold
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
-from obsynth.numerics.scaling import power_of_two_below
+from obsynth.numerics.scaling import balanced_matrix, power_of_two_below
 from obsynth.numerics.sparse import dense
 from obsynth.numerics.threads import on_one_thread_if_small
 from obsynth.plants.descriptor import DescriptorSystem
@@ -75,7 +76,7 @@ def discretise(plant: DescriptorSystem | Transformation, sample_time: float) -> 
             condition="noise without a direct path",
             signals=signals,
         )
-    transition, held = _zero_order_hold(smooth.A, np.hstack([smooth.B, smooth.Bf, smooth.Bd]), sample_time)
+    transition, held = zero_order_hold(smooth.A, np.hstack([smooth.B, smooth.Bf, smooth.Bd]), sample_time)
     B, Bf, Bd = columns_of(held, (smooth.nu, smooth.nf, smooth.nd))
     factor = _noise_factor(smooth.A, smooth.Bw, sample_time)
     kept = [smooth.noise_names[i] for i in direct]
@@ -118,29 +119,14 @@ def sampling_zero_warnings(plant: DescriptorSystem) -> tuple[str, ...]:
     return tuple(dict.fromkeys(texts))
 
 
-def _zero_order_hold(A: FloatArray, inputs: FloatArray, step: float) -> tuple[FloatArray, FloatArray]:
-    """Return ``exp(A h)`` and its integral times ``inputs``, from one balanced block exponential."""
-    from scipy.linalg import expm, matrix_balance
-
-    nx, width = inputs.shape
-    balanced, (scale, _) = matrix_balance(A, permute=False, separate=True)
-    scaled = inputs / scale[:, None]
-    # Large inputs would make the exponential square more often than its dynamics need.
-    sizes = power_of_two_below(np.max(np.abs(scaled), axis=0, initial=0.0))
-    block = np.zeros((nx + width, nx + width))
-    block[:nx, :nx], block[:nx, nx:] = balanced, scaled / sizes
-    result = expm(block * step)
-    return scale[:, None] * result[:nx, :nx] / scale, scale[:, None] * result[:nx, nx:] * sizes
-
-
 def _noise_factor(A: FloatArray, noise: FloatArray, step: float) -> FloatArray:
     """Return a factor of the covariance that unit white noise through ``noise`` gathers in ``step``."""
-    from scipy.linalg import expm, matrix_balance
+    from scipy.linalg import expm
 
     nx = A.shape[0]
     if not noise.any():
         return np.zeros((nx, 0))
-    balanced, (scale, _) = matrix_balance(A, permute=False, separate=True)
+    balanced, scale = balanced_matrix(A)
     scaled = noise / scale[:, None]
     # Van Loan's block grows like exp(-A h): integrate a short step, then double it.
     doublings = math.ceil(math.log2(max(float(np.linalg.norm(balanced, 1)) * step, 1.0)))

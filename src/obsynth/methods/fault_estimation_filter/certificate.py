@@ -9,7 +9,8 @@ import numpy as np
 
 from obsynth.methods.riccati import bounded_real_matrix, normalising_change
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.norms import balancing_factors, output_covariance
+from obsynth.numerics.norms import output_covariance
+from obsynth.numerics.scaling import balancing_factors
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.verification.certificates import prove_bounded_real

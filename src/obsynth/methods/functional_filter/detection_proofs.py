@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.scaling import balanced_matrix
 from obsynth.proofs.balls import Ball, Enclosed, block, rounded_up
 from obsynth.proofs.definiteness import prove_positive_definite
 
@@ -41,11 +42,9 @@ class Transfer:
 
     def balanced(self) -> Transfer:
         """Return it in states of like size, by powers of two: nothing is rounded."""
-        from scipy.linalg import matrix_balance
-
         if not len(self.A):
             return self
-        a, (scale, _) = matrix_balance(self.A, permute=False, separate=True)
+        a, scale = balanced_matrix(self.A)
         return Transfer(
             np.asarray(a), Ball(self.B.midpoint / scale[:, None], self.B.radius / scale[:, None]),
             Ball(self.C.midpoint * scale, self.C.radius * scale), self.D,

@@ -15,6 +15,7 @@ import numpy as np
 from obsynth.methods.pd_observer.checks.certificate import prove_gain
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import spectral_abscissa
+from obsynth.numerics.scaling import balanced_matrix
 from obsynth.proofs.balls import Ball
 
 #: delta is moved by this factor when -1/delta is close to an eigenvalue, where the construction breaks down.
@@ -31,12 +32,10 @@ def explicit_certificate(
     Az: FloatArray, estimate: FloatArray, *, decay: float
 ) -> tuple[FloatArray, FloatArray, float] | None:
     """Return P1, P3 ``(n, n)`` and delta for a shipped observer; ``None`` when its errors do not decay so fast."""
-    from scipy.linalg import matrix_balance
-
     moving = Az + decay * np.eye(len(Az))
     if not spectral_abscissa(moving) < 0.0:
         return None
-    balanced, (units, _) = matrix_balance(moving, permute=False, separate=True)
+    balanced, units = balanced_matrix(moving)
     try:
         p = _gram(balanced)
         delta = _good_delta(balanced)
@@ -73,12 +72,12 @@ def symmetric_certificate(Az: FloatArray, *, decay: float) -> SymmetricCertifica
 
     Shapes: ``Az (n, n)``.
     """
-    from scipy.linalg import eigvalsh, matrix_balance
+    from scipy.linalg import eigvalsh
 
     moving = Az + decay * np.eye(len(Az))
     if not spectral_abscissa(moving) < 0.0:
         return None
-    balanced, (units, _) = matrix_balance(moving, permute=False, separate=True)
+    balanced, units = balanced_matrix(moving)
     try:
         p = _gram(balanced)
         through = p @ balanced
@@ -95,9 +94,7 @@ def coupled_certificate(a: FloatArray, delta: float) -> tuple[FloatArray, FloatA
 
     Nothing but noise where ``-1 / delta`` is an eigenvalue: the inequality is then another one.
     """
-    from scipy.linalg import matrix_balance
-
-    balanced, (units, _) = matrix_balance(a, permute=False, separate=True)
+    balanced, units = balanced_matrix(a)
     p = _gram(balanced)
     x = _coupling(balanced, p, delta)
     return p / units[:, None] / units, x / units[:, None] / units
@@ -110,9 +107,9 @@ def gain_certificate(a: FloatArray, b: Ball, c: FloatArray, gain: float) -> Floa
 
     Shapes: ``a (n, n)``, ``c (p, n)``, ``b (n, m)``.
     """
-    from scipy.linalg import matrix_balance, solve_continuous_are
+    from scipy.linalg import solve_continuous_are
 
-    balanced, (units, _) = matrix_balance(a, permute=False, separate=True)
+    balanced, units = balanced_matrix(a)
     entering, shown = b.midpoint / units[:, None], c * units
     weight = max(float(np.linalg.norm(shown, 2)) ** 2, np.finfo(np.float64).tiny)
     spare = None

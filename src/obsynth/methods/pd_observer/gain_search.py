@@ -19,6 +19,7 @@ from obsynth.methods.pd_observer.options import PdOptions
 from obsynth.methods.pd_observer.realisation import with_faults_as_states, with_sensor_noise
 from obsynth.methods.pd_observer.reduced_inequality import closed_form, reduced_lmi
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.scaling import balancing_factors
 from obsynth.plants.descriptor import DescriptorSystem
 
 #: The unit of time is the power of two nearest to this many times the inverse of the plant's fastest mode, where the
@@ -133,8 +134,6 @@ def _units(
 
 
 def _candidate_units(plant: DescriptorSystem, asked: PdOptions) -> Iterator[tuple[FloatArray, FloatArray]]:
-    from scipy.linalg import matrix_balance
-
     n, ny = plant.nx + plant.nf, plant.ny
     yield np.ones(n), np.ones(ny)
     if asked.gain_bound is not None:
@@ -142,7 +141,7 @@ def _candidate_units(plant: DescriptorSystem, asked: PdOptions) -> Iterator[tupl
     augmented = with_faults_as_states(plant, _inner_gain(plant, asked))
     system = np.zeros((n + ny, n + ny))
     system[:n, :n], system[n:, :n] = augmented.A, augmented.C
-    factors = matrix_balance(system, permute=False, separate=True)[1][0]
+    factors = balancing_factors(system)
     if np.any(factors != 1.0):
         yield factors[:n], factors[n:]
     sizes = np.abs(np.vstack([augmented.A, augmented.C]))

@@ -12,7 +12,7 @@ from obsynth.methods.pd_observer.options import PdOptions
 from obsynth.methods.pd_observer.realisation import with_sensor_noise
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import NEGLIGIBLE_MODE, decide_rank
-from obsynth.numerics.scaling import equilibrate_pencil
+from obsynth.numerics.scaling import balanced_matrix, equilibrate_pencil
 from obsynth.plants.descriptor import DescriptorSystem
 
 #: Damping ratio from which a mode dies out by itself.
@@ -27,9 +27,7 @@ def fastest_mode(a: FloatArray) -> float:
     A well-damped mode far beyond all others (that of a sensor, say) is left aside: it dies out by itself.  1 for a
     plant of integrators, which has no time scale.
     """
-    from scipy.linalg import matrix_balance
-
-    balanced = matrix_balance(a, permute=False)[0]
+    balanced = balanced_matrix(a)[0]
     modes = np.linalg.eigvals(balanced)
     sizes = np.abs(modes)
     if not np.max(sizes) > NEGLIGIBLE_MODE * float(np.linalg.norm(balanced, 2)):

@@ -10,7 +10,7 @@ import numpy as np
 from obsynth.analysis.plant_units import PlantUnits
 from obsynth.methods.ui_pi_observer.checks.decoupling import UNMOVED, frequency_grid, trajectories_at
 from obsynth.numerics.arrays import ComplexArray
-from obsynth.numerics.norms import balancing_factors
+from obsynth.numerics.scaling import balancing_factors
 from obsynth.numerics.spectra import boundary_points
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem

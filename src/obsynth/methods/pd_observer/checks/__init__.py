@@ -20,7 +20,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import spectral_abscissa
 from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.ranks import RANK_TOLERANCE
-from obsynth.numerics.scaling import balance_by_least_squares
+from obsynth.numerics.scaling import balance_by_least_squares, balanced_matrix
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
@@ -154,9 +154,7 @@ def _spectra(design: ObserverDesign, errors: PdErrorSystem) -> Iterator[Check]:
 
 
 def _balanced(matrix: FloatArray) -> FloatArray:
-    from scipy.linalg import matrix_balance
-
-    return np.asarray(matrix_balance(matrix, permute=False)[0])
+    return np.asarray(balanced_matrix(matrix)[0])
 
 
 def _parts(plant: DescriptorSystem, errors: PdErrorSystem) -> Iterator[Check]:

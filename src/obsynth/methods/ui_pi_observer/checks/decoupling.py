@@ -13,8 +13,8 @@ import numpy as np
 from obsynth.analysis.plant_units import PlantUnits
 from obsynth.methods.ui_pi_observer.pencils import equilibrated
 from obsynth.numerics.arrays import ComplexArray, FloatArray
-from obsynth.numerics.norms import balancing_factors
 from obsynth.numerics.ranks import RANK_TOLERANCE
+from obsynth.numerics.scaling import balancing_factors
 from obsynth.numerics.spectra import boundary_points, eigenvalues, speeds
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
