@@ -177,21 +177,21 @@ def _checked_bound(dual: _DualProblem, z1: FloatArray, corner: FloatArray, last:
 def least_gain_certificate(
     work: DescriptorSystem, gains: Mapping[str, FloatArray], factor: FloatArray, *, gain: float, free_weight: bool,
     solver: str,
-) -> dict[str, FloatArray]:  # fmt: skip
-    """Return the matrices of a proof that no such filter has a gain below ``gain``; none where none is found.
+) -> tuple[dict[str, FloatArray], float]:  # fmt: skip
+    """Return the matrices of a proof that no such filter has a gain below ``gain``, and what they prove; else none.
 
     Shapes: ``factor (n, n)`` maps errors to coordinates in which they are of natural sizes.
     """
     pairs = InvisiblePairs.of(work, gains)
     if pairs is None:
-        return {}
+        return {}, 0.0
     s, top, bottom, image, shown, z, zd = (nearest_doubles(getattr(pairs, name)) for name in _PARTS)
     # Orthonormal coordinates: of the errors in the given sizes, of the pairs as they come.
     back = np.linalg.pinv(np.linalg.qr(factor @ s, mode="r")) if s.shape[1] else np.zeros((0, 0))
     whole = np.vstack([np.linalg.pinv(back) @ top, bottom]) if s.shape[1] else bottom
     turn = np.linalg.pinv(np.linalg.qr(whole, mode="r")) if whole.shape[1] else np.zeros((0, 0))
     if not all(np.all(np.isfinite(part)) for part in (back, turn)):
-        return {}
+        return {}, 0.0
     forth = np.linalg.pinv(back)
     moved = (forth @ top @ turn, bottom @ turn, forth @ image @ turn)
     best: dict[str, FloatArray] = {}
@@ -211,7 +211,7 @@ def least_gain_certificate(
         bound = pairs.bound(found, free_weight=free_weight)
         if bound > least:
             best, least = found, bound
-    return best if least >= gain * (1.0 - PROVED_SHARE) else {}
+    return (best, least) if least >= gain * (1.0 - PROVED_SHARE) else ({}, 0.0)
 
 
 def _two_steps(

@@ -86,9 +86,14 @@ def synthesise(plant: DescriptorSystem, asked: FilterOptions, *, progress: Calla
     witnesses = {"P_factor": factor, "tracking": tracking}
     if plant.nd:
         progress("proving that no filter does better")
-        witnesses |= least_gain_certificate(
+        proof, proved = least_gain_certificate(
             prepared.plant, gains, factor, gain=least.gain, free_weight=free, solver=asked.solver
         )
+        witnesses |= proof
+        # The search may end below what is proved, by its tolerance: no filter is there.
+        claims["gamma_min"] = min(max(least.gain, proved), level)
+        if "gamma_bracket_high" in claims:
+            claims["gamma_bracket_high"] = max(claims["gamma_bracket_high"], claims["gamma_min"])
     resolved = {
         "gamma": asked.gamma,
         "gamma_search": asked.gamma_search,
