@@ -90,7 +90,7 @@ def existence(plant: DescriptorSystem, model: Exosystem) -> Existence:
     # (D1) and the others fail independently: a user wants to know both.
     found = [enough, solvable, _zero_condition(working, scaled, units)]
     if found[-1].holds:
-        found += model_conditions(working, model, scaled, courses, units)
+        found += model_conditions(working, model, scaled, courses, units, written=plant)
     if not all(condition.holds for condition in found):
         return Existence(tuple(found), working, transformation, nothing)
     found += order_conditions(scaled, courses, units)

@@ -138,34 +138,63 @@ def _factor_of(model: Exosystem, value: complex) -> fmpz_poly | None:
 
 
 def model_conditions(
-    given: DescriptorSystem, courses: Exosystem, plant: DescriptorSystem, model: Exosystem, units: PlantUnits
-) -> list[Condition]:
-    """Test (D3) at each unstable eigenvalue of the fault model, upper half plane only."""
+    given: DescriptorSystem, courses: Exosystem, plant: DescriptorSystem, model: Exosystem, units: PlantUnits,
+    *, written: DescriptorSystem,
+) -> list[Condition]:  # fmt: skip
+    """Test (D3) at each unstable eigenvalue of the fault model, upper half plane only.
+
+    ``written`` is the plant behind ``given``, with its algebraic equations.
+    """
     unstable = [complex(value) for value in model.eigenvalues if value.imag >= 0.0 and is_outside(value, plant.dt)]
     found = []
     for value in sorted(unstable, key=lambda value: (value.real, value.imag)):
         lost = exact_loss(given, courses, units.eigenvalue(value))
-        found.append(_model_condition(plant, model, value, units, lost))
+        found.append(_model_condition(plant, model, value, units, lost, (written, courses)))
         if not found[-1].holds:
             break
     return found
 
 
+@dataclass(frozen=True, eq=False)
+class _ModelPencil:
+    """The matrix of (D3) at one eigenvalue, scaled, with what its columns stand for."""
+
+    scaled: NDArray[Any]
+    columns: FloatArray
+    courses: NDArray[Any]
+    inputs: FloatArray
+    direct: FloatArray
+
+    @classmethod
+    def of(cls, plant: DescriptorSystem, model: Exosystem, value: complex) -> _ModelPencil:
+        inputs, direct = independent_disturbances(plant)
+        courses = model.Cw @ kernel(model.Phi - value * np.eye(model.order))
+        matrix = np.block([
+            [value * plant.E - plant.A, -plant.Bf @ courses, -inputs],
+            [plant.C.astype(complex), plant.Df @ courses, direct],
+        ])  # fmt: skip
+        return cls(*equilibrated(matrix), courses, inputs, direct)
+
+    def decision(self, lost: int | None) -> RankDecision:
+        width = self.scaled.shape[1]
+        found = decide_rank(self.scaled, expected=width, equilibrated=False)
+        return settled_rank(found, None if lost is None else width - lost)
+
+
 def _model_condition(
-    plant: DescriptorSystem, model: Exosystem, value: complex, units: PlantUnits, lost: int | None
-) -> Condition:
-    inputs, direct = independent_disturbances(plant)
-    courses = model.Cw @ kernel(model.Phi - value * np.eye(model.order))
-    width = courses.shape[1]
-    matrix = np.block([
-        [value * plant.E - plant.A, -plant.Bf @ courses, -inputs],
-        [plant.C.astype(complex), plant.Df @ courses, direct],
-    ])  # fmt: skip
-    scaled, columns = equilibrated(matrix)
-    decision = settled_rank(
-        decide_rank(scaled, expected=matrix.shape[1], equilibrated=False),
-        None if lost is None else matrix.shape[1] - lost,
-    )
+    plant: DescriptorSystem, model: Exosystem, value: complex, units: PlantUnits, lost: int | None,
+    written: tuple[DescriptorSystem, Exosystem],
+) -> Condition:  # fmt: skip
+    pencil = _ModelPencil.of(plant, model, value)
+    decision = pencil.decision(lost)
+    if decision.full and lost is not None:
+        # Natural units make much of a fault of which elimination has left no more than rounding.
+        before = _ModelPencil.of(*written, units.eigenvalue(value))
+        again = before.decision(lost)
+        if not again.full:
+            plant, pencil, decision = written[0], before, again
+    scaled, columns, courses = pencil.scaled, pencil.columns, pencil.courses
+    inputs, direct, width = pencil.inputs, pencil.direct, courses.shape[1]
     own = units.eigenvalue(value)
     where = f"{'s' if plant.dt == 0.0 else 'z'} = {number(own)}"
     signals: tuple[str, ...] = ()
