@@ -17,7 +17,7 @@ from obsynth.analysis.transformations.recovery import Transformation, plant_and_
 from obsynth.errors import PreconditionError, SpecError, VerificationError
 from obsynth.methods.advice import with_advice
 from obsynth.methods.choosing.automatic import automatic_design
-from obsynth.methods.drowned_designs import require_above_rounding
+from obsynth.methods.drowned_designs import require_above_rounding, rounding_notes
 from obsynth.methods.method_spec import MethodSpec, PlantKind, Synthesis
 from obsynth.methods.registry import AUTO, REGISTRY, method_spec, methods_for
 from obsynth.methods.verifying import verify
@@ -294,6 +294,7 @@ def verified(
         )
     if isinstance(draft.observer, LinearObserver) and isinstance(draft.plant, DescriptorSystem):
         require_above_rounding(draft.plant, draft.observer)
+        draft = draft.replace(notes=(*draft.notes, *rounding_notes(draft.plant, draft.observer)))
     return draft.replace(report=report)
 
 

@@ -1,0 +1,51 @@
+"""Plants of which elimination or natural units make much of what is rounding, and observers whose numbers cancel."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import obsynth
+
+
+def test_a_fault_of_which_elimination_leaves_only_rounding_is_unclear() -> None:
+    # The algebraic equation takes the fault up whole, but for the last digit of the number with fifteen of them.
+    plant = obsynth.DescriptorSystem(
+        [[1.0, 0.0, 2.0**-25], [-65536.0, 128.0, -(2.0**-9)], [0.0, 0.0, 0.0]],
+        [[1.5, -(2.0**-9), 5.21540641784668e-08], [-8192.0, 32.0, -0.000732421875], [8.0, 0.0, 2.0**-23]],
+        C=[[-4096.0, 16.0, -(2.0**-13)], [-4096.0, 32.0, -(2.0**-13)]],
+        Bf=[[2.0**-21], [-0.03125], [-(2.0**-17)]],
+        Bd=[[0.375], [0.0], [2.0]],
+        dt=1.0,
+    )
+    with pytest.raises(obsynth.PreconditionError, match=r"Unclear.*\(D3\)") as caught:
+        obsynth.ui_pi_observer(plant)
+    assert caught.value.condition == "(D3) fault model at 1"
+
+
+def cancelling() -> obsynth.DescriptorSystem:
+    """A plant without noise and almost without a least gain: the filter's numbers cancel each other."""
+    plant = obsynth.DescriptorSystem(
+        [[64.0, -131072.0, 256.0], [0.0, 128.0, -0.25], [0.0, 0.0, 256.0]],
+        [[32.0, -131072.0, 256.0], [0.03125, -128.0, 0.125], [16.0, -32768.0, 0.0]],
+        C=[[-0.0078125, 0.0, 0.03125], [0.0009765625, 2.0, -0.01171875]],
+        Bf=[[-524288.0], [-256.0], [-524288.0]],
+        Bd=[[-4.0], [0.0078125], [0.0]],
+        dt=1.0,
+    )
+    return obsynth.eliminate_algebraic_states(plant).plant
+
+
+def test_an_observer_whose_numbers_cancel_says_what_that_does() -> None:
+    design = obsynth.fault_estimation_filter(cancelling())
+    (note,) = [note for note in design.notes if "cancel each other" in note]
+    assert "0.0002 of the fault, and by more" in note
+
+
+def test_other_observers_do_not_say_so() -> None:
+    rng = np.random.default_rng(3)
+    plant = obsynth.DescriptorSystem(
+        A=0.5 * np.eye(3) + 0.1 * rng.normal(size=(3, 3)), B=np.zeros((3, 0)), C=np.eye(3)[:2] + 0.1,
+        Bf=[[1.0], [0.0], [0.0]], Bd=[[0.0], [0.0], [0.1]], dt=0.1,
+    )  # fmt: skip
+    assert not [note for note in obsynth.fault_estimation_filter(plant).notes if "cancel" in note]
