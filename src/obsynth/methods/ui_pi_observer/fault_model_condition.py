@@ -187,7 +187,7 @@ def _model_condition(
 ) -> Condition:  # fmt: skip
     pencil = _ModelPencil.of(plant, model, value)
     decision = pencil.decision(lost)
-    if decision.full and lost is not None:
+    if decision.full and lost is not None and written[0].nx > plant.nx:
         # Natural units make much of a fault of which elimination has left no more than rounding.
         before = _ModelPencil.of(*written, units.eigenvalue(value))
         again = before.decision(lost)
