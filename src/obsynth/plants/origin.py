@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from obsynth.numerics.arrays import FloatArray
+
 if TYPE_CHECKING:
     from obsynth.plants.descriptor import DescriptorSystem
 
@@ -22,17 +24,25 @@ class PlantOrigin:
 
     Fields: exact: The `DECISIVE` matrices; sample_time: Where ``exact`` is a continuous plant and the plant itself is
     that one sampled with a zero-order hold; computed: Whether some of the numbers behind them were computed in floating
-    point.
+    point; sizes: Of the matrices of the plant itself, how large the terms are that each entry is a sum of (``A, Bf, Bd,
+    C, Df, Dd``): what rounding of the data behind it may change is relative to those.
     """
 
     exact: Mapping[str, tuple[tuple[Fraction, ...], ...]]
     sample_time: Fraction | None = None
     computed: bool = False
+    sizes: Mapping[str, FloatArray] | None = None
 
 
 def origin_of(plant: DescriptorSystem) -> PlantOrigin | None:
     """Return what a plant was made from, where that is known and its matrices have not been changed since."""
     return getattr(plant, "_origin", None)
+
+
+def sized_plant(plant: DescriptorSystem) -> DescriptorSystem | None:
+    """Return the plant with the sizes of the terms of its entries in their place; ``None`` where there are none."""
+    origin = origin_of(plant)
+    return None if origin is None or origin.sizes is None else plant.replace(**origin.sizes)
 
 
 def with_origin(plant: DescriptorSystem, origin: PlantOrigin | None) -> DescriptorSystem:

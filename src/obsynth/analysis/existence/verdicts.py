@@ -30,18 +30,23 @@ from obsynth.numerics.ranks import RankDecision
 from obsynth.plants.descriptor import DescriptorSystem
 
 
-def settled_rank(decision: RankDecision, exact_rank: int | None) -> RankDecision:
-    """Return a rank decision with the exact rank in place of that by a tolerance, or unclear."""
+def settled_rank(decision: RankDecision, exact_rank: int | None, share: float = np.inf) -> RankDecision:
+    """Return a rank decision with the exact rank in place of that by a tolerance, or unclear.
+
+    ``share``: the least singular value beside the terms that the entries are sums of, where those are known.
+    """
     if exact_rank is None:
         return decision
     if exact_rank < decision.expected:
         return replace(decision, rank=exact_rank, means="exact")
     values = decision.singular_values
     needed = decision.expected - 1
-    enough = decision.expected == 0 or (len(values) > needed and values[needed] > DROWNED * values[0])
+    enough = decision.expected == 0 or (
+        len(values) > needed and values[needed] > DROWNED * values[0] and share > DROWNED
+    )
     if enough:
-        return replace(decision, rank=decision.expected, means="exact")
-    return replace(decision, rank=min(decision.rank, decision.expected - 1), means="unclear")
+        return replace(decision, rank=decision.expected, means="exact", share=share)
+    return replace(decision, rank=min(decision.rank, decision.expected - 1), means="unclear", share=share)
 
 
 #: Computed data hold more than one rounding: below this distance a zero of theirs is one.
@@ -71,12 +76,14 @@ class ZeroVerdict:
         )
 
 
-def zero_verdict(facts: SystemFacts, E: FloatArray, A: FloatArray, *, nx: int, discrete: bool) -> ZeroVerdict:
-    """Return the answer for the pencil ``A - s E (m, n)`` of which the facts are known."""
+def zero_verdict(
+    facts: SystemFacts, E: FloatArray, A: FloatArray, *, nx: int, discrete: bool, sizes: FloatArray | None = None
+) -> ZeroVerdict:
+    """Return the answer for the pencil ``A - s E (m, n)`` of which the facts are known; ``sizes`` of the terms of A."""
     facts = believed(facts, E, A, nx=nx)
     if not facts.full or facts.outside:
         return ZeroVerdict("no", facts)
-    distance = distance_to_loss(E, A, nx=nx, discrete=discrete, zeros=facts.zeros)
+    distance = distance_to_loss(E, A, nx=nx, discrete=discrete, zeros=facts.zeros, sizes=sizes)
     lost = _lost_in_computing(facts, E, A, nx=nx, discrete=discrete)
     distance = min(distance, lost or distance, key=lambda found: found.value)
     return ZeroVerdict("unclear" if distance.value <= DROWNED or lost else "yes", facts, distance)

@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from obsynth.analysis.conditions import Condition, rank_condition
+from obsynth.analysis.existence.distance import least_share
 from obsynth.analysis.existence.numbers import numbers_of
 from obsynth.analysis.existence.verdicts import described_distance, settled_rank, unclear_detail, zero_verdict
 from obsynth.analysis.plant_units import PlantUnits
@@ -26,6 +27,7 @@ from obsynth.methods.fault_estimation_filter.prepared_plant import PreparedPlant
 from obsynth.numerics.pencils import PencilStructure, regularity
 from obsynth.numerics.ranks import decide_rank
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.origin import sized_plant
 
 #: At most this many signals are named in a failed condition.
 MOST_NAMES = 4
@@ -125,11 +127,14 @@ def _rank_conditions(plant: DescriptorSystem) -> list[Condition]:
         signals=() if plant.nf <= plant.ny else plant.fault_names,
     )
     numbers = numbers_with_fault_states(plant)
-    natural = PlantUnits.of(plant).rounded().scaled_plant(plant)
+    units, terms = PlantUnits.of(plant).rounded(), sized_plant(plant)
+    natural, sizes = units.scaled_plant(plant), None if terms is None else units.scaled_plant(terms)
+    columns = np.vstack([natural.Bf, natural.Df])
     faults = settled_rank(
-        decide_rank(np.vstack([natural.Bf, natural.Df]), expected=plant.nf),
+        decide_rank(columns, expected=plant.nf),
         # Faults that act on the outputs are columns of Bf too, once they are states.
         None if numbers is None else numbers.rank(numbers.blocks([[numbers.matrix("Bf")]])),
+        np.inf if sizes is None else least_share(columns, np.vstack([sizes.Bf, sizes.Df])),
     )
     ranks = [
         enough,
@@ -199,7 +204,11 @@ def _zero_conditions(plant: DescriptorSystem) -> list[Condition]:
         return [_never_shown(hidden_direction(plant, missing=facts.columns - facts.normal_rank)[1])]
     wide_e, wide_a = system_pencil(plant.E, plant.A, plant.Bf, plant.C, plant.Df)
     units = PlantUnits.of(plant).rounded()
-    verdict = zero_verdict(facts, *units.scaled_pencil(wide_e, wide_a, units.faults), nx=plant.nx, discrete=True)
+    terms, sizes = sized_plant(plant), None
+    if terms is not None:
+        sizes = units.scaled_pencil(wide_e, np.block([[terms.A, terms.Bf], [terms.C, terms.Df]]), units.faults)[1]
+    scaled = units.scaled_pencil(wide_e, wide_a, units.faults)
+    verdict = zero_verdict(facts, *scaled, nx=plant.nx, discrete=True, sizes=sizes)
     facts = verdict.facts
     if facts.outside:
         return [_zero_failure(plant, zero_at(plant.E, plant.A, facts.outside[0], plant.Bf, plant.C, plant.Df))]

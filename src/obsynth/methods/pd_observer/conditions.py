@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from obsynth.analysis.conditions import Condition, rank_condition
+from obsynth.analysis.existence.distance import least_share
 from obsynth.analysis.existence.numbers import numbers_of
 from obsynth.analysis.existence.rational import PlantNumbers, WrittenNumbers
 from obsynth.analysis.existence.verdicts import described_distance, settled_rank, unclear_detail, zero_verdict
@@ -26,6 +27,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.ranks import decide_rank, equilibrate
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.origin import sized_plant
 from obsynth.proofs.written_numbers import computed_entries
 
 #: At most this many signals are named in a failed condition.
@@ -100,12 +102,14 @@ def _explicit_conditions(plant: DescriptorSystem) -> Iterator[Condition]:
         f"{plant.nf} faults and {plant.ny} output(s). Measure more, or leave a fault out.",
         signals=plant.fault_names,
     )  # fmt: skip
-    natural = PlantUnits.of(plant).rounded().scaled_plant(plant)
+    units, terms = PlantUnits.of(plant).rounded(), sized_plant(plant)
+    natural, sizes = units.scaled_plant(plant), None if terms is None else units.scaled_plant(terms)
     columns = np.vstack([natural.Bf, natural.Df])
     yield rank_condition(
         "rank F", settled_rank(
             decide_rank(columns, expected=plant.nf),
             None if numbers is None else numbers.rank(numbers.blocks([[numbers.matrix("Bf")], [numbers.matrix("Df")]])),
+            np.inf if sizes is None else least_share(columns, np.vstack([sizes.Bf, sizes.Df])),
         ),
         "some faults act nowhere, or in the same direction as others, and cannot be told apart.",
         source="Filasova et al., eq. (3)", signals=_null_names(columns, plant.fault_names),
@@ -119,6 +123,8 @@ def _explicit_conditions(plant: DescriptorSystem) -> Iterator[Condition]:
             None if numbers is None else numbers.rank(numbers.blocks([
                 [numbers.matrix("A"), numbers.matrix("Bf")], [numbers.matrix("C"), numbers.matrix("Df")],
             ])),
+            np.inf if sizes is None
+            else least_share(rosenbrock, np.block([[sizes.A, sizes.Bf], [sizes.C, sizes.Df]])),
         ),
         f"there is a zero at s = 0, where a constant fault {', '.join(map(repr, hidden))} does not show in the outputs "
         "once the states have settled. Measure another signal.",
@@ -145,8 +151,9 @@ def _detectability(plant: DescriptorSystem, numbers: PlantNumbers) -> Condition:
     none = np.zeros((plant.nx, 0))
     facts = numbers.system(numbers.zeros(plant.nx, 0), numbers.zeros(plant.ny, 0))
     wide_e, wide_a = system_pencil(plant.E, plant.A, none, plant.C, np.zeros((plant.ny, 0)))
-    scaled = PlantUnits.of(plant).rounded().scaled_pencil(wide_e, wide_a)
-    verdict = zero_verdict(facts, *scaled, nx=plant.nx, discrete=False)
+    units, terms = PlantUnits.of(plant).rounded(), sized_plant(plant)
+    sizes = None if terms is None else units.scaled_pencil(wide_e, np.vstack([terms.A, terms.C]))[1]
+    verdict = zero_verdict(facts, *units.scaled_pencil(wide_e, wide_a), nx=plant.nx, discrete=False, sizes=sizes)
     facts = verdict.facts
     if verdict.answer == "no":
         return _hidden_mode(plant, list(facts.outside))

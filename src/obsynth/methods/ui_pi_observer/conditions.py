@@ -53,6 +53,7 @@ from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.pencils import finite_zeros
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.exosystems import Exosystem
+from obsynth.plants.origin import sized_plant
 
 #: Drops of the augmented pencil this close to each other, relative to their size or one, may be one multiple mode.
 SCATTER = 1e-2
@@ -90,7 +91,7 @@ def existence(plant: DescriptorSystem, model: Exosystem) -> Existence:
     # (D1) and the others fail independently: a user wants to know both.
     found = [enough, solvable, _zero_condition(working, scaled, units)]
     if found[-1].holds:
-        found += model_conditions(working, model, scaled, courses, units, written=plant)
+        found += model_conditions(working, model, scaled, courses, units)
     if not all(condition.holds for condition in found):
         return Existence(tuple(found), working, transformation, nothing)
     found += order_conditions(scaled, courses, units)
@@ -131,7 +132,11 @@ def _zero_condition(given: DescriptorSystem, plant: DescriptorSystem, units: Pla
     if not facts.full:
         return _hidden_trajectories(facts.normal_rank, facts.columns)
     wide_e, wide_a = system_pencil(plant.E, plant.A, inputs, plant.C, direct)
-    verdict = zero_verdict(_timed(facts, units.rate), wide_e, wide_a, nx=plant.nx, discrete=plant.dt > 0.0)
+    terms, sizes = sized_plant(given), None
+    if terms is not None:
+        terms = units.scaled_plant(terms)
+        sizes = np.block([[terms.A, terms.Bd[:, kept]], [terms.C, terms.Dd[:, kept]]])
+    verdict = zero_verdict(_timed(facts, units.rate), wide_e, wide_a, nx=plant.nx, discrete=plant.dt > 0.0, sizes=sizes)
     if verdict.facts.outside:
         zero = zero_at(plant.E, plant.A, verdict.facts.outside[0], inputs, plant.C, direct)
         return _zero_failure(plant, units, zero, inputs, direct)

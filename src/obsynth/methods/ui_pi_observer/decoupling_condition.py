@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from obsynth.analysis.conditions import Condition
+from obsynth.analysis.existence.distance import least_share
 from obsynth.analysis.existence.numbers import numbers_of
 from obsynth.analysis.existence.verdicts import settled_rank
 from obsynth.analysis.plant_units import PlantUnits
@@ -22,7 +23,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import RANK_TOLERANCE, RankDecision, decide_rank
 from obsynth.numerics.scaling import equilibrate_pencil
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.origin import origin_of
+from obsynth.plants.origin import origin_of, sized_plant
 
 #: A direct effect on an output, relative to the effect on the states (both in scaled units), that elimination may
 #: leave by rounding.
@@ -54,8 +55,13 @@ def decoupling_rank(plant: DescriptorSystem) -> RankDecision:
             [tall, square, dd],
         ]
     )
-    decision = decide_rank(_decoupling_matrix(scaled), expected=plant.nx + numbers.rank(dd) + disturbance_rank(plant))
-    return settled_rank(decision, numbers.rank(matrix))
+    expected = plant.nx + numbers.rank(dd) + disturbance_rank(plant)
+    decision, terms = decide_rank(_decoupling_matrix(scaled), expected=expected), sized_plant(plant)
+    if terms is None:
+        return settled_rank(decision, numbers.rank(matrix))
+    sizes = PlantUnits.of(plant).rounded().scaled_plant(terms)
+    share = least_share(_decoupling_matrix(scaled), _decoupling_matrix(sizes), rank=expected)
+    return settled_rank(decision, numbers.rank(matrix), share)
 
 
 def _scaled(plant: DescriptorSystem) -> DescriptorSystem:

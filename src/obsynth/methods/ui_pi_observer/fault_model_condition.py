@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.analysis.conditions import Condition
+from obsynth.analysis.existence.distance import least_share
 from obsynth.analysis.existence.numbers import numbers_of
 from obsynth.analysis.existence.rational import PlantNumbers, SystemFacts, WrittenNumbers
 from obsynth.analysis.existence.verdicts import settled_rank
@@ -35,6 +36,7 @@ from obsynth.numerics.pencils import finite_zeros
 from obsynth.numerics.ranks import RankDecision, decide_rank
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.exosystems import Exosystem
+from obsynth.plants.origin import sized_plant
 
 if TYPE_CHECKING:
     from flint import fmpz_poly
@@ -138,18 +140,16 @@ def _factor_of(model: Exosystem, value: complex) -> fmpz_poly | None:
 
 
 def model_conditions(
-    given: DescriptorSystem, courses: Exosystem, plant: DescriptorSystem, model: Exosystem, units: PlantUnits,
-    *, written: DescriptorSystem,
-) -> list[Condition]:  # fmt: skip
-    """Test (D3) at each unstable eigenvalue of the fault model, upper half plane only.
-
-    ``written`` is the plant behind ``given``, with its algebraic equations.
-    """
+    given: DescriptorSystem, courses: Exosystem, plant: DescriptorSystem, model: Exosystem, units: PlantUnits
+) -> list[Condition]:
+    """Test (D3) at each unstable eigenvalue of the fault model, upper half plane only."""
+    terms = sized_plant(given)
+    sizes = None if terms is None else units.scaled_plant(terms)
     unstable = [complex(value) for value in model.eigenvalues if value.imag >= 0.0 and is_outside(value, plant.dt)]
     found = []
     for value in sorted(unstable, key=lambda value: (value.real, value.imag)):
         lost = exact_loss(given, courses, units.eigenvalue(value))
-        found.append(_model_condition(plant, model, value, units, lost, (written, courses)))
+        found.append(_model_condition(plant, model, value, units, lost, sizes))
         if not found[-1].holds:
             break
     return found
@@ -164,35 +164,41 @@ class _ModelPencil:
     courses: NDArray[Any]
     inputs: FloatArray
     direct: FloatArray
+    share: float = np.inf
 
     @classmethod
-    def of(cls, plant: DescriptorSystem, model: Exosystem, value: complex) -> _ModelPencil:
+    def of(
+        cls, plant: DescriptorSystem, model: Exosystem, value: complex, sizes: DescriptorSystem | None
+    ) -> _ModelPencil:
+        """Return the matrix; ``sizes`` of the terms that the entries of the plant are sums of."""
         inputs, direct = independent_disturbances(plant)
         courses = model.Cw @ kernel(model.Phi - value * np.eye(model.order))
         matrix = np.block([
             [value * plant.E - plant.A, -plant.Bf @ courses, -inputs],
             [plant.C.astype(complex), plant.Df @ courses, direct],
         ])  # fmt: skip
-        return cls(*equilibrated(matrix), courses, inputs, direct)
+        if sizes is None:
+            return cls(*equilibrated(matrix), courses, inputs, direct)
+        # Disturbances that are combinations of others are judged as those: their own terms are not known.
+        own = inputs.shape == plant.Bd.shape
+        whole = np.block([
+            [abs(value) * sizes.E + sizes.A, sizes.Bf @ np.abs(courses), sizes.Bd if own else np.abs(inputs)],
+            [sizes.C, sizes.Df @ np.abs(courses), sizes.Dd if own else np.abs(direct)],
+        ])  # fmt: skip
+        return cls(*equilibrated(matrix), courses, inputs, direct, least_share(matrix, whole))
 
     def decision(self, lost: int | None) -> RankDecision:
         width = self.scaled.shape[1]
         found = decide_rank(self.scaled, expected=width, equilibrated=False)
-        return settled_rank(found, None if lost is None else width - lost)
+        return settled_rank(found, None if lost is None else width - lost, self.share)
 
 
 def _model_condition(
     plant: DescriptorSystem, model: Exosystem, value: complex, units: PlantUnits, lost: int | None,
-    written: tuple[DescriptorSystem, Exosystem],
+    sizes: DescriptorSystem | None,
 ) -> Condition:  # fmt: skip
-    pencil = _ModelPencil.of(plant, model, value)
+    pencil = _ModelPencil.of(plant, model, value, sizes)
     decision = pencil.decision(lost)
-    if decision.full and lost is not None and written[0].nx > plant.nx:
-        # Natural units make much of a fault of which elimination has left no more than rounding.
-        before = _ModelPencil.of(*written, units.eigenvalue(value))
-        again = before.decision(lost)
-        if not again.full:
-            plant, pencil, decision = written[0], before, again
     scaled, columns, courses = pencil.scaled, pencil.columns, pencil.courses
     inputs, direct, width = pencil.inputs, pencil.direct, courses.shape[1]
     own = units.eigenvalue(value)
