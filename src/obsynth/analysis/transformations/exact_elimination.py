@@ -120,7 +120,7 @@ def _term_sizes(
 def rounded_once(
     found: ExactElimination, plant: DescriptorSystem, dynamic: FloatArray | None
 ) -> tuple[dict[str, FloatArray], dict[str, FloatArray], dict[str, FloatArray]]:
-    """Return matrices, recovery and sizes of terms as doubles; states ``dynamic (nx, count)`` in place of the pivots."""
+    """Return matrices, recovery and sizes of terms as doubles; states ``dynamic (nx, count)`` instead of the pivots."""
     import flint
 
     from obsynth.proofs.enclosed_pencils import enclosed
