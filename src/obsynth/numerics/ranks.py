@@ -104,10 +104,7 @@ class RankDecision:
             lost = "on the numbers as written; if their last digits are off, any gains would be about 1e16"
             return f"rank {self.rank} of {self.expected} (exactly{self._margin if self.full else f', {lost}'})"
         if self.means == "unclear":
-            return (
-                f"rank {self.expected} exactly, but less of data that differ by rounding{self._margin}; data with more "
-                "digits, or other units of what they describe, would decide it"
-            )
+            return f"rank {self.expected} exactly, but less of data that differ by rounding{self._margin}"
         note = "" if self.clear else ", unclear: check the scaling of the data"
         return f"rank {self.rank} of {self.expected} (gap {self.gap:.1e}{note})"
 

@@ -25,13 +25,15 @@ class PlantOrigin:
     Fields: exact: The `DECISIVE` matrices; sample_time: Where ``exact`` is a continuous plant and the plant itself is
     that one sampled with a zero-order hold; computed: Whether some of the numbers behind them were computed in floating
     point; sizes: Of the matrices of the plant itself, how large the terms are that each entry is a sum of (``A, Bf, Bd,
-    C, Df, Dd``): what rounding of the data behind it may change is relative to those.
+    C, Df, Dd``): what rounding of the data behind it may change is relative to those; states: How many the plant as
+    written has, algebraic ones included; 0 where that is not known.
     """
 
     exact: Mapping[str, tuple[tuple[Fraction, ...], ...]]
     sample_time: Fraction | None = None
     computed: bool = False
     sizes: Mapping[str, FloatArray] | None = None
+    states: int = 0
 
 
 def origin_of(plant: DescriptorSystem) -> PlantOrigin | None:

@@ -8,6 +8,7 @@ Modes that no output shows: those of the numbers as written, and those that only
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,8 +20,10 @@ from obsynth.analysis.existence.distance import (
     drowned_zeros,
     relative_singular_value,
 )
+from obsynth.analysis.existence.named_pencils import named_pencil, unclear
 from obsynth.analysis.existence.numbers import numbers_of
 from obsynth.analysis.existence.rational import SystemFacts
+from obsynth.analysis.existence.witnesses import Unclear
 from obsynth.analysis.far_zeros import system_zeros
 from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.zeros import are_outside, is_outside
@@ -49,6 +52,8 @@ def settled_rank(decision: RankDecision, exact_rank: int | None, share: float = 
     return replace(decision, rank=min(decision.rank, decision.expected - 1), means="unclear", share=share)
 
 
+#: What decides what rounding of the data leaves open.
+DECIDER = "Data with more digits, or an output in which this shows more, would decide it."
 #: Computed data hold more than one rounding: below this distance a zero of theirs is one.
 COMPUTED = 1e-12
 
@@ -129,16 +134,39 @@ def described_distance(verdict: ZeroVerdict) -> str:
 
 
 def unclear_detail(verdict: ZeroVerdict, what: str) -> str:
-    """Return what cannot be told apart, the tolerance, the witness, and what would decide it."""
-    found = verdict.distance
-    size = 0.0 if found is None else found.value
-    where = "" if found is None else f" near {found.point:.6g}"
+    """Return what cannot be told apart."""
+    size = 0.0 if verdict.distance is None else verdict.distance.value
     return (
-        f"{what} exists for the numbers as written ({verdict.means}), but a plant whose scaled entries differ by "
-        f"{size:.1g} of the largest has a zero{where} and none: rounding of the data or of any gains is about "
-        f"{DROWNED:.0e}. Data with more digits in other states or units, or an output in which this shows more, would "
-        "decide it."
+        f"{what} exists for the numbers as written ({verdict.means}), but the least singular value of the scaled "
+        f"pencil outside is {size:.1g}: rounding of the data, or of any gains, is as large."
     )
+
+
+def zero_doubt(
+    plant: DescriptorSystem, units: PlantUnits, verdict: ZeroVerdict, layout: Sequence[Sequence[str | None]],
+    *, kept: Mapping[str, Sequence[int]] | None = None, what: str,
+) -> Unclear:  # fmt: skip
+    """Return why it is unclear whether a pencil has a zero outside, with the point in the time of the plant."""
+    found = verdict.distance
+    point = 0j if found is None else found.point
+    where = f"{point.real:.6g}" if point.imag == 0.0 else f"{point:.6g}"
+    tolerance = DROWNED if found is None else max(DROWNED, found.value)
+    return unclear(
+        plant, named_pencil(plant, units, layout, kept=kept), tolerance=tolerance, point=point, dt=plant.dt,
+        other=f"has a zero at {where}, and no {what}", decider=DECIDER,
+    )  # fmt: skip
+
+
+def rank_doubt(
+    plant: DescriptorSystem, units: PlantUnits, decision: RankDecision, layout: Sequence[Sequence[str | None]],
+    *, rows: bool = False, kept: Mapping[str, Sequence[int]] | None = None,
+) -> Unclear:  # fmt: skip
+    """Return why it is unclear whether a block matrix has full column rank (row rank with ``rows``)."""
+    named = named_pencil(plant, units, layout, kept=kept)
+    return unclear(
+        plant, named.transposed if rows else named, tolerance=DROWNED,
+        other=f"has rank {decision.expected - 1}", decider=DECIDER,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)

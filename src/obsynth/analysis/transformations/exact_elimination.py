@@ -56,7 +56,8 @@ class ExactElimination:
         kept = {name: sizes[name] for name in DECISIVE if name in sizes}
         known = all(np.all(np.isfinite(part)) for part in kept.values())
         exact = {name: fractions_of(found[name]) for name in DECISIVE}
-        return PlantOrigin(exact, computed=self.computed, sizes=kept if known else None)
+        states = int(self.recovery["A"].nrows())
+        return PlantOrigin(exact, computed=self.computed, sizes=kept if known else None, states=states)
 
 
 def exact_elimination(plant: DescriptorSystem) -> ExactElimination | None:

@@ -15,7 +15,14 @@ import numpy as np
 from obsynth.analysis.conditions import Condition, rank_condition
 from obsynth.analysis.existence.distance import least_share
 from obsynth.analysis.existence.numbers import numbers_of
-from obsynth.analysis.existence.verdicts import described_distance, settled_rank, unclear_detail, zero_verdict
+from obsynth.analysis.existence.verdicts import (
+    described_distance,
+    rank_doubt,
+    settled_rank,
+    unclear_detail,
+    zero_doubt,
+    zero_verdict,
+)
 from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.zeros import Zero, fault_zeros, hidden_direction, leading_names, system_pencil, zero_at
 from obsynth.errors import PreconditionError
@@ -136,16 +143,16 @@ def _rank_conditions(plant: DescriptorSystem) -> list[Condition]:
         None if numbers is None else numbers.rank(numbers.blocks([[numbers.matrix("Bf")]])),
         np.inf if sizes is None else least_share(columns, np.vstack([sizes.Bf, sizes.Df])),
     )
-    ranks = [
-        enough,
-        rank_condition(
-            "rank F",
-            faults,
-            "some faults act nowhere, or in the same direction as others, and cannot be told apart.",
-            source="Wang 2015, below eq. (1)",
-            signals=_dependent_columns(plant),
-        ),
-    ]
+    acting = rank_condition(
+        "rank F",
+        faults,
+        "some faults act nowhere, or in the same direction as others, and cannot be told apart.",
+        source="Wang 2015, below eq. (1)",
+        signals=_dependent_columns(plant),
+    )
+    if faults.means == "unclear":
+        acting = acting.in_doubt(rank_doubt(plant, units, faults, [["Bf"], ["Df"]]), plant)
+    ranks = [enough, acting]
     if not all(condition.holds for condition in ranks):
         return ranks
     try:
@@ -171,28 +178,29 @@ def _rank_conditions(plant: DescriptorSystem) -> list[Condition]:
         c = numbers.matrix("C")
         outputs = settled_rank(outputs, numbers.rank(c))
         states = settled_rank(states, numbers.rank(numbers.blocks([[numbers.matrix("E")], [c]])))
-    ranks += [
-        rank_condition(
-            "rank C",
-            outputs,
-            "some outputs repeat others: leave them out.",
-            source="Wang 2015, below eq. (1)",
-            signals=()
-            if outputs.full
-            else leading_names(np.linalg.svd(work.C)[0][:, -1], plant.output_names, most=MOST_NAMES),
-        ),
-        rank_condition(
-            "rank [E; C]",
-            states,
-            "not every state is either dynamic or measured. Measure more, or eliminate the algebraic states first "
-            "(transform: {eliminate_algebraic_states: true} in a spec).",
-            source="Wang 2015, eq. (2)",
-            signals=()
-            if states.full
-            else leading_names(np.linalg.svd(stacked)[2][-1], work.state_names, most=MOST_NAMES),
-        ),
-    ]
-    return ranks
+    repeated = rank_condition(
+        "rank C",
+        outputs,
+        "some outputs repeat others: leave them out.",
+        source="Wang 2015, below eq. (1)",
+        signals=()
+        if outputs.full
+        else leading_names(np.linalg.svd(work.C)[0][:, -1], plant.output_names, most=MOST_NAMES),
+    )
+    known = rank_condition(
+        "rank [E; C]",
+        states,
+        "not every state is either dynamic or measured. Measure more, or eliminate the algebraic states first "
+        "(transform: {eliminate_algebraic_states: true} in a spec).",
+        source="Wang 2015, eq. (2)",
+        signals=() if states.full else leading_names(np.linalg.svd(stacked)[2][-1], work.state_names, most=MOST_NAMES),
+    )
+    units = PlantUnits.of(work).rounded()
+    if outputs.means == "unclear":
+        repeated = repeated.in_doubt(rank_doubt(work, units, outputs, [["C"]], rows=True), work)
+    if states.means == "unclear":
+        known = known.in_doubt(rank_doubt(work, units, states, [["E"], ["C"]]), work)
+    return [*ranks, repeated, known]
 
 
 def _zero_conditions(plant: DescriptorSystem) -> list[Condition]:
@@ -215,11 +223,13 @@ def _zero_conditions(plant: DescriptorSystem) -> list[Condition]:
     largest = max((abs(value) for value in facts.zeros), default=0.0)
     if verdict.answer == "unclear":
         detail = unclear_detail(verdict, "A filter")
+        doubt = zero_doubt(plant, units, verdict, [["A", "Bf"], ["C", "Df"]], what="filter")
         outside = fault_zeros(plant).outside
+        lost = Condition("fault zeros", _CLAIM, False, largest, 1.0, _SOURCE, detail)
         if outside:
             lost = _zero_failure(plant, max(outside, key=lambda zero: abs(zero.value)))
-            return [replace(lost, detail=f"{detail} In floating point, {lost.detail}", unclear=True)]
-        return [Condition("fault zeros", _CLAIM, False, largest, 1.0, _SOURCE, detail, unclear=True)]
+            lost = replace(lost, detail=f"{detail} In floating point, {lost.detail}")
+        return [lost.in_doubt(doubt, plant)]
     detail = f"{len(facts.zeros)} zero(s)" + (f", largest modulus {largest:.6g}" if facts.zeros else "")
     detail += f"; {described_distance(verdict)}"
     return [Condition("fault zeros", _CLAIM, True, largest, 1.0, _SOURCE, detail)]

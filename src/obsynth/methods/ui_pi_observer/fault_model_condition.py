@@ -15,10 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.analysis.conditions import Condition
-from obsynth.analysis.existence.distance import least_share
+from obsynth.analysis.existence.distance import DROWNED, least_share
+from obsynth.analysis.existence.named_pencils import named_augmented, unclear
 from obsynth.analysis.existence.numbers import numbers_of
 from obsynth.analysis.existence.rational import PlantNumbers, SystemFacts, WrittenNumbers
-from obsynth.analysis.existence.verdicts import settled_rank
+from obsynth.analysis.existence.verdicts import DECIDER, settled_rank
+from obsynth.analysis.existence.witnesses import Unclear
 from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.zeros import is_outside, leading_names
 from obsynth.methods.ui_pi_observer.augmented_plant import AugmentedPlant
@@ -33,7 +35,7 @@ from obsynth.methods.ui_pi_observer.pencils import (
 )
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.pencils import finite_zeros
-from obsynth.numerics.ranks import RankDecision, decide_rank
+from obsynth.numerics.ranks import RANK_TOLERANCE, RankDecision, decide_rank
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.exosystems import Exosystem
 from obsynth.plants.origin import sized_plant
@@ -149,7 +151,12 @@ def model_conditions(
     found = []
     for value in sorted(unstable, key=lambda value: (value.real, value.imag)):
         lost = exact_loss(given, courses, units.eigenvalue(value))
-        found.append(_model_condition(plant, model, value, units, lost, sizes))
+        condition, decision = _model_condition(plant, model, value, units, lost, sizes)
+        if decision.means == "unclear":
+            point = units.eigenvalue(value)
+            other = f"hides a fault that follows its model at {number(point)}, and no observer estimates it"
+            condition = condition.in_doubt(_model_doubt(given, courses, units, point, other=other), given)
+        found.append(condition)
         if not found[-1].holds:
             break
     return found
@@ -196,7 +203,7 @@ class _ModelPencil:
 def _model_condition(
     plant: DescriptorSystem, model: Exosystem, value: complex, units: PlantUnits, lost: int | None,
     sizes: DescriptorSystem | None,
-) -> Condition:  # fmt: skip
+) -> tuple[Condition, RankDecision]:  # fmt: skip
     pencil = _ModelPencil.of(plant, model, value, sizes)
     decision = pencil.decision(lost)
     scaled, columns, courses = pencil.scaled, pencil.columns, pencil.courses
@@ -231,11 +238,26 @@ def _model_condition(
         detail,
         mode=None if decision.full else own,
         signals=signals,
-        unclear=decision.means == "unclear",
+    ), decision
+
+
+def _model_doubt(
+    plant: DescriptorSystem, model: Exosystem, units: PlantUnits, value: complex, *, other: str,
+    decider: str = DECIDER, of_the_model: bool = False, tolerance: float = DROWNED, moving: bool = False,
+) -> Unclear:  # fmt: skip
+    """Return why it is unclear whether plant and fault model hide something at a point, in the plant's own time."""
+    numbers = numbers_of(plant)
+    both = None if numbers is None else numbers.blocks([[numbers.matrix("Bd")], [numbers.matrix("Dd")]])
+    kept = list(range(plant.nd)) if numbers is None else numbers.independent_columns(both, plant.nd)
+    named = named_augmented(plant, model, units, kept=kept, of_the_model=of_the_model)
+    return unclear(
+        plant, named, tolerance=tolerance, point=value, dt=plant.dt if moving else None, other=other, decider=decider
     )
 
 
-def order_conditions(plant: DescriptorSystem, model: Exosystem, units: PlantUnits) -> list[Condition]:
+def order_conditions(
+    given: DescriptorSystem, courses: Exosystem, plant: DescriptorSystem, model: Exosystem, units: PlantUnits
+) -> list[Condition]:
     """Test that the fault model is not lost in rounding, at the zeros where faults can hide longest.
 
     At a zero z0 of (f, d) -> y outside the region of stability, a polynomial model of order n is seen with a strength
@@ -264,25 +286,33 @@ def order_conditions(plant: DescriptorSystem, model: Exosystem, units: PlantUnit
         f": at the zero {number(point)} of (f, d) -> y the fault model (order {model.order}) cannot be told from "
         "nothing in double precision. Lower its order."
     )
-    return [
-        Condition(
-            "order of the fault model",
-            "the augmented plant is observable in double precision where faults can hide longest",
-            decision.full,
-            float(decision.rank),
-            float(decision.expected),
-            "ours: observable on paper is not enough",
-            f"{decision.describe()} at {number(point)}" + ("" if decision.full else lost),
-            mode=None if decision.full else point,
-            signals=() if decision.full else plant.fault_names,
-            unclear=not decision.full,
-        )
-    ]
+    found = Condition(
+        "order of the fault model",
+        "the augmented plant is observable in double precision where faults can hide longest",
+        decision.full,
+        float(decision.rank),
+        float(decision.expected),
+        "ours: observable on paper is not enough",
+        f"{decision.describe()} at {number(point)}" + ("" if decision.full else lost),
+        mode=None if decision.full else point,
+        signals=() if decision.full else plant.fault_names,
+    )
+    return [found if decision.full else found.in_doubt(_order_doubt(given, courses, units, point), given)]
 
 
-def lost_in_rounding(model: Exosystem, fault_names: tuple[str, ...], mode: complex, order: int) -> Condition:
+def _order_doubt(plant: DescriptorSystem, model: Exosystem, units: PlantUnits, point: complex) -> Unclear:
+    return _model_doubt(
+        plant, model, units, point, of_the_model=True, tolerance=RANK_TOLERANCE, moving=True,
+        other=f"hides a motion of plant and fault model at {number(point)}, and no observer sees it",
+        decider="A fault model of lower order, or an output nearer to the fault, would decide it.",
+    )  # fmt: skip
+
+
+def lost_in_rounding(
+    plant: DescriptorSystem, model: Exosystem, units: PlantUnits, mode: complex, order: int
+) -> Condition:
     """Return the failing condition for a mode that seems fixed and unstable, against all other conditions."""
-    return Condition(
+    found = Condition(
         "fault model in double precision",
         "no mode of plant and fault model seems hidden by rounding alone",
         False,
@@ -292,9 +322,9 @@ def lost_in_rounding(model: Exosystem, fault_names: tuple[str, ...], mode: compl
         f"plant and fault model (order {model.order}) seem to hide an unstable mode at {number(mode)}, which the "
         "conditions above exclude: in double precision the model is too long a chain. Lower its order.",
         mode=mode,
-        signals=fault_names,
-        unclear=True,
+        signals=plant.fault_names,
     )
+    return found.in_doubt(_order_doubt(plant, model, units, mode), plant)
 
 
 def _masking(scaled: NDArray[Any], plant: DescriptorSystem, width: int, shares: FloatArray) -> tuple[str, ...]:
