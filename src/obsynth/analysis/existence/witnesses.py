@@ -25,7 +25,7 @@ Rational: TypeAlias = NDArray[Any]
 
 @dataclass(frozen=True)
 class EntryChange:
-    """One entry of a matrix and its change; ``Phi`` is that of the fault model."""
+    """One entry of a matrix and its change; ``Phi`` is that of the fault model, ``By`` and ``Dy`` the observer's."""
 
     matrix: str
     row: int
@@ -46,7 +46,7 @@ class EntryChange:
         }  # fmt: skip
         place = f"entry ({self.row + 1}, {self.column + 1}) of {self.matrix}"
         if sides is None:
-            place += " of the fault model"
+            place += " of the fault model" if self.matrix == "Phi" else " of the observer"
         else:
             said = [
                 f"{kind} {names[kind][number]!r}" if kind in names else f"{kind} {number + 1}"
