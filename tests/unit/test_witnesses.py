@@ -72,6 +72,17 @@ CASES = {
         DescriptorSystem([[1, 1], [1, 1 + LITTLE]], [[0.5, 0], [0.5, 0.2]], C=[[1, 1]], Bf=[[1], [1]], dt=0.1),
         "rank [E; C]",
     ),
+    "filter: faults that look alike at first": (
+        fault_filter_conditions,
+        DescriptorSystem(
+            None,
+            [[0.5, 0, 0.25], [0.5, 0.2, 0], [0, 0.5, 0.1]],
+            C=[[1, 1, 0], [1, 1 + LITTLE, 1]],
+            Bf=[[1, 0], [0, 1], [0, 0]],
+            dt=0.1,
+        ),
+        "rank Upsilon",
+    ),
     "ui-pi: decoupling": (
         ui_pi,
         DescriptorSystem(None, [[-1, 1], [0.5, -2]], C=[[1, 1]], Bf=[[1], [0]], Bd=[[1], [-1 + LITTLE]]),

@@ -30,6 +30,7 @@ from obsynth.methods.fault_estimation_filter.detectability_indexes import (
     detectability_conditions,
     numbers_with_fault_states,
 )
+from obsynth.methods.fault_estimation_filter.index_doubt import index_doubt
 from obsynth.methods.fault_estimation_filter.prepared_plant import PreparedPlant, prepare, with_sensor_faults_as_states
 from obsynth.numerics.pencils import PencilStructure, regularity
 from obsynth.numerics.ranks import decide_rank
@@ -59,7 +60,10 @@ def examine_fault_filter(
     def visibility_conditions() -> list[Condition]:
         nonlocal prepared
         prepared = prepare(plant)
-        return list(detectability_conditions(prepared.detectability, plant.fault_names, prepared.scaling.outputs))
+        seen = prepared.detectability
+        *first, last = detectability_conditions(seen, plant.fault_names, prepared.scaling.outputs)
+        doubt = None if last.holds else index_doubt(plant, seen)
+        return [*first, last if doubt is None else last.in_doubt(doubt, plant)]
 
     groups: tuple[Callable[[], list[Condition]], ...] = (
         lambda: _form_conditions(plant, structure),
