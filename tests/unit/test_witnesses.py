@@ -16,6 +16,7 @@ from obsynth.analysis.conditions import Condition
 from obsynth.analysis.existence.witnesses import EntryChange, Unclear, Witness, rational_matrices
 from obsynth.methods.fault_estimation_filter.conditions import fault_filter_conditions
 from obsynth.methods.pd_observer.conditions import pd_observer_conditions
+from obsynth.methods.recursive.conditions import recursive_conditions
 from obsynth.methods.ui_pi_observer.conditions import existence
 from obsynth.methods.ui_pi_observer.fault_model_condition import exact_drops
 from obsynth.plants.exosystems import exosystem
@@ -37,6 +38,14 @@ NEARLY_SINE = [[-1.0, 2, 0], [-1, 0, -0.5], [0, 2, -3]]
 
 def ui_pi(plant: DescriptorSystem, fault_model: object = "step") -> tuple[Condition, ...]:
     return existence(plant, exosystem(fault_model, plant.fault_names, plant.dt)).conditions
+
+
+def kalman(plant: DescriptorSystem) -> tuple[Condition, ...]:
+    return tuple(recursive_conditions(plant, parameters=False))
+
+
+def adaptive(plant: DescriptorSystem) -> tuple[Condition, ...]:
+    return tuple(recursive_conditions(plant, parameters=True))
 
 
 CASES = {
@@ -82,6 +91,17 @@ CASES = {
             dt=0.1,
         ),
         "rank Upsilon",
+    ),
+    "kalman: a mode": (kalman, DescriptorSystem(None, **NEARLY_HIDDEN, dt=0.1), "detectability"),
+    "kalman: a state": (
+        kalman,
+        DescriptorSystem([[1, 1], [1, 1 + LITTLE]], [[0.5, 0], [0.5, 0.2]], C=[[1, 1]], dt=0.1),
+        "rank [E; C]",
+    ),
+    "adaptive: parameters": (
+        adaptive,
+        DescriptorSystem(None, [[0.5, 0], [0.5, 0.2]], C=np.eye(2), Bf=[[1, 1], [1, 1 + LITTLE]], dt=0.1),
+        "identifiable parameters",
     ),
     "ui-pi: decoupling": (
         ui_pi,

@@ -29,8 +29,9 @@ from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.zeros import are_outside, is_outside
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.pencils import finite_zeros
-from obsynth.numerics.ranks import RankDecision
+from obsynth.numerics.ranks import NAMED_SHARE, RankDecision
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.proofs.balls import UNIT_ROUNDOFF
 
 
 def settled_rank(decision: RankDecision, exact_rank: int | None, share: float = np.inf) -> RankDecision:
@@ -155,6 +156,35 @@ def zero_doubt(
         plant, named_pencil(plant, units, layout, kept=kept), tolerance=tolerance, point=point, dt=plant.dt,
         other=f"has a zero at {where}, and no {what}", decider=DECIDER,
     )  # fmt: skip
+
+
+def needed_gain(plant: DescriptorSystem, units: PlantUnits, point: complex, *, inputs: str = "") -> str:
+    """Return which gain any observer would need, were the last digits of data off that hide something only exactly.
+
+    Empty where no digits would help: with as many inputs as outputs (``inputs``: Bf, Bd or none) a zero stays.
+    """
+    entering = getattr(plant, inputs) if inputs else np.zeros((plant.nx, 0))
+    direct = getattr(plant, f"D{inputs[1:]}") if inputs else np.zeros((plant.ny, 0))
+    if plant.ny <= entering.shape[1]:
+        return ""
+    columns = np.concatenate([units.states, getattr(units, {"Bf": "faults", "Bd": "disturbances"}.get(inputs, ""), [])])
+    rows = np.concatenate([units.equations, units.outputs])[:, None]
+    pencil = np.block([[plant.A - point * plant.E, entering], [plant.C, direct]])
+    scaled = np.linalg.svd(rows * pencil * columns)[2][-1].conj()
+    signals = np.abs(columns * scaled)
+    terms = np.max(np.abs(np.hstack([plant.C, direct])) * signals, axis=1, initial=0.0)
+    names = (*plant.state_names, *({"Bf": plant.fault_names, "Bd": plant.disturbance_names}.get(inputs, ())))
+    # What a fault moves is asked for by the fault; a mode by the state that moves most.
+    faults = np.arange(len(signals)) >= plant.nx if inputs == "Bf" else np.zeros(len(signals), dtype=bool)
+    shares = np.abs(scaled) * (faults if np.any(np.abs(scaled[faults]) > NAMED_SHARE) else ~faults)
+    wanted, shown = int(np.argmax(shares)), int(np.argmax(terms))
+    if terms[shown] == 0.0:
+        return "No output holds anything of it: no digits of the data would show it."
+    gain = signals[wanted] / (UNIT_ROUNDOFF * terms[shown])
+    return (
+        "This holds exactly, on the numbers as written: were their last digits off, any observer would need a gain of "
+        f"about {gain:.0e} from {plant.output_names[shown]!r} to {names[wanted]!r}."
+    )
 
 
 def rank_doubt(

@@ -33,8 +33,8 @@ class EntryChange:
     before: Fraction
     after: Fraction
 
-    def described(self, plant: DescriptorSystem) -> str:
-        """Return the change in words."""
+    def described(self, plant: DescriptorSystem, *, parameters: bool = False) -> str:
+        """Return the change in words; with ``parameters`` Bf and Df are called Phi and Psi."""
         sides = {
             "E": ("equation", "state"), "A": ("equation", "state"), "C": ("output", "state"),
             "Bf": ("equation", "fault"), "Df": ("output", "fault"), "Bd": ("equation", "unknown input"),
@@ -44,7 +44,8 @@ class EntryChange:
             "state": plant.state_names, "output": plant.output_names, "fault": plant.fault_names,
             "unknown input": plant.disturbance_names,
         }  # fmt: skip
-        place = f"entry ({self.row + 1}, {self.column + 1}) of {self.matrix}"
+        called = {"Bf": "Phi", "Df": "Psi"}.get(self.matrix, self.matrix) if parameters else self.matrix
+        place = f"entry ({self.row + 1}, {self.column + 1}) of {called}"
         if sides is None:
             place += " of the fault model" if self.matrix == "Phi" else " of the observer"
         else:
@@ -53,6 +54,7 @@ class EntryChange:
                 for kind, number in zip(sides, (self.row, self.column), strict=True)
             ]
             place += f" ({', '.join(said)})"
+            place = place.replace("fault ", "parameter ") if parameters else place
         return f"{place} from {_number(self.before)} to {_after(self.before, self.after)}"
 
 
@@ -67,9 +69,9 @@ class Witness:
     size: float
     point: complex | None = None
 
-    def described(self, plant: DescriptorSystem) -> str:
+    def described(self, plant: DescriptorSystem, *, parameters: bool = False) -> str:
         """Return the changes in words."""
-        texts = [change.described(plant) for change in self.changes[:LISTED]]
+        texts = [change.described(plant, parameters=parameters) for change in self.changes[:LISTED]]
         more = len(self.changes) - len(texts)
         return "; ".join(texts) + (f"; and {more} more like these" if more > 0 else "")
 
@@ -98,20 +100,21 @@ class Unclear:
 
     Fields: tolerance: What the data are known to, relative to the largest scaled entry; witness: A plant within it that
     has the other answer, ``None`` where none was found; other: What that plant is, in words; decider: What would
-    decide it.
+    decide it; parameters: Whether what stands as faults are parameters, in Phi and Psi.
     """
 
     tolerance: float
     witness: Witness | None
     other: str
     decider: str
+    parameters: bool = False
 
     def described(self, plant: DescriptorSystem) -> str:
         """Return all of it in words."""
         if self.witness is None:
             shown = f"{self.other}; no single entries were found that do it."
         else:
-            shown = f"the {_kind(plant)} with {self.witness.described(plant)} {self.other}."
+            shown = f"the {_kind(plant)} with {self.witness.described(plant, parameters=self.parameters)} {self.other}."
         return f"Tolerance: {self.tolerance:.1g} of the largest scaled entry. Witness: {shown} {self.decider}"
 
 

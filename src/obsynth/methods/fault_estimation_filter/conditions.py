@@ -17,6 +17,7 @@ from obsynth.analysis.existence.distance import least_share
 from obsynth.analysis.existence.numbers import numbers_of
 from obsynth.analysis.existence.verdicts import (
     described_distance,
+    needed_gain,
     rank_doubt,
     settled_rank,
     unclear_detail,
@@ -223,7 +224,10 @@ def _zero_conditions(plant: DescriptorSystem) -> list[Condition]:
     verdict = zero_verdict(facts, *scaled, nx=plant.nx, discrete=True, sizes=sizes)
     facts = verdict.facts
     if facts.outside:
-        return [_zero_failure(plant, zero_at(plant.E, plant.A, facts.outside[0], plant.Bf, plant.C, plant.Df))]
+        point = facts.outside[0]
+        lost = _zero_failure(plant, zero_at(plant.E, plant.A, point, plant.Bf, plant.C, plant.Df))
+        gain = needed_gain(plant, units, point, inputs="Bf")
+        return [replace(lost, detail=f"{lost.detail} {gain}".rstrip())]
     largest = max((abs(value) for value in facts.zeros), default=0.0)
     if verdict.answer == "unclear":
         detail = unclear_detail(verdict, "A filter")

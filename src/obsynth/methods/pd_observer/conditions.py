@@ -19,6 +19,7 @@ from obsynth.analysis.existence.numbers import numbers_of
 from obsynth.analysis.existence.rational import PlantNumbers, WrittenNumbers
 from obsynth.analysis.existence.verdicts import (
     described_distance,
+    needed_gain,
     rank_doubt,
     settled_rank,
     unclear_detail,
@@ -178,7 +179,8 @@ def _detectability(plant: DescriptorSystem, numbers: PlantNumbers) -> Condition:
     verdict = zero_verdict(facts, *units.scaled_pencil(wide_e, wide_a), nx=plant.nx, discrete=False, sizes=sizes)
     facts = verdict.facts
     if verdict.answer == "no":
-        return _hidden_mode(plant, list(facts.outside))
+        lost = _hidden_mode(plant, list(facts.outside))
+        return replace(lost, detail=f"{lost.detail} {needed_gain(plant, units, lost.mode or 0j)}")
     if verdict.answer == "unclear":
         detail = unclear_detail(verdict, "An observer")
         doubt = zero_doubt(plant, units, verdict, [["A"], ["C"]], what="observer")

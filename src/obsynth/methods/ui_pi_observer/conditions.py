@@ -27,6 +27,7 @@ from obsynth.analysis.existence.verdicts import (
     believed,
     described_distance,
     in_own_time,
+    needed_gain,
     unclear_detail,
     zero_doubt,
     zero_verdict,
@@ -146,7 +147,9 @@ def _zero_condition(given: DescriptorSystem, plant: DescriptorSystem, units: Pla
     verdict = zero_verdict(_timed(facts, units.rate), wide_e, wide_a, nx=plant.nx, discrete=plant.dt > 0.0, sizes=sizes)
     if verdict.facts.outside:
         zero = zero_at(plant.E, plant.A, verdict.facts.outside[0], inputs, plant.C, direct)
-        return _zero_failure(plant, units, zero, inputs, direct)
+        lost = _zero_failure(plant, units, zero, inputs, direct)
+        gain = needed_gain(given, units, units.eigenvalue(zero.value), inputs="Bd" if given.nd else "")
+        return replace(lost, detail=f"{lost.detail} {gain}".rstrip())
     if verdict.answer == "unclear":
         own = in_own_time(verdict, units.rate)
         detail, layout = unclear_detail(own, "An observer"), [["A", "Bd"], ["C", "Dd"]]
