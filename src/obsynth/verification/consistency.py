@@ -16,7 +16,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.recursive.gain_schedule import GainStep, gain_steps
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.recursive.step_model import EarlyConstraintSteps, StepMatrices
-from obsynth.results.report import Check, upper_bound_check
+from obsynth.results.checks import Check, upper_bound_check
 
 #: Trials and steps: a wrong variance of 10 % is 20 standard deviations away.
 TRIALS = 400

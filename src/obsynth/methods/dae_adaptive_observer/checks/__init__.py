@@ -21,8 +21,8 @@ from obsynth.observers.dae.building import OPTIONS, dae_observer_from_options, r
 from obsynth.observers.dae.nominal_run import NOMINAL_STEPS, DAEFacts, dae_facts
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.robustness import plain_recursion
+from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
-from obsynth.results.report import Check, information, upper_bound_check
 from obsynth.simulation.dae import simulate_dae
 from obsynth.verification.plant import condition_rows
 
