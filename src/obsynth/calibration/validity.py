@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -10,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.analysis.transformations.linearisation import DRIFT
-from obsynth.calibration.logs import Log, LogData, quantum, read_log
+from obsynth.calibration.logs import EVEN, Log, LogData, quantum, read_log
 from obsynth.calibration.plants import NonlinearPlant
 from obsynth.calibration.problem import initial_state_of
 from obsynth.errors import SpecError
@@ -147,7 +148,7 @@ def _deviation(column: FloatArray, name: str, given: Mapping[str, float] | None)
             raise SpecError(f"deviations.{name} is {given[name]!r}: give a positive number.", path=f"deviations.{name}")
         return float(given[name])
     rough = float(np.nanstd(np.diff(column, n=2)) / np.sqrt(6.0))
-    found = max(rough, float(quantum(column) / np.sqrt(12.0)))
+    found = max(rough, quantum(column) / math.sqrt(EVEN))
     if not found > 0.0:
         raise SpecError(f"The record of {name!r} shows no noise: state its deviation by deviations.",
                         path=f"deviations.{name}")  # fmt: skip
