@@ -184,7 +184,7 @@ static void nonnegative(const double *M, const double *right, double *weights)
         weights[i] = 0.0;
         chosen[i] = banned[i] = 0;
     }
-    for (rounds = 0; rounds < 3 * BOUNDS; rounds++) {
+    for (rounds = 0; rounds < 6 * BOUNDS; rounds++) {
         int best = -1;
         double most = 0.0;
         for (i = 0; i < BOUNDS; i++) {
@@ -208,23 +208,27 @@ static void nonnegative(const double *M, const double *right, double *weights)
         }
         for (;;) {
             double share = 1.0;
-            int blocked = 0;
+            int blocking = -1;
             for (i = 0; i < BOUNDS; i++) {
                 if (chosen[i] && s[i] <= 0.0) {
-                    share = fmin(share, weights[i] / (weights[i] - s[i]));
-                    blocked = 1;
+                    double reach = weights[i] / (weights[i] - s[i]);
+                    if (blocking < 0 || reach < share) {
+                        share = reach;
+                        blocking = i;
+                    }
                 }
             }
             for (i = 0; i < BOUNDS; i++) {
                 if (chosen[i]) {
                     weights[i] += share * (s[i] - weights[i]);
-                    if (blocked && weights[i] <= 0.0) {
-                        weights[i] = 0.0;
-                        chosen[i] = 0;
-                    }
                 }
             }
-            if (!blocked || !chosen_solution(M, right, chosen, s)) {
+            if (blocking < 0) {
+                break;
+            }
+            weights[blocking] = 0.0;
+            chosen[blocking] = 0;
+            if (!chosen_solution(M, right, chosen, s)) {
                 break;
             }
         }
