@@ -1,4 +1,7 @@
-"""From the sections of a checked document to plants."""
+"""From the sections of a checked document to plants.
+
+Constants with tolerances in the plant of a spec: expressions in its matrices, entry by entry.
+"""
 
 from __future__ import annotations
 
@@ -11,22 +14,74 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.names import index_of
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.plants.uncertain_system import uncertain_system, with_expressions
+from obsynth.plants.uncertainty import UNCERTAIN_MATRICES, Entry
 from obsynth.spec.checking import DocumentProblems
-from obsynth.spec.constants import with_constants
 from obsynth.spec.documents import read_names
 from obsynth.spec.matrices import read_matrices, read_matrix
+from obsynth.spec.schema import EntrySection, PlantSection
 
 if TYPE_CHECKING:
     from obsynth.analysis.transformations import Transformation
     from obsynth.spec.schema import DAESection, PlantReference, PlantSection, TimeVaryingSection, TransformSection
 
+
+#: Signals that name the columns of a matrix; rows are equations (states) or outputs.
+_COLUMNS = {"B": "input_names", "D": "input_names", "Bf": "fault_names", "Df": "fault_names",
+            "Bd": "disturbance_names", "Dd": "disturbance_names"}  # fmt: skip
+
+
+_OUTPUT_ROWS = ("C", "D", "Df", "Dd")
+
+
+def with_constants(plant: DescriptorSystem, section: PlantSection) -> DescriptorSystem:
+    """Return the plant of a section with its constants and tolerances, if it has any."""
+    if section.constants is None and section.tolerance is None:
+        for name in ("entries", "variation", "box"):
+            if getattr(section, name) is not None:
+                raise SpecError(f"{name} is for a plant with constants: give constants, or tolerance.", path=name)
+        return plant
+    box = {} if section.box is None else section.box.model_dump()
+    options = {"tolerance": section.tolerance, "variation": section.variation, **box}
+    entries = {name: [_entry(plant, name, item) for item in found] for name, found in (section.entries or {}).items()}
+    if not entries:
+        return uncertain_system(plant, section.constants, **options)
+    return with_expressions(plant, entries, section.constants, **options)
+
+
+def _entry(plant: DescriptorSystem, matrix: str, item: EntrySection) -> Entry:
+    if matrix not in UNCERTAIN_MATRICES:
+        raise SpecError(
+            f"{matrix!r} holds no constants: {', '.join(UNCERTAIN_MATRICES)} may.", path=f"entries.{matrix}"
+        )
+    rows = plant.output_names if matrix in _OUTPUT_ROWS else plant.state_names
+    columns = getattr(plant, _COLUMNS.get(matrix, "state_names"))
+    places = []
+    for key, value, names in (("row", item.row, rows), ("column", item.column, columns)):
+        if isinstance(value, str):
+            places.append(index_of(value, names, what=f"entries.{matrix}"))
+        elif 1 <= value <= len(names):
+            places.append(value - 1)
+        else:
+            raise SpecError(f"{matrix} has no {key} {value}: it has {len(names)}.", path=f"entries.{matrix}")
+    return places[0], places[1], str(item.value)
+
+
 _Plant = TypeVar("_Plant", DescriptorSystem, TimeVaryingDescriptorSystem, DAEModel)
 
+
 _MATRICES = ("E", "A", "B", "C", "D", "Bf", "Df", "Bd", "Dd", "Bw", "Dw")
+
+
 _NAME_LISTS = ("state_names", "input_names", "output_names", "fault_names", "disturbance_names", "noise_names")
+
+
 # Equations picked by name also name the signal that enters there.
 _SIGNAL_OF_PICK = {"B": "input_names", "Bw": "noise_names"}
+
+
 _LABELS = ("operating_point", "scales", "units")
 
 

@@ -50,7 +50,7 @@ class ActiveVariables:
 
 
 def active_variables(plant: DescriptorSystem) -> ActiveVariables:
-    """Return which equations and variables stay when those that act on nothing and cannot be solved for are left out."""
+    """Return which equations and variables stay: not those that act on nothing and cannot be solved for."""
     e, a, c = csr(plant.E), csr(plant.A), csr(plant.C)
     rows, columns = np.arange(plant.nx), np.arange(plant.nx)
     if not plant.ny:
