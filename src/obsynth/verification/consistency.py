@@ -13,10 +13,11 @@ from typing import NamedTuple
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.ranks import KNOWN_SHARE
 from obsynth.observers.recursive.gain_schedule import GainStep, gain_steps
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.recursive.step_model import EarlyConstraintSteps, StepMatrices
-from obsynth.results.report import Check, upper_bound_check
+from obsynth.results.checks import Check, upper_bound_check
 
 #: Trials and steps: a wrong variance of 10 % is 20 standard deviations away.
 TRIALS = 400
@@ -24,9 +25,6 @@ STEPS = 60
 SEED = 20130703
 #: Bands are this many standard deviations of the statistic wide: a sound design fails one time in two million.
 BAND = 5.0
-#: Deviations below this share of the terms they are computed from are zero: rounding is seven orders smaller, so that
-#: what is kept has seven digits.
-KNOWN_SHARE = 1e-9
 
 _SOURCE = "recomputed, Monte Carlo with a fixed seed"
 

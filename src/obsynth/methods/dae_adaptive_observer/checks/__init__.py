@@ -25,8 +25,8 @@ from obsynth.proofs.balls import Ball
 from obsynth.proofs.contraction import proved_rate
 from obsynth.proofs.definiteness import prove_positive_definite
 from obsynth.proofs.error_products import logarithm_of_product
+from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
-from obsynth.results.report import Check, information, upper_bound_check
 from obsynth.simulation.dae import simulate_dae
 from obsynth.verification.plant import condition_rows
 
@@ -46,6 +46,8 @@ SEED = 20130206
 #: A mean of normalised squares may be off by this factor: covariances of a nonlinear plant are first-order ones.  Less
 #: than this is left to the information in the row.
 CONSISTENCY_FACTOR = 2.0
+#: Between these probabilities lie 95 %.
+TAILS = (0.025, 0.975)
 
 _SOURCE = "Moussa Ali, Zhang 2013 (DAE)"
 
@@ -271,5 +273,5 @@ def _band(count: float) -> tuple[float, float]:
     """Return where the mean of so many squares of standard normal numbers lies with 95 % (chi squared)."""
     from scipy.special import gammaincinv
 
-    low, high = (2.0 * float(gammaincinv(count / 2.0, share)) / count for share in (0.025, 0.975))
+    low, high = (2.0 * float(gammaincinv(count / 2.0, share)) / count for share in TAILS)
     return low, high

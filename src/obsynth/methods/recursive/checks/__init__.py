@@ -34,8 +34,8 @@ from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.robustness import plain_recursion
 from obsynth.plants.sequences import MatrixSequence
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
-from obsynth.results.report import Check, information, upper_bound_check
 from obsynth.verification.consistency import consistency
 from obsynth.verification.plant import condition_rows
 

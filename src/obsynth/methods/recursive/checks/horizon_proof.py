@@ -22,7 +22,7 @@ from obsynth.observers.recursive.step_model import EarlyConstraintSteps, StepMat
 from obsynth.proofs.balls import Ball, rounded_up
 from obsynth.proofs.definiteness import prove_positive_definite
 from obsynth.proofs.error_products import AT_ONCE, logarithm_of_product, product_of_stack, stacked_product
-from obsynth.results.report import Check, information, upper_bound_check
+from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.verification.identities import EQUALITY_TOLERANCE
 
 #: Of more states nothing is proved: work goes with their cube, and bounds grow with them.

@@ -21,7 +21,7 @@ from obsynth.observers.recursive.step_model import StepMatrices
 from obsynth.proofs.balls import Ball, rounded_up
 from obsynth.proofs.contraction import Contraction, column_norms, prove_contraction, proved_rate
 from obsynth.proofs.definiteness import prove_positive_definite
-from obsynth.results.report import Check, information, upper_bound_check
+from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.verification.identities import EQUALITY_TOLERANCE
 
 #: An enclosure of variances that is wider than this share of the filter's says nothing about definiteness.
