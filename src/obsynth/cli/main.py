@@ -16,7 +16,6 @@ from contextlib import ExitStack, contextmanager, suppress
 from importlib import import_module
 from pathlib import Path
 
-from obsynth import __version__
 from obsynth.cli.arguments import add_force, add_json, add_quiet, add_system, add_verbose
 from obsynth.cli.calibration import add_calibration_verbs
 from obsynth.cli.data_arguments import add_data_verbs
@@ -26,6 +25,7 @@ from obsynth.cli.scenarios import add_compare_verb, add_evaluate_verb
 from obsynth.cli.sweep import add_sweep_verb
 from obsynth.errors import ObsynthError, SolverError, SpecError
 from obsynth.files.inputs import protected_inputs
+from obsynth.version import __version__
 
 #: Exit code of a program whose reader has left, as shells give it.
 BROKEN_PIPE = 141

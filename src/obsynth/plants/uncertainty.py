@@ -25,6 +25,8 @@ UNCERTAIN_MATRICES = ("E", "A", "B", "C", "D", "Bf", "Df", "Bd", "Dd")
 ELIMINATED, SAMPLED = "eliminate", "sample"
 #: A stored number and the value of its expression may differ by this share: matrices in files have few digits.
 SAME_SHARE = 1e-6
+#: Rounding of a middle and of half a width, relative to the ends of a range.
+HALVING = 2.0**-51
 
 #: Row, column and text of an entry.
 Entry = tuple[int, int, str]
@@ -182,7 +184,7 @@ class Uncertainty:
             if name in unknowns:
                 parts[unknowns[name]] = item.half
             # The middle and the half are rounded.
-            slack = 0.0 if item.certain else 2.0**-51 * max(abs(item.low), abs(item.high))
+            slack = 0.0 if item.certain else HALVING * max(abs(item.low), abs(item.high))
             numbers[name] = AffineNumber(item.nominal if item.certain else item.middle, parts, slack)
         translation, known = affine_translation(count), dict[str, AffineNumber]()
         found = {name: AffineMatrix.exact(np.array(matrices[name]), count) for name in UNCERTAIN_MATRICES}

@@ -106,7 +106,7 @@ def _page_text(
         '<meta name="generator" content="obsynth">',
         '<meta name="viewport" content="width=device-width, initial-scale=1">', f"<title>{title}</title>",
         f"<style>{STYLE}</style>", "</head>", "<body>", f"<h1>{title}</h1>",
-        f'<p class="verdict {state}">{escape(verdict_line(report).plain)}</p>',
+        f'<p class="verdict {state}">{escape(verdict_line(report.checks).plain)}</p>',
         f"<nav>{links}</nav>",
     ]  # fmt: skip
     for heading, lines in shown.items():
@@ -194,7 +194,7 @@ def _reproduction(
 ) -> Iterator[str]:
     import shlex
 
-    from obsynth import __version__
+    from obsynth.version import __version__
 
     file = shlex.quote(gains_file or f"{design.name}.gains.json")
     yield "<p>Every check again, from the gain set alone and without a solver; and this page:</p>"

@@ -4,39 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from obsynth.errors import SpecError
 from obsynth.files.inputs import read_json
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.names import index_of
 from obsynth.plants.uncertain_system import with_expressions
-from obsynth.plants.uncertainty import UNCERTAIN_MATRICES, Entry, expressions_in
-
-if TYPE_CHECKING:
-    from obsynth.spec.schema import DAESection, EntrySection, PlantSection
+from obsynth.plants.uncertainty import UNCERTAIN_MATRICES, Entry
+from obsynth.spec.schema import DAESection, EntrySection, PlantSection
 
 #: Signals that name the columns of a matrix; rows are equations (states) or outputs.
 _COLUMNS = {"B": "input_names", "D": "input_names", "Bf": "fault_names", "Df": "fault_names",
             "Bd": "disturbance_names", "Dd": "disturbance_names"}  # fmt: skip
 _OUTPUT_ROWS = ("C", "D", "Df", "Dd")
-
-
-def with_entries(data: Any) -> Any:
-    """Return a raw plant section with expressions in rows moved to ``entries``; only where there are constants."""
-    if not isinstance(data, dict) or not isinstance(data.get("constants"), dict):
-        return data
-    found, entries = dict(data), data.get("entries")
-    entries = dict(entries) if isinstance(entries, dict) else entries
-    for name in UNCERTAIN_MATRICES:
-        rows, texts = expressions_in(found.get(name))
-        if texts and (entries is None or isinstance(entries, dict)):
-            found[name] = rows
-            more = [{"row": i + 1, "column": j + 1, "value": text} for i, j, text in texts]
-            entries = {**(entries or {}), name: [*(entries or {}).get(name, []), *more]}
-    if entries is not None:
-        found["entries"] = entries
-    return found
 
 
 def with_constants(plant: DescriptorSystem, section: PlantSection, folder: Path) -> DescriptorSystem:

@@ -46,6 +46,10 @@ FEW_BOXES = 40
 MOST_GAIN_SAMPLES = 5_000
 #: What is left of a response when its sum ends.
 _GAIN_LEFT = 1e-6
+#: Tolerances whose shares agree so well are one tolerance; what is to blame for less is left out.
+SAME_SHARE, LISTED_SHARE = 1e-9, 5e-3
+#: Two plants are the same where entries agree so well, relatively and around zero.
+SAME_ENTRY, SAME_ZERO = 1e-9, 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +125,7 @@ class Robustness:
         shares = [item.half / abs(item.nominal) for item in self.box.uncertain if item.nominal]
         if self.largest_factor is None or len(shares) != len(self.box.uncertain) or not shares:
             return None
-        common = max(shares) - min(shares) <= 1e-9 * max(shares)
+        common = max(shares) - min(shares) <= SAME_SHARE * max(shares)
         return self.largest_factor * shares[0] if common else None
 
     def facts(self) -> Iterator[tuple[str, str]]:
@@ -183,7 +187,7 @@ class Robustness:
 
 def _top(shares: Mapping[str, float], most: int = 4) -> str:
     found = sorted(shares.items(), key=lambda item: -item[1])[:most]
-    return ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in found if share > 5e-3) or "nothing"
+    return ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in found if share > LISTED_SHARE) or "nothing"
 
 
 def with_tolerances(
@@ -208,7 +212,7 @@ def _of_plant(design: ObserverDesign, given: DescriptorSystem) -> tuple[Observer
     plant, _ = design.linear
     same = all(
         getattr(plant, name).shape == getattr(given, name).shape
-        and np.allclose(getattr(plant, name), getattr(given, name), rtol=1e-9, atol=1e-12)
+        and np.allclose(getattr(plant, name), getattr(given, name), rtol=SAME_ENTRY, atol=SAME_ZERO)
         for name in ("E", "A", "B", "C", "D", "Bd", "Dd", "Bf", "Df")
     )
     own, other = plant.uncertainty, given.uncertainty

@@ -4,8 +4,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from obsynth.results.checks import Check, upper_bound_check
 from obsynth.results.design import ObserverDesign
-from obsynth.results.report import Check, upper_bound_check
 
 
 def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:

@@ -8,20 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from obsynth.analysis.transformations.equations_at_a_point import symbolic_equations
+from obsynth.analysis.transformations.equilibrium import Point
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.expressions import parse_expression
 from obsynth.plants.constants import Constant, ConstantsBox, constants_box
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.uncertain_system import stated_box
 from obsynth.plants.uncertainty import Entry
-
-if TYPE_CHECKING:
-    from obsynth.analysis.transformations.equilibrium import Point
 
 #: How tightly an operation binds its operands, as the language reads it.
 _SUM, _PRODUCT, _SIGN, _POWER, _ATOM = range(1, 6)

@@ -11,7 +11,7 @@ from obsynth.analysis.transformations.idle_variables import equation_name, liste
 from obsynth.analysis.transformations.recovery_operator import RecoveryOperator, without_rounding
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, RANK_TOLERANCE
+from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, NAMED_SHARE, RANK_TOLERANCE
 from obsynth.numerics.scaling import power_of_two_below
 from obsynth.numerics.sparse import coarse_structure, components_of, csr, dense, selection
 from obsynth.numerics.sparse_factor import NullVectors, SolutionBounds, SparseFactor
@@ -19,8 +19,6 @@ from obsynth.plants.descriptor import DescriptorSystem
 
 #: Points without meaning, at which a pencil has its normal rank.
 GENERIC_POINTS = (0.7391, -1.3247)
-#: Entries of null vectors at least this large beside the largest are named.
-NAMED_SHARE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,13 +10,12 @@ import numpy as np
 from obsynth.analysis.transformations.elimination import algebraic_coordinates
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.ranks import UNTOUCHED_SHARE
 from obsynth.plants.constants import ConstantsBox
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.uncertainty import SAMPLED, UNCERTAIN_MATRICES, Uncertainty, matrices_of
 from obsynth.proofs.affine import AffineMatrix, affine_block, affine_inverse, affine_zero_order_hold
 
-#: Directions of the state that no constant touches are found down to this share of the others.
-UNTOUCHED_SHARE = 1e-7
 #: Their coordinates are rounded to this many digits: any invertible change of coordinates is exact.
 COORDINATE_DIGITS = 9
 #: What one state does to a row counts as rounding below this share of all that the row holds.

@@ -14,7 +14,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.exosystems import Exosystem
-from obsynth.results.report import Check
+from obsynth.results.checks import Check
 from obsynth.verification.identities import Residual, equality, residual, worst
 
 

@@ -16,8 +16,8 @@ from obsynth.numerics.spectra import (
     spectrum_error,
 )
 from obsynth.proofs.extended_balls import enclosed_eigenvalues, middle_of
+from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
-from obsynth.results.report import Check, information, upper_bound_check
 from obsynth.verification.certificates import decay_row, prove_stable
 from obsynth.verification.claims import UNCERTAIN
 
