@@ -1,4 +1,7 @@
-"""From the sections of a checked document to plants."""
+"""From the sections of a checked document to plants.
+
+Constants with tolerances in the plant of a spec: expressions in its matrices, entry by entry.
+"""
 
 from __future__ import annotations
 
@@ -17,17 +20,26 @@ from obsynth.spec.checking import DocumentProblems
 from obsynth.spec.constants import boxed_constants, with_constants
 from obsynth.spec.documents import read_names
 from obsynth.spec.matrices import read_matrices, read_matrix
+from obsynth.spec.schema import PlantSection
 
 if TYPE_CHECKING:
     from obsynth.analysis.transformations import Transformation
     from obsynth.spec.schema import DAESection, PlantReference, PlantSection, TimeVaryingSection, TransformSection
 
+
 _Plant = TypeVar("_Plant", DescriptorSystem, TimeVaryingDescriptorSystem, DAEModel)
 
+
 _MATRICES = ("E", "A", "B", "C", "D", "Bf", "Df", "Bd", "Dd", "Bw", "Dw")
+
+
 _NAME_LISTS = ("state_names", "input_names", "output_names", "fault_names", "disturbance_names", "noise_names")
+
+
 # Equations picked by name also name the signal that enters there.
 _SIGNAL_OF_PICK = {"B": "input_names", "Bw": "noise_names"}
+
+
 _LABELS = ("operating_point", "scales", "units")
 
 
