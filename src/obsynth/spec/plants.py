@@ -12,61 +12,19 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from obsynth.errors import SpecError
+from obsynth.plants.constants import constant_of
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.names import index_of
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
-from obsynth.plants.uncertain_system import uncertain_system, with_expressions
-from obsynth.plants.uncertainty import UNCERTAIN_MATRICES, Entry
 from obsynth.spec.checking import DocumentProblems
+from obsynth.spec.constants import boxed_constants, with_constants
 from obsynth.spec.documents import read_names
 from obsynth.spec.matrices import read_matrices, read_matrix
-from obsynth.spec.schema import EntrySection, PlantSection
+from obsynth.spec.schema import PlantSection
 
 if TYPE_CHECKING:
     from obsynth.analysis.transformations import Transformation
     from obsynth.spec.schema import DAESection, PlantReference, PlantSection, TimeVaryingSection, TransformSection
-
-
-#: Signals that name the columns of a matrix; rows are equations (states) or outputs.
-_COLUMNS = {"B": "input_names", "D": "input_names", "Bf": "fault_names", "Df": "fault_names",
-            "Bd": "disturbance_names", "Dd": "disturbance_names"}  # fmt: skip
-
-
-_OUTPUT_ROWS = ("C", "D", "Df", "Dd")
-
-
-def with_constants(plant: DescriptorSystem, section: PlantSection) -> DescriptorSystem:
-    """Return the plant of a section with its constants and tolerances, if it has any."""
-    if section.constants is None and section.tolerance is None:
-        for name in ("entries", "variation", "box"):
-            if getattr(section, name) is not None:
-                raise SpecError(f"{name} is for a plant with constants: give constants, or tolerance.", path=name)
-        return plant
-    box = {} if section.box is None else section.box.model_dump()
-    options = {"tolerance": section.tolerance, "variation": section.variation, **box}
-    entries = {name: [_entry(plant, name, item) for item in found] for name, found in (section.entries or {}).items()}
-    if not entries:
-        return uncertain_system(plant, section.constants, **options)
-    return with_expressions(plant, entries, section.constants, **options)
-
-
-def _entry(plant: DescriptorSystem, matrix: str, item: EntrySection) -> Entry:
-    if matrix not in UNCERTAIN_MATRICES:
-        raise SpecError(
-            f"{matrix!r} holds no constants: {', '.join(UNCERTAIN_MATRICES)} may.", path=f"entries.{matrix}"
-        )
-    rows = plant.output_names if matrix in _OUTPUT_ROWS else plant.state_names
-    columns = getattr(plant, _COLUMNS.get(matrix, "state_names"))
-    places = []
-    for key, value, names in (("row", item.row, rows), ("column", item.column, columns)):
-        if isinstance(value, str):
-            places.append(index_of(value, names, what=f"entries.{matrix}"))
-        elif 1 <= value <= len(names):
-            places.append(value - 1)
-        else:
-            raise SpecError(f"{matrix} has no {key} {value}: it has {len(names)}.", path=f"entries.{matrix}")
-    return places[0], places[1], str(item.value)
 
 
 _Plant = TypeVar("_Plant", DescriptorSystem, TimeVaryingDescriptorSystem, DAEModel)
@@ -160,8 +118,19 @@ def _varying_plant(section: TimeVaryingSection, source: Path, prefix: str) -> Ti
 
 
 def _nonlinear_plant(section: DAESection, source: Path, prefix: str) -> DAEModel:
-    arguments = section.model_dump(exclude={"kind", "schema_version", "transform"}, exclude_none=True)
-    return _placed(lambda: DAEModel(**arguments), source, prefix)
+    left_out = {"kind", "schema_version", "transform", "variation", "box"}
+    arguments = section.model_dump(exclude=left_out, exclude_none=True)
+
+    def made() -> DAEModel:
+        units = arguments.get("units")
+        for name, item in boxed_constants(section, source.parent)[0].items():
+            found = constant_of(name, item)
+            arguments["constants"][name] = found.nominal
+            if found.unit and units is not None:
+                units.setdefault(name, found.unit)
+        return DAEModel(**arguments)
+
+    return _placed(made, source, prefix)
 
 
 def _invariant_plant(section: PlantSection, source: Path, prefix: str) -> DescriptorSystem:
@@ -177,7 +146,7 @@ def _invariant_plant(section: PlantSection, source: Path, prefix: str) -> Descri
         if isinstance(arguments[matrix], list) and arguments[names] is None:
             arguments[names] = arguments[matrix]
 
-    return _placed(lambda: with_constants(DescriptorSystem(**arguments), section), source, prefix)
+    return _placed(lambda: with_constants(DescriptorSystem(**arguments), section, source.parent), source, prefix)
 
 
 def matlab_plant(reference: PlantReference, spec: Path) -> DescriptorSystem | None:
@@ -195,9 +164,18 @@ def matlab_plant(reference: PlantReference, spec: Path) -> DescriptorSystem | No
     return None
 
 
-def linearised(wanted: TransformSection | None, model: DAEModel, source: Path, prefix: str) -> DescriptorSystem | None:
-    """Return the linear model of a nonlinear plant where a section asks for one."""
+def linearised(
+    wanted: TransformSection | None, model: DAEModel, section: DAESection, folder: Path, source: Path, prefix: str
+) -> DescriptorSystem | None:
+    """Return the linear model of a nonlinear plant where a spec asks for one; ``folder``: of the plant's file."""
+    constants, box = boxed_constants(section, folder)
+    tolerances = {name: item for name, item in constants.items() if not isinstance(item, (int, float))}
     if wanted is None:
+        if tolerances or section.variation is not None or section.box is not None:
+            raise SpecError(
+                f"{source}: {_joined(prefix, 'constants')}: tolerances are for the linear model of a nonlinear plant: "
+                "add transform: {linearise: {at: equilibrium}}, or write numbers.", path=_joined(prefix, "constants"),
+            )  # fmt: skip
         return None
     where = _joined(prefix, "transform")
     if wanted.linearise is None:
@@ -205,10 +183,18 @@ def linearised(wanted: TransformSection | None, model: DAEModel, source: Path, p
             f"{source}: {where} is for linear plants: say where this one is linearised, such as linearise: {{at: "
             "equilibrium}, or remove it.", path=where,
         )  # fmt: skip
+    from obsynth.analysis.transformations.entries_in_constants import box_of_model
     from obsynth.analysis.transformations.linearisation import linearise
 
     arguments = wanted.linearise.model_dump(exclude_none=True)
+    tolerances |= arguments.pop("constants", {})
+    if not tolerances and (box or section.variation is not None):
+        raise SpecError(f"{source}: {_joined(prefix, 'variation')} and box are for constants with tolerances: give "
+                        "some.", path=_joined(prefix, "constants"))  # fmt: skip
     try:
+        if tolerances:
+            given = arguments.get("given", {})
+            arguments["constants"] = box_of_model(model, tolerances, given, variation=section.variation, **box)
         return linearise(model, **arguments)
     except SpecError as error:
         raise SpecError(f"{source}: {where}.linearise: {error}", path=f"{where}.linearise") from error
