@@ -47,6 +47,10 @@ QUANTUM_SLACK = 0.02
 
 #: Share of distinct values above which a column shows no quantum that limits its noise: a ramp has none twice.
 REPEATED = 0.7
+#: Decimals to which values of a column are compared, and the share of the largest below which a step is rounding.
+VALUE_DIGITS, SAME_VALUE = 12, 1e-9
+#: The variance of what rounding takes away, even over a step, is the step squared over this.
+EVEN = 12.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,9 +230,9 @@ def _on_grid(
 
 def quantum(column: FloatArray) -> float:
     """Return the smallest step between values of a column of which all others are multiples; zero without one."""
-    values = np.unique(np.round(column[np.isfinite(column)], 12))
+    values = np.unique(np.round(column[np.isfinite(column)], VALUE_DIGITS))
     steps = np.diff(values)
-    steps = steps[steps > 1e-9 * max(1.0, float(np.abs(values).max(initial=0.0)))]
+    steps = steps[steps > SAME_VALUE * max(1.0, float(np.abs(values).max(initial=0.0)))]
     if not steps.size:
         return 0.0
     ratios = steps / steps.min()
@@ -240,4 +244,4 @@ def quantum(column: FloatArray) -> float:
 def repeats(column: FloatArray) -> bool:
     """Whether values of a column come again often enough that its quantum limits what its noise can be."""
     values = column[np.isfinite(column)]
-    return bool(len(np.unique(np.round(values, 12))) < REPEATED * len(values))
+    return bool(len(np.unique(np.round(values, VALUE_DIGITS))) < REPEATED * len(values))

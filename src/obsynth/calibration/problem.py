@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.calibration.logs import Log, bad_log, quantum, refused, repeats
+from obsynth.calibration.logs import EVEN, Log, bad_log, quantum, refused, repeats
 from obsynth.calibration.plants import CalibrationPlant
 from obsynth.calibration.step_graphs import SampleGraphs, sample_graphs
 from obsynth.errors import SpecError
@@ -109,7 +109,7 @@ def calibration_problem(
     held = np.array([repeats(column) for column in log.y.T])
     largest = np.nanmax(np.abs(log.y), axis=0)
     floors = np.maximum(
-        np.where(held, quanta**2 / 12.0, 0.0), (LEAST_NOISE * np.where(largest > 0.0, largest, 1.0)) ** 2
+        np.where(held, quanta**2 / EVEN, 0.0), (LEAST_NOISE * np.where(largest > 0.0, largest, 1.0)) ** 2
     )
     variances = int(np.isnan(known_Q).sum() + np.isnan(known_R).sum())
     if not names and not variances:

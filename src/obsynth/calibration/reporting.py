@@ -12,6 +12,7 @@ import numpy as np
 from obsynth.calibration.diagnostics import SIGNIFICANT, Consistency, Whiteness, change_of_mean, consistency, whiteness
 from obsynth.calibration.innovations_fit import InnovationsFit, Timing
 from obsynth.calibration.intervals import covariance_of, quantile
+from obsynth.calibration.logs import EVEN
 from obsynth.calibration.problem import Problem
 from obsynth.calibration.result import CalibratedBox, Calibration
 from obsynth.calibration.simulation_error import Fit, SimulationError
@@ -69,6 +70,8 @@ AT_QUANTISATION = 1.5
 
 #: A timing that is better by this many nats is told, even where it is not taken.
 NOTED_NATS = 2.0
+#: A constant within this share of the bounds' width from one of them is at it.
+END_SHARE = 1e-6
 
 
 def reported(
@@ -130,7 +133,7 @@ def _of_simulation(problem: Problem, start: Fit, level: float) -> InnovationsFit
     sides = []
     for t, half, low, high in zip(start.t, spread, problem.low, problem.high, strict=True):
         sides.append((Side(max(t - half, low), t - half <= low), Side(min(t + half, high), t + half >= high)))
-    ends = (start.t - problem.low < 1e-6 * problem.widths) | (problem.high - start.t < 1e-6 * problem.widths)
+    ends = (start.t - problem.low < END_SHARE * problem.widths) | (problem.high - start.t < END_SHARE * problem.widths)
     variances = np.tile(start.deviations**2, (len(y), 1))
     nothing = np.zeros(len(problem.noisy))
     return InnovationsFit(
@@ -184,7 +187,7 @@ def _checked(nis: Consistency, colours: dict[str, Whiteness], row: int | None, s
 def _told(problem: Problem, R: dict[str, float], timing: Timing, error: IntegrationError | None) -> list[str]:
     found = []
     for name, step in zip(problem.output_names, problem.quanta, strict=True):
-        if step > 0.0 and R[name] < AT_QUANTISATION * step**2 / 12.0:
+        if step > 0.0 and R[name] < AT_QUANTISATION * step**2 / EVEN:
             found.append(f"The noise of {name} is at its quantisation ({step:.3g} / sqrt 12): its R is no lower in "
                          "truth than what a ramp makes of it.")  # fmt: skip
     if timing.delay and timing.losses:

@@ -20,6 +20,8 @@ ROUNDS = 3
 MOST_EVALUATIONS = 60
 #: Share of a signal's deviation that stands for its noise before anything is fitted.
 FIRST_NOISE = 0.05
+#: Further starts keep this share of the bounds' width away from them; every start keeps the second.
+DRAWN, INSIDE = 0.05, 1e-9
 #: Residuals are cut here, so that a trajectory that runs away does not overflow.
 LARGEST_MISFIT = 1e6
 #: A moving signal of whose deviation more than this share is left is not explained; and one that rests.
@@ -101,7 +103,7 @@ class SimulationError:
         p = self.problem
         low = np.concatenate([p.low / p.widths, np.full(len(p.x0), -np.inf)])
         high = np.concatenate([p.high / p.widths, np.full(len(p.x0), np.inf)])
-        inside = np.clip(start / p.widths, low[: self.nt] + 1e-9, high[: self.nt] - 1e-9)
+        inside = np.clip(start / p.widths, low[: self.nt] + INSIDE, high[: self.nt] - INSIDE)
         v = np.concatenate([inside, p.x0 / self.spread])
         weights = FIRST_NOISE * np.nanstd(p.y, axis=0) + np.sqrt(p.floors)
         for i in range(ROUNDS):
@@ -127,7 +129,7 @@ def simulation_fits(
     fits = []
     for i in range(starts):
         note(f"simulation error, start {i + 1} of {starts}")
-        drawn = problem.low + problem.widths * rng.uniform(0.05, 0.95, len(problem.low))
+        drawn = problem.low + problem.widths * rng.uniform(DRAWN, 1.0 - DRAWN, len(problem.low))
         found = error.fit(drawn if i else problem.nominal if start is None else start)
         if found is not None:
             fits.append(found)

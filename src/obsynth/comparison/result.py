@@ -88,6 +88,8 @@ class ComparedMethod:
         return float(np.sqrt(np.mean([found.rms**2 for found in self.faults]))) if self.faults else float("inf")
 
 
+#: A picture of estimates reaches as far as this share of their samples.
+SHOWN = 0.98
 #: What the page of a comparison begins with.
 COMPARISON_PAGE = FileKind("a comparison of obsynth", rb'name="generator" content="obsynth compare"')
 _HEADER = (
@@ -205,7 +207,7 @@ class Comparison:
             right.set(xlabel="s", ylabel=name)
             spread = float(np.max(np.abs(self.truth[:, row]), initial=0.0)) or 1.0
             best = shown[0].estimates[:, 0] if shown else self.truth[:, row]
-            reach = max(2.5 * spread, 1.5 * float(np.quantile(np.abs(best), 0.98))) if row == 0 else 2.5 * spread
+            reach = max(2.5 * spread, 1.5 * float(np.quantile(np.abs(best), SHOWN))) if row == 0 else 2.5 * spread
             right.set_ylim(-reach, reach)
         axes[0, 0].legend(fontsize=8)
         return figure

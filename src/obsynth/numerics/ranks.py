@@ -51,8 +51,26 @@ JACOBIAN_RANK_TOLERANCE = 1e-9
 NEGLIGIBLE_SHARE = 1e-12
 #: Singular values of a set of directions below this share of the largest are no direction of their own.
 DIRECTION_SHARE = 1e-9
+#: A zero nearer than this to the point at which a constant fault stands is that point.
+REST_TOLERANCE = 1e-6
+#: Singular values of a constant's directions below this share of the largest are rounding of its derivatives.
+ACTING_TOLERANCE = 1e-6
 #: Singular values of a constant's effect below this share count as zero; what is left out goes into the remainder.
 EFFECT_RANK_SHARE = 1e-12
+#: Singular values below this share of the largest are zero: the sensitivities carry rounding of 1e-16 times the
+#: condition of (7), which stays below 1e5 in models that can be used.
+IDENTIFIABLE_SHARE = 1e-10
+#: Directions of the state that no constant touches are found down to this share of the others.
+UNTOUCHED_SHARE = 1e-7
+#: Eigenvalues of the variances' information below this share of the largest are left out.
+LEAST_INFORMATION = 1e-10
+#: Deviations below this share of the terms they are computed from are zero: rounding is seven orders smaller, so that
+#: what is kept has seven digits.
+KNOWN_SHARE = 1e-9
+#: Size of a fault's column in a decoupled plant, relative to before the reduction, below which it left no trace.
+TRACE_TOLERANCE = 1e-9
+#: Parity directions whose noise is below this share of the terms it is made of are free of noise: a few roundings.
+PERFECT_PARITY = 1e-14
 
 
 def rounding_rank(matrix: FloatArray) -> int:

@@ -5,14 +5,22 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import TYPE_CHECKING
+from typing import Protocol, TypeVar
 
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
 
-if TYPE_CHECKING:
-    from obsynth.plants.descriptor import DescriptorSystem
+
+class Written(Protocol):
+    """A linear plant: its matrices by name, and the seconds between its samples."""
+
+    @property
+    def dt(self) -> float:
+        """Sample time in s, zero for a plant in continuous time."""
+
+
+Plant = TypeVar("Plant", bound=Written)
 
 #: The matrices on which existence depends.
 DECISIVE = ("E", "A", "Bf", "Bd", "C", "Df", "Dd")
@@ -36,24 +44,18 @@ class PlantOrigin:
     states: int = 0
 
 
-def origin_of(plant: DescriptorSystem) -> PlantOrigin | None:
+def origin_of(plant: Written) -> PlantOrigin | None:
     """Return what a plant was made from, where that is known and its matrices have not been changed since."""
     return getattr(plant, "_origin", None)
 
 
-def sized_plant(plant: DescriptorSystem) -> DescriptorSystem | None:
-    """Return the plant with the sizes of the terms of its entries in their place; ``None`` where there are none."""
-    origin = origin_of(plant)
-    return None if origin is None or origin.sizes is None else plant.replace(**origin.sizes)
-
-
-def with_origin(plant: DescriptorSystem, origin: PlantOrigin | None) -> DescriptorSystem:
+def with_origin(plant: Plant, origin: PlantOrigin | None) -> Plant:
     """Note on a plant that was just made what it was made from, and return it."""
     object.__setattr__(plant, "_origin", origin)
     return plant
 
 
-def note_source(source: DescriptorSystem, new: DescriptorSystem, *, sample_time: float | None = None) -> None:
+def note_source(source: Written, new: Written, *, sample_time: float | None = None) -> None:
     """Note on a plant that elimination or sampling has just made which plant, as written, it comes from."""
     if new is source:
         return
@@ -62,7 +64,7 @@ def note_source(source: DescriptorSystem, new: DescriptorSystem, *, sample_time:
         object.__setattr__(new, "_made_from", (written, earlier if sample_time is None else sample_time))
 
 
-def carry_origin(old: DescriptorSystem, new: DescriptorSystem) -> DescriptorSystem:
+def carry_origin(old: Written, new: Plant) -> Plant:
     """Note on a changed plant what the old one was made from, if nothing has changed that matters."""
     made = getattr(old, "_made_from", None)
     unchanged = old.dt == new.dt and all(

@@ -20,10 +20,16 @@ from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
-from obsynth.results.checks_table import verification_report
+from obsynth.results.checks_table import print_checks
 from obsynth.results.delta_scan import DeltaScan
 from obsynth.results.design import ObserverDesign
 from obsynth.results.layout import facts_table, headed_table, name_list, number, print_section
+from obsynth.results.report import VerificationReport
+
+
+def verification_report(report: VerificationReport, *, console: Console) -> None:
+    """Print a verification report."""
+    print_checks(report.checks, console=console)
 
 
 def tolerances_report(design: ObserverDesign, *, console: Console) -> None:

@@ -8,15 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING
 
 from rich import box
 from rich.console import Console, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-if TYPE_CHECKING:
-    from obsynth.results.report import Check
 from obsynth.numerics.arguments import is_number
 
 #: Two values this near to each other, relative to their size or one, are shown as conjugates.
@@ -62,15 +59,6 @@ def name_list(names: Sequence[str], *, limit: int = 6) -> str:
     if len(names) <= limit + 1:
         return ", ".join(names)
     return f"{', '.join(names[:limit])} and {len(names) - limit} more"
-
-
-def verdict(check: Check) -> Text:
-    """Return ``holds``, ``FAILS`` or ``info``."""
-    if not check.passed:
-        return Text("FAILS", style="bold red")
-    if check.kind == "information":
-        return Text("info", style="cyan")
-    return Text("holds", style="green")
 
 
 def print_section(console: Console, title: str, content: RenderableType) -> None:

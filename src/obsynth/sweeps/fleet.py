@@ -16,7 +16,7 @@ import numpy as np
 from obsynth.data.run import run_on_data
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.files.inputs import read_json
-from obsynth.files.outputs import FileKind, write_atomically
+from obsynth.files.outputs import write_atomically
 from obsynth.files.tables import TableWriter
 from obsynth.results.gain_sets import load
 from obsynth.sweeps.sweep import STATUSES, each, folder_for
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _KIND = "obsynth fleet result"
-RESULT = FileKind("a result of a fleet", rb'"kind":\s*"obsynth fleet result"', ending=".result.json")
 #: What ends the name of a gain set; logs by their suffix.
 GAINS_ENDING = ".gains.json"
 LOG_ENDINGS = (".csv", ".tsv", ".parquet", ".tdms", ".mf4", ".mdf", ".dat")

@@ -230,7 +230,7 @@ def sweep(
 
 
 def _cases(cases: Any, parameters: Mapping[str, Sequence[Any]], method: str | None) -> list[SweepCase]:
-    from obsynth import __version__
+    from obsynth.version import __version__
 
     if not isinstance(parameters, Mapping):
         raise SpecError("parameters must be a mapping of names to lists of values.", path="parameters")

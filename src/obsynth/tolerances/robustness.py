@@ -46,6 +46,10 @@ FEW_BOXES = 40
 MOST_GAIN_SAMPLES = 5_000
 #: What is left of a response when its sum ends.
 _GAIN_LEFT = 1e-6
+#: Tolerances whose shares agree so well are one tolerance; what is to blame for less is left out.
+SAME_SHARE, LISTED_SHARE = 1e-9, 5e-3
+#: Two plants are the same where entries agree so well, relatively and around zero.
+SAME_ENTRY, SAME_ZERO = 1e-9, 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +89,8 @@ class Robustness:
         Constants that act where a fault acts: no observer can ever tell their tolerance from it.
     untouched : tuple of complex
         Modes of the plant that no constant touches and that are not stable: ``stable`` is about all others.
+    not_covered : str
+        For a linear model of a nonlinear plant: that its nonlinearity is not covered.
     """
 
     box: ConstantsBox
@@ -102,6 +108,7 @@ class Robustness:
     reason: str = ""
     sharing: tuple[str, ...] = ()
     untouched: tuple[complex, ...] = ()
+    not_covered: str = ""
 
     def __post_init__(self) -> None:
         for name in ("breaking", "blame", "rows", "error_per_unit", "vertex_gains"):
@@ -118,7 +125,7 @@ class Robustness:
         shares = [item.half / abs(item.nominal) for item in self.box.uncertain if item.nominal]
         if self.largest_factor is None or len(shares) != len(self.box.uncertain) or not shares:
             return None
-        common = max(shares) - min(shares) <= 1e-9 * max(shares)
+        common = max(shares) - min(shares) <= SAME_SHARE * max(shares)
         return self.largest_factor * shares[0] if common else None
 
     def facts(self) -> Iterator[tuple[str, str]]:
@@ -127,7 +134,9 @@ class Robustness:
             yield "model", EXACT_MODEL
             return
         names = ", ".join(self.box.names[:6]) + (", ..." if len(self.box.names) > 6 else "")
-        yield "constants", f"{len(self.box.names)} with a tolerance ({names}), {self.box.variation}, {self.box.source}"
+        yield "constants", f"{len(self.box.names)} with a tolerance ({names}), {self.box.variation}, {self.box.origin}"
+        if self.not_covered:
+            yield "linear model", self.not_covered
         yield "regular, index 1", self.regular + (self._where() if self.regular == "refuted" else "")
         where = self._where() if self.stable == "refuted" and self.regular != "refuted" else ""
         lasting = ", ".join(f"{value.real:.4g}" if not value.imag else f"{value:.4g}" for value in self.untouched)
@@ -163,6 +172,7 @@ class Robustness:
             "error_per_unit": {name: dict(row) for name, row in self.error_per_unit.items()},
             "vertex_gains": dict(self.vertex_gains), "stable": self.stable, "boxes": self.boxes, "reason": self.reason,
             "sharing": list(self.sharing), "untouched": [[value.real, value.imag] for value in self.untouched],
+            "not_covered": self.not_covered,
         }  # fmt: skip
 
     def __str__(self) -> str:
@@ -177,7 +187,7 @@ class Robustness:
 
 def _top(shares: Mapping[str, float], most: int = 4) -> str:
     found = sorted(shares.items(), key=lambda item: -item[1])[:most]
-    return ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in found if share > 5e-3) or "nothing"
+    return ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in found if share > LISTED_SHARE) or "nothing"
 
 
 def with_tolerances(
@@ -202,7 +212,7 @@ def _of_plant(design: ObserverDesign, given: DescriptorSystem) -> tuple[Observer
     plant, _ = design.linear
     same = all(
         getattr(plant, name).shape == getattr(given, name).shape
-        and np.allclose(getattr(plant, name), getattr(given, name), rtol=1e-9, atol=1e-12)
+        and np.allclose(getattr(plant, name), getattr(given, name), rtol=SAME_ENTRY, atol=SAME_ZERO)
         for name in ("E", "A", "B", "C", "D", "Bd", "Dd", "Bf", "Df")
     )
     own, other = plant.uncertainty, given.uncertainty
@@ -296,6 +306,7 @@ def robustness(
     return Robustness(
         uncertain.box, False, regular.verdict, breaking, radius, factor, shares, rows, errors, gains, stable.verdict,
         stable.boxes, reason, tuple(name for name, found in told_from_faults(plant).items() if found.shares), untouched,
+        uncertain.not_covered,
     )  # fmt: skip
 
 
@@ -312,7 +323,10 @@ def structure_of(
             condition="discrete time",
         )  # fmt: skip
     sizes = np.zeros(plant.nd) if bounds is None else bounds
-    return error_structure(observer, affine, tracking, sizes, noise_bound, faults=faults, states=states)
+    return error_structure(
+        observer, affine, tracking, sizes, noise_bound, faults=faults, states=states,
+        varying=affine.box.variation == "varying",
+    )  # fmt: skip
 
 
 def _named(names: tuple[str, ...], shares: FloatArray) -> dict[str, float]:

@@ -15,8 +15,8 @@ from obsynth.proofs.balls import Ball
 from obsynth.proofs.contraction import column_norms, prove_contraction
 from obsynth.proofs.exponentials import energy
 from obsynth.proofs.peak_sums import gathered, interval_pieces, peak_sums
+from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
-from obsynth.results.report import Check, information, upper_bound_check
 from obsynth.verification.remainder_channel import TrackedPlant
 
 #: Matrices found again may differ by this share of the largest entry of their row or column: another order of sums.

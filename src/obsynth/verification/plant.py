@@ -8,7 +8,7 @@ from obsynth.analysis.conditions import Condition
 from obsynth.analysis.zeros import are_outside
 from obsynth.numerics.pencils import FiniteZeros, PencilStructure, pencil_structure
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.results.report import Check, information
+from obsynth.results.checks import Check, information
 
 #: Imaginary parts below this are not shown.
 SHOWN_AS_REAL = 1e-12

@@ -23,12 +23,11 @@ from obsynth.analysis.existence.witnesses import (
     rational,
     rational_matrices,
 )
-from obsynth.analysis.plant_units import PlantUnits
+from obsynth.analysis.plant_units import PlantUnits, sized_plant
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.scaling import equilibrate_pencil
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.exosystems import Exosystem
-from obsynth.plants.origin import sized_plant
 from obsynth.proofs.written_numbers import written_fraction
 
 #: Digits to which the vector of a witness is rounded, until the plant is within the tolerance.

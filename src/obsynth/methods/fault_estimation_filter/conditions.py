@@ -24,7 +24,7 @@ from obsynth.analysis.existence.verdicts import (
     zero_doubt,
     zero_verdict,
 )
-from obsynth.analysis.plant_units import PlantUnits
+from obsynth.analysis.plant_units import PlantUnits, sized_plant
 from obsynth.analysis.zeros import Zero, fault_zeros, hidden_direction, leading_names, system_pencil, zero_at
 from obsynth.errors import PreconditionError
 from obsynth.methods.fault_estimation_filter.detectability_indexes import (
@@ -36,7 +36,6 @@ from obsynth.methods.fault_estimation_filter.prepared_plant import PreparedPlant
 from obsynth.numerics.pencils import PencilStructure, regularity
 from obsynth.numerics.ranks import decide_rank
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.origin import sized_plant
 
 #: At most this many signals are named in a failed condition.
 MOST_NAMES = 4

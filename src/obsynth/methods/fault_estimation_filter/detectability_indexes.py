@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 
 #: Random choices of T after which none is taken to be nonsingular.
 MOST_CHOICES = 20
+#: Faults with at least this share of the largest in a dependence are named.
+DEPENDENT_SHARE = 0.1
 
 
 _SEED = 45
@@ -263,4 +265,6 @@ def _names(faults: tuple[str, ...]) -> str:
 def _dependent_faults(upsilon: FloatArray, names: tuple[str, ...]) -> tuple[str, ...]:
     lengths = np.linalg.norm(upsilon, axis=0)
     direction = np.abs(np.linalg.svd(upsilon / lengths)[2][-1])
-    return tuple(name for name, size in zip(names, direction, strict=True) if size > 0.1 * np.max(direction))
+    return tuple(
+        name for name, size in zip(names, direction, strict=True) if size > DEPENDENT_SHARE * np.max(direction)
+    )

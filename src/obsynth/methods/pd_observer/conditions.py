@@ -27,7 +27,7 @@ from obsynth.analysis.existence.verdicts import (
     zero_verdict,
 )
 from obsynth.analysis.far_zeros import equilibrated_at
-from obsynth.analysis.plant_units import PlantUnits
+from obsynth.analysis.plant_units import PlantUnits, sized_plant
 from obsynth.analysis.structure import analyse_structure
 from obsynth.analysis.transformations import Transformation, eliminate_algebraic_states
 from obsynth.analysis.zeros import leading_names, system_pencil
@@ -35,7 +35,6 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.ranks import decide_rank, equilibrate
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.origin import sized_plant
 from obsynth.proofs.written_numbers import computed_entries
 
 #: At most this many signals are named in a failed condition.

@@ -13,7 +13,7 @@ from obsynth.analysis.conditions import Condition
 from obsynth.analysis.existence.distance import least_share
 from obsynth.analysis.existence.numbers import numbers_of
 from obsynth.analysis.existence.verdicts import rank_doubt, settled_rank
-from obsynth.analysis.plant_units import PlantUnits
+from obsynth.analysis.plant_units import PlantUnits, sized_plant
 from obsynth.analysis.transformations import StateRecovery, Transformation, eliminate_algebraic_states
 from obsynth.analysis.transformations.elimination import dynamic_coordinates, eliminated_exactly
 from obsynth.analysis.zeros import leading_names
@@ -23,7 +23,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import RANK_TOLERANCE, RankDecision, decide_rank
 from obsynth.numerics.scaling import equilibrate_pencil
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.origin import origin_of, sized_plant
+from obsynth.plants.origin import origin_of
 
 #: A direct effect on an output, relative to the effect on the states (both in scaled units), that elimination may
 #: leave by rounding.

@@ -21,7 +21,7 @@ from obsynth.analysis.existence.numbers import numbers_of
 from obsynth.analysis.existence.rational import PlantNumbers, SystemFacts, WrittenNumbers
 from obsynth.analysis.existence.verdicts import DECIDER, settled_rank
 from obsynth.analysis.existence.witnesses import Unclear
-from obsynth.analysis.plant_units import PlantUnits
+from obsynth.analysis.plant_units import PlantUnits, sized_plant
 from obsynth.analysis.zeros import is_outside, leading_names
 from obsynth.methods.ui_pi_observer.augmented_plant import AugmentedPlant
 from obsynth.methods.ui_pi_observer.pencils import (
@@ -38,7 +38,6 @@ from obsynth.numerics.pencils import finite_zeros
 from obsynth.numerics.ranks import RANK_TOLERANCE, RankDecision, decide_rank
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.exosystems import Exosystem
-from obsynth.plants.origin import sized_plant
 
 if TYPE_CHECKING:
     from flint import fmpz_poly

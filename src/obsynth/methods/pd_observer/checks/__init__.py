@@ -23,8 +23,8 @@ from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.numerics.scaling import balance_by_least_squares, balanced_matrix
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.results.checks import Check, information, lower_bound_check, upper_bound_check
 from obsynth.results.design import ObserverDesign
-from obsynth.results.report import Check, information, lower_bound_check, upper_bound_check
 from obsynth.verification.identities import equality, relative_tolerance, residual, tracking_identities, worst
 from obsynth.verification.plant import condition_rows, plant_information
 from obsynth.verification.remainder_channel import TrackedPlant

@@ -21,8 +21,8 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import ContinuousHinfNorm, continuous_hinf_norm
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
-from obsynth.results.report import Check, information, upper_bound_check
 from obsynth.verification.error_system import ErrorSystem
 
 
