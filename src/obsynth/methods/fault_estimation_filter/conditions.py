@@ -15,6 +15,7 @@ import numpy as np
 from obsynth.analysis.conditions import Condition, rank_condition
 from obsynth.analysis.existence.distance import least_share
 from obsynth.analysis.existence.numbers import numbers_of
+from obsynth.analysis.existence.rational import PlantNumbers
 from obsynth.analysis.existence.verdicts import (
     described_distance,
     needed_gain,
@@ -138,25 +139,7 @@ def _rank_conditions(plant: DescriptorSystem) -> list[Condition]:
         signals=() if plant.nf <= plant.ny else plant.fault_names,
     )
     numbers = numbers_with_fault_states(plant)
-    units, terms = PlantUnits.of(plant).rounded(), sized_plant(plant)
-    natural, sizes = units.scaled_plant(plant), None if terms is None else units.scaled_plant(terms)
-    columns = np.vstack([natural.Bf, natural.Df])
-    faults = settled_rank(
-        decide_rank(columns, expected=plant.nf),
-        # Faults that act on the outputs are columns of Bf too, once they are states.
-        None if numbers is None else numbers.rank(numbers.blocks([[numbers.matrix("Bf")]])),
-        np.inf if sizes is None else least_share(columns, np.vstack([sizes.Bf, sizes.Df])),
-    )
-    acting = rank_condition(
-        "rank F",
-        faults,
-        "some faults act nowhere, or in the same direction as others, and cannot be told apart.",
-        source="Wang 2015, below eq. (1)",
-        signals=_dependent_columns(plant),
-    )
-    if faults.means == "unclear":
-        acting = acting.in_doubt(rank_doubt(plant, units, faults, [["Bf"], ["Df"]]), plant)
-    ranks = [enough, acting]
+    ranks = [enough, _fault_rank(plant, numbers)]
     if not all(condition.holds for condition in ranks):
         return ranks
     try:
@@ -175,7 +158,37 @@ def _rank_conditions(plant: DescriptorSystem) -> list[Condition]:
                 signals=error.signals,
             ),
         ]
-    natural = PlantUnits.of(work).rounded().scaled_plant(work)
+    return [*ranks, *_output_ranks(work, plant.output_names, numbers)]
+
+
+def _fault_rank(plant: DescriptorSystem, numbers: PlantNumbers | None) -> Condition:
+    units, terms = PlantUnits.of(plant).rounded(), sized_plant(plant)
+    natural, sizes = units.scaled_plant(plant), None if terms is None else units.scaled_plant(terms)
+    columns = np.vstack([natural.Bf, natural.Df])
+    faults = settled_rank(
+        decide_rank(columns, expected=plant.nf),
+        # Faults that act on the outputs are columns of Bf too, once they are states.
+        None if numbers is None else numbers.rank(numbers.blocks([[numbers.matrix("Bf")]])),
+        np.inf if sizes is None else least_share(columns, np.vstack([sizes.Bf, sizes.Df])),
+    )
+    acting = rank_condition(
+        "rank F",
+        faults,
+        "some faults act nowhere, or in the same direction as others, and cannot be told apart.",
+        source="Wang 2015, below eq. (1)",
+        signals=_dependent_columns(plant),
+    )
+    if faults.means == "unclear":
+        acting = acting.in_doubt(rank_doubt(plant, units, faults, [["Bf"], ["Df"]]), plant)
+    return acting
+
+
+def _output_ranks(
+    work: DescriptorSystem, output_names: tuple[str, ...], numbers: PlantNumbers | None
+) -> list[Condition]:
+    """Return the conditions on C and [E; C] of a plant whose sensor faults are states."""
+    units = PlantUnits.of(work).rounded()
+    natural = units.scaled_plant(work)
     stacked = np.vstack([natural.E, natural.C])
     outputs, states = decide_rank(natural.C, expected=work.ny), decide_rank(stacked, expected=work.nx)
     if numbers is not None:
@@ -187,9 +200,7 @@ def _rank_conditions(plant: DescriptorSystem) -> list[Condition]:
         outputs,
         "some outputs repeat others: leave them out.",
         source="Wang 2015, below eq. (1)",
-        signals=()
-        if outputs.full
-        else leading_names(np.linalg.svd(work.C)[0][:, -1], plant.output_names, most=MOST_NAMES),
+        signals=() if outputs.full else leading_names(np.linalg.svd(work.C)[0][:, -1], output_names, most=MOST_NAMES),
     )
     known = rank_condition(
         "rank [E; C]",
@@ -199,12 +210,11 @@ def _rank_conditions(plant: DescriptorSystem) -> list[Condition]:
         source="Wang 2015, eq. (2)",
         signals=() if states.full else leading_names(np.linalg.svd(stacked)[2][-1], work.state_names, most=MOST_NAMES),
     )
-    units = PlantUnits.of(work).rounded()
     if outputs.means == "unclear":
         repeated = repeated.in_doubt(rank_doubt(work, units, outputs, [["C"]], rows=True), work)
     if states.means == "unclear":
         known = known.in_doubt(rank_doubt(work, units, states, [["E"], ["C"]]), work)
-    return [*ranks, repeated, known]
+    return [repeated, known]
 
 
 def _zero_conditions(plant: DescriptorSystem) -> list[Condition]:
