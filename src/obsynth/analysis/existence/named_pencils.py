@@ -87,11 +87,11 @@ class NamedPencil:
         for digits in DIGITS:
             place = _placed(at, digits, dt)
             changes, size = self._changes(_rounded(vector, digits), place, rows, columns)
-            if changes and (best is None or size < best.size):
+            if best is None or size < best.size:
                 best = Witness(changes, size, None if point is None else complex(float(place[0]), float(place[1])))
-            if best is not None and best.size <= tolerance:
+            if best.size <= tolerance:
                 break
-        return best
+        return best if best is not None and np.isfinite(best.size) else None
 
     def last_share(self, point: complex) -> float:
         """Return how much of the last column no combination of the others makes, beside the terms it is made of."""
