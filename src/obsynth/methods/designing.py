@@ -242,11 +242,6 @@ def _kind_conditions(plant: Plant, method: MethodSpec) -> tuple[Condition, ...]:
     )  # fmt: skip
 
 
-def public_function(method: str) -> Callable[..., ObserverDesign]:
-    """Return the public function of a method."""
-    return method_spec(method).load("public")
-
-
 def draft_of(
     plant: Plant, method: str, found: Synthesis, *, name: str, recovery: StateRecovery | None = None
 ) -> ObserverDesign:

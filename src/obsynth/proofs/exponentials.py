@@ -38,15 +38,6 @@ def exponential(matrix: FloatArray, time: float) -> Ball:
         return as_ball(scaled.exp())
 
 
-def held_input(a: FloatArray, b: FloatArray, time: float) -> Ball:
-    r"""Return a ball that holds ``\int_0^t e^{A s} ds B``, for ``A (n, n)``, ``B (n, m)``."""
-    n, m = b.shape
-    chain = np.zeros((n + m, n + m))
-    chain[:n, :n], chain[:n, n:] = a, b
-    whole = exponential(chain, time)
-    return Ball(whole.midpoint[:n, n:], whole.radius[:n, n:])
-
-
 def energy(a: FloatArray, b: FloatArray, time: float) -> Ball:
     r"""Return a ball that holds ``\int_0^t e^{A s} B B' e^{A' s} ds`` (Van Loan), for ``A (n, n)``, ``B (n, m)``."""
     import flint

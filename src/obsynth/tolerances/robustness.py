@@ -89,6 +89,8 @@ class Robustness:
         Constants that act where a fault acts: no observer can ever tell their tolerance from it.
     untouched : tuple of complex
         Modes of the plant that no constant touches and that are not stable: ``stable`` is about all others.
+    not_covered : str
+        For a linear model of a nonlinear plant: that its nonlinearity is not covered.
     """
 
     box: ConstantsBox
@@ -106,6 +108,7 @@ class Robustness:
     reason: str = ""
     sharing: tuple[str, ...] = ()
     untouched: tuple[complex, ...] = ()
+    not_covered: str = ""
 
     def __post_init__(self) -> None:
         for name in ("breaking", "blame", "rows", "error_per_unit", "vertex_gains"):
@@ -131,7 +134,9 @@ class Robustness:
             yield "model", EXACT_MODEL
             return
         names = ", ".join(self.box.names[:6]) + (", ..." if len(self.box.names) > 6 else "")
-        yield "constants", f"{len(self.box.names)} with a tolerance ({names}), {self.box.variation}, {self.box.source}"
+        yield "constants", f"{len(self.box.names)} with a tolerance ({names}), {self.box.variation}, {self.box.origin}"
+        if self.not_covered:
+            yield "linear model", self.not_covered
         yield "regular, index 1", self.regular + (self._where() if self.regular == "refuted" else "")
         where = self._where() if self.stable == "refuted" and self.regular != "refuted" else ""
         lasting = ", ".join(f"{value.real:.4g}" if not value.imag else f"{value:.4g}" for value in self.untouched)
@@ -167,6 +172,7 @@ class Robustness:
             "error_per_unit": {name: dict(row) for name, row in self.error_per_unit.items()},
             "vertex_gains": dict(self.vertex_gains), "stable": self.stable, "boxes": self.boxes, "reason": self.reason,
             "sharing": list(self.sharing), "untouched": [[value.real, value.imag] for value in self.untouched],
+            "not_covered": self.not_covered,
         }  # fmt: skip
 
     def __str__(self) -> str:
@@ -300,6 +306,7 @@ def robustness(
     return Robustness(
         uncertain.box, False, regular.verdict, breaking, radius, factor, shares, rows, errors, gains, stable.verdict,
         stable.boxes, reason, tuple(name for name, found in told_from_faults(plant).items() if found.shares), untouched,
+        uncertain.not_covered,
     )  # fmt: skip
 
 
@@ -316,7 +323,10 @@ def structure_of(
             condition="discrete time",
         )  # fmt: skip
     sizes = np.zeros(plant.nd) if bounds is None else bounds
-    return error_structure(observer, affine, tracking, sizes, noise_bound, faults=faults, states=states)
+    return error_structure(
+        observer, affine, tracking, sizes, noise_bound, faults=faults, states=states,
+        varying=affine.box.variation == "varying",
+    )  # fmt: skip
 
 
 def _named(names: tuple[str, ...], shares: FloatArray) -> dict[str, float]:

@@ -66,9 +66,9 @@ def consistency(stated: RecursiveObserver, shipped: RecursiveObserver, steps: in
         yield _band("NIS", "squared whitened innovations per degree of freedom are one", squares)
         products = np.concatenate([found.ravel() for found in pairs])
         if products.size:
-            yield upper_bound_check(
-                "whiteness", "innovations of successive samples are uncorrelated", abs(float(products.mean())),
-                BAND / np.sqrt(products.size), source=_SOURCE, detail=f"{products.size} products",
+            yield _estimated(
+                "whiteness", "mean product of innovations of successive samples: they are uncorrelated",
+                float(products.mean()), 0.0, BAND / float(np.sqrt(products.size)), f"{products.size} products",
             )  # fmt: skip
 
 
@@ -140,7 +140,7 @@ def _error_rows(scores: dict[int, Scores]) -> Iterator[Check]:
         if found.normalised.size
     ]
     if rows:
-        yield max(rows, key=lambda row: row.value / row.bound)
+        yield min(rows, key=lambda row: row.margin / (row.bound - 1.0) * np.sign(row.bound - 1.0))
     exact = [float(np.max(np.abs(found.known))) for found in scores.values() if found.known.size]
     if exact:
         yield upper_bound_check(
@@ -151,8 +151,16 @@ def _error_rows(scores: dict[int, Scores]) -> Iterator[Check]:
 
 def _band(name: str, claim: str, squares: FloatArray, where: str = "") -> Check:
     """Return the row that the mean of squares of independent standard normal numbers is one."""
-    gap = abs(float(squares.mean()) - 1.0)
-    bound = BAND * float(np.sqrt(2.0 / squares.size))
-    return upper_bound_check(
-        name, claim, gap, bound, source=_SOURCE, detail=f"mean {squares.mean():.4f} of {squares.size}{where}"
-    )
+    width = BAND * float(np.sqrt(2.0 / squares.size))
+    return _estimated(name, claim, float(squares.mean()), 1.0, width, f"mean of {squares.size}{where}")
+
+
+def _estimated(name: str, claim: str, mean: float, expected: float, width: float, detail: str) -> Check:
+    """Return the row that a mean is within so much of what is expected."""
+    low, high = expected - width, expected + width
+    return Check(
+        name, claim, mean, high if mean >= expected else low, width - abs(mean - expected),
+        bool(low <= mean <= high), _SOURCE, "computed",
+        f"{detail}; chance alone keeps it within {low:.4g} to {high:.4g}, but one time in two million", "estimated",
+        (low, high),
+    )  # fmt: skip
