@@ -111,7 +111,7 @@ def run_report(options: argparse.Namespace) -> int:
 
     require_distinct({"--gains": options.gains, "--system": options.system, "--out": options.out})
     design = load(options.gains)
-    from obsynth.cli.simulate import required_scenario
+    from obsynth.cli.data_run import required_scenario
     from obsynth.report.page import PAGE, html_report
     from obsynth.spec import load_spec
 

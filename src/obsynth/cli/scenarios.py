@@ -1,7 +1,4 @@
-"""The verbs ``evaluate`` and ``compare``: one design on its scenario many times, or every method that exists on it.
-
-The verb ``compare``: every method that exists for a spec's plant, side by side.
-"""
+"""The verbs that run a scenario: ``simulate``, ``evaluate``, and ``compare``, which does so for every method."""
 
 from __future__ import annotations
 
@@ -9,12 +6,12 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from obsynth.cli.arguments import add_force, add_json, add_quiet, add_system, output_file
+from obsynth.cli.arguments import add_force, add_json, add_quiet, add_spec_gains, output_file, spec_verb
 from obsynth.cli.data_arguments import add_monitor_arguments
 from obsynth.cli.output import print_json, progress, stdout_console
-from obsynth.cli.simulate import required_scenario
 from obsynth.cli.sweep import chosen_executor
 from obsynth.errors import PreconditionError, SpecError
+from obsynth.files.inputs import protect
 
 if TYPE_CHECKING:
     from obsynth.experiments.monitors.monitor import Monitor
@@ -23,16 +20,55 @@ if TYPE_CHECKING:
     from obsynth.spec import Spec
 
 
+_SIMULATE = "Design an observer from a spec, and simulate it on the spec's scenario."
+
+
+def add_simulate_verb(verbs: Any) -> None:
+    """Add the parser."""
+    simulate = spec_verb(verbs, "simulate", _SIMULATE)
+    add_spec_gains(simulate)
+    simulate.add_argument("--out", type=Path, metavar="FILE", help="write every signal to this file (CSV)")
+    add_json(simulate)
+    add_force(simulate)
+    add_quiet(simulate)
+
+
+def run_simulate(options: argparse.Namespace) -> int:
+    """Run ``simulate``: spec in, table of errors out, and every signal in a file if asked."""
+    from obsynth.cli.commands import designed_or_loaded, spec_output
+    from obsynth.cli.data_run import required_scenario
+    from obsynth.experiments.columns import SIGNALS
+    from obsynth.spec import load_spec
+
+    with progress(quiet=options.quiet) as report_stage:
+        report_stage(f"reading {options.system}")
+        spec = load_spec(options.system)
+        scenario = required_scenario(spec)
+        if options.gains is not None:
+            protect(options.gains)
+        target = None if options.out is None else spec_output(options.out, SIGNALS, spec, options, option="--out")
+        design = designed_or_loaded(spec, options.gains, report_stage)
+        report_stage("simulating")
+        from obsynth.experiments.simulation import simulate
+
+        found = simulate(design, scenario)
+        written = None if target is None else str(found.write_csv(target))
+    if options.json:
+        print_json({"command": "simulate", "spec": str(spec.path), "file": written, **found.summary()})
+        return 0
+    from obsynth.report.scenarios import simulation_report
+
+    simulation_report(design.name, found, console=stdout_console(), units=design.plant.units, file=written)
+    return 0
+
+
 _EVALUATE = "Design an observer from a spec, run the spec's scenario many times, and count alarms, delays and errors."
 
 
 def add_evaluate_verb(verbs: Any) -> None:
     """Add the parser."""
-    evaluate = verbs.add_parser("evaluate", help=_EVALUATE, description=_EVALUATE)
-    add_system(evaluate)
-    evaluate.add_argument(
-        "--gains", type=Path, metavar="FILE", help="a gain set for the spec's plant: nothing is designed"
-    )
+    evaluate = spec_verb(verbs, "evaluate", _EVALUATE)
+    add_spec_gains(evaluate)
     evaluate.add_argument(
         "--runs", type=int, default=100, metavar="N", help="how many, each with its seed (default: 100)"
     )
@@ -46,13 +82,12 @@ def add_evaluate_verb(verbs: Any) -> None:
     add_monitor_arguments(evaluate)
     add_json(evaluate)
     add_quiet(evaluate)
-    evaluate.set_defaults(verb="evaluate")
 
 
 def run_evaluate(options: argparse.Namespace) -> int:
     """Run ``evaluate``: spec in, table of rates and errors out."""
     from obsynth.cli.commands import designed_or_loaded
-    from obsynth.cli.data_run import numbers_of, own_tolerances, ranges_of
+    from obsynth.cli.data_run import numbers_of, own_tolerances, ranges_of, required_scenario
     from obsynth.spec import load_spec
 
     with progress(quiet=options.quiet) as report_stage:
@@ -100,8 +135,7 @@ _COMPARE = "Design by every method that exists for a spec's plant, and show them
 
 def add_compare_verb(verbs: Any) -> None:
     """Add the parser."""
-    compare = verbs.add_parser("compare", help=_COMPARE, description=_COMPARE)
-    add_system(compare)
+    compare = spec_verb(verbs, "compare", _COMPARE)
     compare.add_argument("--data", type=Path, metavar="FILE", help="a log (CSV) to replay through every method")
     compare.add_argument("--out", type=Path, metavar="FILE", help="write a page (HTML) with table and picture")
     compare.add_argument("--runs", type=int, default=20, metavar="N", help="drawn runs of the scenario (default: 20)")
@@ -115,7 +149,6 @@ def add_compare_verb(verbs: Any) -> None:
     add_force(compare)
     add_json(compare)
     add_quiet(compare)
-    compare.set_defaults(verb="compare")
 
 
 def run_compare(options: argparse.Namespace) -> int:

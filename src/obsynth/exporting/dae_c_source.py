@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from obsynth.errors import SpecError
-from obsynth.exporting.c_words import c_identifier, comment, included, quoted
+from obsynth.exporting.c_source import c_identifier, comment, included, quoted
 from obsynth.files.outputs import write_together
 from obsynth.observers.dae.c_code import observer_code, observer_struct
 from obsynth.plants.dae.model import DAEModel

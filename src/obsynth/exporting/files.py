@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.exporting.c_source import header_text, source_text
-from obsynth.exporting.c_words import c_identifier
+from obsynth.exporting.c_source import c_identifier, header_text, source_text
 from obsynth.exporting.dae_c_source import write_dae_c
 from obsynth.exporting.realisation import Realisation
 from obsynth.files.outputs import FileKind, write_atomically, write_together

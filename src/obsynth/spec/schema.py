@@ -46,6 +46,7 @@ class LineariseSection(Section):
     disturbances: list[Text] | None = None
     start: dict[Text, float] | None = None
     drift: bool | None = None
+    constants: dict[Text, Any] | None = None
 
 
 class TransformSection(Section):
@@ -65,11 +66,12 @@ class EntrySection(Section):
 
 
 class BoxSection(Section):
-    """Where the tolerances come from."""
+    """Where the tolerances come from: a source, or a file that ``obsynth calibrate --out`` has written."""
 
-    source: Literal["stated", "set-membership", "calibrated"]
+    source: Literal["stated", "set-membership", "calibrated"] | None = None
     level: float | None = None
     digest: Text | None = None
+    file: Text | None = None
 
 
 class PlantSection(Section):
@@ -167,7 +169,9 @@ class DAESection(Section):
     units: dict[Text, str] | None = None
     inputs: dict[Text, float] | None = None
     parameters: dict[Text, float] | None = None
-    constants: dict[Text, float] | None = None
+    constants: dict[Text, Any] | None = None
+    variation: Literal["constant", "varying"] | None = None
+    box: BoxSection | None = None
     definitions: dict[Text, Text] | None = None
     transform: TransformSection | None = None
 

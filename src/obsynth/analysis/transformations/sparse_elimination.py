@@ -52,13 +52,7 @@ class SparseReduction:
 
 
 def reduced_by_sparsity(plant: DescriptorSystem) -> SparseReduction:
-    """Solve the algebraic equations of an index-1 plant with sparse factors.
-
-    Raises
-    ------
-    PreconditionError
-        Not regular, index 2 or more, or no dynamic state: equations and variables are named.
-    """
+    """Solve the algebraic equations of an index-1 plant with sparse factors."""
     split = split_by_derivatives(plant)
     count = split.dynamic.shape[1]
     if count == 0:
@@ -193,13 +187,7 @@ def _scales(e: Any, a: Any) -> tuple[FloatArray, FloatArray]:
 
 
 def culprits(plant: DescriptorSystem) -> tuple[str, tuple[str, ...]]:
-    """Return what keeps a plant from having index 1, in words, and its variables; nothing for one that has.
-
-    Raises
-    ------
-    PreconditionError
-        The pattern alone leaves variables free: these are named.
-    """
+    """Return what keeps a plant from having index 1, in words, and its variables; nothing for one that has."""
     whole = coarse_structure(abs(csr(plant.E)) + abs(csr(plant.A)))
     if whole.structural_rank < plant.nx:
         raise_structurally_singular(plant, whole.over_rows, whole.under_columns)

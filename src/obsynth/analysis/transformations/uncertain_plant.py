@@ -222,12 +222,15 @@ def _reduced(
 
 def _require_algebraic(rows: AffineMatrix, columns: AffineMatrix) -> None:
     """Refuse a box that puts a derivative into an algebraic row, or of an algebraic state."""
+    advice = {
+        "row": "The tolerances put a derivative into an algebraic equation (row {} of those that have none at the "
+        "nominal values): the plant's order would change in the box. Give E no tolerance there.",
+        "state": "The tolerances give a derivative to what is algebraic at the nominal values (state {} of those "
+        "without one): which states are dynamic would change in the box. Multiply whole rows of E by a "
+        "constant, or give E no tolerance there.",
+    }  # fmt: skip
     for what, found, axis in (("row", rows, 1), ("state", columns, 0)):
         moving = (np.abs(found.center) + found.spread + found.radius).any(axis=axis)
         if moving.any():
             numbers = ", ".join(str(i + 1) for i in np.flatnonzero(moving))
-            raise PreconditionError(
-                f"The tolerances put a derivative into an algebraic equation ({what} {numbers} of those that have "
-                "none at the nominal values): the plant's order would change in the box. Give E no tolerance there.",
-                condition="algebraic rows",
-            )  # fmt: skip
+            raise PreconditionError(advice[what].format(numbers), condition="algebraic rows")

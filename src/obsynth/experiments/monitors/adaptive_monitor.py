@@ -21,7 +21,8 @@ from obsynth.plants.uncertainty import SAMPLED
 from obsynth.results.design import ObserverDesign
 from obsynth.tolerances.error_structure import error_structure
 from obsynth.tolerances.responses import loop_radius
-from obsynth.tolerances.robustness import EXACT_MODEL, structure_of, with_tolerances
+from obsynth.tolerances.result import EXACT_MODEL
+from obsynth.tolerances.robustness import structure_of, with_tolerances
 from obsynth.tolerances.subdivision import index_one_on_box
 from obsynth.tolerances.tracking import Tracking, tracking_of
 
@@ -183,19 +184,22 @@ def adaptive_statement(plan: AdaptivePlan, design: ObserverDesign) -> str:
     )
     if box is None:
         return text + EXACT
+    steps = () if uncertain is None else uncertain.steps
+    sampled = any(kind == SAMPLED for kind, _ in steps)
     kept = "constants stay the same" if box.variation == "constant" else (
+        "constants may change at each sample (where the state does not jump)" if sampled else
         "constants may change at each sample (the value at k + 1 multiplies x(k+1))"
     )  # fmt: skip
     radius = loop_radius(plan.bound.responses)
     ever = "" if radius < 1.0 else (
         f"; the loop through the tolerances has radius {radius:.3g}: the threshold holds at each sample, but may grow"
     )  # fmt: skip
-    steps = () if uncertain is None else uncertain.steps
-    held = "; inputs and disturbances are held between samples" if any(kind == SAMPLED for kind, _ in steps) else ""
+    held = "; inputs and disturbances are held between samples" if sampled else ""
     if plan.sample_time is not None:
         held = "; known inputs are held between rows, which are the sample time apart, disturbances may move in between"
     missing = "" if plan.intervals or not plan.fault_names else f"; no guaranteed interval of faults: {plan.reason}"
-    return f"{text}; {kept}{held}{ever}{missing}"
+    linear = "" if uncertain is None or not uncertain.not_covered else f"; {uncertain.not_covered}"
+    return f"{text}; {kept}{held}{ever}{missing}{linear}"
 
 
 def tolerances_of(

@@ -13,8 +13,7 @@ from obsynth.analysis.plant_units import PlantUnits
 from obsynth.methods.ui_pi_observer.augmented_plant import AugmentedPlant
 from obsynth.methods.ui_pi_observer.checks.decoupling import decoupling_norm
 from obsynth.methods.ui_pi_observer.checks.fault_response import tracking_rows
-from obsynth.methods.ui_pi_observer.checks.gains import gain_rows
-from obsynth.methods.ui_pi_observer.checks.numbers import noise_rows, stability_rows
+from obsynth.methods.ui_pi_observer.checks.numbers import gain_rows, noise_rows, stability_rows
 from obsynth.methods.ui_pi_observer.conditions import existence
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.observer import LinearObserver
