@@ -47,7 +47,7 @@ def steady_rows(
     listed = recomputed._replace(gain=np.hstack([L, K]))
     yield upper_bound_check(
         "steady state: unbiased", "L E + K C = I for the listed gains",
-        largest_bias([(step, listed)], natural_units(stated)), EQUALITY_TOLERANCE * condition,
+        largest_bias([(step, listed)], natural_units(stated)[: plant.nx]), EQUALITY_TOLERANCE * condition,
         source=f"{_SOURCE}, (10)-(11)", kind="proved", detail="in units of its terms, outward rounded",
     )  # fmt: skip
     transition = Ball.exact(L) @ Ball.exact(A)
