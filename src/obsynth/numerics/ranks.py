@@ -86,7 +86,8 @@ class RankDecision:
     singular_values: All singular values, largest first, of the matrix as decided upon (rows and columns scaled);
     smallest_kept, largest_dropped: The singular values on both sides of the cut, relative to the largest (0 where there
     is none); gap: ``smallest_kept / largest_dropped``; infinite when nothing, or only an exact zero, was dropped; when
-    the rank is full, the distance to the tolerance instead.
+    the rank is full, the distance to the tolerance instead; share: The last singular value beside the terms that the
+    entries are sums of, where those are known.
     """
 
     rank: int
@@ -96,6 +97,7 @@ class RankDecision:
     largest_dropped: float
     gap: float
     means: Literal["tolerance", "exact", "unclear"] = "tolerance"
+    share: float = np.inf
 
     @property
     def full(self) -> bool:
@@ -112,7 +114,7 @@ class RankDecision:
         values = self.singular_values
         if not 0 < self.expected <= len(values) or values[0] == 0.0:
             return ""
-        return f", least singular value {values[self.expected - 1] / values[0]:.1e}"
+        return f", least singular value {min(values[self.expected - 1] / values[0], self.share):.1e}"
 
     def describe(self) -> str:
         """Return one line for a report, such as ``rank 4 of 4 (gap 2.1e+09)``."""
@@ -120,10 +122,7 @@ class RankDecision:
             lost = "on the numbers as written; if their last digits are off, any gains would be about 1e16"
             return f"rank {self.rank} of {self.expected} (exactly{self._margin if self.full else f', {lost}'})"
         if self.means == "unclear":
-            return (
-                f"rank {self.expected} exactly, but less of data that differ by rounding{self._margin}; data with more "
-                "digits, or other units of what they describe, would decide it"
-            )
+            return f"rank {self.expected} exactly, but less of data that differ by rounding{self._margin}"
         note = "" if self.clear else ", unclear: check the scaling of the data"
         return f"rank {self.rank} of {self.expected} (gap {self.gap:.1e}{note})"
 

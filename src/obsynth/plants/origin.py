@@ -9,6 +9,8 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
+from obsynth.numerics.arrays import FloatArray
+
 
 class Written(Protocol):
     """A linear plant: its matrices by name, and the seconds between its samples."""
@@ -30,12 +32,16 @@ class PlantOrigin:
 
     Fields: exact: The `DECISIVE` matrices; sample_time: Where ``exact`` is a continuous plant and the plant itself is
     that one sampled with a zero-order hold; computed: Whether some of the numbers behind them were computed in floating
-    point.
+    point; sizes: Of the matrices of the plant itself, how large the terms are that each entry is a sum of (``A, Bf, Bd,
+    C, Df, Dd``): what rounding of the data behind it may change is relative to those; states: How many the plant as
+    written has, algebraic ones included; 0 where that is not known.
     """
 
     exact: Mapping[str, tuple[tuple[Fraction, ...], ...]]
     sample_time: Fraction | None = None
     computed: bool = False
+    sizes: Mapping[str, FloatArray] | None = None
+    states: int = 0
 
 
 def origin_of(plant: Written) -> PlantOrigin | None:

@@ -87,7 +87,7 @@ def _decided_indexes(plant: DescriptorSystem) -> ExactIndexes | None:
     numbers = numbers_with_fault_states(plant)
     if numbers is None:
         return None
-    t = _nonsingular_t(numbers)
+    t = nonsingular_t(numbers)
     if t is None:
         return None
     left: Any = numbers.as_own(t)
@@ -108,7 +108,7 @@ def _decided_indexes(plant: DescriptorSystem) -> ExactIndexes | None:
     return ExactIndexes(tuple(indexes), rank)
 
 
-def _nonsingular_t(numbers: PlantNumbers) -> fmpq_mat | None:
+def nonsingular_t(numbers: PlantNumbers) -> fmpq_mat | None:
     """Return a rational nonsingular T with ``T E + N C = I``."""
     from flint import fmpq_mat
 
@@ -254,7 +254,6 @@ def detectability_conditions(
         f"||Upsilon|| = {float(np.linalg.norm(user_units, 2)):.3g}"
         + (f"; {_names(mixed)} cannot be told apart at first sight. Leave one out, or measure more." if mixed else "."),
         signals=mixed,
-        unclear=not usable and rank.means != "exact" and (rank.full or rank.means == "unclear"),
     )
     return finite, independent
 
