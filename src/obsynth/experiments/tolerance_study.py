@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -20,9 +20,6 @@ from obsynth.results.design import ObserverDesign
 from obsynth.simulation.profiles import Step
 from obsynth.simulation.scenario import Scenario
 from obsynth.tolerances.exact_plant import drawn_points, plant_at
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 #: Tolerances that are tried, by default.
 TOLERANCES = (0.0, 0.01, 0.02, 0.05)
@@ -89,15 +86,6 @@ class ToleranceStudy:
         table = self.rows()
         widths = [max(len(row[i]) for row in table) for i in range(len(table[0]))]
         return "\n".join("  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in table)
-
-    def plot(self) -> Figure:
-        """Return a picture: false alarms, and the least fault, against the tolerance."""
-        import matplotlib.pyplot as plt
-
-        from obsynth.plotting.trade_off import plot_tolerances
-
-        plot_tolerances(self)
-        return plt.gcf()
 
 
 def tolerance_study(
