@@ -56,6 +56,7 @@ _NAMES = {
     "experiments.monitors.online_monitor": "online_monitor",
     "experiments.monitors.residual_monitor": "monitor",
     "experiments.monte_carlo": "evaluate Evaluation",
+    "experiments.tolerance_study": "tolerance_study ToleranceStudy",
     "experiments.simulation": "simulate Simulation RecursiveSimulation=Simulation",
     "exporting.files": "export",
     "importing.andes": "from_andes",
@@ -112,7 +113,8 @@ _NAMES = {
     "spec.loader": "load_spec Spec",
     "sweeps.fleet": "Fleet FleetRun run_fleet",
     "sweeps.sweep": "Sweep sweep SweepResult",
-    "tolerances.robustness": "Robustness robustness",
+    "tolerances.result": "Robustness",
+    "tolerances.robustness": "robustness",
 }
 _HOMES = {
     name: (f"obsynth.{module}", other or name)

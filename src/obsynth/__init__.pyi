@@ -47,6 +47,8 @@ from obsynth.experiments.monte_carlo import Evaluation as Evaluation
 from obsynth.experiments.monte_carlo import evaluate as evaluate
 from obsynth.experiments.simulation import Simulation as Simulation
 from obsynth.experiments.simulation import simulate as simulate
+from obsynth.experiments.tolerance_study import ToleranceStudy as ToleranceStudy
+from obsynth.experiments.tolerance_study import tolerance_study as tolerance_study
 from obsynth.exporting.files import export as export
 from obsynth.importing.andes import from_andes as from_andes
 from obsynth.importing.fmu import from_fmu as from_fmu
@@ -128,7 +130,7 @@ from obsynth.sweeps.fleet import run_fleet as run_fleet
 from obsynth.sweeps.sweep import Sweep as Sweep
 from obsynth.sweeps.sweep import SweepResult as SweepResult
 from obsynth.sweeps.sweep import sweep as sweep
-from obsynth.tolerances.robustness import Robustness as Robustness
+from obsynth.tolerances.result import Robustness as Robustness
 from obsynth.tolerances.robustness import robustness as robustness
 from obsynth.version import __version__ as __version__
 

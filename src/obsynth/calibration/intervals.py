@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from obsynth.calibration.maximum import Maximum, Objective, at_bounds, descent, polished
 from obsynth.numerics.arrays import SMALLEST, FloatArray
@@ -49,10 +50,13 @@ class Information:
     undetermined: tuple[dict[str, float], ...]
 
 
-def information(hessian: FloatArray, objective: Objective, z: FloatArray) -> Information:
-    """Return what the log says of the constants, the variances integrated out."""
+def information(
+    hessian: FloatArray, objective: Objective, z: FloatArray, *, apart: NDArray[np.bool_] | None = None
+) -> Information:
+    """Return what the log says of the constants, the variances integrated out but for those that are held ``apart``."""
     nt, widths = objective.nt, objective.problem.widths
     held = at_bounds(z, objective.low, objective.high)
+    held = held if apart is None else held | apart
     nuisance = [i for i in range(nt, len(z)) if not held[i]]
     found = hessian[:nt, :nt]
     if nuisance:
@@ -110,7 +114,7 @@ def profile_box(
     """Return both ends of each constant's box, in its own units."""
     found, names = [], objective.problem.unknown
     for i, width in enumerate(objective.problem.widths):
-        weak = any(names[i] in direction for direction in said.undetermined)
+        weak = objective.bent or any(names[i] in direction for direction in said.undetermined)
         side = _side_along_valley if weak else _side
         sides = [side(objective, maximum, i, sign, root) for sign in (-1.0, 1.0)]
         found.append((Side(sides[0].value * width, sides[0].is_open), Side(sides[1].value * width, sides[1].is_open)))

@@ -50,6 +50,7 @@ class Problem:
     graphs: SampleGraphs
     integration: str
     substeps: int
+    notes: tuple[str, ...] = ()
 
     @property
     def y(self) -> FloatArray:
@@ -77,6 +78,10 @@ class Problem:
             self.plant, self.unknown, self.log.dt, integration=integration, substeps=substeps, samples=self.log.samples
         )
         return Problem(**{**vars(self), "graphs": graphs, "integration": integration, "substeps": substeps})
+
+    def with_start(self, P0: FloatArray, *notes: str) -> Problem:
+        """Return the same problem with another covariance of the initial state, and what is said of that."""
+        return Problem(**{**vars(self), "P0": P0, "notes": notes})
 
     def with_log(self, log: Log) -> Problem:
         """Return the same problem with another log of the same signals."""
