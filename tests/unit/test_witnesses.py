@@ -5,6 +5,7 @@ The witness is confirmed by deciding existence on its exact numbers: the answer 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from fractions import Fraction
 from typing import Any
@@ -167,6 +168,24 @@ def test_the_witness_has_the_other_answer(case: str) -> None:
     # Faults that are alike do not show at all, at no pole of their models.
     assert {name, f"{name.split()[0]} shows"} & {found.name for found in changed}
     assert all(found.unclear is None for found in changed)
+
+
+@pytest.mark.parametrize("units", [1.0, 2.0**20])
+def test_a_no_that_holds_only_exactly_names_the_gain_it_would_take(units: float) -> None:
+    """With a last digit off, the outputs show x = (1, 1) by 2e-16 or less: a gain of 1e16 or more undoes that."""
+    hidden = made(None, NEARLY_HIDDEN["A"], C=[[units, -units]], Bf=[[1], [0]])
+    lost = pd_observer_conditions(hidden)[-1]
+    assert (lost.holds, lost.unclear) == (False, None)
+    told = re.search(r"any observer would need a gain of about (\S+) from 'y1' to 'x[12]'", lost.detail)
+    assert told is not None
+    assert float(told[1]) * units == pytest.approx(1e16, rel=0.2)
+    with pytest.raises(PreconditionError, match=r"^No observer of this kind exists: .*detectability"):
+        lost.require()
+
+
+def test_what_no_output_holds_anything_of_no_digits_would_show() -> None:
+    plant = made(None, [[0.5, 0], [0, 1.5]], C=[[1, 0]], dt=0.1)
+    assert "No output holds anything of it" in kalman(plant)[-1].detail
 
 
 def test_a_long_fault_model_has_a_witness_of_its_own() -> None:
