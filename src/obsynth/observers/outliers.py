@@ -51,17 +51,18 @@ def no_refusals(outputs: int) -> FloatArray:
 def robust_advance(
     kind: str, limit: float, plain: Callable[[State, FloatArray, FloatArray], tuple[State, Row]],
     predicted: Callable[[State, FloatArray, FloatArray], tuple[FloatArray, FloatArray]], state: State, y: FloatArray,
-    u: FloatArray,
+    u: FloatArray, *, always: bool = False,
 ) -> tuple[State, Row]:  # fmt: skip
     """Take a step; where its innovation is too long, ask each sensor and take the step again without the outliers.
 
+    ``always`` asks them of every sample: an output that a step needs to determine its state has no innovation there.
     ``predicted(state, heard, u)`` returns mean and deviation of each output ``(ny,)`` from the samples that are heard.
     """
     failed = False
     try:
         with np.errstate(all="ignore"):
             after, row = plain(state, y, u)
-        if float(row.nis) <= limit**2:
+        if float(row.nis) <= limit**2 and not always:
             return after._replace(refused=np.stack([np.zeros(len(y)), state.refused[1]])), row
     except (SolverError, np.linalg.LinAlgError, ValueError):
         failed = True
