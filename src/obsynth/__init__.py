@@ -112,7 +112,8 @@ _NAMES = {
     "spec.loader": "load_spec Spec",
     "sweeps.fleet": "Fleet FleetRun run_fleet",
     "sweeps.sweep": "Sweep sweep SweepResult",
-    "tolerances.robustness": "Robustness robustness",
+    "tolerances.result": "Robustness",
+    "tolerances.robustness": "robustness",
 }
 _HOMES = {
     name: (f"obsynth.{module}", other or name)

@@ -128,7 +128,7 @@ from obsynth.sweeps.fleet import run_fleet as run_fleet
 from obsynth.sweeps.sweep import Sweep as Sweep
 from obsynth.sweeps.sweep import SweepResult as SweepResult
 from obsynth.sweeps.sweep import sweep as sweep
-from obsynth.tolerances.robustness import Robustness as Robustness
+from obsynth.tolerances.result import Robustness as Robustness
 from obsynth.tolerances.robustness import robustness as robustness
 from obsynth.version import __version__ as __version__
 

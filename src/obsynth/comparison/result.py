@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import TYPE_CHECKING, Any
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from obsynth.files.outputs import FileKind
+from obsynth.files.tables import html_table
 from obsynth.methods.choosing.figures import FaultFigures
 from obsynth.numerics.arrays import FloatArray
 from obsynth.results.design import ObserverDesign
@@ -248,13 +248,6 @@ class Comparison:
             f"<img alt='Estimates of each method' style='max-width:100%' src='data:image/png;base64,{encoded}'></body>"
             "</html>\n"
         )
-
-
-def html_table(rows: Sequence[Sequence[str]]) -> str:
-    """Return a table of HTML with a header."""
-    head = "".join(f"<th>{escape(text)}</th>" for text in rows[0])
-    body = "".join("<tr>" + "".join(f"<td>{escape(text)}</td>" for text in row) + "</tr>" for row in rows[1:])
-    return f"<table><tr>{head}</tr>{body}</table>"
 
 
 def _number(value: float) -> str:

@@ -62,7 +62,7 @@ class Contraction:
             return 0.0
         ball = Ball.exact(rows) if radius is None else Ball(np.asarray(rows, dtype=np.float64), radius)
         product = ball @ Ball.exact(self.inverse)
-        size = rounded_up(np.abs(product.midpoint) + product.radius, 2)
+        size = product.magnitude
         if summed:
             return float(rounded_up(np.asarray(np.sum(size) / (1.0 - self.defect)), size.size + 4))
         # |X|^2 <= |X|_1 |X|_inf, or Frobenius: both bound the spectral norm.
@@ -80,7 +80,7 @@ class Contraction:
 
 def column_norms(ball: Ball) -> FloatArray:
     """Return upper bounds on the norms of the columns of every member, ``(m,)``."""
-    size = rounded_up(np.abs(ball.midpoint) + ball.radius, 2)
+    size = ball.magnitude
     largest = np.max(size, axis=0, initial=0.0)
     safe = np.where((largest > 0.0) & np.isfinite(largest), largest, 1.0)
     sums = rounded_up(np.sum((size / safe) ** 2, axis=0), len(size) + 6)

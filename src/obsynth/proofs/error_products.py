@@ -46,7 +46,7 @@ def logarithm_of_product(factors: Sequence[Ball], units: FloatArray | None = Non
         if not slack < 0.5:
             return np.inf
         near = Ball.exact(following.T) @ moved @ Ball.exact(axes)
-        triangle = rounded_up(np.abs(near.midpoint) + near.radius, 2)
+        triangle = near.magnitude
         # What the inverse of the axes has beside their transpose.
         triangle = rounded_up(triangle + slack / (1.0 - slack) * triangle.sum(axis=0, keepdims=True), size + 6)
         left = rounded_up(triangle @ left, size + 2)

@@ -105,7 +105,7 @@ class _Doubling:
         """Return a ball that holds the energy of inputs; ``None`` where it is not sharp."""
         inputs = Ball.exact(np.ldexp(b, -self.exponents[:, None]))
         term = (inputs @ inputs.T).scaled(self.short)
-        largest = float(np.max(rounded_up(np.abs(term.midpoint) + term.radius, 2), initial=0.0))
+        largest = float(np.max(term.magnitude, initial=0.0))
         total = term
         for k in range(2, ENERGY_ORDER + 1):
             through = self.x @ term

@@ -34,7 +34,8 @@ def verification_report(report: VerificationReport, *, console: Console) -> None
 
 def tolerances_report(design: ObserverDesign, *, console: Console) -> None:
     """Print what holds for every plant within its tolerances, or that the design assumes an exact model."""
-    from obsynth.tolerances.robustness import EXACT_MODEL, robustness
+    from obsynth.tolerances.result import EXACT_MODEL
+    from obsynth.tolerances.robustness import robustness
 
     if not isinstance(design.plant, DescriptorSystem) or not isinstance(design.observer, LinearObserver):
         return

@@ -16,6 +16,8 @@ from obsynth.results.layout import number, print_section
 
 #: On narrower terminals the claim stands below the numbers, over the whole width.
 WIDE_ENOUGH = 110
+#: Of a report as text.
+TEXT_WIDTH = 120
 
 _HEADINGS = ("check", "claim", "value", "bound", "margin", "verdict", "kind")
 _NUMBER_WIDTH = 10
@@ -91,9 +93,9 @@ def verdict_line(checks: Sequence[Check]) -> Text:
     return Text(told, style="bold red")
 
 
-def report_text(checks: Sequence[Check], *, width: int = 120) -> str:
+def report_text(checks: Sequence[Check]) -> str:
     """Return what ``print(report)`` shows: the table of the checks, and the verdict."""
-    console = Console(file=StringIO(), width=width, markup=False, highlight=False, emoji=False, color_system=None)
+    console = Console(file=StringIO(), width=TEXT_WIDTH, markup=False, highlight=False, emoji=False, color_system=None)
     print_checks(checks, console=console)
     text: str = console.file.getvalue()  # type: ignore[attr-defined]
     return "\n".join(line.rstrip() for line in text.splitlines())

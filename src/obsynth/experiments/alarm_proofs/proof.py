@@ -27,7 +27,8 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.names import index_of
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import digest_of
-from obsynth.tolerances.robustness import EXACT_MODEL, structure_of
+from obsynth.tolerances.result import EXACT_MODEL
+from obsynth.tolerances.robustness import structure_of
 from obsynth.tolerances.tracking import tracking_of
 
 #: Where the bounds of the state come from.

@@ -21,7 +21,8 @@ from obsynth.plants.uncertainty import SAMPLED
 from obsynth.results.design import ObserverDesign
 from obsynth.tolerances.error_structure import error_structure
 from obsynth.tolerances.responses import loop_radius
-from obsynth.tolerances.robustness import EXACT_MODEL, structure_of, with_tolerances
+from obsynth.tolerances.result import EXACT_MODEL
+from obsynth.tolerances.robustness import structure_of, with_tolerances
 from obsynth.tolerances.subdivision import index_one_on_box
 from obsynth.tolerances.tracking import Tracking, tracking_of
 

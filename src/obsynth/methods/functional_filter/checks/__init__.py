@@ -220,9 +220,10 @@ def _tracking(
 
 def _claimed(design: ObserverDesign) -> Iterator[Check]:
     (plant, observer), claims = design.linear, design.certificate.claims
+    order = claims.get("order", float("nan"))
     yield upper_bound_check(
-        "order", "number of states of the filter", float(observer.order), claims.get("order", float("nan")),
-        source="shipped realisation",
+        "order", "the filter has as many states as claimed: difference", abs(observer.order - order), 0.0,
+        source="shipped realisation", kind="equality", detail=f"{observer.order} states",
     )  # fmt: skip
     if "decay" in claims:
         yield decay_row(observer.Az, plant.dt, claims["decay"])

@@ -28,6 +28,8 @@ from obsynth.verification.identities import EQUALITY_TOLERANCE
 WIDEST = 0.1
 #: So many deviations are listed in a row.
 LISTED = 6
+#: Both ends are told where the upper one is so many times the lower one.
+TOLD_APART = 1.001
 
 _SOURCE = "Moussa Ali, Zhang 2013"
 
@@ -47,7 +49,7 @@ def steady_rows(
     listed = recomputed._replace(gain=np.hstack([L, K]))
     yield upper_bound_check(
         "steady state: unbiased", "L E + K C = I for the listed gains",
-        largest_bias([(step, listed)], natural_units(stated)), EQUALITY_TOLERANCE * condition,
+        largest_bias([(step, listed)], natural_units(stated)[: plant.nx]), EQUALITY_TOLERANCE * condition,
         source=f"{_SOURCE}, (10)-(11)", kind="proved", detail="in units of its terms, outward rounded",
     )  # fmt: skip
     transition = Ball.exact(L) @ Ball.exact(A)
@@ -101,7 +103,7 @@ def _steady_covariance(
     low, high = np.sqrt(np.maximum(middle - spread, 0.0)), np.sqrt(rounded_up(np.abs(middle) + spread, 4))
     proof = prove_positive_definite(enclosed)
     certain = bool(np.all(spread <= WIDEST * variances))
-    listed = [f"{name} {low[i]:.4g} to {high[i]:.4g}" if high[i] > low[i] * (1.0 + 1e-3) else f"{name} {high[i]:.4g}"
+    listed = [f"{name} {low[i]:.4g} to {high[i]:.4g}" if high[i] > low[i] * TOLD_APART else f"{name} {high[i]:.4g}"
               for i, name in enumerate(stated.plant.state_names[:LISTED])]  # fmt: skip
     more = f", and {len(low) - LISTED} more" if len(low) > LISTED else ""
     detail = (
