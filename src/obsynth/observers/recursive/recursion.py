@@ -183,10 +183,27 @@ class Recursion:
         """
         if self.settings.outliers == "none":
             return self.plain(state, y, u)
-        always = state.k > 0 and self._constraints is not None
+        foreseen = self.foreseen if state.k and self._constraints is not None else None
         return robust_advance(
-            self.settings.outliers, self.limit, self.plain, self.predicted, state, y, u, always=always
+            self.settings.outliers, self.limit, self.plain, self.predicted, state, y, u, foreseen=foreseen
         )
+
+    def foreseen(self, state: RecursiveState, u: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return mean and deviation of each output ``(ny,)`` before the sample, with its own algebraic equations.
+
+        They come with the next step, but what they say of this sample is known now.  Infinite where nothing is.
+        """
+        plant, k = self.settings.plant, state.k
+        nothing = np.full(plant.ny, np.nan)
+        if self._constraints is None or (plant.horizon is not None and k >= plant.horizon):
+            return nothing, np.full(plant.ny, np.inf)
+        try:
+            after, _ = self.plain(state, nothing, u)
+            corrected, v, G = self._stepped(after, self._constraints.correction(k), np.zeros(0), u)
+        except PreconditionError:
+            # Equations without noise contradict each other within rounding: they judge nothing.
+            return nothing, np.full(plant.ny, np.inf)
+        return self._outputs(self._estimate(corrected, v, G, v, nothing)._replace(k=k))
 
     def predicted(self, state: RecursiveState, heard: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return mean and deviation of each output ``(ny,)`` from what is heard of the next sample.
@@ -196,13 +213,7 @@ class Recursion:
         plant, k = self.settings.plant, state.k
         if k == 0:
             return np.zeros(plant.ny), np.full(plant.ny, np.inf)
-        after, row = self.plain(state, heard, u)
-        mean, deviation = self._outputs(row)
-        if np.isinf(deviation).any() and self._constraints is not None and self._holds_at(k):
-            # The algebraic equations of k come with the next step; what they say of this sample is known now.
-            corrected, v, G = self._stepped(after, self._constraints.correction(k), np.zeros(0), u)
-            mean, deviation = self._outputs(self._estimate(corrected, v, G, v, heard))
-        return mean, deviation
+        return self._outputs(self.plain(state, heard, u)[1])
 
     def _outputs(self, row: RawEstimate) -> tuple[FloatArray, FloatArray]:
         """Return mean and deviation of each output ``(ny,)`` at what is known; infinite where nothing is."""
@@ -231,10 +242,6 @@ class Recursion:
         if settings.adaptation is None or settings.adaptation.form != "random-walk":
             return EarlyConstraintSteps(*parts)
         return WalkingEarlySteps(*parts, covariance_factor(settings.adaptation.walk, "walk"))
-
-    def _holds_at(self, k: int) -> bool:
-        """Whether a step begins at k: the last sample of a horizon has none."""
-        return self.settings.plant.horizon is None or k < self.settings.plant.horizon
 
     def plain(self, state: RecursiveState, y: FloatArray, u: FloatArray) -> tuple[RecursiveState, RawEstimate]:
         """Take a sample as it is."""
