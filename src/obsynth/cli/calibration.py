@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from obsynth.cli.arguments import add_force, add_gains, add_json, add_quiet, add_system, output_file
-from obsynth.cli.data_arguments import pair
+from obsynth.cli.data_arguments import add_map, pair
 from obsynth.cli.output import print_json, progress
 from obsynth.errors import SpecError
 from obsynth.files.inputs import protect
@@ -73,10 +73,7 @@ def _add_linearise(parser: argparse.ArgumentParser) -> None:
 def _add_log(parser: argparse.ArgumentParser, *, required: bool) -> None:
     parser.add_argument("--data", type=Path, required=required, metavar="FILE", help="the log (CSV or Parquet)")
     parser.add_argument("--rows", metavar="A:B", help="rows of the log without faults, as Python counts (default: all)")
-    parser.add_argument(
-        "--map", type=pair, action="append", default=[], metavar="SIGNAL=COLUMN",
-        help="column of a signal (or of time) where the names differ; may be repeated",
-    )  # fmt: skip
+    add_map(parser)
     parser.add_argument(
         "--scale", type=pair, action="append", default=[], metavar="SIGNAL=FACTOR",
         help="the column's value times the factor is in the signal's unit; may be repeated",

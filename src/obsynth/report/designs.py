@@ -13,6 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from obsynth.analysis.transformations import StateRecovery
+from obsynth.errors import PreconditionError
 from obsynth.methods.functional_filter.delay_curve import DelayCurve, delay_curve
 from obsynth.methods.registry import REGISTRY, method_spec
 from obsynth.observers.linear.observer import LinearObserver
@@ -43,7 +44,12 @@ def tolerances_report(design: ObserverDesign, *, console: Console) -> None:
     if uncertain is None or not uncertain.box.names:
         console.print(Text(f"Model: {EXACT_MODEL} (no constant has a tolerance)."))
         return
-    print_section(console, "Within the tolerances of the plant", facts_table(robustness(design).facts()))
+    try:
+        facts = list(robustness(design).facts())
+    except PreconditionError as error:
+        # The design is one for the nominal plant whatever the box may be.
+        facts = [("bounds", f"none: {error}")]
+    print_section(console, "Within the tolerances of the plant", facts_table(facts))
 
 
 def plant_facts(plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel) -> Iterator[tuple[str, str]]:

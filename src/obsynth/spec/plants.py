@@ -1,7 +1,4 @@
-"""From the sections of a checked document to plants.
-
-Constants with tolerances in the plant of a spec: expressions in its matrices, entry by entry.
-"""
+"""From the sections of a checked document to plants."""
 
 from __future__ import annotations
 
