@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
@@ -23,7 +25,7 @@ def test_a_fault_of_which_elimination_leaves_only_rounding_is_unclear() -> None:
     assert caught.value.condition == "(D3) fault model at 1"
 
 
-METHODS = {
+METHODS: dict[str, tuple[float, Callable[[obsynth.DescriptorSystem], obsynth.ObserverDesign]]] = {
     "pd": (0.0, obsynth.pd_observer),
     "filter": (1.0, lambda plant: obsynth.fault_estimation_filter(obsynth.eliminate_algebraic_states(plant))),
     "filter, sampled": (0.0, lambda plant: obsynth.fault_estimation_filter(obsynth.discretise(plant, 0.5))),

@@ -125,8 +125,8 @@ class NamedPencil:
             if solved is None:
                 return (), np.inf
             for j, delta in solved:
-                owner = self.owners[i, j]
-                found.append(EntryChange(*owner, self.A[i, j], self.A[i, j] + delta))
+                name, row, column = self.owners[i, j]
+                found.append(EntryChange(name, row, column, self.A[i, j], self.A[i, j] + delta))
                 size = max(size, float(rows[i] * columns[j] * abs(float(delta))))
         return tuple(change for change in found if change.before != change.after), size
 
