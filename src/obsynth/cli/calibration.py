@@ -141,7 +141,7 @@ def run_linearise(options: argparse.Namespace) -> int:
             **{name: list(getattr(linear, name)) for name in (
                 "state_names", "input_names", "output_names", "fault_names", "disturbance_names")},
         })  # fmt: skip
-    elif not options.quiet:
+    else:
         print(linear_plant_text(linear))
         if found is not None:
             print(found)
@@ -179,7 +179,7 @@ def run_calibrate(options: argparse.Namespace) -> int:
         write_atomically(target, json.dumps(plain(data), indent=1, allow_nan=False) + "\n")
     if options.json:
         print_json({"command": "calibrate", "file": None if target is None else str(target), **data})
-    elif not options.quiet:
+    else:
         print(found)
         print(f"  digest of the log: {found.box.digest}")
         if target is not None:
