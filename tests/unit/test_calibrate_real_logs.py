@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from test_calibrate import BOUNDS, LOG, tanks
 
-from obsynth import DAEModel, SpecError, calibrate, simulate_dae
+from obsynth import DAEModel, SpecError, calibrate, dae_adaptive_observer, simulate_dae, validate
 
 TRUE = {"C": 1e-3, "Rs": 100.0}
 WIDE = {"C": (1e-4, 1e-2), "Rs": (10.0, 1000.0)}
@@ -122,3 +124,22 @@ def test_a_kink_of_the_model_at_the_maximum_spoils_no_box() -> None:
 def test_rows_that_are_asked_for_are_named() -> None:
     with pytest.raises(SpecError, match=r"rows 400:500 holds nothing: the log has 300 rows"):
         calibrate(circuit(), circuit_log(), WIDE, rows="400:500")
+
+
+def test_a_log_with_a_wrong_sample_is_compared_without_it_and_steps_that_are_too_long_are_told() -> None:
+    design = dae_adaptive_observer(
+        circuit().replace(constants={"C": 1e-3}, parameters={"Rs": 100.0}), dt=0.01, Q={"node": 1e-12, "ohm": 1e-12},
+        R={"vm": 1e-4, "im": 1e-8}, initial_state={"v": 1.0}, initial_covariance={"v": 0.01, "i": 1e-4},
+        initial_parameter_covariance={"Rs": 1.0}, integration="backward-euler",
+    )  # fmt: skip
+
+    def wrong(column):
+        column[77] += 1e6
+        return column
+
+    found = validate(design, circuit_log(vm=wrong))
+    assert said(found, "1 value(s) of vm are far from all others")
+    assert said(found, "A step of backward Euler errs by up to 0.4")
+    exact = validate(replace(design, observer=replace(design.observer, integration="radau")), circuit_log())
+    assert exact.nis.holds
+    assert not said(exact, "backward Euler")
