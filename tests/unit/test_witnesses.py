@@ -14,7 +14,14 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag
 
-from obsynth import DescriptorSystem, PreconditionError, discretise, eliminate_algebraic_states, functional_filter
+from obsynth import (
+    DescriptorSystem,
+    PreconditionError,
+    check,
+    discretise,
+    eliminate_algebraic_states,
+    functional_filter,
+)
 from obsynth.analysis.conditions import Condition
 from obsynth.analysis.existence.witnesses import EntryChange, Unclear, Witness, rational_matrices
 from obsynth.methods.fault_estimation_filter.conditions import fault_filter_conditions
@@ -214,6 +221,13 @@ def test_a_plant_that_was_sampled_or_reduced_is_named_so() -> None:
             plant
         )
         assert kind in text
+
+
+def test_the_rows_of_a_check_say_that_they_are_unclear() -> None:
+    row = check(CASES["pd: a mode"][1])["pd-observer"].failures[0]
+    assert row.name == "exists: detectability"
+    assert row.detail.startswith("Unclear: ")
+    assert "Witness: the plant with entry (" in row.detail
 
 
 def test_a_witness_is_named_entry_by_entry() -> None:

@@ -199,9 +199,9 @@ def _over_box(
             input_names=[*linear.input_names, shift], operating_point={**linear.operating_point, shift: 0.0},
             units={**linear.units, shift: "1"} if linear.units else linear.units,
         )  # fmt: skip
-    uncertainty = Uncertainty(box, entries, shift=shift)
+    uncertainty = Uncertainty(box, {name: tuple(found) for name, found in entries.items()}, shift=shift)
     kept = {name: item for name, item in box.constants.items() if name in uncertainty.used}
-    return filled_plant(linear, Uncertainty(replace(box, constants=kept), entries, shift=shift), set(kept))
+    return filled_plant(linear, uncertainty.with_box(replace(box, constants=kept)), set(kept))
 
 
 def _state_name(model: DAEModel, i: int, point: Point, local: LocalEquations) -> str:
