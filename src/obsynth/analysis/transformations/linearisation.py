@@ -162,7 +162,8 @@ def linear_model(
     values = _operating_point(model, point, local, names) | ({DRIFT: 0.0} if moves.any() else {})
     signals = {*names, *inputs, *model.output_names, *chosen, *disturbances}
     units = {name: unit for name, unit in model.units.items() if name in signals}
-    units |= {name: model.units[given] for name, given in zip(names, model.state_names, strict=True)}
+    units |= {name: model.units[given] for name, given in zip(names, model.state_names, strict=True)
+              if given in model.units}  # fmt: skip
     linear = DescriptorSystem(
         local.E, -local.by_state, B if inputs else None, local.C, dt=0.0,
         Bf=-local.by_parameter[:, fault_columns] if fault_columns else None,
