@@ -1,7 +1,7 @@
 """Powers of a stable matrix that have lost rank: the rest of a doubling takes place in fewer states.
 
-Doubling squares the dynamics again and again, and what forgets fast is soon gone from the power, down to rounding.  With
-``P = U V'`` of less rank, the equation ``X = H + P (X^-1 + G)^-1 P'`` has the solution ``X = H + U Z U'``, where
+Doubling squares the dynamics again and again, and what forgets fast is soon gone from the power, down to rounding.
+With ``P = U V'`` of less rank, the equation ``X = H + P (X^-1 + G)^-1 P'`` has the solution ``X = H + U Z U'``, where
 
 ``Z = h + p (Z^-1 + g)^-1 p'``, ``p = V' M^-1 U``, ``g = U' G M^-1 U``, ``h = V' M^-1 H V``, ``M = I + H G``,
 
