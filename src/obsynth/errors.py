@@ -7,10 +7,18 @@ for programs.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
-if TYPE_CHECKING:
-    from obsynth.results.report import VerificationReport
+
+class Report(Protocol):
+    """What an error tells of a verification report; `obsynth.VerificationReport` is one."""
+
+    @property
+    def failures(self) -> tuple[Any, ...]:
+        """The checks that do not hold."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the report as plain data."""
 
 
 class ObsynthError(Exception):
@@ -170,7 +178,7 @@ class VerificationError(ObsynthError):
 
     exit_code = 6
 
-    def __init__(self, message: str, *, report: VerificationReport) -> None:
+    def __init__(self, message: str, *, report: Report) -> None:
         self.report = report
         super().__init__(message)
 

@@ -66,6 +66,14 @@ def test_processes_give_the_same_and_what_is_there_is_kept(places: tuple[Path, P
     assert told(again) == told(there)
 
 
+def test_logs_of_the_same_numbers_are_runs_of_their_own(places: tuple[Path, Path], tmp_path: Path) -> None:
+    (places[1] / "again.csv").write_bytes((places[1] / "shared.csv").read_bytes())
+    found = obsynth.run_fleet(places[0] / "one.gains.json", places[1], tmp_path / "out")
+    assert [run.name for run in found.runs] == ["one on again", "one on shared", "one on three"]
+    assert found.runs[0].file != found.runs[1].file
+    assert found.runs[0].largest == found.runs[1].largest
+
+
 def test_a_log_that_does_not_fit_is_a_row(places: tuple[Path, Path], tmp_path: Path) -> None:
     (places[1] / "shared.csv").write_text("time,y1\n0,1\n1,2\n")
     found = obsynth.run_fleet(*places, tmp_path / "out")

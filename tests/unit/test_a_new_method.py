@@ -72,7 +72,7 @@ def test_the_whole_command_line_knows_it(folder: Path, capsys: pytest.CaptureFix
 
 
 def test_existence_is_refused_by_its_own_condition() -> None:
-    plant = obsynth.DescriptorSystem(None, [[0.5]], C=[[2.0]], dt=1.0)
+    plant = obsynth.DescriptorSystem(None, [[0.5, 0.1], [0.0, 0.2]], C=[[2.0, 0.0]], dt=1.0)
     with pytest.raises(obsynth.PreconditionError, match="states measured"):
         obsynth.design(plant, "luenberger-observer")
 

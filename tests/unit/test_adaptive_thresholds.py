@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
 from scipy.linalg import expm
-from uncertain_plants import drive, wang
+from uncertain_plants import DRIVE, drive, wang
 
 import obsynth
 from obsynth.errors import PreconditionError, SpecError
@@ -301,3 +302,61 @@ def test_records_and_rows_of_continuous_designs_agree(continuous) -> None:
     scenario = obsynth.Scenario(horizon=3, sample_time=STEP, disturbances={"load": obsynth.Uniform(low=-0.1, high=0.1)})
     watched = obsynth.monitor(continuous, scenario, constants=plant)
     assert obsynth.evaluate(continuous, scenario, runs=20, plants=20, monitor=watched).false_alarm_rate.value == 0.0
+
+
+def test_intervals_hold_while_the_effect_of_a_fault_varies() -> None:
+    """What a fault did in the sample before, it did with the constant of that sample: correction 8.1 with varying q."""
+    plant = obsynth.uncertain_system(
+        {"A": [["0.5 * p", 0.1], [0.0, 0.4]], "Bf": [["p"], [0.3]], "C": [[1.0, 0.0], [0.0, 1.0]], "dt": 1.0},
+        {"p": {"nominal": 1.0, "tolerance": "10 %"}}, variation="varying",
+    )  # fmt: skip
+    design = obsynth.fault_estimation_filter(plant)
+    first, _ = adaptive_plan(design, np.zeros(0), 0.0, initial_error=None, initial_set={"x1": 0.0, "x2": 0.0})
+    assert first.intervals
+    rng = np.random.default_rng(0)
+    closest = 0.0
+    for _ in range(40):
+        q, f = rng.choice([-1.0, 1.0], 60), np.repeat(rng.normal(size=12), 5)
+        x, y = np.zeros(2), np.empty((60, 2))
+        for k in range(60):
+            y[k], p = x, 1.0 + 0.1 * q[k]
+            x = np.array([[0.5 * p, 0.1], [0.0, 0.4]]) @ x + np.array([p, 0.3]) * f[k]
+        found = design.observer.run(y)
+        rows = np.hstack([found.states, found.faults, found.residuals])[None]
+        interval = record_columns(first, rows, np.zeros((1, 60, 0)), y[None])[1][0, :, 0]
+        low, high = interval[1:, 0], interval[1:, 1]
+        assert (low <= f[:-1]).all()
+        assert (f[:-1] <= high).all()
+        closest = max(closest, float(np.max(np.abs(f[:-1] - (low + high) / 2.0) / ((high - low) / 2.0))))
+    assert closest > 0.8
+
+
+@pytest.mark.parametrize("ranges", [{"J1": (0.45, 0.52)}, {"J2": (0.99, 1.15), "k": (17.0, 20.5)}])
+def test_a_box_whose_middle_is_not_nominal_has_bounds(ranges) -> None:
+    """A calibrated box is not symmetric: the remainder of inverses then leaves something at the nominal plant."""
+    constants = {name: {"nominal": value, "range": ranges.get(name, (0.98 * value, 1.02 * value))}
+                 for name, value in DRIVE.items()}  # fmt: skip
+    plant = obsynth.uncertain_system(drive(), constants)
+    design = obsynth.fault_estimation_filter(plant)
+    assert obsynth.robustness(design).finite_for_ever
+    start = dict.fromkeys(plant.state_names, 0.0)
+    first, _ = adaptive_plan(design, np.zeros(1), 0.0, initial_error=None, initial_set=start)
+    assert first.intervals
+    u = np.sign(np.sin(2.0 * np.pi * np.arange(200) / 70.0))[:, None]
+    shares = []
+    for corner in itertools.product((0, 1), repeat=5):
+        ends = dict(zip(plant.uncertainty.box.names, corner, strict=True))
+        values = {name: (item.low, item.high)[ends[name]] for name, item in plant.uncertainty.box.constants.items()}
+        exact = plant_at(plant, values)
+        x, y = np.zeros(3), np.empty((200, 2))
+        for k in range(200):
+            y[k] = exact.C @ x
+            x = exact.A @ x + exact.B @ u[k]
+        found = design.observer.run(y, u)
+        rows = np.hstack([found.states, found.faults, found.residuals])[None]
+        thresholds, intervals = record_columns(first, rows, u[None], y[None])
+        no = thresholds.shape[2]
+        shares.append(np.max(np.abs(rows[0, 1:, -no:]) / thresholds[0, 1:]))
+        assert (intervals[0, 1:, 0, 0] <= 0.0).all()
+        assert (intervals[0, 1:, 0, 1] >= 0.0).all()
+    assert 0.5 < max(shares) <= 1.0

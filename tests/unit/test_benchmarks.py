@@ -102,3 +102,9 @@ def test_the_benchmarks_of_running_run(name):
     assert row[0] == "4"
     assert len(row) == 5
     assert all(float(cell.replace(",", "")) > 0.0 for cell in row[1:])
+
+
+def test_the_benchmark_of_the_start_runs():
+    rows = small_table("start")
+    assert len(rows) == 6
+    assert all(float(cell) > 0.0 for row in rows for cell in row[1:])

@@ -117,6 +117,7 @@ TABLE = {
     "T0 sees a dynamic row": ("both", matrix("T0", at(0, 0, add=1.0)), [T0E, A_ROW, U_ROW, D_ROW, MODELS]),
     "no proof of stability": ("both", matrix("stability", lambda q: np.diag(-np.diag(q) + 1e3)), [STABILITY]),
     "order": ("both", claim(order=1.0), [ORDER]),
+    "order, more than there are": ("both", claim(order=40.0), [ORDER]),
     "decay": ("both", claim(decay=1e3), [DECAY]),
     "a claimed gain": ("both", claim(gamma=1e-9), ["claims covered"]),
     "a claimed error per unit of a state": (

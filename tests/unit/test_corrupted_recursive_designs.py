@@ -19,10 +19,13 @@ CONTRACTION, CLAIMS, NEES, NIS, WHITE, RUNS = "contraction", "claims", "NEES", "
 RANK, PARAMETERS, DIRECTIONS = "exists: rank [E; C]", "exists: parameters", "exists: residual directions"
 EARLY_RANK = "exists: rank [E; C; algebraic rows of A]"
 DETECTABLE, IDENTIFIABLE, KNOWN = "exists: detectability", "exists: identifiable parameters", "known directions"
+UNBIASED, DEFINITE = "unbiased", "covariance"
+STEADY_UNBIASED, STEADY_CONTRACTION = "steady state: unbiased", "steady state: contraction"
+STEADY_DEFINITE = "steady state: covariance"
 EVERYTHING = {FITS, STATE, COVARIANCE, REGRESSOR, CLAIMS, NEES, NIS, WHITE, CONTRACTION}
 
 
-GOOD = ("innovation", "literal", "early", "walk", "constant", "exact output")
+GOOD = ("innovation", "literal", "early", "walk", "constant", "constant walk", "exact output")
 STILL = {
     "E": np.diag([1.0, 1, 0]), "A": [[0.8, 0.1, 0.3], [0, 0.7, 0.2], [1, 0.4, -1]],
     "C": [[1, 0, 0.3], [0, 1, 1]], "Phi": [[0.5, 0.3], [1, 0.2], [0.2, 0]], "Psi": None,
@@ -33,6 +36,9 @@ STILL = {
 def good(name: str = "innovation") -> ObserverDesign:
     if name == "constant":
         return obsynth.adaptive_observer(varying(horizon=60, **STILL), Q=0.1, R=0.2, window=10, name=name)
+    if name == "constant walk":
+        options = {"form": "random-walk", "random_walk": 1e-3}
+        return obsynth.adaptive_observer(varying(horizon=60, **STILL), Q=0.1, R=0.2, window=10, name=name, **options)
     if name == "exact output":
         return obsynth.descriptor_kalman(varying(horizon=60, **STILL), Q=0.1, R=np.diag([0.0, 0.2]), name=name)
     options = {"literal": {"form": "literal"}, "early": {"early_constraints": True},
@@ -59,6 +65,14 @@ def with_adaptation(**changes) -> Corruption:
     def corrupt(design: ObserverDesign) -> ObserverDesign:
         adaptation = dataclasses.replace(design.observer.adaptation, **changes)
         return shipped(adaptation=adaptation)(design)
+
+    return corrupt
+
+
+def with_gains(change) -> Corruption:
+    def corrupt(design: ObserverDesign) -> ObserverDesign:
+        L, K = change(design.gains["L"], design.gains["K"])
+        return design.replace(gains={**design.gains, "L": L, "K": K})
 
     return corrupt
 
@@ -131,6 +145,17 @@ TABLE: dict[str, tuple[str, Corruption, set[str]]] = {
     "claim: directions": ("innovation", claim_times("residual_directions", 2.0), {CLAIMS}),
     "claim: steps": ("innovation", claim_times("steps", 2.0), {CLAIMS}),
     "claim: sample of the condition": ("innovation", claim("condition_k", 3.5), {CLAIMS}),
+    "exact outputs after all": ("innovation", noise("R", 2, 0.0), {FITS, DEFINITE}),
+    "another C, constant": (
+        "constant", with_model(C=[[1, 0, 0.3], [0, 1, 1.001]]), {FITS, UNBIASED},
+    ),
+    "a kept gain, by little": ("constant", with_gains(lambda L, K: (L, (1.0 + 1e-7) * K)), {STEADY_UNBIASED}),
+    "kept gains that make errors grow": (
+        "constant", with_gains(lambda L, K: (10.0 * L, K)), {"gains", STEADY_UNBIASED, STEADY_CONTRACTION},
+    ),
+    "kept gains that hear nothing": (
+        "constant", with_gains(lambda L, K: (0.0 * L, 0.0 * K)), {"gains", STEADY_UNBIASED, STEADY_DEFINITE},
+    ),
     "a listed gain": ("innovation", lambda d: d.replace(gains={**d.gains, "K": 1.001 * d.gains["K"]}), {"gains"}),
     "claim: a gain": ("innovation", claim("gamma", 1e-9), {"claims covered"}),
     "claim: not a number": ("innovation", claim("contraction", np.nan), {CLAIMS}),

@@ -5,7 +5,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from flint import fmpq, fmpq_mat, fmpq_poly, fmpz_poly
+from flint import fmpq, fmpq_mat, fmpz_poly
 
 from obsynth.proofs.exact_pencils import ExactPencil, blocks, null_basis, pivot_columns
 from obsynth.proofs.root_location import locate_roots
@@ -118,19 +118,6 @@ def test_sides_of_roots(polynomial, discrete, sides):
     found = locate_roots(polynomial, discrete=discrete)
     assert [root.side for root in found.roots] == sides
     assert found.stable == all(side == "stable" for side in sides)
-
-
-def test_left_null_space_annihilates_and_is_of_least_degree():
-    E, A = np.vstack([np.eye(3), np.zeros((2, 3))]), np.zeros((5, 3))
-    A[:3] = np.array([[0, 1, 0], [0, 0, 1], [1, 0, 0]])
-    A[3, 1], A[4, 0] = 1.0, 1.0
-    pencil = mixed(E, A, 3)
-    basis = pencil.left_null_basis()
-    assert sorted(max(entry.degree() for entry in row) for row in basis) == [1, 2]
-    for row in basis:
-        for j in range(3):
-            column = [fmpq_poly([pencil.A[i, j], -pencil.E[i, j]]) for i in range(5)]
-            assert sum((row[i] * column[i] for i in range(5)), fmpq_poly([0])) == 0
 
 
 def test_index_of_pencils_that_are_not_regular():

@@ -14,7 +14,7 @@ import scipy.signal
 
 import obsynth
 from obsynth import LinearObserver, SpecError
-from obsynth.exporting.c_words import c_identifier
+from obsynth.exporting.c_source import c_identifier
 from obsynth.spec import load_spec
 
 ROOT = Path(__file__).parents[2]

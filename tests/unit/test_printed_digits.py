@@ -17,7 +17,7 @@ from obsynth import (
     fault_estimation_filter_from_gains,
     verify,
 )
-from obsynth.results.report import Check
+from obsynth.results.checks import Check
 
 sys.path.append(str(Path(__file__).parents[1] / "property"))
 from plants import build, random_recipe

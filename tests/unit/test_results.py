@@ -434,7 +434,7 @@ class TestReport:
         assert design.report.as_dict()["passed"] is True
 
     def test_bounds_with_nan_fail(self):
-        from obsynth.results.report import lower_bound_check, upper_bound_check
+        from obsynth.results.checks import lower_bound_check, upper_bound_check
 
         for make in (upper_bound_check, lower_bound_check):
             for value, bound in ((math.nan, 1.0), (1.0, math.nan), (math.nan, math.nan)):

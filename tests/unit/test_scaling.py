@@ -29,7 +29,6 @@ def test_power_of_two_below_is_exact_at_the_borders():
 
 def test_paper_example_is_left_alone():
     scaling = balance_system(PAPER_E, PAPER_A, [np.ones((4, 2))], [PAPER_C])
-    assert scaling.is_identity
     np.testing.assert_array_equal(scaling.equations, np.ones(4))
     np.testing.assert_array_equal(scaling.states, np.ones(4))
     np.testing.assert_array_equal(scaling.outputs, np.ones(3))
@@ -42,7 +41,8 @@ def test_plants_with_peaks_between_one_and_two_are_left_alone(seed):
     C = rng.uniform(-1, 1, (3, 5))
     E[np.arange(5), rng.permutation(5)] = rng.uniform(1, 2, 5)
     C[np.arange(3), :3] = np.diag(rng.uniform(1, 2, 3))
-    assert balance_system(E, A, [rng.standard_normal((5, 2)) * 1e6], [C]).is_identity
+    scaling = balance_system(E, A, [rng.standard_normal((5, 2)) * 1e6], [C])
+    assert all(np.all(factors == 1.0) for factors in (scaling.equations, scaling.states, scaling.outputs))
 
 
 @pytest.mark.parametrize("seed", range(20))

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+from obsynth.analysis.existence.witnesses import Unclear
 from obsynth.errors import PreconditionError
 from obsynth.numerics.ranks import RankDecision
+from obsynth.plants.descriptor import DescriptorSystem
 
 
 @dataclass(frozen=True)
@@ -17,7 +19,7 @@ class Condition:
     value, bound: The deciding number and what it is compared with; source: Paper and equation, or the finding it rests
     on; detail: The evidence (singular-value gap, the eigenvalue) and, when it fails, what to do; mode: The eigenvalue
     or zero at which it fails; signals: Names of the signals
-    involved; unclear: Whether it does not hold only as far as double precision can tell.
+    involved; unclear: Why it does not hold only as far as the data can tell, where that is so: told in the detail.
     """
 
     name: str
@@ -29,7 +31,7 @@ class Condition:
     detail: str = ""
     mode: complex | None = None
     signals: tuple[str, ...] = ()
-    unclear: bool = False
+    unclear: Unclear | None = None
 
     def require(self) -> None:
         """Raise `PreconditionError` when the condition fails."""
@@ -45,6 +47,10 @@ class Condition:
                 mode=self.mode,
                 signals=self.signals,
             )
+
+    def in_doubt(self, found: Unclear, plant: DescriptorSystem) -> Condition:
+        """Return the condition as one that rounding of the data could change, with what tells so in its detail."""
+        return replace(self, holds=False, unclear=found, detail=f"{self.detail.rstrip()} {found.described(plant)}")
 
 
 def _involved(signals: tuple[str, ...], detail: str) -> str:
@@ -72,5 +78,4 @@ def rank_condition(
         source,
         decision.describe() + ("" if decision.full else f": {remedy}"),
         signals=() if decision.full else signals,
-        unclear=decision.means == "unclear",
     )

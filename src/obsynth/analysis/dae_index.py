@@ -16,7 +16,7 @@ SINGULAR_CONDITION = 1e13
 #: The step is shortened by these factors.  Short enough that dF/dx' rules, long enough that index 3 stays countable.
 SHORTENINGS = (1e-2, 1e-3)
 #: Equations and states with at least this share of the largest entry of a singular vector are named.
-NAMED_SHARE = 0.1
+LEADING_SHARE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,4 +74,4 @@ def involved(model: DAEModel, matrix: FloatArray) -> tuple[tuple[str, ...], tupl
 
 def _named(vector: FloatArray, names: tuple[str, ...]) -> tuple[str, ...]:
     sizes = np.abs(vector).reshape(-1, len(names)).max(axis=0)
-    return tuple(name for name, size in zip(names, sizes, strict=True) if size >= NAMED_SHARE * sizes.max())
+    return tuple(name for name, size in zip(names, sizes, strict=True) if size >= LEADING_SHARE * sizes.max())

@@ -10,16 +10,12 @@ from numpy.typing import ArrayLike
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.covariances import covariance_factor, is_definite
+from obsynth.numerics.ranks import IDENTIFIABLE_SHARE, NAMED_SHARE
 from obsynth.plants.dae.checks import checked_inputs, finite_vector, step_length
 from obsynth.plants.dae.functions import DAEFunctions
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.dae.step import ImplicitStep
 
-#: Singular values below this share of the largest are zero: the sensitivities carry rounding of 1e-16 times the
-#: condition of (7), which stays below 1e5 in models that can be used.
-ZERO_SHARE = 1e-10
-#: Shares of a direction below this are not named, and do not make a signal indistinguishable.
-NAMED_SHARE = 1e-3
 #: A start and one step.
 FEWEST_SAMPLES = 2
 
@@ -152,7 +148,7 @@ def identifiability(
     to_signals = np.block([[free.T, np.zeros((r, model.nq))], [np.zeros((model.nq, model.nx)), np.eye(model.nq)]])
     _, values, coefficients = np.linalg.svd(whitened, full_matrices=False)
     directions = coefficients @ to_signals
-    rank = int(np.sum(values > ZERO_SHARE * values[0]))
+    rank = int(np.sum(values > IDENTIFIABLE_SHARE * values[0]))
     spread = scales * np.sqrt(np.sum((directions[:rank] / values[:rank, None]) ** 2, axis=0))
     hidden = np.abs(directions[rank:]).max(axis=0, initial=0.0) > NAMED_SHARE
     of_parameters = np.linalg.svd(whitened[:, r:], compute_uv=False)
@@ -177,7 +173,7 @@ def _sensitivities(
         x = solution.x
         if k == 1:
             left, values, _ = np.linalg.svd(local.F * scales / scales[:, None])
-            free = left[:, values > ZERO_SHARE * values[0]]
+            free = left[:, values > IDENTIFIABLE_SHARE * values[0]]
             moved = np.hstack([scales[:, None] * free, np.zeros((model.nx, model.nq))])
         else:
             moved = local.F @ moved

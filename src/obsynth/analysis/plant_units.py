@@ -20,6 +20,7 @@ from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.numerics.scaling import LogBalance
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.exosystems import Exosystem
+from obsynth.plants.origin import origin_of
 
 #: Given units in which the natural factors differ by more than this are no units to design in.
 FAR_UNITS = 256.0
@@ -160,6 +161,12 @@ class PlantUnits:
     def eigenvalues(self, scaled: ComplexArray) -> ComplexArray:
         """Return eigenvalues or zeros in the plant's own time."""
         return np.asarray(scaled / self.rate, dtype=np.complex128)
+
+
+def sized_plant(plant: DescriptorSystem) -> DescriptorSystem | None:
+    """Return the plant with the sizes of the terms of its entries in their place; ``None`` where there are none."""
+    origin = origin_of(plant)
+    return None if origin is None or origin.sizes is None else plant.replace(**origin.sizes)
 
 
 def _inverse_sizes(*parts: FloatArray) -> FloatArray:

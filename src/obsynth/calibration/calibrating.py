@@ -3,19 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.calibration.innovations_fit import Timing, chosen_timing, innovations_fit
+from obsynth.calibration.diagnostics import wrong_samples
+from obsynth.calibration.innovations_fit import InnovationsFit, Timing, chosen_timing, innovations_fit
 from obsynth.calibration.linear_plants import EXACT, LinearPlant, plant_as_written
 from obsynth.calibration.logs import LogData, read_log
 from obsynth.calibration.plants import NonlinearPlant
 from obsynth.calibration.problem import Problem, calibration_problem, require_variation
 from obsynth.calibration.reporting import IntegrationError, integration_error, reported
 from obsynth.calibration.result import Calibration
-from obsynth.calibration.simulation_error import Fit, SimulationError, simulation_fits
+from obsynth.calibration.simulation_error import (
+    FIRST_ROWS,
+    Fit,
+    SimulationError,
+    simulation_fits,
+    with_seen_start,
+)
 from obsynth.errors import SolverError, SpecError
 from obsynth.numerics.arguments import is_whole
 from obsynth.plants.dae.model import DAEModel
@@ -71,7 +79,7 @@ def calibrate(
         the row of the log.
     log : path, pandas.DataFrame or mapping
         CSV or Parquet file, or columns by name: ``time`` in seconds, every input and every output; NaN where an output
-        is missing.
+        is missing.  Single outputs a hundred times further off than the others count as missing, which is told.
     unknown : mapping of str to (low, high)
         Constants and parameters that are to be found, with finite bounds around their nominal values; none (``{}``)
         to find the noise alone.
@@ -85,7 +93,8 @@ def calibrate(
         ``(nx,)``, or values by name; by default nominal values, of linear plants zero.
     initial_covariance : array_like or mapping, optional
         ``(nx, nx)``, one variance, or variances by name.  By default deviations are 10 % of the nominal
-        sizes; of linear plants, what alone would make outputs as large as they are.
+        sizes, or as far as the log begins elsewhere (which is told); of linear plants, what alone would make outputs as
+        large as they are.
     rows : str, slice or pair, optional
         ``"a:b"``: the rows that are free of faults, as Python counts; all by default.
     columns : mapping of str to str, optional
@@ -101,8 +110,9 @@ def calibrate(
     method : {"innovations", "simulation"}, optional
         The second one stops at the fit of simulations, whose boxes are too small where its residuals are not white.
     integration : {"auto", "backward-euler", "radau"}, optional
-        ``"auto"`` takes backward Euler unless its error of one step exceeds a quarter of a sensor's deviation; for
-        linear plants in continuous time Radau.  Discrete plants are stepped as they are.
+        ``"auto"`` takes backward Euler unless its error of one step exceeds a quarter of a sensor's deviation, or exact
+        steps would move a constant by half of its deviation; for linear plants in continuous time Radau.  Discrete
+        plants are stepped as they are.
     substeps : int, optional
         Steps in a sample.
     level : float, optional
@@ -143,6 +153,7 @@ def calibrate(
     whole = read_log(log, model.input_names, model.output_names, rows=rows, columns=columns, scales=factors,
                      dt=_sample_time(model, dt, substeps))  # fmt: skip
     digest = whole.digest
+    whole = whole.without(wrong_samples(whole.y))
     whole = whole.shifted(input_delay) if isinstance(input_delay, int) else whole
     plant = NonlinearPlant(model) if isinstance(model, DAEModel) else LinearPlant(model, whole)
     problem = calibration_problem(
@@ -151,6 +162,8 @@ def calibrate(
     )  # fmt: skip
     require_variation(problem)
     fits = simulation_fits(problem, starts, seed, note)
+    if initial_covariance is None and (seen := with_seen_start(problem, fits[0])) is not problem:
+        problem, fits = seen, simulation_fits(seen, 1, seed, note, start=fits[0].t)
     error = None
     if integration == "auto" and isinstance(plant, NonlinearPlant):
         error = _step_error(problem, fits[0])
@@ -161,8 +174,31 @@ def calibrate(
     timing = Timing(input_delay if isinstance(input_delay, int) else 0, {})
     if method == "innovations" and input_delay == "auto" and model.input_names:
         problem, fits, timing = chosen_timing(problem, fits, seed, note)
-    fit = innovations_fit(problem, fits, level, note) if method == "innovations" else None
+    fit = None
+    if method == "innovations":
+        before = problem, error
+        problem, fit, error = _innovations(problem, fits, level, note, error)
+        if initial_covariance is None and fit is not None:
+            seen = with_seen_start(before[0], fits[0], first=fit.whitened[:FIRST_ROWS])
+            if seen is not before[0]:
+                fits = simulation_fits(seen, 1, seed, note, start=fits[0].t)
+                problem, fit, error = _innovations(seen, fits, level, note, before[1])
     return reported(problem, fits[0], fit, level=level, timing=timing, error=error, digest=digest)
+
+
+def _innovations(
+    problem: Problem, fits: list[Fit], level: float, note: Callable[[str], object], error: IntegrationError | None
+) -> tuple[Problem, InnovationsFit | None, IntegrationError | None]:
+    """Return the fit, with the steps that it needs: errors of single steps that are small may move constants still."""
+    chosen = error is not None and not error.matters
+    exact = problem.integrated("radau", problem.substeps) if chosen else None
+    fit, moved = innovations_fit(problem, fits, level, note, exact=exact)
+    if error is None or exact is None:
+        return problem, fit, error
+    if fit is None:
+        note("integrating by Radau")
+        problem, (fit, _) = exact, innovations_fit(exact, fits, level, note)
+    return problem, fit, replace(error, moved=moved)
 
 
 def require_plant(given: Any) -> DAEModel | DescriptorSystem | TimeVaryingDescriptorSystem:

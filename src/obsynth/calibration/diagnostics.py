@@ -6,8 +6,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import SMALLEST, FloatArray
+
+BoolArray = NDArray[np.bool_]
 
 #: Lags of the whiteness test, and their least number of rows each.
 LAGS, ROWS_PER_LAG = 10, 5
@@ -17,6 +20,13 @@ SIGNIFICANT = 0.01
 CHANGE_CONFIDENCE = 0.999
 #: Rows at both ends between which a change is looked for, and how many there must be at all.
 CHANGE_MARGIN, LEAST_ROWS = 5, 20
+#: The mean of whitened innovations is told where it is this many of its deviations from zero.
+MEAN_LIMIT = 4.0
+#: A whitened innovation of this size stands out.
+STANDS_OUT = 6.0
+#: A value is no measurement if it is further from the median than this multiple of what 90 % of the others are, alone
+#: or in pairs, between values that are not; what 90 % are counts as this share of the median at least.
+FAR_OFF, OTHERS, LEAST_SPREAD, LONGEST_SPIKE = 100.0, 0.9, 1e-3, 2
 
 
 @dataclass(frozen=True)
@@ -91,3 +101,28 @@ def change_of_mean(whitened: FloatArray, *, confidence: float = CHANGE_CONFIDENC
     statistic = ((before - after) ** 2).sum(axis=1) * k * (n - k) / n
     limit = chi2.ppf(1.0 - (1.0 - confidence) / n, m)
     return int(k[int(np.argmax(statistic))]) if statistic.max() > limit else None
+
+
+def mean_off(column: FloatArray) -> float:
+    """Return the mean of a whitened column where it is no chance, else zero."""
+    e = column[np.isfinite(column)]
+    mean, spread = float(e.mean()) if len(e) else 0.0, float(e.std()) if len(e) else 0.0
+    return mean if abs(mean) * np.sqrt(len(e)) > MEAN_LIMIT * max(spread, SMALLEST) else 0.0
+
+
+def wrong_samples(y: FloatArray) -> BoolArray:
+    """Return which single values of outputs ``(n, ny)`` are far from all others of their sensor, as truth values."""
+    found = np.zeros(y.shape, dtype=bool)
+    for i, column in enumerate(y.T):
+        seen = np.isfinite(column)
+        if seen.sum() < LEAST_ROWS:
+            continue
+        middle = float(np.median(column[seen]))
+        away = np.abs(column - middle)
+        spread = max(float(np.quantile(away[seen], OTHERS)), LEAST_SPREAD * abs(middle))
+        far = seen & (away > FAR_OFF * spread)
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], far, [False]]).astype(int)))
+        for begin, end in zip(edges[::2], edges[1::2], strict=True):
+            if spread > 0.0 and begin > 0 and end < len(column) and end - begin <= LONGEST_SPIKE:
+                found[begin:end, i] = True
+    return found

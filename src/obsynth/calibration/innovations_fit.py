@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.calibration.intervals import Information, Side, information, profile_box, quantile, upper_limit
+from obsynth.calibration.likelihood import IMPOSSIBLE
 from obsynth.calibration.maximum import (
     Maximum,
     Objective,
@@ -30,6 +31,10 @@ TIMING_NATS = 5.0
 ZERO_SHARE = 0.01
 #: Rows by which the inputs are tried later; only the positive one is ever taken.
 TRIED_DELAYS = (-1, 1)
+#: Share of its deviation by which a constant may move if the steps were exact.
+TOLERATED_MOVE = 0.5
+#: A logarithm of a variance with less curvature is known to no more than a factor of three or so.
+WEAK_CURVATURE = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,23 +83,58 @@ def chosen_timing(
     return problem, fits, Timing(delay, losses)
 
 
+def _said(objective: Objective, maximum: Maximum) -> Information:
+    """Return what the log says of the constants; a variance with hardly a curvature leaves none of them open."""
+    found = information(maximum.hessian, objective, maximum.z)
+    weak = (objective.is_q | objective.is_r) & (np.diag(maximum.hessian) < WEAK_CURVATURE)
+    if found.undetermined and weak.any():
+        others = information(maximum.hessian, objective, maximum.z, apart=weak)
+        return others if len(others.undetermined) < len(found.undetermined) else found
+    return found
+
+
 def guarded_maximum(
     objective: Objective, fits: list[Fit], note: Callable[[str], object]
 ) -> tuple[Maximum, Information]:
     """Return the greatest likelihood, with variances that the log cannot tell from zero kept away from it."""
     maximum = greatest_likelihood(objective, fits, note)
-    found = information(maximum.hessian, objective, maximum.z)
+    found = _said(objective, maximum)
     if not found.undetermined:
         # Along a direction that the log leaves open the weight of a variance would only lead the constants away.
         maximum = without_collapse(objective, maximum, note)
-        found = information(maximum.hessian, objective, maximum.z)
+        found = _said(objective, maximum)
     return maximum, found
 
 
-def innovations_fit(problem: Problem, fits: list[Fit], level: float, note: Callable[[str], object]) -> InnovationsFit:
-    """Return the fit of the innovations, from fits of the simulation."""
+def moved_by(exact: Problem, start: Fit, maximum: Maximum, avoided: FloatArray, said: Information) -> float:
+    """Return by how much constants move with exact steps: the most, in their deviations."""
+    objective = Objective(exact, start)
+    objective.avoided[:] = avoided
+    begin = np.clip(maximum.z, objective.low, objective.high)
+    value, z = descent(objective, begin, objective.low, objective.high, objective.scale)
+    if value >= IMPOSSIBLE:
+        return 0.0
+    moves = np.abs(objective.constants(z) - objective.constants(maximum.z))
+    return float(np.max(moves / np.sqrt(np.diag(said.covariance)), initial=0.0))
+
+
+def innovations_fit(
+    problem: Problem,
+    fits: list[Fit],
+    level: float,
+    note: Callable[[str], object],
+    *,
+    exact: Problem | None = None,
+) -> tuple[InnovationsFit | None, float]:
+    """Return the fit of the innovations, from fits of the simulation.
+
+    With an ``exact`` problem also by how much its constants would move; there is no fit where that matters.
+    """
     objective = Objective(problem, fits[0])
     maximum, found = guarded_maximum(objective, fits, note)
+    moved = 0.0 if exact is None else moved_by(exact, fits[0], maximum, objective.avoided, found)
+    if moved > TOLERATED_MOVE:
+        return None, moved
     variances = int((objective.is_q | objective.is_r).sum())
     root = quantile(level, objective.nt, problem.log.samples, variances)
     note("boxes by profile likelihood")
@@ -108,7 +148,7 @@ def innovations_fit(problem: Problem, fits: list[Fit], level: float, note: Calla
     return InnovationsFit(
         objective.constants(maximum.z), objective.plain(maximum.z), found, sides, Q, R, limited[: len(Q)],
         limited[len(Q) :], bounds, whitened, e, spread,
-    )  # fmt: skip
+    ), moved  # fmt: skip
 
 
 def _limits(objective: Objective, maximum: Maximum) -> tuple[BoolArray, FloatArray]:

@@ -6,16 +6,16 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from obsynth.calibration.maximum import Maximum, Objective, at_bounds, descent, polished
 from obsynth.numerics.arrays import SMALLEST, FloatArray
+from obsynth.numerics.ranks import LEAST_INFORMATION
 
 #: A direction whose deviation exceeds this share of the bounds' width is not determined by the log.
 UNDETERMINED = 1.0 / 6.0
 #: Entries of a direction that are named.
-NAMED_SHARE = 0.05
-#: Eigenvalues of the variances' information below this share of the largest are left out.
-LEAST_INFORMATION = 1e-10
+LISTED_SHARE = 0.05
 #: Variances that are found from n rows are themselves uncertain, which a quantile of Student's distribution covers in
 #: part; what it leaves was measured (benchmarks/campaigns/calibration_coverage.md): boxes of `SHORT` rows need this.
 SHORT, SHORT_WIDENING = 56.0, 1.05
@@ -24,6 +24,18 @@ LIMIT_ROOT = 1.645
 #: A profile ends when its root is within this share of what is sought.
 PROFILE_TOLERANCE = 0.02
 MOST_PROFILE_STEPS = 12
+#: Curvatures below this share of the largest count as this much: rounding of the Hessian.
+LEAST_CURVATURE = 1e-8
+#: Of the search for the others along a profile: the gain in nats that ends it, and its steps.
+PROFILE_SEARCH_TOLERANCE, MOST_PROFILE_SEARCHES = 1e-4, 60
+#: In widths of the bounds: a place this near to a bound is at it; the least deviation a profile begins with.
+AT_BOUND, LEAST_DEVIATION = 1e-9, 1e-9
+#: A root below this says nothing of how far to go; two roots nearer than the second are one.
+LEAST_ROOT, SAME_ROOT = 1e-9, 1e-12
+#: Outwards a profile goes this much further than proportion says, and grows by a factor between these.
+FURTHER, LEAST_GROWTH, MOST_GROWTH = 1.1, 1.2, 4.0
+#: Inwards an interval is cut at a share of it no nearer to its ends than this, until it is this share of the way.
+LEAST_CUT, SHORT_INTERVAL = 0.1, 1e-3
 #: Along a valley: longest step in widths of the bounds, Newton's steps at each, and the gain in nats that ends them.
 VALLEY_STEP, VALLEY_NEWTON_STEPS, VALLEY_TOLERANCE = 0.0625, 8, 1e-3
 #: The share of that step at which an end is told.
@@ -38,10 +50,13 @@ class Information:
     undetermined: tuple[dict[str, float], ...]
 
 
-def information(hessian: FloatArray, objective: Objective, z: FloatArray) -> Information:
-    """Return what the log says of the constants, the variances integrated out."""
+def information(
+    hessian: FloatArray, objective: Objective, z: FloatArray, *, apart: NDArray[np.bool_] | None = None
+) -> Information:
+    """Return what the log says of the constants, the variances integrated out but for those that are held ``apart``."""
     nt, widths = objective.nt, objective.problem.widths
     held = at_bounds(z, objective.low, objective.high)
+    held = held if apart is None else held | apart
     nuisance = [i for i in range(nt, len(z)) if not held[i]]
     found = hessian[:nt, :nt]
     if nuisance:
@@ -62,7 +77,7 @@ def covariance_of(found: FloatArray, widths: FloatArray, names: tuple[str, ...])
         if deviations[i] > UNDETERMINED:
             shares = vectors[:, i] / vectors[int(np.argmax(np.abs(vectors[:, i]))), i]
             directions.append({name: float(share) for name, share in zip(names, shares, strict=True)
-                               if abs(share) > NAMED_SHARE})  # fmt: skip
+                               if abs(share) > LISTED_SHARE})  # fmt: skip
     covariance = (vectors * deviations**2) @ vectors.T * np.outer(widths, widths)
     return Information(covariance, tuple(directions))
 
@@ -99,7 +114,7 @@ def profile_box(
     """Return both ends of each constant's box, in its own units."""
     found, names = [], objective.problem.unknown
     for i, width in enumerate(objective.problem.widths):
-        weak = any(names[i] in direction for direction in said.undetermined)
+        weak = objective.bent or any(names[i] in direction for direction in said.undetermined)
         side = _side_along_valley if weak else _side
         sides = [side(objective, maximum, i, sign, root) for sign in (-1.0, 1.0)]
         found.append((Side(sides[0].value * width, sides[0].is_open), Side(sides[1].value * width, sides[1].is_open)))
@@ -130,11 +145,11 @@ class _Profile:
         self.objective, self.maximum, self.i = objective, maximum, i
         self.others = [j for j in range(len(maximum.z)) if j != i]
         values, vectors = np.linalg.eigh(maximum.hessian)
-        values = np.maximum(values, 1e-8 * max(float(values.max()), SMALLEST))
+        values = np.maximum(values, LEAST_CURVATURE * max(float(values.max()), SMALLEST))
         self.covariance = (vectors / values) @ vectors.T
         inner = maximum.hessian[np.ix_(self.others, self.others)]
         values, vectors = np.linalg.eigh(inner)
-        values = np.maximum(values, 1e-8 * max(float(values.max(initial=0.0)), SMALLEST))
+        values = np.maximum(values, LEAST_CURVATURE * max(float(values.max(initial=0.0)), SMALLEST))
         spread = np.sqrt(np.diag((vectors / values) @ vectors.T))
         # Variables that the log does not determine move by no more than their search does.
         self.scale = np.minimum(spread, np.where(np.arange(len(maximum.z))[self.others] < objective.nt, 1.0, 3.0))
@@ -154,7 +169,9 @@ class _Profile:
             return found, gradient[others]
 
         if others:
-            least, self.rest = descent(both, guess, low, high, self.scale, tolerance=1e-4, most=60)
+            least, self.rest = descent(
+                both, guess, low, high, self.scale, tolerance=PROFILE_SEARCH_TOLERANCE, most=MOST_PROFILE_SEARCHES
+            )
         else:
             least = both(self.rest)[0]
         self.place = value
@@ -165,9 +182,9 @@ def _side(objective: Objective, maximum: Maximum, i: int, sign: float, target: f
     """Return where the root of the profile's deviance reaches a target; open where a bound comes first."""
     profile, begin = _Profile(objective, maximum, i), float(maximum.z[i])
     end = float(objective.low[i] if sign < 0 else objective.high[i])
-    if abs(end - begin) < 1e-9:
+    if abs(end - begin) < AT_BOUND:
         return Side(end, True)
-    deviation = math.sqrt(max(profile.covariance[i, i], 1e-18))
+    deviation = math.sqrt(max(profile.covariance[i, i], LEAST_DEVIATION**2))
     inner, reached_inner = begin, 0.0
     outer, reached = begin + sign * min(target * deviation, abs(end - begin)), 0.0
     for _ in range(MOST_PROFILE_STEPS):
@@ -175,14 +192,14 @@ def _side(objective: Objective, maximum: Maximum, i: int, sign: float, target: f
         if reached >= target or outer == end:
             break
         inner, reached_inner = outer, reached
-        longer = abs(outer - begin) * min(max(1.1 * target / max(reached, 1e-9), 1.2), 4.0)
+        longer = abs(outer - begin) * min(max(FURTHER * target / max(reached, LEAST_ROOT), LEAST_GROWTH), MOST_GROWTH)
         outer = begin + sign * min(longer, abs(end - begin))
     if reached < target:
         return Side(end, True)
     for _ in range(MOST_PROFILE_STEPS):
-        if reached - target < PROFILE_TOLERANCE * target or abs(outer - inner) < 1e-3 * abs(outer - begin):
+        if reached - target < PROFILE_TOLERANCE * target or abs(outer - inner) < SHORT_INTERVAL * abs(outer - begin):
             break
-        share = min(max((target - reached_inner) / (reached - reached_inner), 0.1), 0.9)
+        share = min(max((target - reached_inner) / (reached - reached_inner), LEAST_CUT), 1.0 - LEAST_CUT)
         middle = inner + share * (outer - inner)
         found = profile.root(middle)
         if found >= target:
@@ -191,7 +208,7 @@ def _side(objective: Objective, maximum: Maximum, i: int, sign: float, target: f
             inner, reached_inner = middle, found
         if target - reached_inner < PROFILE_TOLERANCE * target:
             # The outer end would do as well; between them the interpolation is better than either.
-            share = (target - reached_inner) / max(reached - reached_inner, 1e-12)
+            share = (target - reached_inner) / max(reached - reached_inner, SAME_ROOT)
             return Side(inner + share * (outer - inner), False)
     return Side(outer, False)
 
@@ -207,7 +224,7 @@ def _side_along_valley(objective: Objective, maximum: Maximum, i: int, sign: flo
     inner = maximum.hessian[np.ix_(others, others)]
     slope = -np.linalg.lstsq(inner, maximum.hessian[others, i], rcond=LEAST_INFORMATION)[0]
     step, reached, curvature = VALLEY_STEP, 0.0, maximum.hessian
-    while abs(end - place) > 1e-9:
+    while abs(end - place) > AT_BOUND:
         new = place + sign * min(step, abs(end - place))
         z = np.empty(len(maximum.z))
         z[others], z[i] = rest + slope * (new - place), new
@@ -218,7 +235,7 @@ def _side_along_valley(objective: Objective, maximum: Maximum, i: int, sign: flo
         found = math.sqrt(max(2.0 * (least - maximum.value), 0.0))
         if found >= target:
             if step <= LEAST_VALLEY_STEP * VALLEY_STEP:
-                share = (target - reached) / max(found - reached, 1e-12)
+                share = (target - reached) / max(found - reached, SAME_ROOT)
                 return Side(place + share * (new - place), False)
             step *= 0.25
             continue

@@ -8,11 +8,12 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arrays import FloatArray, read_only
@@ -47,6 +48,14 @@ QUANTUM_SLACK = 0.02
 
 #: Share of distinct values above which a column shows no quantum that limits its noise: a ramp has none twice.
 REPEATED = 0.7
+
+
+#: Rows of wrong values that are named.
+TOLD_ROWS = 5
+#: Decimals to which values of a column are compared, and the share of the largest below which a step is rounding.
+VALUE_DIGITS, SAME_VALUE = 12, 1e-9
+#: The variance of what rounding takes away, even over a step, is the step squared over this.
+EVEN = 12.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +98,17 @@ class Log:
         return Log(self.time, read_only(u), self.y, self.dt, self.input_names, self.output_names, self.rows,
                    self.source, self.notes)  # fmt: skip
 
+    def without(self, wrong: NDArray[np.bool_]) -> Log:
+        """Return the log without single outputs ``(n, ny)`` that are no measurements, with a note for each sensor."""
+        notes = list(self.notes)
+        for i, name in enumerate(self.output_names):
+            rows = np.flatnonzero(wrong[:, i])
+            told = ", ".join(f"row {self.rows[0] + row}: {self.y[row, i]:.4g}" for row in rows[:TOLD_ROWS])
+            if len(rows):
+                notes.append(f"{len(rows)} value(s) of {name} are far from all others and count as not measured "
+                             f"({told}{', ...' if len(rows) > TOLD_ROWS else ''}).")  # fmt: skip
+        return replace(self, y=read_only(np.where(wrong, np.nan, self.y)), notes=tuple(notes))
+
 
 def parsed_rows(rows: str | slice | Sequence[int] | None, count: int) -> tuple[int, int]:
     """Return first row and one past the last of ``"a:b"``, a slice or a pair, as Python counts."""
@@ -103,7 +123,9 @@ def parsed_rows(rows: str | slice | Sequence[int] | None, count: int) -> tuple[i
         rows = slice(int(rows[0]), int(rows[1]))
     first, last, step = (rows or slice(None)).indices(count)
     if step != 1 or last <= first:
-        raise SpecError(f"rows {first}:{last} holds nothing: the log has {count} rows.", path="rows")
+        asked = rows if isinstance(rows, slice) else slice(None)
+        told = ":".join("" if end is None else str(end) for end in (asked.start, asked.stop))
+        raise SpecError(f"rows {told} holds nothing: the log has {count} rows.", path="rows")
     if isinstance(rows, slice) and any(end is not None and abs(end) > count for end in (rows.start, rows.stop)):
         raise SpecError(f"rows asks for {rows.start}:{rows.stop}, but the log has {count} rows.", path="rows")
     return first, last
@@ -226,9 +248,9 @@ def _on_grid(
 
 def quantum(column: FloatArray) -> float:
     """Return the smallest step between values of a column of which all others are multiples; zero without one."""
-    values = np.unique(np.round(column[np.isfinite(column)], 12))
+    values = np.unique(np.round(column[np.isfinite(column)], VALUE_DIGITS))
     steps = np.diff(values)
-    steps = steps[steps > 1e-9 * max(1.0, float(np.abs(values).max(initial=0.0)))]
+    steps = steps[steps > SAME_VALUE * max(1.0, float(np.abs(values).max(initial=0.0)))]
     if not steps.size:
         return 0.0
     ratios = steps / steps.min()
@@ -240,4 +262,4 @@ def quantum(column: FloatArray) -> float:
 def repeats(column: FloatArray) -> bool:
     """Whether values of a column come again often enough that its quantum limits what its noise can be."""
     values = column[np.isfinite(column)]
-    return bool(len(np.unique(np.round(values, 12))) < REPEATED * len(values))
+    return bool(len(np.unique(np.round(values, VALUE_DIGITS))) < REPEATED * len(values))

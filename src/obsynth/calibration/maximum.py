@@ -37,6 +37,9 @@ NEWTON_REACH, LEAST_CURVATURE, NEWTON_TOLERANCE = (0.1, 2.0), 0.1, 1e-6
 ACROSS_STEPS, STEEP, VALUE_ROUNDING = 4, 1e3, 1e-13
 #: Differences of the gradient: the longest, as a share of a deviation, and the shortest.
 DIFFERENCE, DIFFERENCE_SHARE, LEAST_DIFFERENCE = 1e-4, 0.03, 1e-6
+#: Longer ones, where a kink of the model bends the likelihood the wrong way: of logarithms of variances, and what share
+#: of them of constants; curvatures below zero that are rounding, and as a share of the largest.
+LONGER_DIFFERENCES, CONSTANT_STEP, DOWNWARDS, DOWNWARDS_SHARE = (1e-3, 1e-2, 1e-1), 0.1, 1e-2, 1e-6
 #: A variance counts as indistinguishable from zero if making it smaller by this logarithm costs fewer nats than this.
 COLLAPSE, COLLAPSE_NATS = 3.0, 0.05
 #: Where variances that must not collapse begin, as logarithms of factors of their first guess.
@@ -70,6 +73,8 @@ class Objective:
         self.scale = np.where(self.is_q | self.is_r, VARIANCE_SCALE, CONSTANT_SCALE)
         self.first = np.concatenate([np.zeros(g.nt), self.variances])[self.free]
         self.avoided = np.zeros(self.size)
+        # Whether its slope jumps where it is least, as it does at a kink of the model.
+        self.bent = False
 
     @property
     def size(self) -> int:
@@ -211,7 +216,20 @@ def polished(
         if not found < value + VALUE_ROUNDING * abs(value):
             break
         z, value, gradient = trial, found, slope
-    return value, z, hessian(objective, z, curvature) if fixed is None else curvature
+    return value, z, _hessian_of_minimum(objective, z, curvature) if fixed is None else curvature
+
+
+def _hessian_of_minimum(objective: Objective, z: FloatArray, near: FloatArray) -> FloatArray:
+    """Return the Hessian, in longer steps where short ones see a kink of the model and no minimum."""
+    free = np.flatnonzero(~at_bounds(z, objective.low, objective.high))
+    found = hessian(objective, z, near)
+    for step in LONGER_DIFFERENCES:
+        values = np.linalg.eigvalsh(found[np.ix_(free, free)]) if free.size else np.zeros(1)
+        if values[0] >= -max(DOWNWARDS, DOWNWARDS_SHARE * values[-1]):
+            break
+        objective.bent = True
+        found = hessian(objective, z, steps=np.where(objective.is_q | objective.is_r, 1.0, CONSTANT_STEP) * step)
+    return found
 
 
 def _newton_step(
@@ -269,9 +287,12 @@ def without_collapse(objective: Objective, maximum: Maximum, note: Callable[[str
     return maximum
 
 
-def hessian(both: Objective, z: FloatArray, near: FloatArray | None = None) -> FloatArray:
+def hessian(
+    both: Objective, z: FloatArray, near: FloatArray | None = None, *, steps: FloatArray | None = None
+) -> FloatArray:
     """Return second derivatives by central differences of the exact gradient, in steps that suit those nearby."""
-    steps = np.full(len(z), DIFFERENCE)
+    if steps is None:
+        steps = np.full(len(z), DIFFERENCE)
     if near is not None:
         steeper = np.sqrt(np.maximum(np.diag(near), 1.0))
         steps = np.clip(DIFFERENCE_SHARE / steeper, LEAST_DIFFERENCE, DIFFERENCE)

@@ -7,8 +7,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from obsynth.analysis.transformations.entries_in_constants import promoted
 from obsynth.calibration.logs import Log
-from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.dae.functions import DAEFunctions
 from obsynth.plants.dae.model import DAEModel
@@ -109,6 +109,8 @@ class NonlinearPlant:
         """Return the model with what is unknown among its parameters."""
         key = tuple(unknown)
         if key not in self._promoted:
+            for name in key:
+                index_of(name, [*self.model.parameter_names, *self.model.constants], what="unknown")
             self._promoted[key] = promoted(self.model, key)
         return self._promoted[key]
 
@@ -149,20 +151,3 @@ def _column(entries: Sequence[Any]) -> Any:
     import casadi as ca
 
     return ca.vertcat(*(ca.SX(entry) for entry in entries)) if entries else ca.SX(0, 1)
-
-
-def promoted(model: DAEModel, names: Sequence[str]) -> DAEModel:
-    """Return a model whose named constants are parameters, before those it has."""
-    for name in names:
-        index_of(name, [*model.parameter_names, *model.constants], what="unknown")
-    new = [name for name in names if name in model.constants]
-    if not new:
-        return model
-    if not model.is_data:
-        raise SpecError(f"{new[0]!r} is a constant of Python functions, which only texts can give up: make it a "
-                        "parameter.", path=f"unknown.{new[0]}")  # fmt: skip
-    return model.replace(
-        constants={name: value for name, value in model.constants.items() if name not in new},
-        parameters={**{name: model.constants[name] for name in new}, **model.parameters},
-        units={**dict.fromkeys(new, "1"), **model.units},
-    )

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.calibration.logs import Log, bad_log, quantum, refused, repeats
+from obsynth.calibration.logs import EVEN, Log, bad_log, quantum, refused, repeats
 from obsynth.calibration.plants import CalibrationPlant
 from obsynth.calibration.step_graphs import SampleGraphs, sample_graphs
 from obsynth.errors import SpecError
@@ -50,6 +50,7 @@ class Problem:
     graphs: SampleGraphs
     integration: str
     substeps: int
+    notes: tuple[str, ...] = ()
 
     @property
     def y(self) -> FloatArray:
@@ -77,6 +78,10 @@ class Problem:
             self.plant, self.unknown, self.log.dt, integration=integration, substeps=substeps, samples=self.log.samples
         )
         return Problem(**{**vars(self), "graphs": graphs, "integration": integration, "substeps": substeps})
+
+    def with_start(self, P0: FloatArray, *notes: str) -> Problem:
+        """Return the same problem with another covariance of the initial state, and what is said of that."""
+        return Problem(**{**vars(self), "P0": P0, "notes": notes})
 
     def with_log(self, log: Log) -> Problem:
         """Return the same problem with another log of the same signals."""
@@ -109,7 +114,7 @@ def calibration_problem(
     held = np.array([repeats(column) for column in log.y.T])
     largest = np.nanmax(np.abs(log.y), axis=0)
     floors = np.maximum(
-        np.where(held, quanta**2 / 12.0, 0.0), (LEAST_NOISE * np.where(largest > 0.0, largest, 1.0)) ** 2
+        np.where(held, quanta**2 / EVEN, 0.0), (LEAST_NOISE * np.where(largest > 0.0, largest, 1.0)) ** 2
     )
     variances = int(np.isnan(known_Q).sum() + np.isnan(known_R).sum())
     if not names and not variances:

@@ -9,12 +9,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from obsynth.calibration.diagnostics import SIGNIFICANT, Consistency, Whiteness, change_of_mean, consistency, whiteness
+from obsynth.calibration.diagnostics import (
+    SIGNIFICANT,
+    STANDS_OUT,
+    Consistency,
+    Whiteness,
+    change_of_mean,
+    consistency,
+    mean_off,
+    whiteness,
+)
 from obsynth.calibration.innovations_fit import InnovationsFit, Timing
 from obsynth.calibration.intervals import covariance_of, quantile
+from obsynth.calibration.logs import EVEN, TOLD_ROWS
 from obsynth.calibration.problem import Problem
 from obsynth.calibration.result import CalibratedBox, Calibration
-from obsynth.calibration.simulation_error import Fit, SimulationError
+from obsynth.calibration.simulation_error import Fit, SimulationError, unexplained
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.plants.dae.functions import DAEFunctions
 from obsynth.plants.dae.model import DAEModel
@@ -30,11 +40,15 @@ COMPARED = 100
 
 @dataclass(frozen=True)
 class IntegrationError:
-    """Largest difference of one step of backward Euler from Radau, in deviations of a sensor, and where it is."""
+    """Largest difference of one step of backward Euler from Radau, in deviations of a sensor, and where it is.
+
+    moved : by how much it moves a constant, in deviations of that, where it was asked.
+    """
 
     largest: float
     sensor: str
     row: int
+    moved: float = 0.0
 
     @property
     def matters(self) -> bool:
@@ -69,6 +83,8 @@ AT_QUANTISATION = 1.5
 
 #: A timing that is better by this many nats is told, even where it is not taken.
 NOTED_NATS = 2.0
+#: A constant within this share of the bounds' width from one of them is at it.
+END_SHARE = 1e-6
 
 
 def reported(
@@ -99,8 +115,8 @@ def reported(
                                           (*found.limited_Q, *found.limited_R), strict=True) if weak]  # fmt: skip
     row = None if change is None else problem.log.rows[0] + change
     at_end = tuple(name for name, there in zip(names, found.at_bounds, strict=True) if there)
-    verdict = [*problem.log.notes, *problem.plant.notes,
-               *_fitted(problem, box, found, at_end, correlation, limited, Q, R),
+    verdict = [*problem.log.notes, *problem.plant.notes, *problem.notes,
+               *_fitted(problem, box, found, at_end, correlation, limited, Q, R), *_misfits(problem, start, whitened),
                *_checked(nis, colours, row, fit is None), *_told(problem, R, timing, error)]  # fmt: skip
     return Calibration(
         nominal, read_only(covariance), read_only(correlation), box, found.information.undetermined, Q, R,
@@ -130,7 +146,7 @@ def _of_simulation(problem: Problem, start: Fit, level: float) -> InnovationsFit
     sides = []
     for t, half, low, high in zip(start.t, spread, problem.low, problem.high, strict=True):
         sides.append((Side(max(t - half, low), t - half <= low), Side(min(t + half, high), t + half >= high)))
-    ends = (start.t - problem.low < 1e-6 * problem.widths) | (problem.high - start.t < 1e-6 * problem.widths)
+    ends = (start.t - problem.low < END_SHARE * problem.widths) | (problem.high - start.t < END_SHARE * problem.widths)
     variances = np.tile(start.deviations**2, (len(y), 1))
     nothing = np.zeros(len(problem.noisy))
     return InnovationsFit(
@@ -164,6 +180,25 @@ def _fitted(
     return found
 
 
+def _misfits(problem: Problem, start: Fit, whitened: FloatArray) -> list[str]:
+    """Return sentences about sensors that the model does not follow, their mean, and single samples that stand out."""
+    found = []
+    for name in unexplained(problem, start.deviations):
+        found.append(f"The best simulation leaves nearly all of what {name} does: its sign, its unit or its equation "
+                     "is another, and its R stands for the signal itself.")  # fmt: skip
+    for name, column in zip(problem.output_names, whitened.T, strict=True):
+        mean = mean_off(column)
+        if mean:
+            found.append(f"The innovations of {name} have the mean {mean:+.2f} deviations: a bias of the sensor, or an "
+                         "offset that the model lacks.")  # fmt: skip
+        rows = problem.log.rows[0] + np.flatnonzero(np.abs(np.nan_to_num(column)) > STANDS_OUT)
+        if len(rows):
+            told = ", ".join(map(str, rows[:TOLD_ROWS])) + (", ..." if len(rows) > TOLD_ROWS else "")
+            found.append(f"Samples of {name} stand out by more than {STANDS_OUT:g} deviations (row {told}): if they "
+                         "are outliers, mark them as missing.")  # fmt: skip
+    return found
+
+
 def _checked(nis: Consistency, colours: dict[str, Whiteness], row: int | None, simulated: bool) -> list[str]:
     found = []
     coloured = [name for name, test in colours.items() if test.probability < SIGNIFICANT]
@@ -184,7 +219,7 @@ def _checked(nis: Consistency, colours: dict[str, Whiteness], row: int | None, s
 def _told(problem: Problem, R: dict[str, float], timing: Timing, error: IntegrationError | None) -> list[str]:
     found = []
     for name, step in zip(problem.output_names, problem.quanta, strict=True):
-        if step > 0.0 and R[name] < AT_QUANTISATION * step**2 / 12.0:
+        if step > 0.0 and R[name] < AT_QUANTISATION * step**2 / EVEN:
             found.append(f"The noise of {name} is at its quantisation ({step:.3g} / sqrt 12): its R is no lower in "
                          "truth than what a ramp makes of it.")  # fmt: skip
     if timing.delay and timing.losses:
@@ -195,7 +230,7 @@ def _told(problem: Problem, R: dict[str, float], timing: Timing, error: Integrat
         found.append(f"The inputs taken {rows:+d} row would be better by {timing.losses[0]:.1f} nats: see input_delay.")
     if error is not None:
         what = "Radau is taken" if problem.integration == "radau" else "it is taken"
-        found.append(
-            f"A step of backward Euler errs by at most {error.largest:.2g} deviations of {error.sensor}: {what}."
-        )
+        told = f" and moves a constant by {error.moved:.2g} of its own" if error.moved else ""
+        found.append(f"A step of backward Euler errs by at most {error.largest:.2g} deviations of {error.sensor}"
+                     f"{told}: {what}.")  # fmt: skip
     return found

@@ -14,9 +14,11 @@ import numpy as np
 
 from obsynth.calibration.diagnostics import Consistency, Whiteness
 from obsynth.errors import SpecError
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import SMALLEST, FloatArray
+from obsynth.observers.estimates import BAND_WIDTH
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
@@ -221,11 +223,51 @@ class Calibration:
 
     def plot(self) -> Figure:
         """Return a picture: each constant in its box, and the innovations of each sensor in deviations."""
-        from obsynth.calibration.pictures import calibration_figure
-
-        return calibration_figure(self)
+        return _figure(self)
 
     @property
     def innovation_deviation(self) -> FloatArray:
         """Root mean square of each sensor's innovations ``(ny,)``, in its unit."""
         return np.asarray(np.sqrt(np.nanmean((self.innovations * self.deviations) ** 2, axis=0)))
+
+
+def _figure(found: Calibration) -> Figure:
+    """Return each constant in its box, and the whitened innovations of each sensor."""
+    import matplotlib.pyplot as plt
+
+    sensors = len(found.output_names)
+    heights = [0.6 + 0.35 * len(found.names), *[1.7] * sensors]
+    figure, panels = plt.subplots(
+        sensors + 1, 1, layout="constrained", squeeze=False, figsize=(7.5, 0.5 + sum(heights)),
+        gridspec_kw={"height_ratios": heights},
+    )  # fmt: skip
+    _boxes(panels[0, 0], found)
+    time = found.log["rows"][0] + np.arange(len(found.innovations))
+    for panel, name, column in zip(panels[1:, 0], found.output_names, found.innovations.T, strict=True):
+        panel.axhspan(-BAND_WIDTH, BAND_WIDTH, color="tab:blue", alpha=0.15, linewidth=0.0)
+        panel.plot(time, column, color="black", linewidth=0.8, marker=".", markersize=3)
+        panel.set_ylabel(f"{name}\n(deviations)")
+        panel.grid(True, color="0.9", linewidth=0.6)
+        if found.change is not None:
+            panel.axvline(found.change, color="tab:red", linestyle="--", linewidth=1.2)
+    panels[1, 0].set_title("Innovations; 95 % lie in the band", fontsize=10, loc="left")
+    panels[-1, 0].set_xlabel("row of the log")
+    return figure
+
+
+def _boxes(panel: Axes, found: Calibration) -> None:
+    """Draw boxes relative to their nominal values, so that constants of all sizes stand side by side."""
+    opened = set(found.box.open_sides)
+    for i, (name, value) in enumerate(found.nominal.items()):
+        size = abs(value) or max(abs(found.box.low[name]), abs(found.box.high[name]), SMALLEST)
+        low, high = (found.box.low[name] - value) / size * 100.0, (found.box.high[name] - value) / size * 100.0
+        panel.plot([low, high], [i, i], color="0.5", linewidth=3.0, solid_capstyle="butt")
+        for side, end in (("low", low), ("high", high)):
+            marker = ("<" if side == "low" else ">") if (name, side) in opened else "|"
+            panel.plot([end], [i], color="black", marker=marker, markersize=9, linestyle="none")
+        panel.plot([0.0], [i], color="black", marker="o", markersize=4)
+    panel.set_yticks(range(len(found.nominal)), [f"{name} = {value:.4g}" for name, value in found.nominal.items()])
+    panel.set_ylim(len(found.nominal) - 0.5, -0.5)
+    panel.set_xlabel("per cent of the value")
+    panel.set_title(f"{100 * found.box.level:g} % box, all at once (arrows: open)", fontsize=10, loc="left")
+    panel.grid(True, axis="x", color="0.9", linewidth=0.6)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from obsynth.calibration.likelihood import LARGEST_RESIDUAL
 from obsynth.calibration.logs import refused
@@ -15,11 +16,15 @@ from obsynth.calibration.problem import Problem
 from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.plants.dae.functions import Compiled
 
+BoolArray = NDArray[np.bool_]
+
 #: Rounds in which the sensors' weights are estimated again; the first is robust against single wrong values.
 ROUNDS = 3
 MOST_EVALUATIONS = 60
 #: Share of a signal's deviation that stands for its noise before anything is fitted.
 FIRST_NOISE = 0.05
+#: Further starts keep this share of the bounds' width away from them; every start keeps the second.
+DRAWN, INSIDE = 0.05, 1e-9
 #: Residuals are cut here, so that a trajectory that runs away does not overflow.
 LARGEST_MISFIT = 1e6
 #: A moving signal of whose deviation more than this share is left is not explained; and one that rests.
@@ -31,6 +36,10 @@ MOVING = 3.0
 OUTSIZED = 10.0
 #: A sensor that the best fit does not explain, and whose level is so many times another, is in other units.
 OTHER_LEVEL = 30.0
+#: Deviations by which a fitted initial state may differ from the nominal one where its covariance is not stated.
+START_LIMIT = 3.0
+#: Whitened innovations of the first rows beyond this do not fit the start; by how much wider it is then sought.
+FIRST_ROWS, FIRST_LIMIT, UNKNOWN_START = 2, 4.0, 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +110,7 @@ class SimulationError:
         p = self.problem
         low = np.concatenate([p.low / p.widths, np.full(len(p.x0), -np.inf)])
         high = np.concatenate([p.high / p.widths, np.full(len(p.x0), np.inf)])
-        inside = np.clip(start / p.widths, low[: self.nt] + 1e-9, high[: self.nt] - 1e-9)
+        inside = np.clip(start / p.widths, low[: self.nt] + INSIDE, high[: self.nt] - INSIDE)
         v = np.concatenate([inside, p.x0 / self.spread])
         weights = FIRST_NOISE * np.nanstd(p.y, axis=0) + np.sqrt(p.floors)
         for i in range(ROUNDS):
@@ -127,7 +136,7 @@ def simulation_fits(
     fits = []
     for i in range(starts):
         note(f"simulation error, start {i + 1} of {starts}")
-        drawn = problem.low + problem.widths * rng.uniform(0.05, 0.95, len(problem.low))
+        drawn = problem.low + problem.widths * rng.uniform(DRAWN, 1.0 - DRAWN, len(problem.low))
         found = error.fit(drawn if i else problem.nominal if start is None else start)
         if found is not None:
             fits.append(found)
@@ -142,14 +151,47 @@ def simulation_fits(
     return fits
 
 
+def with_seen_start(problem: Problem, fit: Fit, *, first: FloatArray | None = None) -> Problem:
+    """Return the problem with a wider covariance of the initial state, where the log begins elsewhere.
+
+    A start that nobody stated would else look like a fault in the first rows.  It is seen in the fit, or in the
+    ``first`` whitened innovations ``(rows, ny)``: then a fit that hardly knows it says where it is.
+    """
+    deviations, limit = np.sqrt(np.diag(problem.P0)), START_LIMIT
+    if first is not None:
+        if not np.abs(np.nan_to_num(first)).max() > FIRST_LIMIT:
+            return problem
+        found = SimulationError(problem.with_start(UNKNOWN_START**2 * problem.P0)).fit(fit.t)
+        fit, limit = fit if found is None else found, 1.0
+    away = np.abs(fit.x0 - problem.x0)
+    far = away > limit * deviations
+    if not far.any():
+        return problem
+    told = ", ".join(f"{name} {fit.x0[i]:.4g} for {problem.x0[i]:.4g}"
+                     for i, name in enumerate(problem.plant.state_names) if far[i])  # fmt: skip
+    note = f"The log does not begin at the nominal state ({told}): what is known of the start is widened."
+    return problem.with_start(np.diag(np.where(far, away, deviations) ** 2), note)
+
+
+def unexplained(problem: Problem, left: FloatArray) -> list[str]:
+    """Return sensors that move, and of whose motion the best fit leaves nearly all ``left (ny,)``."""
+    share, moves = _shares(problem, left)
+    return [name for name, bad in zip(problem.output_names, moves & (share > UNEXPLAINED), strict=True) if bad]
+
+
+def _shares(problem: Problem, left: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Return what a fit leaves of each sensor, as a share of its deviation, and whether it moves."""
+    deviations = np.nanstd(problem.y, axis=0)
+    with np.errstate(invalid="ignore"):
+        roughness = np.nan_to_num(np.nanstd(np.diff(problem.y, axis=0), axis=0)) / np.sqrt(2.0)
+    moves = deviations > MOVING * np.maximum(roughness, np.sqrt(problem.floors))
+    return left / np.maximum(deviations, SMALLEST), moves
+
+
 def _require_explained(problem: Problem, left: FloatArray) -> None:
     """Refuse a model whose best fit leaves as much as there was: its units, scales or sample time are wrong."""
-    y = problem.y
-    deviations = np.nanstd(y, axis=0)
-    share = left / np.maximum(deviations, SMALLEST)
-    with np.errstate(invalid="ignore"):
-        roughness = np.nan_to_num(np.nanstd(np.diff(y, axis=0), axis=0)) / np.sqrt(2.0)
-    moves = deviations > MOVING * np.maximum(roughness, np.sqrt(problem.floors))
+    deviations = np.nanstd(problem.y, axis=0)
+    share, moves = _shares(problem, left)
     bad = np.where(moves, share > UNEXPLAINED, share > UNEXPLAINED_AT_REST)
     if bad.any() and (bad[moves].all() if moves.any() else True) and not _moved_by_noise(problem, deviations):
         names = [name for name, wrong in zip(problem.output_names, bad, strict=True) if wrong]

@@ -114,8 +114,8 @@ def noise_ratios(observer: DAEObserver, log: Log) -> Mapping[str, float]:
     quanta = np.array([quantum(column) for column in log.y.T])
     problem = Problem(
         plant, log, log.u, (), nothing, nothing, nothing, nothing, nothing, noisy, free_Q, np.full(model.ny, np.nan),
-        np.array(observer.initial_state), np.array(observer.initial_covariance), quanta, 1e-6 * designed_R, graphs,
-        observer.integration, 1,
+        np.array(observer.initial_state), np.array(observer.initial_covariance), quanta, LEAST_RATIO * designed_R,
+        graphs, observer.integration, 1,
     )  # fmt: skip
     fit = Fit(nothing, np.array(observer.initial_state), np.sqrt(designed_R), 0.0, np.zeros((0, 0)))
     objective = Objective(problem, fit)
@@ -140,6 +140,8 @@ OFFSET = 3.0
 
 #: Rows that a log must have at least.
 LEAST_ROWS = 20
+#: A sensor's variance that a log may say, at least, as a share of what the design says.
+LEAST_RATIO = 1e-6
 
 
 def validate(

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from obsynth.calibration.diagnostics import Consistency, Whiteness
 from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.estimates import BAND_WIDTH
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
@@ -93,6 +97,39 @@ class Validation:
 
     def plot(self) -> Figure:
         """Return a picture: measured and predicted signals, innovations in their band, estimates."""
-        from obsynth.calibration.pictures import validation_figure
+        return _figure(self)
 
-        return validation_figure(self)
+
+def _figure(found: Validation) -> Figure:
+    """Return measured and predicted signals, innovations in their band, and each estimate with its own."""
+    import matplotlib.pyplot as plt
+
+    count = 2 * len(found.sensors) + len(found.estimates)
+    figure, panels = plt.subplots(
+        count, 1, layout="constrained", squeeze=False, sharex=True, figsize=(7.5, 0.6 + 1.5 * count)
+    )
+    draw_validation(found, list(panels[:, 0]))
+    return figure
+
+
+def draw_validation(found: Validation, panels: Sequence[Axes]) -> None:
+    """Draw signal and innovation of each sensor, then each estimate, on a panel each."""
+    names, time = list(found.sensors), found.log["rows"][0] + np.arange(len(found.innovations))
+    for i, name in enumerate(names):
+        signals, said = panels[2 * i], panels[2 * i + 1]
+        signals.plot(time, found.measured[:, i], color="0.7", linewidth=3.0, label="measured")
+        signals.plot(time, found.predicted[:, i], color="black", linewidth=1.0, linestyle="--", label="predicted")
+        signals.set_ylabel(name)
+        signals.legend(fontsize=8, loc="upper left", frameon=False, ncols=2)
+        band = BAND_WIDTH * found.deviations[:, i]
+        said.fill_between(time, -band, band, color="tab:blue", alpha=0.15, linewidth=0.0)
+        said.plot(time, found.innovations[:, i], color="black", linewidth=0.8, marker=".", markersize=3)
+        said.set_ylabel(f"innovation\nof {name}")
+    for panel, (name, columns) in zip(panels[2 * len(names) :], found.estimates.items(), strict=True):
+        value, band = columns[:, 0], BAND_WIDTH * columns[:, 1]
+        panel.fill_between(time, value - band, value + band, color="tab:blue", alpha=0.25, linewidth=0.0)
+        panel.plot(time, value, color="black", linewidth=1.1)
+        panel.set_ylabel(name)
+    for panel in panels:
+        panel.grid(True, color="0.9", linewidth=0.6)
+    panels[-1].set_xlabel("row of the log")

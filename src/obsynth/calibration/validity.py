@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -10,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.analysis.transformations.linearisation import DRIFT
-from obsynth.calibration.logs import Log, LogData, quantum, read_log
+from obsynth.calibration.logs import EVEN, Log, LogData, quantum, read_log
 from obsynth.calibration.plants import NonlinearPlant
 from obsynth.calibration.problem import initial_state_of
 from obsynth.errors import SpecError
@@ -65,9 +66,7 @@ class Validity:
 
     def plot(self) -> Figure:
         """Return a picture: both outputs, and their difference in deviations, by sensor."""
-        from obsynth.calibration.pictures import validity_figure
-
-        return validity_figure(self)
+        return _figure(self)
 
 
 def validity(
@@ -149,7 +148,7 @@ def _deviation(column: FloatArray, name: str, given: Mapping[str, float] | None)
             raise SpecError(f"deviations.{name} is {given[name]!r}: give a positive number.", path=f"deviations.{name}")
         return float(given[name])
     rough = float(np.nanstd(np.diff(column, n=2)) / np.sqrt(6.0))
-    found = max(rough, float(quantum(column) / np.sqrt(12.0)))
+    found = max(rough, quantum(column) / math.sqrt(EVEN))
     if not found > 0.0:
         raise SpecError(f"The record of {name!r} shows no noise: state its deviation by deviations.",
                         path=f"deviations.{name}")  # fmt: skip
@@ -174,3 +173,26 @@ def _linear_outputs(linear: DescriptorSystem, log: Log, start: FloatArray) -> Fl
         z = z + log.dt * (ending @ slopes)
         found.append(linear.C @ z)
     return np.array(found)
+
+
+def _figure(found: Validity) -> Figure:
+    """Return outputs of plant and linear model, and their difference in deviations of the sensor."""
+    import matplotlib.pyplot as plt
+
+    names = list(found.by_sensor)
+    figure, panels = plt.subplots(
+        2 * len(names), 1, layout="constrained", squeeze=False, sharex=True, figsize=(7.5, 0.6 + 3.0 * len(names))
+    )
+    for i, name in enumerate(names):
+        signals, apart = panels[2 * i, 0], panels[2 * i + 1, 0]
+        signals.plot(found.time, found.nonlinear[:, i], color="0.7", linewidth=3.0, label="nonlinear")
+        signals.plot(found.time, found.linear[:, i], color="black", linewidth=1.0, linestyle="--", label="linear")
+        signals.set_ylabel(name)
+        signals.legend(fontsize=8, loc="best", frameon=False, ncols=2)
+        apart.axhspan(-1.0, 1.0, color="tab:blue", alpha=0.15, linewidth=0.0)
+        apart.plot(found.time, (found.linear - found.nonlinear)[:, i] / found.deviations[name], color="black")
+        apart.set_ylabel(f"difference of\n{name} (deviations)")
+    for panel in panels[:, 0]:
+        panel.grid(True, color="0.9", linewidth=0.6)
+    panels[-1, 0].set_xlabel("time (s)")
+    return figure

@@ -4,8 +4,24 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 from obsynth.files.outputs import FileKind, check_output, check_replaceable
+
+
+def spec_verb(verbs: Any, name: str, told: str) -> argparse.ArgumentParser:
+    """Return the parser of a new verb that reads a spec."""
+    parser: argparse.ArgumentParser = verbs.add_parser(name, help=told, description=told)
+    parser.set_defaults(verb=name)
+    add_system(parser)
+    return parser
+
+
+def add_spec_gains(parser: argparse.ArgumentParser) -> None:
+    """Add the gain set that a spec's scenario is run with."""
+    parser.add_argument(
+        "--gains", type=Path, metavar="FILE", help="a gain set for the spec's plant: nothing is designed"
+    )
 
 
 def add_system(parser: argparse.ArgumentParser) -> None:

@@ -206,7 +206,7 @@ def _is_alarm(path: Path) -> bool:
 def _verify_alarm(options: argparse.Namespace) -> int:
     """Recheck the certificate of an alarm without a solver."""
     from obsynth.experiments.alarm_proofs.certificate import verify_alarm
-    from obsynth.results.checks_table import verification_report
+    from obsynth.results.checks_table import print_checks
 
     report = verify_alarm(options.gains)
     if options.json:
@@ -214,7 +214,7 @@ def _verify_alarm(options: argparse.Namespace) -> int:
             "command": "verify", "file": str(options.gains), "passed": report.passed, "report": report.as_dict()
         })  # fmt: skip
     else:
-        verification_report(report, console=stdout_console())
+        print_checks(report.checks, console=stdout_console())
     return 0 if report.passed else VerificationError.exit_code
 
 

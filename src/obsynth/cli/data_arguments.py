@@ -9,6 +9,8 @@ from typing import Any
 from obsynth.cli.arguments import add_force, add_gains, add_json, add_quiet
 from obsynth.cli.sweep import add_executors
 
+#: Probability of a false alarm in the whole run, where none is given.
+FALSE_ALARMS = 0.01
 _RUN = "Run a design on measured data: a log, or a stream on standard input, a row in, a row out."
 _EXPORT = (
     "Write a gain set for Simulink (.mat), numpy (.npz), C99 (.c and .h), or as a functional mock-up unit for "
@@ -202,8 +204,8 @@ def add_monitor_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     group.add_argument("--initial-error", type=float, metavar="E", help="bound on the norm of the error at the start")
     group.add_argument(
-        "--false-alarms", type=float, default=0.01, metavar="P",
-        help="statistical kinds: probability of a false alarm in the whole run (default: 0.01)",
+        "--false-alarms", type=float, default=FALSE_ALARMS, metavar="P",
+        help="statistical kinds: probability of a false alarm in the whole run (default: %(default)s)",
     )  # fmt: skip
     group.add_argument("--window", type=int, default=20, metavar="N", help="samples looked back (default: 20)")
     group.add_argument(

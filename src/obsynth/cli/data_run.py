@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from obsynth.experiments.monitors.online import OnlineMonitor
     from obsynth.plants.uncertainty import Uncertainty
     from obsynth.results.design import ObserverDesign
+    from obsynth.simulation.scenario import Scenario
+    from obsynth.spec import Spec
 
 STREAM = "-"
 
@@ -103,7 +105,6 @@ def monitor_of(
     scenario = None
     if options.system is not None:
         from obsynth.cli.commands import require_same_signals
-        from obsynth.cli.simulate import required_scenario
         from obsynth.spec import load_spec
 
         spec = load_spec(options.system)
@@ -173,3 +174,12 @@ def rows_in(path: Path) -> int | None:
         return round(path.stat().st_size / len(sample) * lines) - 1 if lines > 1 else None
     except (OSError, ImportError, ValueError):
         return None
+
+
+def required_scenario(spec: Spec) -> Scenario:
+    """Return the scenario of a spec."""
+    if spec.scenario is None:
+        raise SpecError(
+            f"{spec.path} has no scenario: add one, for example scenario: {{horizon: 100}}.", path="scenario"
+        )
+    return spec.scenario

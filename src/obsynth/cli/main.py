@@ -16,16 +16,16 @@ from contextlib import ExitStack, contextmanager, suppress
 from importlib import import_module
 from pathlib import Path
 
-from obsynth import __version__
-from obsynth.cli.arguments import add_force, add_json, add_quiet, add_system, add_verbose
+from obsynth.cli.arguments import add_force, add_json, add_quiet, add_system, add_verbose, spec_verb
 from obsynth.cli.calibration import add_calibration_verbs
 from obsynth.cli.data_arguments import add_data_verbs
 from obsynth.cli.output import print_error, print_json
 from obsynth.cli.prove_alarm import add_prove_alarm_verb
-from obsynth.cli.scenarios import add_compare_verb, add_evaluate_verb
+from obsynth.cli.scenarios import add_compare_verb, add_evaluate_verb, add_simulate_verb
 from obsynth.cli.sweep import add_sweep_verb
 from obsynth.errors import ObsynthError, SolverError, SpecError
 from obsynth.files.inputs import protected_inputs
+from obsynth.version import __version__
 
 #: Exit code of a program whose reader has left, as shells give it.
 BROKEN_PIPE = 141
@@ -115,9 +115,6 @@ _CHECK = "Analyse the plant of a spec, and check for every method whether a desi
 _VERIFY = "Verify a saved gain set again, from the plant and the shipped realisation alone."
 
 
-_SIMULATE = "Design an observer from a spec, and simulate it on the spec's scenario."
-
-
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="obsynth", epilog=_EXIT_CODES, formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -127,11 +124,9 @@ def _parser() -> argparse.ArgumentParser:
     verbs = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     _add_design_arguments(verbs.add_parser("design", help=_DESIGN, description=_DESIGN))
 
-    check = verbs.add_parser("check", help=_CHECK, description=_CHECK)
-    add_system(check)
+    check = spec_verb(verbs, "check", _CHECK)
     add_verbose(check, "the structure of the plant and every condition")
     add_json(check)
-    check.set_defaults(verb="check")
 
     verify = verbs.add_parser("verify", help=_VERIFY, description=_VERIFY)
     verify.add_argument(
@@ -145,16 +140,7 @@ def _parser() -> argparse.ArgumentParser:
     add_json(verify)
     verify.set_defaults(verb="verify")
 
-    simulate = verbs.add_parser("simulate", help=_SIMULATE, description=_SIMULATE)
-    add_system(simulate)
-    simulate.add_argument(
-        "--gains", type=Path, metavar="FILE", help="a gain set for the spec's plant: nothing is designed"
-    )
-    simulate.add_argument("--out", type=Path, metavar="FILE", help="write every signal to this file (CSV)")
-    add_json(simulate)
-    add_force(simulate)
-    add_quiet(simulate)
-    simulate.set_defaults(verb="simulate")
+    add_simulate_verb(verbs)
     add_compare_verb(verbs)
     add_evaluate_verb(verbs)
     add_sweep_verb(verbs)
@@ -191,7 +177,7 @@ def _digits(text: str) -> int:
 #: Verb -> module of `obsynth.cli` and function; only the one that is asked for is loaded.
 _VERBS = {
     "design": "commands:run_design", "check": "commands:run_check", "verify": "commands:run_verify",
-    "simulate": "simulate:run_simulate", "compare": "scenarios:run_compare", "evaluate": "scenarios:run_evaluate",
+    "simulate": "scenarios:run_simulate", "compare": "scenarios:run_compare", "evaluate": "scenarios:run_evaluate",
     "sweep": "sweep:run_sweep", "run": "data_commands:run_run", "export": "data_commands:run_export",
     "plot": "data_commands:run_plot", "report": "data_commands:run_report", "linearise": "calibration:run_linearise",
     "calibrate": "calibration:run_calibrate", "validate": "calibration:run_validate",

@@ -1,7 +1,4 @@
-"""The verbs ``evaluate`` and ``compare``: one design on its scenario many times, or every method that exists on it.
-
-The verb ``compare``: every method that exists for a spec's plant, side by side.
-"""
+"""The verbs that run a scenario: ``simulate``, ``evaluate``, and ``compare``, which does so for every method."""
 
 from __future__ import annotations
 
@@ -9,12 +6,12 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from obsynth.cli.arguments import add_force, add_json, add_quiet, add_system, output_file
+from obsynth.cli.arguments import add_force, add_json, add_quiet, add_spec_gains, output_file, spec_verb
 from obsynth.cli.data_arguments import add_monitor_arguments
 from obsynth.cli.output import print_json, progress, stdout_console
-from obsynth.cli.simulate import required_scenario
 from obsynth.cli.sweep import chosen_executor
 from obsynth.errors import PreconditionError, SpecError
+from obsynth.files.inputs import protect
 
 if TYPE_CHECKING:
     from obsynth.experiments.monitors.monitor import Monitor
@@ -23,16 +20,55 @@ if TYPE_CHECKING:
     from obsynth.spec import Spec
 
 
+_SIMULATE = "Design an observer from a spec, and simulate it on the spec's scenario."
+
+
+def add_simulate_verb(verbs: Any) -> None:
+    """Add the parser."""
+    simulate = spec_verb(verbs, "simulate", _SIMULATE)
+    add_spec_gains(simulate)
+    simulate.add_argument("--out", type=Path, metavar="FILE", help="write every signal to this file (CSV)")
+    add_json(simulate)
+    add_force(simulate)
+    add_quiet(simulate)
+
+
+def run_simulate(options: argparse.Namespace) -> int:
+    """Run ``simulate``: spec in, table of errors out, and every signal in a file if asked."""
+    from obsynth.cli.commands import designed_or_loaded, spec_output
+    from obsynth.cli.data_run import required_scenario
+    from obsynth.experiments.columns import SIGNALS
+    from obsynth.spec import load_spec
+
+    with progress(quiet=options.quiet) as report_stage:
+        report_stage(f"reading {options.system}")
+        spec = load_spec(options.system)
+        scenario = required_scenario(spec)
+        if options.gains is not None:
+            protect(options.gains)
+        target = None if options.out is None else spec_output(options.out, SIGNALS, spec, options, option="--out")
+        design = designed_or_loaded(spec, options.gains, report_stage)
+        report_stage("simulating")
+        from obsynth.experiments.simulation import simulate
+
+        found = simulate(design, scenario)
+        written = None if target is None else str(found.write_csv(target))
+    if options.json:
+        print_json({"command": "simulate", "spec": str(spec.path), "file": written, **found.summary()})
+        return 0
+    from obsynth.report.scenarios import simulation_report
+
+    simulation_report(design.name, found, console=stdout_console(), units=design.plant.units, file=written)
+    return 0
+
+
 _EVALUATE = "Design an observer from a spec, run the spec's scenario many times, and count alarms, delays and errors."
 
 
 def add_evaluate_verb(verbs: Any) -> None:
     """Add the parser."""
-    evaluate = verbs.add_parser("evaluate", help=_EVALUATE, description=_EVALUATE)
-    add_system(evaluate)
-    evaluate.add_argument(
-        "--gains", type=Path, metavar="FILE", help="a gain set for the spec's plant: nothing is designed"
-    )
+    evaluate = spec_verb(verbs, "evaluate", _EVALUATE)
+    add_spec_gains(evaluate)
     evaluate.add_argument(
         "--runs", type=int, default=100, metavar="N", help="how many, each with its seed (default: 100)"
     )
@@ -43,16 +79,74 @@ def add_evaluate_verb(verbs: Any) -> None:
         "--plants", type=int, metavar="N", help="draw N plants from the tolerances, half of them vertices"
     )
     evaluate.add_argument("--jobs", type=int, default=1, metavar="N", help="processes (default: 1)")
+    evaluate.add_argument(
+        "--tolerances", metavar="LIST",
+        help="instead, a fixed bound beside the adaptive threshold for these tolerances, such as 0,1%%,2%%,5%%",
+    )  # fmt: skip
+    evaluate.add_argument(
+        "--out", type=Path, metavar="FILE", help="with --tolerances: write the picture (.png, .svg or .pdf)"
+    )
     add_monitor_arguments(evaluate)
     add_json(evaluate)
+    add_force(evaluate)
     add_quiet(evaluate)
-    evaluate.set_defaults(verb="evaluate")
+
+
+def _run_tolerances(options: argparse.Namespace) -> int:
+    """Run ``evaluate --tolerances``: spec in, a table and a picture out."""
+    from obsynth.cli.commands import designed_or_loaded, spec_output
+    from obsynth.cli.data_commands import picture_kind, written_picture
+    from obsynth.cli.data_run import numbers_of, required_scenario
+    from obsynth.spec import load_spec
+
+    if options.plants is not None or options.monitor not in (None, "pointwise"):
+        raise SpecError("--tolerances compares two pointwise monitors on plants that it draws itself: leave out "
+                        "--plants and --monitor.", path="--tolerances")  # fmt: skip
+    with progress(quiet=options.quiet) as report_stage:
+        report_stage(f"reading {options.system}")
+        spec = load_spec(options.system)
+        scenario = required_scenario(spec)
+        target = options.out
+        if target is not None:
+            spec_output(target, picture_kind(target), spec, options, option="--out")
+        design = designed_or_loaded(spec, options.gains, report_stage)
+        from obsynth.experiments.tolerance_study import tolerance_study
+
+        found = tolerance_study(
+            design, scenario, tolerances=[_tolerance(item) for item in options.tolerances.split(",")],
+            runs=options.runs, disturbance_bounds=numbers_of(options.disturbance) or None,
+            noise_bound=options.noise_bound, progress=report_stage,
+        )  # fmt: skip
+    if target is not None:
+        from obsynth.plotting.trade_off import plot_tolerances
+
+        written_picture(target, 2, lambda axes: plot_tolerances(found, axes=axes))
+    if options.json:
+        file = None if target is None else str(target)
+        print_json({"command": "evaluate", "spec": str(spec.path), "file": file, **found.as_dict()})
+        return 0
+    print(found)
+    if target is not None:
+        print(f"Written: {target}")
+    return 0
+
+
+def _tolerance(text: str) -> float | str:
+    """Return a tolerance as a share, or as a text with its per cent."""
+    try:
+        return float(text)
+    except ValueError:
+        return text.strip()
 
 
 def run_evaluate(options: argparse.Namespace) -> int:
     """Run ``evaluate``: spec in, table of rates and errors out."""
+    if options.tolerances is not None:
+        return _run_tolerances(options)
+    if options.out is not None:
+        raise SpecError("--out is for the picture of --tolerances.", path="--out")
     from obsynth.cli.commands import designed_or_loaded
-    from obsynth.cli.data_run import numbers_of, own_tolerances, ranges_of
+    from obsynth.cli.data_run import numbers_of, own_tolerances, ranges_of, required_scenario
     from obsynth.spec import load_spec
 
     with progress(quiet=options.quiet) as report_stage:
@@ -100,8 +194,7 @@ _COMPARE = "Design by every method that exists for a spec's plant, and show them
 
 def add_compare_verb(verbs: Any) -> None:
     """Add the parser."""
-    compare = verbs.add_parser("compare", help=_COMPARE, description=_COMPARE)
-    add_system(compare)
+    compare = spec_verb(verbs, "compare", _COMPARE)
     compare.add_argument("--data", type=Path, metavar="FILE", help="a log (CSV) to replay through every method")
     compare.add_argument("--out", type=Path, metavar="FILE", help="write a page (HTML) with table and picture")
     compare.add_argument("--runs", type=int, default=20, metavar="N", help="drawn runs of the scenario (default: 20)")
@@ -115,7 +208,6 @@ def add_compare_verb(verbs: Any) -> None:
     add_force(compare)
     add_json(compare)
     add_quiet(compare)
-    compare.set_defaults(verb="compare")
 
 
 def run_compare(options: argparse.Namespace) -> int:

@@ -35,6 +35,8 @@ from obsynth.simulation.scenario import Scenario
 #: Runs of the scenario, and samples and settling times where nothing is stated.
 RUNS, SAMPLES, SETTLING_TIMES, MOST_STEPS = 20, 40, 8, 6000
 SEED = 7
+#: Unknown inputs of the scenario that is made up are sines with so many periods in a settling time.
+PERIOD_SHARE = 0.2
 
 
 @on_one_thread_if_small
@@ -178,7 +180,7 @@ def _scenario(plant: DescriptorSystem, given: Scenario | None, dt: float, distur
         name: Step(size=1.0, start=(1.0 + 2.0 * i) * length / 2.0, end=(2.0 + 2.0 * i) * length / 2.0)
         for i, name in enumerate(plant.fault_names)
     }
-    frequency = 0.2 / settle
+    frequency = PERIOD_SHARE / settle
     return Scenario(
         horizon=min(plant.nf * length, MOST_STEPS * dt), sample_time=None if plant.dt else dt, faults=faults, noise=1.0,
         disturbances={name: Sine(amplitude=disturbance, frequency=frequency) for name in plant.disturbance_names}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import TYPE_CHECKING, Any
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from obsynth.files.outputs import FileKind
+from obsynth.files.tables import html_table
 from obsynth.methods.choosing.figures import FaultFigures
 from obsynth.numerics.arrays import FloatArray
 from obsynth.results.design import ObserverDesign
@@ -88,6 +88,8 @@ class ComparedMethod:
         return float(np.sqrt(np.mean([found.rms**2 for found in self.faults]))) if self.faults else float("inf")
 
 
+#: A picture of estimates reaches as far as this share of their samples.
+SHOWN = 0.98
 #: What the page of a comparison begins with.
 COMPARISON_PAGE = FileKind("a comparison of obsynth", rb'name="generator" content="obsynth compare"')
 _HEADER = (
@@ -205,7 +207,7 @@ class Comparison:
             right.set(xlabel="s", ylabel=name)
             spread = float(np.max(np.abs(self.truth[:, row]), initial=0.0)) or 1.0
             best = shown[0].estimates[:, 0] if shown else self.truth[:, row]
-            reach = max(2.5 * spread, 1.5 * float(np.quantile(np.abs(best), 0.98))) if row == 0 else 2.5 * spread
+            reach = max(2.5 * spread, 1.5 * float(np.quantile(np.abs(best), SHOWN))) if row == 0 else 2.5 * spread
             right.set_ylim(-reach, reach)
         axes[0, 0].legend(fontsize=8)
         return figure
@@ -246,13 +248,6 @@ class Comparison:
             f"<img alt='Estimates of each method' style='max-width:100%' src='data:image/png;base64,{encoded}'></body>"
             "</html>\n"
         )
-
-
-def html_table(rows: Sequence[Sequence[str]]) -> str:
-    """Return a table of HTML with a header."""
-    head = "".join(f"<th>{escape(text)}</th>" for text in rows[0])
-    body = "".join("<tr>" + "".join(f"<td>{escape(text)}</td>" for text in row) + "</tr>" for row in rows[1:])
-    return f"<table><tr>{head}</tr>{body}</table>"
 
 
 def _number(value: float) -> str:

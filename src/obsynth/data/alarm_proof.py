@@ -77,10 +77,9 @@ def prove_alarm(
     signals = Signals.of(reader, columns, scales)
     found: list[np.ndarray] = []
     for chunk in chunks(data, signals, Stamps(), _CHUNK):
-        for line in chunk:
+        for line, values in zip(chunk, signals.deviations(chunk), strict=True):
             seconds, missing = reader.clock.advance(float(line[0]), len(found) + 1)
             del seconds
-            values = signals.scale * line[1:] - signals.offset
             if (len(found) and missing) or not np.isfinite(values).all():
                 raise SpecError(f"Row {len(found) + 1} has a gap before it or misses a sample: give complete rows.",
                                 path="data")  # fmt: skip

@@ -137,7 +137,7 @@ class Job:
 
     def _taken(self, chunk: FloatArray) -> list[list[Any]]:
         entries: list[Entry] = []
-        scaled = self.signals.scale * chunk[:, 1:] - self.signals.offset
+        scaled = self.signals.deviations(chunk)
         for time, deviations in zip(chunk[:, 0].tolist(), scaled, strict=True):
             entry = Entry(time, deviations, self.engine.step(time, deviations, self.rows + 1))
             self.rows += 1

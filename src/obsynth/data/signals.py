@@ -26,7 +26,7 @@ class Signals:
 
     Fields: names: Signals: known inputs, then outputs; columns: The columns that are read: time, then one for each
     signal; scale, offset: ``(nu + ny,)``: deviation = scale times the value in the column, minus offset; point: The
-    operating point.
+    operating point; one: Number of the signal that is one in every row and has no column, if there is such a one.
     """
 
     names: tuple[str, ...]
@@ -34,6 +34,7 @@ class Signals:
     scale: FloatArray
     offset: FloatArray
     point: Mapping[str, float]
+    one: int | None = None
 
     @classmethod
     def of(
@@ -54,13 +55,25 @@ class Signals:
         for name, factor in factors.items():
             if not is_finite_number(factor) or factor == 0.0:
                 raise SpecError(f"The scale of {name!r} is {factor!r}: give a finite number, not zero.", path="scales")
+        uncertain = getattr(getattr(engine, "plant", None), "uncertainty", None)
+        shift = None if uncertain is None else uncertain.shift
         return cls(
             names,
-            tuple(renamed.get(name, name) for name in (TIME, *names)),
+            tuple(renamed.get(name, name) for name in (TIME, *names) if not shift or name != shift),
             read_only(np.array([factors.get(name, engine.scales.get(name, 1.0)) for name in names])),
             read_only(np.array([engine.point.get(name, 0.0) for name in names])),
             dict(engine.point),
+            names.index(shift) if shift and shift in names else None,
         )
+
+    def measured(self, rows: FloatArray) -> FloatArray:
+        """Return signals in their units ``(rows, nu + ny)`` from rows of time and columns."""
+        read = rows[:, 1:] if self.one is None else np.insert(rows[:, 1:], self.one, 1.0, axis=1)
+        return np.asarray(self.scale * read)
+
+    def deviations(self, rows: FloatArray) -> FloatArray:
+        """Return deviations ``(rows, nu + ny)`` from rows of time and columns."""
+        return self.measured(rows) - self.offset
 
     def positions(self, header: tuple[str, ...]) -> list[int]:
         """Return where in a header each column is that is read."""

@@ -138,7 +138,7 @@ def measured_frame(kept: list[FloatArray] | None, signals: Signals, stamps: Stam
     import pandas as pd
 
     rows = np.concatenate(kept)
-    frame = pd.DataFrame(signals.scale * rows[:, 1:], columns=list(signals.names))
+    frame = pd.DataFrame(signals.measured(rows), columns=list(signals.names))
     times = [stamps.moment(time) for time in rows[:, 0].tolist()] if stamps.is_dated else rows[:, 0]
     frame.insert(0, TIME, times)
     return frame

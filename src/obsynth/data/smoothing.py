@@ -205,7 +205,7 @@ def _smoothed_log(engine: Any, data: Any, lag: int | None, signals: Signals) -> 
     found: list[tuple[Entry, Any, Smoothed]] = []
     count = 0
     for chunk in chunks(data, signals, Stamps(), CHUNK_ROWS):
-        values = signals.scale * chunk[:, 1:] - signals.offset
+        values = signals.deviations(chunk)
         for time, deviations in zip(chunk[:, 0].tolist(), values, strict=True):
             count += 1
             found.extend(later.take(Entry(time, deviations, engine.step(time, deviations, count))))

@@ -25,6 +25,8 @@ _EXPECTED = "seconds, such as 12.5, or a date and a time, such as 2026-05-01T08:
 
 
 _MICROSECOND = timedelta(microseconds=1)
+#: Seconds in a nanosecond, a microsecond and a day; microseconds in a second.
+_NANO, _MICRO, _DAY, _MICROSECONDS = 1e-9, 1e-6, 86400.0, 1e6
 
 
 class Stamps:
@@ -73,7 +75,7 @@ class Stamps:
             plain = column.dt.tz_convert("UTC").dt.tz_localize(None) if hasattr(column.dtype, "tz") else column
             counts = plain.to_numpy().astype("datetime64[ns]").astype(np.int64)
             # Apart, so that the fraction keeps its digits.
-            seconds = (counts // 1_000_000_000).astype(np.float64) + (counts % 1_000_000_000) * 1e-9
+            seconds = (counts // 1_000_000_000).astype(np.float64) + (counts % 1_000_000_000) * _NANO
         return np.where(missing, np.nan, seconds)
 
     def shown(self, seconds: float) -> str:
@@ -88,7 +90,7 @@ class Stamps:
 
     def moment(self, seconds: float) -> datetime:
         """Return the date and time of some seconds, to the microsecond, with the log's zone if it names one."""
-        found = _ZERO + timedelta(seconds=math.floor(seconds)) + round((seconds % 1.0) * 1e6) * _MICROSECOND
+        found = _ZERO + timedelta(seconds=math.floor(seconds)) + round((seconds % 1.0) * _MICROSECONDS) * _MICROSECOND
         return found.replace(tzinfo=None) if self.zone is None else found.astimezone(self.zone)
 
     def _seconds(self, found: datetime, row: int, column: str) -> float:
@@ -98,7 +100,7 @@ class Stamps:
             raise SpecError(f"Row {row}, column {column!r}: stamps with a time zone and without one stand in one log.",
                             path=f"row {row}")  # fmt: skip
         past = (found if found.tzinfo is not None else found.replace(tzinfo=UTC)) - _ZERO
-        return past.days * 86400.0 + past.seconds + past.microseconds * 1e-6
+        return past.days * _DAY + past.seconds + past.microseconds * _MICRO
 
     def _expected(self) -> str:
         if self.is_dated is None:

@@ -13,7 +13,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.holds import driven, first_order_hold
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.estimates import Estimates
-from obsynth.observers.linear.observer import LinearObserver
+from obsynth.observers.linear.observer import LinearObserver, split_rows
 from obsynth.observers.linear.sampling import sample_observer
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.plants.names import index_of
@@ -52,7 +52,7 @@ class Runs:
         """What the observer says, one per run."""
         if not isinstance(self.observer, LinearObserver):
             return self.kept
-        return tuple(Estimates.split(self.observer, self.rows[:, run]) for run in range(self.rows.shape[1]))
+        return tuple(split_rows(self.observer, self.rows[:, run]) for run in range(self.rows.shape[1]))
 
 
 @dataclass(frozen=True, eq=False)

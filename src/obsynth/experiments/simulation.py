@@ -16,7 +16,7 @@ from obsynth.experiments.benches import bench_of
 from obsynth.experiments.columns import named_columns, root_mean_square, write_columns
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray, read_only
-from obsynth.observers.estimates import Estimates
+from obsynth.observers.estimates import BAND_WIDTH, Estimates
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
@@ -27,9 +27,6 @@ from obsynth.simulation.linear import simulate_plant
 from obsynth.simulation.scenario import Scenario
 from obsynth.simulation.time_varying import simulate_time_varying
 from obsynth.simulation.trajectory import Trajectory
-
-#: Standard deviations on each side: 95 % of a normal variable.
-BAND_WIDTH = 1.96
 
 
 @dataclass(frozen=True, eq=False)

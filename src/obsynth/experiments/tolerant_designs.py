@@ -18,7 +18,8 @@ from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.batch_simulation import make_bench
 from obsynth.experiments.monitors.residual_monitor import monitor
 from obsynth.methods.verifying import verify
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import SMALLEST, FloatArray
+from obsynth.numerics.ranks import ACTING_TOLERANCE
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario
@@ -150,7 +151,7 @@ def _acting(affine: AffinePlant, i: int) -> FloatArray:
     """Return where a constant acts to first order: unit columns of the plant's equations."""
     parts = np.hstack([affine.A.parts[i], affine.E.parts[i]])
     left, values, _ = np.linalg.svd(parts)
-    return np.asarray(left[:, : int(np.sum(values > 1e-6 * max(values[0], np.finfo(np.float64).tiny)))])
+    return np.asarray(left[:, : int(np.sum(values > ACTING_TOLERANCE * max(values[0], SMALLEST)))])
 
 
 def _with_noise(plant: DescriptorSystem, what: str, columns: FloatArray, weight: float) -> _Candidate:

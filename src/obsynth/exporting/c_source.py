@@ -1,23 +1,67 @@
-"""A sampled observer as C99: one header, one source, no allocation, no library."""
+"""A sampled observer as C99: one header, one source, no allocation, no library.
+
+Words of C: names, comments and paths that a compiler takes, whatever they are made of.
+"""
 
 from __future__ import annotations
 
+import json
+import re
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from obsynth.exporting.c_words import comment, included, quoted
 from obsynth.exporting.realisation import Realisation
 from obsynth.numerics.arrays import FloatArray
 
+_KEYWORDS = frozenset(
+    {
+        "auto", "break", "case", "char", "const", "continue", "default", "do", "double", "else", "enum", "extern",
+        "float", "for", "goto", "if", "inline", "int", "long", "register", "restrict", "return", "short", "signed",
+        "sizeof", "static", "struct", "switch", "typedef", "union", "unsigned", "void", "volatile", "while",
+    }
+)  # fmt: skip
+
+
+def c_identifier(text: str) -> str:
+    """Return a C identifier made of ``text``; one that C reserves, or that begins with a digit, gets a prefix."""
+    name = re.sub(r"\W", "_", text, flags=re.ASCII)
+    return name if re.match(r"[A-Za-z]", name) and name not in _KEYWORDS else f"obs_{name}"
+
+
+def quoted(name: str) -> str:
+    """Return a name in quotes, in ASCII, that cannot end or begin a comment or form a trigraph."""
+    return json.dumps(name).replace("*/", "* /").replace("/*", "/ *").replace("??", "? ?").replace("??", "? ?")
+
+
+def included(name: str) -> str:
+    """Return the name of a header as an include line takes it."""
+    return name.replace("\\", "/")
+
+
+def comment(text: str) -> str:
+    """Return a comment of one line."""
+    return f"/* {text} */"
+
+
 _NUMBERS_PER_LINE = 4
+
+
 #: Matrices with fewer entries are multiplied row by row: nothing is gained by more.
 LARGE_TABLE = 1024
+
+
 #: At most this share of entries that are not zero makes a matrix sparse.
 SPARSE_SHARE = 0.25
+
+
 #: Columns that are added in one pass over the rows.
 UNROLLED = 4
+
+
 PLAIN, ENTRIES, COLUMNS = "plain", "entries", "columns"
+
+
 ADVICE = (
     "Compile with -O3, and with -march=native where it runs on the same machine: the products are written so that rows "
     "are independent, and sums keep their order."

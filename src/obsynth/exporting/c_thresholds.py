@@ -8,8 +8,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.experiments.monitors.adaptive_bound import THRESHOLD_ROUNDING, AdaptiveBound
-from obsynth.exporting.c_source import table_lines
-from obsynth.exporting.c_words import comment
+from obsynth.exporting.c_source import comment, table_lines
 
 _TEMPLATE = "adaptive_threshold.c"
 

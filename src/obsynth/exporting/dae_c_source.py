@@ -10,10 +10,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from obsynth.errors import SpecError
-from obsynth.exporting.c_words import c_identifier, comment, included, quoted
-from obsynth.exporting.realisation import require_plain_steps
+from obsynth.exporting.c_source import c_identifier, comment, included, quoted
 from obsynth.files.outputs import write_together
-from obsynth.observers.dae.c_code import observer_code
+from obsynth.observers.dae.c_code import observer_code, observer_struct
 from obsynth.plants.dae.model import DAEModel
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import gain_set_digest
@@ -21,18 +20,20 @@ from obsynth.results.gain_sets import gain_set_digest
 _STEP = r"""
 void PREFIX_reset(PREFIX_state *state)
 {
-    reset(state);
+    begin(state);
 }
 
 int PREFIX_step(PREFIX_state *state, ARGUMENTSconst double y[NY], PREFIX_estimates *estimates)
 {
-    double after[MEMORY];
+    double heard[NY];
     double said[ROW];
+    const double *after;
     int i, failed;
-NOTHING    failed = advance(state, INPUT, y, after, said);
+NOTHING    failed = advance(state, INPUT, y, heard, said);
     if (failed) {
         return failed;
     }
+    after = latest_of(state)->memory;
     copy(estimates->states, after + AT_POSTERIOR, NX);
     copy(estimates->parameters, after + AT_THETA, NQ);
     for (i = 0; i < NX; i++) {
@@ -42,7 +43,7 @@ NOTHING    failed = advance(state, INPUT, y, after, said);
         estimates->parameter_deviations[i] = sqrt(fmax(after[AT_SPREAD + i * (NQ + 1)], 0.0));
     }
     for (i = 0; i < NY; i++) {
-        estimates->innovations[i] = isnan(y[i]) ? NAN : said[AT_INNOVATION + i];
+        estimates->innovations[i] = isnan(heard[i]) ? NAN : said[AT_INNOVATION + i];
     }
     estimates->nis = said[AT_NIS];
     estimates->residual = said[AT_RESIDUAL];
@@ -73,11 +74,12 @@ def require_no_sample_time(design: ObserverDesign, sample_time: float | None) ->
 def dae_c_texts(design: ObserverDesign, prefix: str, header: str) -> tuple[str, str, str]:
     """Return source, header and the digest of the gain set."""
     _, observer = design.nonlinear
-    require_plain_steps(design.name, observer.outside_graph)
     digest = gain_set_digest(design)
+    inner = f"{prefix}_observer" if observer.timing.is_plain else f"{prefix}_observer_memory"
     source = "\n".join([
         comment(f"sha256 of the gain set: {digest}"), f'#include "{included(header)}"', "",
-        "#define OBSERVER_IS_DECLARED", f"#define observer {prefix}_observer", "", observer_code(observer.steps),
+        f"#define observer {inner}", *([f"#define waiting {prefix}_observer"] if inner != f"{prefix}_observer" else []),
+        "", observer_code(observer.steps),
         _step_text(prefix, design.nonlinear[0]),
     ])  # fmt: skip
     return source, "\n".join(_header(design, prefix, digest)) + "\n", digest
@@ -99,9 +101,8 @@ def _header(design: ObserverDesign, prefix: str, digest: str) -> Iterator[str]:
     yield comment(f"Observer {quoted(design.name)} by {quoted(design.method)}, written by obsynth.")
     yield from (f"#ifndef {guard}", f"#define {guard}", "", comment("sha256 of the gain set"))
     yield from (f'#define {upper}_SHA256 "{digest}"', comment("seconds between samples"))
-    yield from (f"#define {upper}_DT {observer.dt!r}", "", f"struct {prefix}_observer {{")
-    yield from (f"    double memory[{observer.graph.memory.size}];", f"    double u[{max(model.nu, 1)}];")
-    yield from ("    int started;", "};", f"typedef struct {prefix}_observer {prefix}_state;", "")
+    yield from (f"#define {upper}_DT {observer.dt!r}", "", *observer_struct(observer.steps, f"{prefix}_observer"))
+    yield from (f"typedef struct {prefix}_observer {prefix}_state;", "")
     yield comment("States after the measurement, parameters, their standard deviations; innovations (NaN where y is);")
     yield comment("their square in units of their covariance; the residual of the step in sizes of the states.")
     yield "typedef struct {"

@@ -10,14 +10,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.exporting.c_source import header_text, source_text
-from obsynth.exporting.c_words import c_identifier
+from obsynth.exporting.c_source import c_identifier, header_text, source_text
 from obsynth.exporting.dae_c_source import write_dae_c
 from obsynth.exporting.realisation import Realisation
 from obsynth.files.outputs import FileKind, write_atomically, write_together
 from obsynth.numerics.arguments import require_kind
 from obsynth.observers.dae.observer import DAEObserver
-from obsynth.observers.running import StepObserver
+from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.sensor_timing import require_plain
 from obsynth.results.design import ObserverDesign
 
@@ -102,7 +101,7 @@ def export(
     suffix = target.suffix.lower()
     if suffix not in SUFFIXES:
         raise SpecError(f"{target} has an unknown suffix: use one of {', '.join(SUFFIXES)}.", path=str(target))
-    if isinstance(design, ObserverDesign) and isinstance(design.observer, StepObserver):
+    if isinstance(design, ObserverDesign) and isinstance(design.observer, RecursiveObserver):
         require_plain(design.observer, "An export")
     if suffix == ".fmu":
         from obsynth.exporting.fmu.archive import write_fmu

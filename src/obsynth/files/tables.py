@@ -1,9 +1,10 @@
-"""Tables as comma-separated text that is harmless in spreadsheets."""
+"""Tables as comma-separated text that is harmless in spreadsheets, and as HTML."""
 
 from __future__ import annotations
 
 import csv
 from collections.abc import Iterable, Sequence
+from html import escape
 from typing import Any, Protocol
 
 #: A text that begins so is taken for a formula by spreadsheets; the last four are the full-width forms.
@@ -42,3 +43,10 @@ def _cell(value: Any) -> Any:
     if isinstance(value, str):
         return harmless(value)
     return "" if value != value else value
+
+
+def html_table(rows: Sequence[Sequence[str]]) -> str:
+    """Return a table of HTML with a header."""
+    head = "".join(f"<th>{escape(text)}</th>" for text in rows[0])
+    body = "".join("<tr>" + "".join(f"<td>{escape(text)}</td>" for text in row) + "</tr>" for row in rows[1:])
+    return f"<table><tr>{head}</tr>{body}</table>"

@@ -141,6 +141,10 @@ def _names(picked: Picked, known: Sequence[str], what: str) -> list[str]:
     return listed
 
 
-def _devices(known: Sequence[str], shown: int = 12) -> str:
+#: Devices that a message lists.
+_SHOWN = 12
+
+
+def _devices(known: Sequence[str]) -> str:
     devices = list(dict.fromkeys(name.partition(" ")[2] for name in known))
-    return ", ".join(devices[:shown]) + (", ..." if len(devices) > shown else "")
+    return ", ".join(devices[:_SHOWN]) + (", ..." if len(devices) > _SHOWN else "")

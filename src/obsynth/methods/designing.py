@@ -15,6 +15,7 @@ from obsynth.analysis.transformations import StateRecovery, eliminate_algebraic_
 from obsynth.analysis.transformations.elimination import MANY_VARIABLES
 from obsynth.analysis.transformations.recovery import Transformation, plant_and_recovery
 from obsynth.errors import PreconditionError, SpecError, VerificationError
+from obsynth.extensions import extension
 from obsynth.methods.advice import with_advice
 from obsynth.methods.choosing.automatic import automatic_design
 from obsynth.methods.drowned_designs import require_above_rounding, rounding_notes
@@ -42,10 +43,6 @@ _KINDS: Mapping[PlantKind, tuple[type, str]] = {
     "time-varying": (TimeVaryingDescriptorSystem, "a linear plant whose matrices change with k"),
     "nonlinear": (DAEModel, "a nonlinear DAEModel"),
 }
-
-
-#: Where designs that know their tolerances are made: above the methods, as they are compared by their thresholds.
-MODEL_ERROR = "obsynth.experiments.tolerant_designs"
 
 
 def _silent(_: str) -> None:
@@ -111,11 +108,9 @@ def design(
         each = partial(_designed, method=method, name=name, recovery=recovery, progress=report_stage, advise=advise)
         if method_spec(method).read_options(options).as_given().get("model_error", "none") == "none":
             return each(plant, options=options)
-        from importlib import import_module
-
-        ways = import_module(MODEL_ERROR)
-        found: ObserverDesign = ways.with_model_error(
-            plant, scenario, partial(each, options={**options, "model_error": "none"}), report_stage
+        exact_model = {**options, "model_error": "none"}
+        found: ObserverDesign = extension("designs with model error")(
+            plant, scenario, partial(each, options=exact_model), report_stage
         )
         return found
 
@@ -245,11 +240,6 @@ def _kind_conditions(plant: Plant, method: MethodSpec) -> tuple[Condition, ...]:
             f"{_KINDS[kind][1]}; methods for such plants are: {', '.join(methods_for(kind))}.",
         ),
     )  # fmt: skip
-
-
-def public_function(method: str) -> Callable[..., ObserverDesign]:
-    """Return the public function of a method."""
-    return method_spec(method).load("public")
 
 
 def draft_of(

@@ -8,11 +8,13 @@ roundoff, whatever the units.  The observer's own numbers, right to their last d
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from fractions import Fraction
 from typing import TypeAlias
 
 import numpy as np
 
+from obsynth.analysis.existence.witnesses import EntryChange, Unclear, Witness
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.observers.linear.observer import LinearObserver
@@ -38,14 +40,56 @@ def require_above_rounding(plant: DescriptorSystem, observer: LinearObserver) ->
         return
     worst = int(np.argmax(least))
     if least[worst] >= MOST:
+        name = plant.fault_names[worst]
         raise PreconditionError(
             "Unclear: gains were found and proved, but they are so large that rounding of the outputs to double "
-            f"precision alone moves the estimate of {plant.fault_names[worst]!r} by {least[worst]:.2g} of the fault at "
-            "every frequency tried: the data are too close to those of a plant without an observer. An output in which "
-            "the fault shows more would decide it.",
+            f"precision alone moves the estimate of {name!r} by {least[worst]:.2g} of the fault at every frequency "
+            f"tried. {_doubt(plant, observer, worst).described(plant)}",
             condition="gains against rounding",
-            signals=(plant.fault_names[worst],),
+            signals=(name,),
         )
+
+
+def _doubt(plant: DescriptorSystem, observer: LinearObserver, fault: int) -> Unclear:
+    """Return the last digit of a number of the plant, or else of the observer, that moves an estimate most."""
+    found = max((witness for point in _points(plant) for witness in last_digits(plant, observer, fault, point)),
+                key=lambda witness: (witness.changes[0].matrix in ("C", "Df") and witness.size >= MOST, witness.size),
+                default=None)  # fmt: skip
+    size, place = (0.0, 0j) if found is None else (found.size, found.point or 0j)
+    where = f"{place.real:.4g}" if place.imag == 0.0 else f"{place:.4g}"
+    return Unclear(
+        UNIT_ROUNDOFF, found,
+        f"has an estimate of {plant.fault_names[fault]!r} that differs by {size:.2g} of the fault at "
+        f"{'z' if plant.is_discrete else 's'} = {where}",
+        "Less asked of the gains (a slower decay, a larger gamma), or an output in which the fault shows more, would "
+        "decide it.",
+    )  # fmt: skip
+
+
+def last_digits(plant: DescriptorSystem, observer: LinearObserver, fault: int, point: complex) -> Iterator[Witness]:
+    """Yield the entry of each matrix whose last digit moves the estimate of a unit fault most at a point."""
+    responses = _responses(plant, observer, point)
+    if responses is None:
+        return
+    outputs, resolvent = responses
+    row = range(len(observer.Cz))[observer.fault_rows][fault]
+    states = np.linalg.solve(point * plant.E - plant.A, plant.Bf)[:, fault]
+    left, shown = observer.Cz[row] @ resolvent, outputs[:, fault]
+    gain = left @ observer.By + observer.Dy[row]
+    effects = {
+        "C": np.outer(np.abs(gain), np.abs(states)), "Df": np.outer(np.abs(gain), np.eye(plant.nf)[fault]),
+        "By": np.outer(np.abs(left), np.abs(shown)), "Dy": np.outer(np.arange(len(observer.Dy)) == row, np.abs(shown)),
+    }  # fmt: skip
+    for name, effect in effects.items():
+        matrix = getattr(plant if name in ("C", "Df") else observer, name)
+        moved = effect * np.where(matrix != 0.0, np.spacing(np.abs(matrix)), 0.0)
+        if not moved.size or not np.all(np.isfinite(moved)) or not moved.any():
+            continue
+        i, j = (int(k) for k in np.unravel_index(np.argmax(moved), moved.shape))
+        before = float(matrix[i, j])
+        after = before + float(np.copysign(np.spacing(abs(before)), before))
+        change = EntryChange(name, i, j, Fraction(before), Fraction(after))
+        yield Witness((change,), float(moved[i, j]), point)
 
 
 def rounding_notes(plant: DescriptorSystem, observer: LinearObserver) -> tuple[str, ...]:

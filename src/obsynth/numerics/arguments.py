@@ -24,10 +24,10 @@ def real_number(value: Any, name: str, what: str = "a number") -> float:
     return float(value)
 
 
-def whole_number(value: Any, name: str, what: str = "a whole number", *, least: int = 1) -> int:
-    """Return an integer that is ``least`` or more; raise `SpecError` naming the argument and ``what`` it should be."""
-    if not is_whole(value) or value < least:
-        raise SpecError(f"{name} is {shown(value)}: give {what}, at least {least}.", path=name)
+def whole_number(value: Any, name: str, what: str = "a whole number") -> int:
+    """Return an integer that is one or more; raise `SpecError` naming the argument and ``what`` it should be."""
+    if not is_whole(value) or value < 1:
+        raise SpecError(f"{name} is {shown(value)}: give {what}, at least 1.", path=name)
     return int(value)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.ranks import RANK_TOLERANCE
+from obsynth.numerics.ranks import PERFECT_PARITY, RANK_TOLERANCE
 
 #: Standard deviations above this outgrow double precision soon: their squares overflow at 1e154.
 OUTGROWN = 1e100
@@ -25,8 +25,6 @@ SUSPECT_COLUMN = RANK_TOLERANCE
 #: The same for a row of the parity covariance, relative to the whole noise: the rank-revealing step then decides. It
 #: must lie above `PERFECT_PARITY`, or rounding passes for noise.
 SUSPECT_PARITY = 1e-12
-#: Parity directions whose noise is below this share of the terms it is made of are free of noise: a few roundings.
-PERFECT_PARITY = 1e-14
 #: Columns that LAPACK's ``tpqrt`` treats at once.
 BLOCK = 32
 #: Noise-free parity directions must vanish to this share of their terms; rounding of data in double precision.

@@ -51,8 +51,26 @@ JACOBIAN_RANK_TOLERANCE = 1e-9
 NEGLIGIBLE_SHARE = 1e-12
 #: Singular values of a set of directions below this share of the largest are no direction of their own.
 DIRECTION_SHARE = 1e-9
+#: A zero nearer than this to the point at which a constant fault stands is that point.
+REST_TOLERANCE = 1e-6
+#: Singular values of a constant's directions below this share of the largest are rounding of its derivatives.
+ACTING_TOLERANCE = 1e-6
 #: Singular values of a constant's effect below this share count as zero; what is left out goes into the remainder.
 EFFECT_RANK_SHARE = 1e-12
+#: Singular values below this share of the largest are zero: the sensitivities carry rounding of 1e-16 times the
+#: condition of (7), which stays below 1e5 in models that can be used.
+IDENTIFIABLE_SHARE = 1e-10
+#: Directions of the state that no constant touches are found down to this share of the others.
+UNTOUCHED_SHARE = 1e-7
+#: Eigenvalues of the variances' information below this share of the largest are left out.
+LEAST_INFORMATION = 1e-10
+#: Deviations below this share of the terms they are computed from are zero: rounding is seven orders smaller, so that
+#: what is kept has seven digits.
+KNOWN_SHARE = 1e-9
+#: Size of a fault's column in a decoupled plant, relative to before the reduction, below which it left no trace.
+TRACE_TOLERANCE = 1e-9
+#: Parity directions whose noise is below this share of the terms it is made of are free of noise: a few roundings.
+PERFECT_PARITY = 1e-14
 
 
 def rounding_rank(matrix: FloatArray) -> int:
@@ -68,7 +86,8 @@ class RankDecision:
     singular_values: All singular values, largest first, of the matrix as decided upon (rows and columns scaled);
     smallest_kept, largest_dropped: The singular values on both sides of the cut, relative to the largest (0 where there
     is none); gap: ``smallest_kept / largest_dropped``; infinite when nothing, or only an exact zero, was dropped; when
-    the rank is full, the distance to the tolerance instead.
+    the rank is full, the distance to the tolerance instead; share: The last singular value beside the terms that the
+    entries are sums of, where those are known.
     """
 
     rank: int
@@ -78,6 +97,7 @@ class RankDecision:
     largest_dropped: float
     gap: float
     means: Literal["tolerance", "exact", "unclear"] = "tolerance"
+    share: float = np.inf
 
     @property
     def full(self) -> bool:
@@ -94,7 +114,7 @@ class RankDecision:
         values = self.singular_values
         if not 0 < self.expected <= len(values) or values[0] == 0.0:
             return ""
-        return f", least singular value {values[self.expected - 1] / values[0]:.1e}"
+        return f", least singular value {min(values[self.expected - 1] / values[0], self.share):.1e}"
 
     def describe(self) -> str:
         """Return one line for a report, such as ``rank 4 of 4 (gap 2.1e+09)``."""
@@ -102,10 +122,7 @@ class RankDecision:
             lost = "on the numbers as written; if their last digits are off, any gains would be about 1e16"
             return f"rank {self.rank} of {self.expected} (exactly{self._margin if self.full else f', {lost}'})"
         if self.means == "unclear":
-            return (
-                f"rank {self.expected} exactly, but less of data that differ by rounding{self._margin}; data with more "
-                "digits, or other units of what they describe, would decide it"
-            )
+            return f"rank {self.expected} exactly, but less of data that differ by rounding{self._margin}"
         note = "" if self.clear else ", unclear: check the scaling of the data"
         return f"rank {self.rank} of {self.expected} (gap {self.gap:.1e}{note})"
 

@@ -41,11 +41,6 @@ class Scaling:
     states: FloatArray
     outputs: FloatArray
 
-    @property
-    def is_identity(self) -> bool:
-        """Whether nothing is scaled."""
-        return all(bool(np.all(factors == 1.0)) for factors in (self.equations, self.states, self.outputs))
-
     def scale_dynamics(self, matrix: FloatArray) -> FloatArray:
         """Return ``E`` or ``A`` ``(nx, nx)`` of the scaled plant."""
         return self.equations[:, None] * matrix * self.states

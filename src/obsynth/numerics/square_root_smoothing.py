@@ -21,12 +21,11 @@ import numpy as np
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.least_squares_step import (
     DEPENDENT_COLUMN,
-    PERFECT_PARITY,
     SUSPECT_COLUMN,
     SUSPECT_PARITY,
     projection_of,
 )
-from obsynth.numerics.ranks import RANK_TOLERANCE
+from obsynth.numerics.ranks import PERFECT_PARITY, RANK_TOLERANCE
 
 
 class Gaussian(NamedTuple):

@@ -36,8 +36,8 @@ def reduce_pencil(pencil: EquilibratedPencil) -> tuple[Deflation, Deflation]:
 
 def without_infinite_part(pencil: EquilibratedPencil) -> tuple[tuple[float, float], Deflation]:
     """Deflate the infinite and right singular part; the norms of E and A, which decide its ranks, come first."""
-    first = _svd(pencil.E)
-    scales = (float(np.max(first[1], initial=0.0)), _norm(pencil.A))
+    first = full_svd(pencil.E)
+    scales = (float(np.max(first[1], initial=0.0)), largest_singular_value(pencil.A))
     return scales, _deflate(pencil.E, pencil.A, scales, most_nullity=pencil.E.shape[1], first=first)
 
 
@@ -58,7 +58,7 @@ def _deflate(
     while most_nullity > 0:
         rows, columns = E.shape
         if first is None and columns > rows:
-            first = _svd(E)
+            first = full_svd(E)
         # Most often nothing is left to deflate after the first step: bases are then not needed.
         values = _singular_values(E) if first is None else first[1]
         decision = rank_from(values, scale=scales[0], expected=columns)
@@ -68,9 +68,9 @@ def _deflate(
             decisions.append(decision)
         if rank == columns:
             break
-        right = (_svd(E) if first is None else first)[2]
+        right = (full_svd(E) if first is None else first)[2]
         kernel, complement, first = right[rank:].T, right[:rank].T, None
-        left, values, _ = _svd(A @ kernel)
+        left, values, _ = full_svd(A @ kernel)
         decision = rank_from(values, scale=scales[1], expected=columns - rank)
         decisions.append(decision)
         rest = left[:, decision.rank :].T
@@ -81,7 +81,7 @@ def _deflate(
     return Deflation(E, A, tuple(nullities), tuple(ranks), tuple(decisions))
 
 
-def _svd(matrix: FloatArray) -> _Svd:
+def full_svd(matrix: FloatArray) -> _Svd:
     """Return the full left basis, the singular values and the full right basis."""
     if matrix.size == 0:
         return np.eye(matrix.shape[0]), np.zeros(0), np.eye(matrix.shape[1])
@@ -98,5 +98,6 @@ def normal_rank_of(right: Deflation, left: Deflation) -> int:
     return sum(right.ranks) + sum(left.ranks) + int(left.E.shape[0])
 
 
-def _norm(matrix: FloatArray) -> float:
+def largest_singular_value(matrix: FloatArray) -> float:
+    """Return the spectral norm; zero of an empty matrix."""
     return float(np.linalg.norm(matrix, 2)) if matrix.size else 0.0

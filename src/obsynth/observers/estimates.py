@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.numerics.arrays import FloatArray, read_only
 
-if TYPE_CHECKING:
-    from obsynth.observers.linear.observer import LinearObserver
-
 NOTHING = read_only(np.zeros(0))
+#: Standard deviations within which 95 % of a normal number lie: the width of bands, drawn or counted.
+BAND_WIDTH = 1.96
 #: The residual of an observer of a nonlinear plant: of its equations in each step.
 STEP_RESIDUAL = ("equations",)
 
@@ -155,23 +154,6 @@ class Estimates:
     def parameter_deviations(self) -> FloatArray:
         """The same as `fault_deviations`, ``(samples, nq)``."""
         return self.fault_deviations
-
-    @classmethod
-    def split(cls, observer: LinearObserver, rows: FloatArray) -> Estimates:
-        """Return the estimates in the output rows of a linear observer.
-
-        Parameters
-        ----------
-        observer : LinearObserver
-            Whose rows they are.
-        rows : FloatArray
-            ``(samples, nx + nf + nr)``.
-        """
-        return cls(
-            read_only(rows[..., observer.state_rows]), read_only(rows[..., observer.fault_rows]),
-            read_only(rows[..., observer.residual_rows]), observer.state_names, observer.fault_names,
-            observer.residual_names, observer.state_delays, observer.fault_delays,
-        )  # fmt: skip
 
 
 class Undelayed(ABC):

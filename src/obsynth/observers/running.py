@@ -133,13 +133,7 @@ class StepObserver(Undelayed, Generic[State, Known]):
         """When each sensor is sampled, and how late its values are: `obsynth.observers.sensor_timing.SensorTiming`."""
 
     def shown(self, row: Known) -> Known:
-        """Return a row as it is shown, within the bounds of the states.
-
-        Parameters
-        ----------
-        row : NamedTuple
-            What is known at a sample.
-        """
+        """Return a row as it is shown, within the bounds of the states."""
         return row
 
     def init(self) -> State:
@@ -150,12 +144,7 @@ class StepObserver(Undelayed, Generic[State, Known]):
     def advance(self, state: State, y: FloatArray, u: FloatArray) -> tuple[State, Known]:
         """Return the next state and what is known at a sample, without checking it.
 
-        Parameters
-        ----------
-        state : NamedTuple
-            Before the sample.
-        y, u : FloatArray
-            ``(ny,)``, NaN for what is missing, and ``(nu,)``.
+        Shapes: ``y (ny,)``, ``u (nu,)``.
         """
         after, row = self.timing.advance(self._steps.advance, state, y, u)
         return after, self.shown(row)
@@ -163,19 +152,7 @@ class StepObserver(Undelayed, Generic[State, Known]):
     def accept(self, state: State, y: FloatArray, u: FloatArray) -> tuple[State, Known]:
         """Return the same as `advance`, where the step is one that can be trusted.
 
-        Parameters
-        ----------
-        state : NamedTuple
-            Before the sample.
-        y, u : FloatArray
-            ``(ny,)``, NaN for what is missing, and ``(nu,)``.
-
-        Raises
-        ------
-        SpecError
-            The horizon of a time-varying plant is passed.
-        SolverError
-            The step of a nonlinear plant has no solution, or more than one.
+        Shapes: ``y (ny,)``, ``u (nu,)``.
         """
         after, row = self.timing.advance(self.in_order, state, y, u)
         return after, self.shown(row)
@@ -183,17 +160,7 @@ class StepObserver(Undelayed, Generic[State, Known]):
     def in_order(self, state: State, y: FloatArray, u: FloatArray) -> tuple[State, Known]:
         """Take a sample whose values are all of its own time, as `accept` takes it.
 
-        Parameters
-        ----------
-        state : NamedTuple
-            Before the sample, of an observer without late sensors.
-        y, u : FloatArray
-            ``(ny,)``, NaN for what is missing, and ``(nu,)``.
-
-        Raises
-        ------
-        SpecError, SolverError
-            As `accept` does.
+        Shapes: ``y (ny,)``, ``u (nu,)``.
         """
         self._allow(state)
         after, row = self._steps.advance(state, y, u)
@@ -203,23 +170,7 @@ class StepObserver(Undelayed, Generic[State, Known]):
     def step(self, state: State, y: ArrayLike, u: ArrayLike = ()) -> tuple[State, Estimates]:
         """Return the state after a sample, and the estimates at it.
 
-        Parameters
-        ----------
-        state : NamedTuple
-            Before the sample; it is not changed.
-        y : array_like
-            Outputs ``(ny,)``; NaN marks a missing one.  A recursive observer does not use y(0).
-        u : array_like, optional
-            Known inputs ``(nu,)`` at this sample; of a nonlinear plant, during the step that ends at it.
-
-        Raises
-        ------
-        SpecError
-            A sample has the wrong length, an input is not finite, or the horizon is passed.
-        PreconditionError
-            Rank H_k is lost at this k although no sample is missing (recursive observers).
-        SolverError
-            The step has no solution; k, iteration and worst equation are named (nonlinear observers).
+        Shapes: ``y (ny,)``, ``u (nu,)``.
         """
         after, row = self.accept(state, *self._sample(state, y, u))
         return after, self._estimates(getattr(after, "latest", after), row)

@@ -165,11 +165,6 @@ class SensorTiming:
         return WaitingState(tuple(states[kept]), after, outputs[kept], inputs[kept]), row
 
 
-def latest_of(state: Any) -> Any:
-    """Return the state after the last sample of an observer that may wait for late values."""
-    return state.latest if isinstance(state, WaitingState) else state
-
-
 def require_plain(observer: Any, what: str) -> None:
     """Raise `SpecError` where an observer has sensors of their own times, or bounds on states."""
     for option in ("sensors", "state_bounds"):

@@ -67,6 +67,10 @@ def projected(x: FloatArray, factor: FloatArray, bounds: FloatArray) -> FloatArr
     target[-1] = 1.0
     weights, rest = nnls(np.vstack((sides.T, least)), target)
     residual = np.vstack((sides.T, least)) @ weights - target
+    moved = x
     # Without a rest no e keeps all of them: a state that is known exactly stands in the way.
-    moved = x - factor @ residual[:-1] / residual[-1] if rest > 0.0 and residual[-1] < 0.0 else x
+    if rest > 0.0 and residual[-1] < 0.0:
+        # The shortest e that reaches the ends that hold it, without the cancellation of the ratio of residuals.
+        held = weights > 0.0
+        moved = x + factor @ np.linalg.lstsq(sides[held], least[held], rcond=None)[0]
     return np.asarray(np.clip(moved, bounds[:, 0], bounds[:, 1]))

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any
 
@@ -96,13 +96,16 @@ class ConstantsBox:
         By name, in order.
     variation : {"constant", "varying"}, optional
         ``constant``: unknown, but the same at all times.  ``varying``: anything in its range at each sample, where the
-        value at sample k + 1 multiplies x(k+1): ``E(p_{k+1}) x(k+1) = A(p_k) x(k) + ...``.
+        value at sample k + 1 multiplies x(k+1): ``E(p_{k+1}) x(k+1) = A(p_k) x(k) + ...``; a plant that was sampled
+        has one value within a sample, and a state that does not jump when it changes.
     source : {"stated", "set-membership", "calibrated"}, optional
         Where the ranges come from.
     level : float, optional
         For ``calibrated``: probability that the box holds the truth.
     digest : str, optional
         For ``calibrated``: sha256 of the log.
+    calibrated : tuple of str, optional
+        For ``calibrated``: the constants that the log has bounded, where the ranges of others are stated; all if empty.
     """
 
     constants: Mapping[str, Constant]
@@ -110,9 +113,11 @@ class ConstantsBox:
     source: str = "stated"
     level: float | None = None
     digest: str = ""
+    calibrated: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "constants", MappingProxyType(dict(self.constants)))
+        object.__setattr__(self, "calibrated", tuple(self.calibrated))
         if self.variation not in VARIATIONS:
             raise SpecError(f"variation is {self.variation!r}: use one of {', '.join(VARIATIONS)}.", path="variation")
         if self.source not in SOURCES:
@@ -121,7 +126,7 @@ class ConstantsBox:
         if calibrated and not (is_finite_number(self.level) and 0.0 < float(self.level or 0.0) < 1.0):
             raise SpecError(f"level is {self.level!r}: a calibrated box needs its probability, between 0 and 1.",
                             path="level")  # fmt: skip
-        if not calibrated and (self.level is not None or self.digest):
+        if not calibrated and (self.level is not None or self.digest or self.calibrated):
             raise SpecError("level and digest are for a calibrated box (source: calibrated).", path="level")
 
     @property
@@ -134,12 +139,26 @@ class ConstantsBox:
         """Names of the constants that have a tolerance: the unknowns q, in order."""
         return tuple(item.name for item in self.uncertain)
 
+    def _logged(self) -> tuple[str, list[str]]:
+        """Return the words for a calibrated box, and the constants whose ranges are stated beside it."""
+        log = f" of the log {self.digest[:12]}" if self.digest else ""
+        stated = [name for name in self.names if self.calibrated and name not in self.calibrated]
+        return f"{100.0 * float(self.level or 0.0):g} % box{log}", stated
+
+    @property
+    def origin(self) -> str:
+        """Where the box comes from, in a few words."""
+        words, stated = self._logged()
+        only = f" for {', '.join(self.calibrated)}, others stated" if stated else ""
+        return f"calibrated ({words}{only})" if self.source == "calibrated" else self.source
+
     @property
     def sentence(self) -> str:
         """What a statement says about where the box comes from."""
         if self.source == "calibrated":
-            log = f" of the log {self.digest[:12]}" if self.digest else ""
-            return f"a constant outside its {100.0 * float(self.level or 0.0):g} % box{log}"
+            words, stated = self._logged()
+            others = f", or outside its stated tolerance ({', '.join(stated)})" if stated else ""
+            return f"a constant outside its {words}{others}"
         if self.source == "set-membership":
             return "a constant outside the set that the log's bounds allow"
         return "a constant outside its stated tolerance"
@@ -160,7 +179,7 @@ class ConstantsBox:
         names = self.names
         each = dict(zip(names, np.broadcast_to(factors, (len(names),)).tolist(), strict=True))
         found = {name: item.scaled(each.get(name, 1.0)) for name, item in self.constants.items()}
-        return ConstantsBox(found, self.variation, self.source, self.level, self.digest)
+        return replace(self, constants=found)
 
     def part(self, lower: FloatArray, upper: FloatArray) -> ConstantsBox:
         """Return the part ``lower <= q <= upper`` of the box; its nominal values are in its middle.
@@ -174,7 +193,7 @@ class ConstantsBox:
         for item, a, b in zip(self.uncertain, lower, upper, strict=True):
             low, high = item.middle + float(a) * item.half, item.middle + float(b) * item.half
             found[item.name] = Constant(item.name, min(max((low + high) / 2.0, low), high), low, high, item.unit)
-        return ConstantsBox(found, self.variation, self.source, self.level, self.digest)
+        return replace(self, constants=found)
 
     def values(self, q: FloatArray) -> dict[str, float]:
         """Return the value of each constant at ``q (p,)`` in -1 .. 1.
@@ -194,6 +213,7 @@ class ConstantsBox:
         return {
             "constants": {name: item.as_dict() for name, item in self.constants.items()}, "variation": self.variation,
             "source": self.source, "level": self.level, "digest": self.digest,
+            **({"calibrated": list(self.calibrated)} if self.calibrated else {}),
         }  # fmt: skip
 
 
@@ -268,6 +288,7 @@ def _with_range(name: str, given: Mapping[str, Any], middle: Any, unit: str) -> 
 def constants_box(
     given: Mapping[str, Any] | ConstantsBox, *, known: Mapping[str, Constant] | None = None,
     variation: str | None = None, source: str | None = None, level: float | None = None, digest: str | None = None,
+    calibrated: Sequence[str] | None = None,
 ) -> ConstantsBox:  # fmt: skip
     """Return a box from a mapping by name; nominal values that are left out are those of ``known``."""
     if isinstance(given, ConstantsBox):
@@ -280,5 +301,6 @@ def constants_box(
         if not isinstance(name, str) or not name:
             raise SpecError(f"{name!r} is no name of a constant.", path="constants")
         found[name] = constant_of(name, value, nominal=before[name].nominal if name in before else None)
-    more = {"variation": variation, "source": source, "level": level, "digest": digest}
+    more = {"variation": variation, "source": source, "level": level, "digest": digest,
+            "calibrated": calibrated}  # fmt: skip
     return ConstantsBox(found, **{key: value for key, value in more.items() if value is not None})  # type: ignore[arg-type]

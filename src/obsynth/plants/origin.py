@@ -5,12 +5,22 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import TYPE_CHECKING
+from typing import Protocol, TypeVar
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.numerics.arrays import FloatArray
+
+
+class Written(Protocol):
+    """A linear plant: its matrices by name, and the seconds between its samples."""
+
+    @property
+    def dt(self) -> float:
+        """Sample time in s, zero for a plant in continuous time."""
+
+
+Plant = TypeVar("Plant", bound=Written)
 
 #: The matrices on which existence depends.
 DECISIVE = ("E", "A", "Bf", "Bd", "C", "Df", "Dd")
@@ -22,26 +32,30 @@ class PlantOrigin:
 
     Fields: exact: The `DECISIVE` matrices; sample_time: Where ``exact`` is a continuous plant and the plant itself is
     that one sampled with a zero-order hold; computed: Whether some of the numbers behind them were computed in floating
-    point.
+    point; sizes: Of the matrices of the plant itself, how large the terms are that each entry is a sum of (``A, Bf, Bd,
+    C, Df, Dd``): what rounding of the data behind it may change is relative to those; states: How many the plant as
+    written has, algebraic ones included; 0 where that is not known.
     """
 
     exact: Mapping[str, tuple[tuple[Fraction, ...], ...]]
     sample_time: Fraction | None = None
     computed: bool = False
+    sizes: Mapping[str, FloatArray] | None = None
+    states: int = 0
 
 
-def origin_of(plant: DescriptorSystem) -> PlantOrigin | None:
+def origin_of(plant: Written) -> PlantOrigin | None:
     """Return what a plant was made from, where that is known and its matrices have not been changed since."""
     return getattr(plant, "_origin", None)
 
 
-def with_origin(plant: DescriptorSystem, origin: PlantOrigin | None) -> DescriptorSystem:
+def with_origin(plant: Plant, origin: PlantOrigin | None) -> Plant:
     """Note on a plant that was just made what it was made from, and return it."""
     object.__setattr__(plant, "_origin", origin)
     return plant
 
 
-def note_source(source: DescriptorSystem, new: DescriptorSystem, *, sample_time: float | None = None) -> None:
+def note_source(source: Written, new: Written, *, sample_time: float | None = None) -> None:
     """Note on a plant that elimination or sampling has just made which plant, as written, it comes from."""
     if new is source:
         return
@@ -50,7 +64,7 @@ def note_source(source: DescriptorSystem, new: DescriptorSystem, *, sample_time:
         object.__setattr__(new, "_made_from", (written, earlier if sample_time is None else sample_time))
 
 
-def carry_origin(old: DescriptorSystem, new: DescriptorSystem) -> DescriptorSystem:
+def carry_origin(old: Written, new: Plant) -> Plant:
     """Note on a changed plant what the old one was made from, if nothing has changed that matters."""
     made = getattr(old, "_made_from", None)
     unchanged = old.dt == new.dt and all(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -20,6 +20,26 @@ from obsynth.plants.uncertainty import (
     expressions_in,
     matrices_of,
 )
+
+
+@runtime_checkable
+class Calibrated(Protocol):
+    """A box that a log allows, as a calibration gives it: its level, the log's digest, nominal values and ranges."""
+
+    level: float
+    digest: str
+
+    def constants(self) -> Mapping[str, Any]:
+        """Return nominal value and range by name; refused where a side is open."""
+        ...
+
+
+def stated_box(given: Any, variation: str | None = None) -> Any:
+    """Return a calibrated box as a box of constants, with its level and digest; all else as it is."""
+    if isinstance(given, ConstantsBox) or not isinstance(given, Calibrated) or isinstance(given, Mapping):
+        return given
+    return constants_box(given.constants(), variation=variation, source="calibrated", level=given.level,
+                         digest=given.digest)  # fmt: skip
 
 
 def uncertain_system(
@@ -40,7 +60,7 @@ def uncertain_system(
         A mapping holds the arguments of `DescriptorSystem`, where entries of ``E, A, B, C, D, Bf, Df, Bd, Dd`` may be
         expressions in the constants, such as ``"-k / mass"``.  A plant that has constants already gets the new
         tolerances; its nominal values stay where none is given.
-    constants : mapping or ConstantsBox, optional
+    constants : mapping, ConstantsBox or CalibratedBox, optional
         By name: a number (known exactly), ``{nominal, tolerance, unit}`` with a tolerance such as ``"5 %"``,
         ``{range: [low, high]}`` or ``(low, high)``.  One constant in several entries is one unknown.  The name of a
         matrix, such as ``{"A": "2 %"}``, stands for a tolerance of each of its entries.
@@ -85,11 +105,13 @@ def uncertain_system(
     ([[0.8]], ('k', 'm'))
     """
     options = {"variation": variation, "source": source, "level": level, "digest": digest}
+    before = plant.uncertainty if isinstance(plant, DescriptorSystem) else None
+    constants = stated_box(constants, variation or (None if before is None else before.box.variation))
     for name, given in (("constants", constants), ("tolerance", tolerance)):
         if not isinstance(given, ConstantsBox):
             require_mapping(given, name)
     if isinstance(plant, DescriptorSystem):
-        system, entries, before = plant, dict[str, list[Entry]](), plant.uncertainty
+        system, entries = plant, dict[str, list[Entry]]()
         if before is not None:
             return _with_tolerances(plant, before, constants, tolerance, options)
     else:
@@ -146,23 +168,33 @@ def _with_tolerances(
     """Return a plant that has constants with new tolerances of these; nominal values may not move."""
     written = matrices_of(plant) if before.written is None else before.written
     entries = {name: list(found) for name, found in before.entries.items()}
-    kept = {"variation": before.box.variation, "source": before.box.source, "level": before.box.level,
-            "digest": before.box.digest}  # fmt: skip
     stated = {key: value for key, value in options.items() if value is not None}
-    if stated.get("source", "calibrated") != "calibrated":
-        kept |= {"level": None, "digest": None}
+    given = {"variation": constants.variation if isinstance(constants, ConstantsBox) else before.box.variation}
+    kept = {**given, **_kept_source(before.box, constants, stated)}
     box, more = _boxed(constants, tolerance, before.box.constants, written, entries, kept | stated)
-    after = Uncertainty(box, _joined(entries, more), before.written, before.steps)
+    after = Uncertainty(box, _joined(entries, more), before.written, before.steps, before.shift)
     _require_used(after, set(box.constants))
-    for name, item in before.box.constants.items():
-        if name not in box.constants or abs(box.constants[name].nominal - item.nominal) > SAME_SHARE * abs(
-            item.nominal
-        ):
-            raise SpecError(
-                f"The nominal value of {name!r} is {item.nominal:g} in this plant: its tolerance may change, but "
-                "another nominal value is another plant.", path=f"constants.{name}",
-            )  # fmt: skip
+    moved = [name for name, item in before.box.constants.items() if name not in box.constants
+             or abs(box.constants[name].nominal - item.nominal) > SAME_SHARE * abs(item.nominal)]  # fmt: skip
+    if moved and before.written is None and moved[0] in box.constants:
+        return filled_plant(plant, after, set())
+    if moved:
+        raise SpecError(
+            f"The nominal value of {moved[0]!r} is {before.box.constants[moved[0]].nominal:g} in this plant, which was "
+            "transformed since it was written: its tolerance may change, but another nominal value is another plant. "
+            "Give the plant as written.", path=f"constants.{moved[0]}",
+        )  # fmt: skip
     return plant.replace(uncertainty=after)
+
+
+def _kept_source(box: ConstantsBox, constants: Any, stated: Mapping[str, Any]) -> dict[str, Any]:
+    """Return where a box comes from after some of its tolerances were given anew."""
+    if isinstance(constants, ConstantsBox) or "source" in stated:
+        return {}
+    if box.source != "calibrated":
+        return {"source": box.source}
+    left = tuple(name for name in box.calibrated or box.constants if name not in (constants or {}))
+    return {"source": "calibrated", "level": box.level, "digest": box.digest, "calibrated": left} if left else {}
 
 
 def _boxed(
@@ -171,10 +203,11 @@ def _boxed(
 ) -> tuple[ConstantsBox, dict[str, list[Entry]]]:  # fmt: skip
     """Return the box, and entries that are constants of their own."""
     if isinstance(constants, ConstantsBox):
-        if not tolerance:
+        if not tolerance and not known.keys() - constants.constants.keys():
             return constants, {}
+        logged = (constants.calibrated or tuple(constants.constants)) if constants.source == "calibrated" else None
         own = {"variation": constants.variation, "source": constants.source, "level": constants.level,
-               "digest": constants.digest}  # fmt: skip
+               "digest": constants.digest, "calibrated": logged}  # fmt: skip
         options = own | {key: value for key, value in options.items() if value is not None}
         constants = constants.constants
     given, shares = {}, dict(tolerance or {})

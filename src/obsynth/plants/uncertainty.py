@@ -25,6 +25,8 @@ UNCERTAIN_MATRICES = ("E", "A", "B", "C", "D", "Bf", "Df", "Bd", "Dd")
 ELIMINATED, SAMPLED = "eliminate", "sample"
 #: A stored number and the value of its expression may differ by this share: matrices in files have few digits.
 SAME_SHARE = 1e-6
+#: Rounding of a middle and of half a width, relative to the ends of a range.
+HALVING = 2.0**-51
 
 #: Row, column and text of an entry.
 Entry = tuple[int, int, str]
@@ -45,12 +47,16 @@ class Uncertainty:
         Matrices of the plant as written, if what holds this was made from it by ``steps``.
     steps : sequence, optional
         ``(kind, seconds)``, kinds ``eliminate`` and ``sample``.
+    shift : str, optional
+        For a linear model of a nonlinear plant: the input that is one in every row and carries how the equilibrium
+        moves with the constants; empty where it does not move, None for a plant that is linear.
     """
 
     box: ConstantsBox
     entries: Mapping[str, tuple[Entry, ...]]
     written: Mapping[str, Any] | None = None
     steps: tuple[tuple[str, float], ...] = ()
+    shift: str | None = None
     _parsed: dict[str, Expression] = field(default_factory=dict, repr=False, init=False)
 
     def __post_init__(self) -> None:
@@ -85,6 +91,11 @@ class Uncertainty:
         direct = {text for text in texts if text in self.box.constants}
         return frozenset(direct.union(*(self._parsed[text].names for text in texts - direct)))
 
+    @property
+    def not_covered(self) -> str:
+        """What statements about the box leave out: empty for a plant that is linear."""
+        return "" if self.shift is None else "what is not linear in the plant is not covered: this is its linear model"
+
     def with_box(self, box: ConstantsBox) -> Uncertainty:
         """Return the same entries with other tolerances.
 
@@ -93,7 +104,7 @@ class Uncertainty:
         box : ConstantsBox
             Of the same constants.
         """
-        return Uncertainty(box, self.entries, self.written, self.steps)
+        return Uncertainty(box, self.entries, self.written, self.steps, self.shift)
 
     def then(self, matrices: Mapping[str, FloatArray], kind: str, size: float = 0.0) -> Uncertainty:
         """Return what is uncertain in a plant made from this one.
@@ -108,7 +119,7 @@ class Uncertainty:
             Seconds, for ``sample``.
         """
         written = {name: matrices[name] for name in UNCERTAIN_MATRICES} if self.written is None else self.written
-        return Uncertainty(self.box, self.entries, written, (*self.steps, (kind, size)))
+        return Uncertainty(self.box, self.entries, written, (*self.steps, (kind, size)), self.shift)
 
     def value(self, text: str, values: Mapping[str, float]) -> float:
         """Return the value of an entry for values of the constants.
@@ -173,7 +184,7 @@ class Uncertainty:
             if name in unknowns:
                 parts[unknowns[name]] = item.half
             # The middle and the half are rounded.
-            slack = 0.0 if item.certain else 2.0**-51 * max(abs(item.low), abs(item.high))
+            slack = 0.0 if item.certain else HALVING * max(abs(item.low), abs(item.high))
             numbers[name] = AffineNumber(item.nominal if item.certain else item.middle, parts, slack)
         translation, known = affine_translation(count), dict[str, AffineNumber]()
         found = {name: AffineMatrix.exact(np.array(matrices[name]), count) for name in UNCERTAIN_MATRICES}
@@ -202,6 +213,7 @@ class Uncertainty:
                                                    for name, found in self.entries.items()},
             "written": None if self.written is None else dict(self.written),
             "steps": [list(step) for step in self.steps],
+            **({} if self.shift is None else {"shift": self.shift}),
         }  # fmt: skip
 
 
@@ -210,7 +222,9 @@ def uncertainty_of(data: Any) -> Uncertainty | None:
     if data is None or isinstance(data, Uncertainty):
         return data
     box = dict(data["box"])
-    return Uncertainty(constants_box(box.pop("constants"), **box), data["entries"], data["written"], data["steps"])
+    return Uncertainty(
+        constants_box(box.pop("constants"), **box), data["entries"], data["written"], data["steps"], data.get("shift")
+    )
 
 
 def expressions_in(rows: Any) -> tuple[Any, list[Entry]]:

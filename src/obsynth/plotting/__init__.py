@@ -1,14 +1,12 @@
 """Pictures of results, readable without colour; nothing is shown or saved here."""
 
 from obsynth.plotting.data import plot_data
-from obsynth.plotting.delta_scan import plot_delta_scan
 from obsynth.plotting.faults import plot_faults, plot_residuals
 from obsynth.plotting.frequency import estimate_gains, plot_gains
-from obsynth.plotting.recursive import plot_decision
-from obsynth.plotting.simulation import plot_detection, plot_simulation
+from obsynth.plotting.simulation import plot_decision, plot_detection, plot_simulation
 from obsynth.plotting.spectra import plot_poles
 from obsynth.plotting.states import plot_parameters, plot_states
-from obsynth.plotting.trade_off import plot_trade_off
+from obsynth.plotting.trade_off import plot_delta_scan, plot_tolerances, plot_trade_off
 
 __all__ = [
     "estimate_gains",
@@ -23,5 +21,6 @@ __all__ = [
     "plot_residuals",
     "plot_simulation",
     "plot_states",
+    "plot_tolerances",
     "plot_trade_off",
 ]

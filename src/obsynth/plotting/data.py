@@ -11,9 +11,9 @@ from obsynth.data.log_estimator import DECIDING
 from obsynth.data.run import DataRun
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import require_kind
+from obsynth.observers.estimates import BAND_WIDTH
 from obsynth.plotting.panels import (
     BAND_STYLE,
-    BAND_WIDTH,
     ESTIMATE_STYLE,
     LINE_COLOURS,
     MARK_STYLE,

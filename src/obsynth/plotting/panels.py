@@ -21,8 +21,6 @@ TRUE_STYLE: dict[str, Any] = {"color": "0.72", "linewidth": 4.0, "linestyle": "-
 LINE_COLOURS = ("black", "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00")
 ESTIMATE_STYLE: dict[str, Any] = {"color": "black", "linewidth": 1.1, "linestyle": "--"}
 RESIDUAL_STYLE: dict[str, Any] = {"color": "black", "linewidth": 1.0, "linestyle": "-"}
-#: Standard deviations on each side of a band: 95 % of a normal variable.
-BAND_WIDTH = 1.96
 BAND_STYLE: dict[str, Any] = {"color": "tab:blue", "alpha": 0.25, "linewidth": 0.0}
 #: One line style for each threshold, in order.
 THRESHOLD_STYLES: tuple[dict[str, Any], ...] = (

@@ -1,4 +1,7 @@
-"""A simulation in one picture: faults against estimates, and what the monitors of its residual saw."""
+"""A simulation in one picture: faults against estimates, and what the monitors of its residual saw.
+
+Decisions of recursive observers with their thresholds.
+"""
 
 from __future__ import annotations
 
@@ -13,11 +16,68 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.alarms import Decision
 from obsynth.plotting.faults import plot_faults
 from obsynth.plotting.panels import MARK_STYLE, RESIDUAL_STYLE, THRESHOLD_STYLES, legend_above, new_panels, tidy
-from obsynth.plotting.recursive import plot_decision
 from obsynth.plotting.states import plot_parameters
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+
+#: What each statistic says, on the vertical axis.
+_DECISION_LABELS = {
+    "chi-square": "chi-square of theta",
+    "cusum": "CUSUM",
+    "glr": "likelihood ratio",
+    "nis": "NIS over a window",
+}
+
+
+#: Values below this share of the threshold say nothing, and would stretch a logarithmic axis.
+LEAST_SHARE = 1e-3
+
+
+def plot_decision(decision: Decision, *, dt: float = 1.0, axes: Axes | None = None) -> Axes:
+    """Plot a decision statistic, its threshold, and the alarm with its onset, on a logarithmic scale.
+
+    Parameters
+    ----------
+    decision : Decision
+        From `obsynth.decide`.
+    dt : float, optional, seconds
+        Time between samples.
+    axes : Axes, optional
+        New ones by default.
+
+    Returns
+    -------
+    Axes
+        With the statistic.
+
+    Raises
+    ------
+    SpecError
+        Never for a decision as `obsynth.decide` makes it.
+    """
+    (panel,) = new_panels(None if axes is None else [axes], 1)
+    time = dt * np.arange(len(decision.values))
+    shown = np.isfinite(decision.thresholds)
+    floor = LEAST_SHARE * float(np.min(decision.thresholds[shown], initial=1.0))
+    panel.plot(time, np.maximum(decision.values, floor), label=decision.statistic, **RESIDUAL_STYLE)
+    panel.plot(time[shown], decision.thresholds[shown], label="threshold", **THRESHOLD_STYLES[0])
+    panel.set_yscale("log")
+    alarm = decision.alarm
+    if alarm is not None:
+        blamed = f": {alarm.parameter}" if alarm.parameter else ""
+        panel.plot(
+            [dt * alarm.k], [alarm.value], marker="o", color="black", label=f"alarm at {dt * alarm.k:g} s{blamed}",
+            **MARK_STYLE,
+        )  # fmt: skip
+        panel.axvline(dt * alarm.onset, color="0.4", linestyle=":", label=f"onset at {dt * alarm.onset:g} s")
+    panel.set_ylabel(_DECISION_LABELS.get(decision.statistic, decision.statistic))
+    panel.set_xlabel("time (s)")
+    legend_above(panel)
+    tidy(panel)
+    return panel
+
 
 #: Names of the statistics on the vertical axis.
 _LABELS = {
@@ -27,6 +87,8 @@ _LABELS = {
     "chi-square": "chi-square",
     "cusum": "CUSUM",
 }
+
+
 _THRESHOLDS = {
     "paper": "(66): not a pointwise bound",
     "pointwise": "pointwise bound",
@@ -34,11 +96,19 @@ _THRESHOLDS = {
     "chi-square": "threshold for Gaussian noise",
     "cusum": "threshold for Gaussian noise",
 }
+
+
 #: An estimate whose typical step from sample to sample is this share of its range is a band, not a line.
 NOISY_SHARE = 0.05
+
+
 #: Such a band lies under the truth.
 _BAND = {"color": "0.7", "linewidth": 0.6, "linestyle": "-", "zorder": 1.8}
+
+
 _TRUTH_ON_BAND = {"color": "black", "linewidth": 1.8, "zorder": 2.5}
+
+
 #: Decades that a logarithmic axis shows below the lowest threshold.
 DECADES_BELOW = 3
 

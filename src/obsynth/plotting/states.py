@@ -10,11 +10,10 @@ from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, as_matrix
-from obsynth.observers.estimates import Estimates
+from obsynth.observers.estimates import BAND_WIDTH, Estimates
 from obsynth.plants.names import index_of
 from obsynth.plotting.panels import (
     BAND_STYLE,
-    BAND_WIDTH,
     ESTIMATE_STYLE,
     TRUE_STYLE,
     legend_above,

@@ -163,7 +163,11 @@ def affine_inverse(matrix: AffineMatrix) -> AffineMatrix:
     return series @ near
 
 
-def affine_exponential(matrix: AffineMatrix, terms: int = 14) -> AffineMatrix:
+#: Terms of the series of an exponential.
+TERMS = 14
+
+
+def affine_exponential(matrix: AffineMatrix) -> AffineMatrix:
     """Return the exponential: Taylor's series of ``2^-s X`` with its rest bounded, squared s times."""
     size = len(matrix.center)
     largest = float(matrix.magnitude.sum(axis=1).max(initial=0.0))
@@ -172,11 +176,11 @@ def affine_exponential(matrix: AffineMatrix, terms: int = 14) -> AffineMatrix:
     doublings = max(0, int(np.ceil(np.log2(max(largest, SMALLEST) * 2.0))))
     small, identity = matrix.scaled(2.0**-doublings), np.eye(size)
     series = AffineMatrix.exact(identity, matrix.count)
-    for k in range(terms, 0, -1):
+    for k in range(TERMS, 0, -1):
         series = (small @ series).scaled(1.0 / k) + identity
     # With row sums of at most 1/2, the terms that are left out are less than twice the first of them.
     bound, rest = small.magnitude, np.eye(size)
-    for k in range(1, terms + 2):
+    for k in range(1, TERMS + 2):
         rest = _up(bound @ rest / k, size + 3)
     series = series.enlarged(np.where(_connected(bound), 2.0 * float(rest.sum(axis=1).max(initial=0.0)), 0.0))
     for _ in range(doublings):

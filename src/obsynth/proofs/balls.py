@@ -177,6 +177,11 @@ class Ball(Enclosure):
             radius = abs(factor) * self.radius + UNIT_ROUNDOFF * np.abs(product) + UNDERFLOW
             return type(self)(product, rounded_up(radius, 4))
 
+    @property
+    def magnitude(self) -> FloatArray:
+        """Upper bounds on the absolute values of the entries of every member."""
+        return rounded_up(np.abs(self.midpoint) + self.radius, 2)
+
     def widened(self, share: float) -> Ball:
         """Return the ball of every member times a number that is off one by at most ``share``."""
         radius = self.radius + share * (np.abs(self.midpoint) + self.radius)

@@ -26,6 +26,8 @@ from obsynth.proofs.definiteness import prove_positive_definite
 
 #: Where between the spectral radius (0) and one (1) the rate is tried, in turn.
 RATES = (0.5, 0.2, 0.8, 0.95)
+#: The same where the rate itself is what is asked for.
+TIGHT_RATES = (0.01, 0.1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +62,7 @@ class Contraction:
             return 0.0
         ball = Ball.exact(rows) if radius is None else Ball(np.asarray(rows, dtype=np.float64), radius)
         product = ball @ Ball.exact(self.inverse)
-        size = rounded_up(np.abs(product.midpoint) + product.radius, 2)
+        size = product.magnitude
         if summed:
             return float(rounded_up(np.asarray(np.sum(size) / (1.0 - self.defect)), size.size + 4))
         # |X|^2 <= |X|_1 |X|_inf, or Frobenius: both bound the spectral norm.
@@ -78,7 +80,7 @@ class Contraction:
 
 def column_norms(ball: Ball) -> FloatArray:
     """Return upper bounds on the norms of the columns of every member, ``(m,)``."""
-    size = rounded_up(np.abs(ball.midpoint) + ball.radius, 2)
+    size = ball.magnitude
     largest = np.max(size, axis=0, initial=0.0)
     safe = np.where((largest > 0.0) & np.isfinite(largest), largest, 1.0)
     sums = rounded_up(np.sum((size / safe) ** 2, axis=0), len(size) + 6)
@@ -108,6 +110,25 @@ def prove_contraction(matrix: FloatArray | Ball, *, discrete: bool, rate: float 
         if found is not None:
             return found
     return None
+
+
+def proved_rate(matrix: FloatArray | Ball, known: Contraction | None = None) -> float | None:
+    """Return a modulus below one that is proved to contract in some norm, little above the spectral radius.
+
+    With ``known`` a contraction to fall back on is there already.
+    """
+    ball = matrix if isinstance(matrix, Ball) else Ball.exact(matrix)
+    if not ball.midpoint.size:
+        return 0.0
+    if not np.all(np.isfinite(ball.midpoint)):
+        return None
+    radius = float(np.max(np.abs(np.linalg.eigvals(ball.midpoint))))
+    for share in TIGHT_RATES if radius < 1.0 else ():
+        found = prove_contraction(ball, discrete=True, rate=radius + share * (1.0 - radius))
+        if found is not None:
+            return found.rate
+    found = prove_contraction(ball, discrete=True) if known is None else known
+    return None if found is None else found.rate
 
 
 def _tried(ball: Ball, rate: float, *, discrete: bool) -> Contraction | None:

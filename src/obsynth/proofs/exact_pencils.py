@@ -139,25 +139,6 @@ class ExactPencil:
             ranks.append(int(power.rank()))
         return len(ranks) - 2
 
-    def left_null_basis(self, *, most: int | None = None) -> list[list[fmpq_poly]]:
-        """Return a minimal polynomial basis ``N(s)`` of the left null space: rows of polynomials, by degree.
-
-        ``most`` bounds the degrees looked for (the number of columns by default).  The cost grows with the cube of
-        (degree times rows): for large pencils of high degree ask `zero_polynomial` of bordered pencils instead.
-        """
-        rows, columns = self.shape
-        wanted, basis = rows - self.normal_rank, list[list[fmpq_poly]]()
-        for degree in range((columns if most is None else most) + 1):
-            if len(basis) == wanted:
-                break
-            known = [_shifted(row, k) for row in basis for k in range(degree - _degree_of(row) + 1)]
-            for vector in _left_kernel(_toeplitz(self.E, self.A, degree)):
-                candidate = [fmpq_poly([vector[k * rows + i] for k in range(degree + 1)]) for i in range(rows)]
-                if _coefficient_rank([*known, candidate], degree) == len(known) + 1:
-                    basis.append(candidate)
-                    known.append(candidate)
-        return basis
-
     @cached_property
     def _integers(self) -> tuple[fmpz_mat, fmpz_mat]:
         """E and A with rows and columns multiplied by rational numbers, so that all entries are small integers."""
@@ -245,33 +226,3 @@ def _determinant(e: fmpz_mat, a: fmpz_mat, degree: int) -> fmpz_poly:
     for k in range(degree - 1, -1, -1):
         found = found * fmpq_poly([-points[k], 1]) + fmpq_poly([differences[k]])
     return primitive(found)
-
-
-def _toeplitz(E: fmpq_mat, A: fmpq_mat, degree: int) -> fmpq_mat:
-    """Return the matrix whose left kernel holds the coefficients of all null vectors of at most this degree."""
-    rows, columns = int(A.nrows()), int(A.ncols())
-    whole = fmpq_mat((degree + 1) * rows, (degree + 2) * columns)
-    for k in range(degree + 1):
-        for i in range(rows):
-            for j in range(columns):
-                whole[k * rows + i, k * columns + j] = A[i, j]
-                whole[k * rows + i, (k + 1) * columns + j] = -E[i, j]
-    return whole
-
-
-def _left_kernel(matrix: fmpq_mat) -> list[list[fmpq]]:
-    basis = null_basis(matrix.transpose())
-    return [[basis[i, k] for i in range(basis.nrows())] for k in range(basis.ncols())]
-
-
-def _shifted(row: list[fmpq_poly], power: int) -> list[fmpq_poly]:
-    return [entry.left_shift(power) if power else entry for entry in row]
-
-
-def _degree_of(row: list[fmpq_poly]) -> int:
-    return max(int(entry.degree()) for entry in row)
-
-
-def _coefficient_rank(rows: list[list[fmpq_poly]], degree: int) -> int:
-    entries = [entry[k] for row in rows for entry in row for k in range(degree + 1)]
-    return int(fmpq_mat(len(rows), len(entries) // len(rows), entries).rank())

@@ -38,15 +38,6 @@ def exponential(matrix: FloatArray, time: float) -> Ball:
         return as_ball(scaled.exp())
 
 
-def held_input(a: FloatArray, b: FloatArray, time: float) -> Ball:
-    r"""Return a ball that holds ``\int_0^t e^{A s} ds B``, for ``A (n, n)``, ``B (n, m)``."""
-    n, m = b.shape
-    chain = np.zeros((n + m, n + m))
-    chain[:n, :n], chain[:n, n:] = a, b
-    whole = exponential(chain, time)
-    return Ball(whole.midpoint[:n, n:], whole.radius[:n, n:])
-
-
 def energy(a: FloatArray, b: FloatArray, time: float) -> Ball:
     r"""Return a ball that holds ``\int_0^t e^{A s} B B' e^{A' s} ds`` (Van Loan), for ``A (n, n)``, ``B (n, m)``."""
     import flint
@@ -114,7 +105,7 @@ class _Doubling:
         """Return a ball that holds the energy of inputs; ``None`` where it is not sharp."""
         inputs = Ball.exact(np.ldexp(b, -self.exponents[:, None]))
         term = (inputs @ inputs.T).scaled(self.short)
-        largest = float(np.max(rounded_up(np.abs(term.midpoint) + term.radius, 2), initial=0.0))
+        largest = float(np.max(term.magnitude, initial=0.0))
         total = term
         for k in range(2, ENERGY_ORDER + 1):
             through = self.x @ term

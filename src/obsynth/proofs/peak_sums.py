@@ -129,7 +129,7 @@ def interval_pieces(a: FloatArray, b: FloatArray, into: Ball, length: float) -> 
     at = Ball.exact(b)
     first = ball_a @ (ball_a @ Ball.exact(b))
     growth = _growth(a, step)
-    third = growth @ np.abs(_upper(ball_a @ first))
+    third = growth @ (ball_a @ first).magnitude
     parts: list[Ball] = []
     weights: list[float] = []
     largest = np.zeros_like(b)
@@ -141,9 +141,9 @@ def interval_pieces(a: FloatArray, b: FloatArray, into: Ball, length: float) -> 
             weights.append(step**3 / 12.0)
             largest = np.maximum(largest, third)
             at, first = transition @ at, transition @ first
-            third = growth @ _upper(ball_a @ first)
+            third = growth @ (ball_a @ first).magnitude
     # What is left, of any sign, in every coordinate at once: as many columns as coordinates.
-    rest = Ball(np.zeros((into.shape[0], m)), rounded_up(_upper(into) @ largest, 2 * len(a) + 6))
+    rest = Ball(np.zeros((into.shape[0], m)), rounded_up(into.magnitude @ largest, 2 * len(a) + 6))
     parts.append(rest)
     weights.append(count * step**4 / 12.0)
     joined = Ball(np.hstack([part.midpoint for part in parts]), np.hstack([part.radius for part in parts]))
@@ -158,11 +158,7 @@ def _natural_norm(a: FloatArray) -> float:
 
 def _growth(a: FloatArray, step: float) -> FloatArray:
     """Return an upper bound on ``|e^{A s}|``, entry by entry, for s up to ``step``."""
-    return _upper(exponential(np.abs(a), step))
-
-
-def _upper(ball: Ball) -> FloatArray:
-    return np.asarray(rounded_up(np.abs(ball.midpoint) + ball.radius, 2))
+    return exponential(np.abs(a), step).magnitude
 
 
 def gathered(pieces: Pieces, sums: FloatArray, inputs: int) -> FloatArray:

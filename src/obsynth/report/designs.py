@@ -13,6 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from obsynth.analysis.transformations import StateRecovery
+from obsynth.errors import PreconditionError
 from obsynth.methods.functional_filter.delay_curve import DelayCurve, delay_curve
 from obsynth.methods.registry import REGISTRY, method_spec
 from obsynth.observers.linear.observer import LinearObserver
@@ -20,15 +21,22 @@ from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
-from obsynth.results.checks_table import verification_report
+from obsynth.results.checks_table import print_checks
 from obsynth.results.delta_scan import DeltaScan
 from obsynth.results.design import ObserverDesign
 from obsynth.results.layout import facts_table, headed_table, name_list, number, print_section
+from obsynth.results.report import VerificationReport
+
+
+def verification_report(report: VerificationReport, *, console: Console) -> None:
+    """Print a verification report."""
+    print_checks(report.checks, console=console)
 
 
 def tolerances_report(design: ObserverDesign, *, console: Console) -> None:
     """Print what holds for every plant within its tolerances, or that the design assumes an exact model."""
-    from obsynth.tolerances.robustness import EXACT_MODEL, robustness
+    from obsynth.tolerances.result import EXACT_MODEL
+    from obsynth.tolerances.robustness import robustness
 
     if not isinstance(design.plant, DescriptorSystem) or not isinstance(design.observer, LinearObserver):
         return
@@ -36,7 +44,12 @@ def tolerances_report(design: ObserverDesign, *, console: Console) -> None:
     if uncertain is None or not uncertain.box.names:
         console.print(Text(f"Model: {EXACT_MODEL} (no constant has a tolerance)."))
         return
-    print_section(console, "Within the tolerances of the plant", facts_table(robustness(design).facts()))
+    try:
+        facts = list(robustness(design).facts())
+    except PreconditionError as error:
+        # The design is one for the nominal plant whatever the box may be.
+        facts = [("bounds", f"none: {error}")]
+    print_section(console, "Within the tolerances of the plant", facts_table(facts))
 
 
 def plant_facts(plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel) -> Iterator[tuple[str, str]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from html import escape
+from importlib.resources import files
 from pathlib import Path
 
 from obsynth.data.run import DataRun
@@ -11,7 +12,6 @@ from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.methods.registry import REGISTRY, method_spec
 from obsynth.report.designs import delay_curves, fault_estimates_table, plant_facts, promises, recovered_states
 from obsynth.report.log_agreement import agreement_section
-from obsynth.report.page_style import STYLE
 from obsynth.report.page_tables import check_rows, copied_table, fact_rows, matrix_rows, value_text
 from obsynth.report.pictures import data_section, pictures_of
 from obsynth.report.summary import summary
@@ -85,6 +85,7 @@ def _page_text(
     system_file: str | None, own: Mapping[str, list[str]], data_file: str | None,
 ) -> str:  # fmt: skip
     digest = gain_set_digest(design)
+    style = files("obsynth.report").joinpath("page.css").read_text(encoding="utf-8")
     title = escape(f"{design.name}: {design.method}")
     state = "holds" if report.passed else "fails"
     sections = {
@@ -105,8 +106,8 @@ def _page_text(
         "<!DOCTYPE html>", '<html lang="en">', "<head>", '<meta charset="utf-8">',
         '<meta name="generator" content="obsynth">',
         '<meta name="viewport" content="width=device-width, initial-scale=1">', f"<title>{title}</title>",
-        f"<style>{STYLE}</style>", "</head>", "<body>", f"<h1>{title}</h1>",
-        f'<p class="verdict {state}">{escape(verdict_line(report).plain)}</p>',
+        f"<style>{style}</style>", "</head>", "<body>", f"<h1>{title}</h1>",
+        f'<p class="verdict {state}">{escape(verdict_line(report.checks).plain)}</p>',
         f"<nav>{links}</nav>",
     ]  # fmt: skip
     for heading, lines in shown.items():
@@ -194,7 +195,7 @@ def _reproduction(
 ) -> Iterator[str]:
     import shlex
 
-    from obsynth import __version__
+    from obsynth.version import __version__
 
     file = shlex.quote(gains_file or f"{design.name}.gains.json")
     yield "<p>Every check again, from the gain set alone and without a solver; and this page:</p>"

@@ -11,8 +11,9 @@ import numpy as np
 from rich.table import Table
 
 from obsynth.numerics.arrays import FloatArray
-from obsynth.results.layout import number, verdict
-from obsynth.results.report import Check, CheckKind, Status
+from obsynth.results.checks import Check, CheckKind, Status
+from obsynth.results.checks_table import verdict
+from obsynth.results.layout import number
 
 #: Prefix of a check's name -> heading of its group; the others are about the shipped observer.
 _GROUPS = {"plant": "The plant", "exists": "Does such an observer exist?"}

@@ -107,7 +107,7 @@ def summary(design: ObserverDesign, *, file: Path | None = None, everything: boo
     notes = design.notes if everything else design.notes[:_MOST_NOTES]
     hidden = ((len(rows) - shown, "more estimate"), (len(design.notes) - len(notes), "more note"))
     more = _counted([(count, what) for count, what in hidden if count > 0])
-    verdict = f"{design.name}: {verdict_line(design.report).plain}"
+    verdict = f"{design.name}: {verdict_line(design.report.checks).plain}"
     return Summary(
         verdict, design.report.passed, tuple(_facts(design, steps)), headings, tuple(rows[:shown]),
         f"{more} with -v" if more else "", warnings, notes, "" if file is None else str(file),
@@ -118,16 +118,6 @@ def print_summary(found: Summary, *, console: Console) -> None:
     """Print a summary; a file's name stays in one piece, so that it can be copied."""
     for text, style in found.lines(min(console.width, 120)):
         console.print(Text(text, style=style), soft_wrap=True)
-
-
-def design_text(design: ObserverDesign) -> str:
-    """Return what ``print(design)`` shows."""
-    return str(summary(design))
-
-
-def design_html(design: ObserverDesign) -> str:
-    """Return what a notebook shows of a design."""
-    return summary(design).html()
 
 
 def _facts(design: ObserverDesign, steps: Followed) -> Iterator[tuple[str, str]]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from io import StringIO
-from typing import TYPE_CHECKING
 
 from rich.console import Console, Group, RenderableType
 from rich.padding import Padding
@@ -12,13 +11,13 @@ from rich.rule import Rule
 from rich.table import Table
 from rich.text import Text
 
-from obsynth.results.layout import number, print_section, verdict
-
-if TYPE_CHECKING:
-    from obsynth.results.report import Check, VerificationReport
+from obsynth.results.checks import Check, all_hold
+from obsynth.results.layout import number, print_section
 
 #: On narrower terminals the claim stands below the numbers, over the whole width.
 WIDE_ENOUGH = 110
+#: Of a report as text.
+TEXT_WIDTH = 120
 
 _HEADINGS = ("check", "claim", "value", "bound", "margin", "verdict", "kind")
 _NUMBER_WIDTH = 10
@@ -73,26 +72,36 @@ def _numbers_and_verdict(check: Check) -> list[Text]:
     return [*numbers, verdict(check), Text(check.status, style="dim")]
 
 
-def verdict_line(report: VerificationReport) -> Text:
-    """Return one line that says whether the whole report holds, and what fails."""
-    real = [check for check in report.checks if check.kind != "information"]
-    if report.passed:
+def verdict(check: Check) -> Text:
+    """Return ``holds``, ``FAILS`` or ``info``."""
+    if not check.passed:
+        return Text("FAILS", style="bold red")
+    if check.kind == "information":
+        return Text("info", style="cyan")
+    return Text("holds", style="green")
+
+
+def verdict_line(checks: Sequence[Check]) -> Text:
+    """Return one line that says whether a whole report holds, and what fails."""
+    real = [check for check in checks if check.kind != "information"]
+    if all_hold(checks):
         return Text(f"Verified: all {len(real)} checks hold.", style="green")
     if not real:
         return Text("FAILS: the report is empty, so nothing is verified.", style="bold red")
-    failed = ", ".join(check.name for check in report.failures)
-    return Text(f"FAILS: {len(report.failures)} of {len(real)} checks do not hold: {failed}.", style="bold red")
+    failed = [check.name for check in checks if not check.passed]
+    told = f"FAILS: {len(failed)} of {len(real)} checks do not hold: {', '.join(failed)}."
+    return Text(told, style="bold red")
 
 
-def report_text(report: VerificationReport, *, width: int = 120) -> str:
+def report_text(checks: Sequence[Check]) -> str:
     """Return what ``print(report)`` shows: the table of the checks, and the verdict."""
-    console = Console(file=StringIO(), width=width, markup=False, highlight=False, emoji=False, color_system=None)
-    verification_report(report, console=console)
+    console = Console(file=StringIO(), width=TEXT_WIDTH, markup=False, highlight=False, emoji=False, color_system=None)
+    print_checks(checks, console=console)
     text: str = console.file.getvalue()  # type: ignore[attr-defined]
     return "\n".join(line.rstrip() for line in text.splitlines())
 
 
-def verification_report(report: VerificationReport, *, console: Console) -> None:
-    """Print a verification report."""
-    print_section(console, "Verification", checks_table(report.checks, width=console.width))
-    console.print(verdict_line(report))
+def print_checks(checks: Sequence[Check], *, console: Console) -> None:
+    """Print the checks of a report and its verdict."""
+    print_section(console, "Verification", checks_table(checks, width=console.width))
+    console.print(verdict_line(checks))

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from importlib import import_module
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from obsynth.errors import SpecError
+from obsynth.extensions import extension
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
@@ -154,10 +154,10 @@ class ObserverDesign:
 
     def __str__(self) -> str:
         """Return the summary: what it is, what each estimate is worth, what it rests on."""
-        return str(_shown("design_text", self))
+        return str(extension("design summary")(self))
 
     def _repr_html_(self) -> str:
-        return str(_shown("design_html", self))
+        return str(extension("design summary")(self).html())
 
     def replace(self, **changes: Any) -> ObserverDesign:
         """Return the design with some fields changed (its report stays until `verify` is run again).
@@ -226,8 +226,3 @@ class ObserverDesign:
             states=[f"z[{i + 1}]" for i in range(observer.order)],
             name=self.name,
         )
-
-
-def _shown(what: str, design: ObserverDesign) -> Any:
-    """Return a view of a design; the tables are above the results, and are loaded when they are asked for."""
-    return getattr(import_module("obsynth.report.summary"), what)(design)

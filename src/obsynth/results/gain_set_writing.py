@@ -16,8 +16,7 @@ from obsynth.analysis.transformations.recovery import StateRecovery
 from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.results.binary_members import count_of_numbers, digest_of_both, packed, split
-from obsynth.results.plain_data import digest_of, plain
+from obsynth.results.plain_data import count_of_numbers, digest_of, digest_of_both, packed, plain, split
 
 SCHEMA_VERSION = 2
 KIND = "obsynth gain set"

@@ -13,12 +13,6 @@ from obsynth.analysis.transformations.recovery import StateRecovery
 from obsynth.analysis.transformations.recovery_operator import RecoveryOperator
 from obsynth.errors import SpecError
 from obsynth.files.inputs import input_file, json_data, read_json
-from obsynth.results.binary_members import (
-    digest_of_both,
-    is_packed,
-    unpacked,
-    with_arrays,
-)
 from obsynth.results.design import Certificate, ObserverDesign
 from obsynth.results.gain_set_parts import checked_parts, made
 from obsynth.results.gain_set_writing import (
@@ -33,7 +27,15 @@ from obsynth.results.gain_set_writing import (
     save,
     types_of,
 )
-from obsynth.results.plain_data import digest_of, plain, restored
+from obsynth.results.plain_data import (
+    digest_of,
+    digest_of_both,
+    is_packed,
+    plain,
+    restored,
+    unpacked,
+    with_arrays,
+)
 from obsynth.results.plant_source import PlantSource
 from obsynth.results.report import VerificationReport
 

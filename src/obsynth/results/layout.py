@@ -8,19 +8,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING
 
 from rich import box
 from rich.console import Console, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-if TYPE_CHECKING:
-    from obsynth.results.report import Check
 from obsynth.numerics.arguments import is_number
 
 #: Two values this near to each other, relative to their size or one, are shown as conjugates.
 SAME_NUMBER = 1e-9
+#: Values that are listed; the others are counted.
+MOST_VALUES = 8
 
 
 def number(value: float, *, digits: int = 4) -> str:
@@ -40,7 +39,7 @@ def complex_number(value: complex) -> str:
     return f"{number(value.real)} {sign} {number(abs(value.imag))}j"
 
 
-def complex_numbers(values: Iterable[complex], *, limit: int = 8) -> str:
+def complex_numbers(values: Iterable[complex]) -> str:
     """Return several values as text, largest first; conjugate pairs once, as ``a +- bj``; long lists are cut."""
     waiting = sorted((complex(value) for value in values), key=lambda value: (-abs(value), -value.real, -value.imag))
     shown: list[str] = []
@@ -52,7 +51,7 @@ def complex_numbers(values: Iterable[complex], *, limit: int = 8) -> str:
         else:
             waiting.remove(partner)
             shown.append(f"{number(value.real)} +- {number(abs(value.imag))}j")
-    return name_list(shown, limit=limit)
+    return name_list(shown, limit=MOST_VALUES)
 
 
 def name_list(names: Sequence[str], *, limit: int = 6) -> str:
@@ -62,15 +61,6 @@ def name_list(names: Sequence[str], *, limit: int = 6) -> str:
     if len(names) <= limit + 1:
         return ", ".join(names)
     return f"{', '.join(names[:limit])} and {len(names) - limit} more"
-
-
-def verdict(check: Check) -> Text:
-    """Return ``holds``, ``FAILS`` or ``info``."""
-    if not check.passed:
-        return Text("FAILS", style="bold red")
-    if check.kind == "information":
-        return Text("info", style="cyan")
-    return Text("holds", style="green")
 
 
 def print_section(console: Console, title: str, content: RenderableType) -> None:

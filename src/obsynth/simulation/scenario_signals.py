@@ -112,6 +112,11 @@ def resolve(plant: DescriptorSystem, scenario: Scenario) -> Drive:
                     for ends, values in zip((left, right), sampled(profile, steps, dt), strict=True):
                         ends[:, column] += values
     random.sort(key=lambda item: item[0])
+    shift = None if plant.uncertainty is None else plant.uncertainty.shift
+    if shift and shift not in scenario.inputs:
+        # What the equilibrium's motion enters through is one, always.
+        for ends in (left, right):
+            ends[:, plant.input_names.index(shift)] = 1.0
     return Drive(dt, left, right, tuple(random), *_sensors(plant.output_names, scenario))
 
 

@@ -53,6 +53,10 @@ def read_names(path: Path, *, where: str) -> list[str]:
     return names
 
 
+#: Whole numbers from here on are not printed.
+LONGEST_NUMBER = 1e15
+
+
 def described(value: Any) -> str:
     """Return a short description of ``value`` for a message, such as ``the text '1.0'``."""
     if value is None:
@@ -63,7 +67,9 @@ def described(value: Any) -> str:
         return f"the text {value!r}" if len(value) <= 40 else f"the text {value[:37]!r}..."
     if isinstance(value, (int, float)):
         # A long integer cannot even be printed.
-        return f"the number {value}" if abs(value) < 1e15 or isinstance(value, float) else "a huge whole number"
+        return (
+            f"the number {value}" if abs(value) < LONGEST_NUMBER or isinstance(value, float) else "a huge whole number"
+        )
     if isinstance(value, dict):
         return "a mapping"
     return "a list" if isinstance(value, list) else f"a {type(value).__name__}"

@@ -193,7 +193,7 @@ def spec_of(document: Mapping[str, Any], source: Path, *, plant_changes: Mapping
         asked = (reference.transform, source, "plant")
     model = plant if isinstance(plant, DAEModel) else None
     if model is not None:
-        linear = linearised(asked[0], model, *asked[1:])
+        linear = linearised(asked[0], model, section, plant_source.parent, *asked[1:])
         plant = plant if linear is None else linear
     elif asked[0] is not None and asked[0].linearise is not None:
         raise SpecError(f"{asked[1]}: transform.linearise is for nonlinear plants (kind: dae): remove it.",

@@ -13,7 +13,7 @@ from typing import Annotated, Any, get_args, get_origin
 from pydantic import Field, create_model
 
 from obsynth.methods.method_spec import option_types
-from obsynth.methods.registry import REGISTRY, method_spec
+from obsynth.methods.registry import method_spec
 from obsynth.numerics.arguments import Count, NonNegative, OpenUnitInterval, Positive, WrittenAs
 from obsynth.spec.schema_values import Covariance, Matrix, Section, Text, VaryingCovariance
 
@@ -65,11 +65,6 @@ KINDS: Mapping[str, Any] = {
     "named pairs": dict[Text, Two] | None,
     "sensor times": dict[Text, SensorTimes] | None,
 }
-
-
-def method_options() -> dict[str, type[Section]]:
-    """Return the schema of the options of every method, by its id."""
-    return {method: options_schema(method) for method in REGISTRY}
 
 
 @cache

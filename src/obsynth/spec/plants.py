@@ -9,24 +9,34 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from obsynth.errors import SpecError
+from obsynth.plants.constants import constant_of
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.spec.checking import DocumentProblems
-from obsynth.spec.constants import with_constants
+from obsynth.spec.constants import boxed_constants, with_constants
 from obsynth.spec.documents import read_names
 from obsynth.spec.matrices import read_matrices, read_matrix
+from obsynth.spec.schema import PlantSection
 
 if TYPE_CHECKING:
     from obsynth.analysis.transformations import Transformation
     from obsynth.spec.schema import DAESection, PlantReference, PlantSection, TimeVaryingSection, TransformSection
 
+
 _Plant = TypeVar("_Plant", DescriptorSystem, TimeVaryingDescriptorSystem, DAEModel)
 
+
 _MATRICES = ("E", "A", "B", "C", "D", "Bf", "Df", "Bd", "Dd", "Bw", "Dw")
+
+
 _NAME_LISTS = ("state_names", "input_names", "output_names", "fault_names", "disturbance_names", "noise_names")
+
+
 # Equations picked by name also name the signal that enters there.
 _SIGNAL_OF_PICK = {"B": "input_names", "Bw": "noise_names"}
+
+
 _LABELS = ("operating_point", "scales", "units")
 
 
@@ -105,8 +115,19 @@ def _varying_plant(section: TimeVaryingSection, source: Path, prefix: str) -> Ti
 
 
 def _nonlinear_plant(section: DAESection, source: Path, prefix: str) -> DAEModel:
-    arguments = section.model_dump(exclude={"kind", "schema_version", "transform"}, exclude_none=True)
-    return _placed(lambda: DAEModel(**arguments), source, prefix)
+    left_out = {"kind", "schema_version", "transform", "variation", "box"}
+    arguments = section.model_dump(exclude=left_out, exclude_none=True)
+
+    def made() -> DAEModel:
+        units = arguments.get("units")
+        for name, item in boxed_constants(section, source.parent)[0].items():
+            found = constant_of(name, item)
+            arguments["constants"][name] = found.nominal
+            if found.unit and units is not None:
+                units.setdefault(name, found.unit)
+        return DAEModel(**arguments)
+
+    return _placed(made, source, prefix)
 
 
 def _invariant_plant(section: PlantSection, source: Path, prefix: str) -> DescriptorSystem:
@@ -122,7 +143,7 @@ def _invariant_plant(section: PlantSection, source: Path, prefix: str) -> Descri
         if isinstance(arguments[matrix], list) and arguments[names] is None:
             arguments[names] = arguments[matrix]
 
-    return _placed(lambda: with_constants(DescriptorSystem(**arguments), section), source, prefix)
+    return _placed(lambda: with_constants(DescriptorSystem(**arguments), section, source.parent), source, prefix)
 
 
 def matlab_plant(reference: PlantReference, spec: Path) -> DescriptorSystem | None:
@@ -140,9 +161,18 @@ def matlab_plant(reference: PlantReference, spec: Path) -> DescriptorSystem | No
     return None
 
 
-def linearised(wanted: TransformSection | None, model: DAEModel, source: Path, prefix: str) -> DescriptorSystem | None:
-    """Return the linear model of a nonlinear plant where a section asks for one."""
+def linearised(
+    wanted: TransformSection | None, model: DAEModel, section: DAESection, folder: Path, source: Path, prefix: str
+) -> DescriptorSystem | None:
+    """Return the linear model of a nonlinear plant where a spec asks for one; ``folder``: of the plant's file."""
+    constants, box = boxed_constants(section, folder)
+    tolerances = {name: item for name, item in constants.items() if not isinstance(item, (int, float))}
     if wanted is None:
+        if tolerances or section.variation is not None or section.box is not None:
+            raise SpecError(
+                f"{source}: {_joined(prefix, 'constants')}: tolerances are for the linear model of a nonlinear plant: "
+                "add transform: {linearise: {at: equilibrium}}, or write numbers.", path=_joined(prefix, "constants"),
+            )  # fmt: skip
         return None
     where = _joined(prefix, "transform")
     if wanted.linearise is None:
@@ -150,10 +180,18 @@ def linearised(wanted: TransformSection | None, model: DAEModel, source: Path, p
             f"{source}: {where} is for linear plants: say where this one is linearised, such as linearise: {{at: "
             "equilibrium}, or remove it.", path=where,
         )  # fmt: skip
+    from obsynth.analysis.transformations.entries_in_constants import box_of_model
     from obsynth.analysis.transformations.linearisation import linearise
 
     arguments = wanted.linearise.model_dump(exclude_none=True)
+    tolerances |= arguments.pop("constants", {})
+    if not tolerances and (box or section.variation is not None):
+        raise SpecError(f"{source}: {_joined(prefix, 'variation')} and box are for constants with tolerances: give "
+                        "some.", path=_joined(prefix, "constants"))  # fmt: skip
     try:
+        if tolerances:
+            given = arguments.get("given", {})
+            arguments["constants"] = box_of_model(model, tolerances, given, variation=section.variation, **box)
         return linearise(model, **arguments)
     except SpecError as error:
         raise SpecError(f"{source}: {where}.linearise: {error}", path=f"{where}.linearise") from error

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Discriminator, Field, Tag, model_validator
 
-from obsynth.spec.constants import with_entries
+from obsynth.plants.uncertainty import UNCERTAIN_MATRICES, expressions_in
 from obsynth.spec.schema_values import (
     EquationMatrix,
     Matrix,
@@ -46,6 +46,7 @@ class LineariseSection(Section):
     disturbances: list[Text] | None = None
     start: dict[Text, float] | None = None
     drift: bool | None = None
+    constants: dict[Text, Any] | None = None
 
 
 class TransformSection(Section):
@@ -65,11 +66,12 @@ class EntrySection(Section):
 
 
 class BoxSection(Section):
-    """Where the tolerances come from."""
+    """Where the tolerances come from: a source, or a file that ``obsynth calibrate --out`` has written."""
 
-    source: Literal["stated", "set-membership", "calibrated"]
+    source: Literal["stated", "set-membership", "calibrated"] | None = None
     level: float | None = None
     digest: Text | None = None
+    file: Text | None = None
 
 
 class PlantSection(Section):
@@ -107,8 +109,20 @@ class PlantSection(Section):
     @model_validator(mode="before")
     @classmethod
     def _expressions(cls, data: Any) -> Any:
-        """Take expressions in the constants out of rows of numbers."""
-        return with_entries(data)
+        """Return a raw plant section with expressions in rows moved to ``entries``; only where there are constants."""
+        if not isinstance(data, dict) or not isinstance(data.get("constants"), dict):
+            return data
+        found, entries = dict(data), data.get("entries")
+        entries = dict(entries) if isinstance(entries, dict) else entries
+        for name in UNCERTAIN_MATRICES:
+            rows, texts = expressions_in(found.get(name))
+            if texts and (entries is None or isinstance(entries, dict)):
+                found[name] = rows
+                more = [{"row": i + 1, "column": j + 1, "value": text} for i, j, text in texts]
+                entries = {**(entries or {}), name: [*(entries or {}).get(name, []), *more]}
+        if entries is not None:
+            found["entries"] = entries
+        return found
 
 
 class PlantDocument(PlantSection):
@@ -155,7 +169,9 @@ class DAESection(Section):
     units: dict[Text, str] | None = None
     inputs: dict[Text, float] | None = None
     parameters: dict[Text, float] | None = None
-    constants: dict[Text, float] | None = None
+    constants: dict[Text, Any] | None = None
+    variation: Literal["constant", "varying"] | None = None
+    box: BoxSection | None = None
     definitions: dict[Text, Text] | None = None
     transform: TransformSection | None = None
 

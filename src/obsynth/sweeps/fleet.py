@@ -15,18 +15,16 @@ import numpy as np
 
 from obsynth.data.run import run_on_data
 from obsynth.errors import ObsynthError, SpecError
-from obsynth.files.inputs import read_json
-from obsynth.files.outputs import FileKind, write_atomically
-from obsynth.files.tables import TableWriter
+from obsynth.files.outputs import write_atomically
 from obsynth.results.gain_sets import load
-from obsynth.sweeps.sweep import STATUSES, each, folder_for
+from obsynth.sweeps.kept_work import STATUSES, ResultTable, all_of, carried_out, file_stem, folder_for, result_in
 
 if TYPE_CHECKING:
-    import pandas as pd
     from matplotlib.figure import Figure
 
 _KIND = "obsynth fleet result"
-RESULT = FileKind("a result of a fleet", rb'"kind":\s*"obsynth fleet result"', ending=".result.json")
+#: Letters of a run's name in the names of its files.
+LONGEST_STEM = 80
 #: What ends the name of a gain set; logs by their suffix.
 GAINS_ENDING = ".gains.json"
 LOG_ENDINGS = (".csv", ".tsv", ".parquet", ".tdms", ".mf4", ".mdf", ".dat")
@@ -69,7 +67,7 @@ class FleetRun:
 
 
 @dataclass(frozen=True)
-class Fleet:
+class Fleet(ResultTable):
     """All runs of a fleet, in the order of designs and logs.
 
     Parameters
@@ -91,8 +89,8 @@ class Fleet:
 
     def rows(self) -> tuple[list[str], list[list[Any]]]:
         """Return the table as a header and rows: one column for each alarm and each largest value of any run."""
-        alarms = list(dict.fromkeys(name for run in self.runs for name in run.alarms))
-        largest = list(dict.fromkeys(name for run in self.runs for name in run.largest))
+        alarms = all_of(run.alarms for run in self.runs)
+        largest = all_of(run.largest for run in self.runs)
         header = ["run", "status", "rows", "ok", *(f"alarm {n}, s" for n in alarms), *(f"largest {n}" for n in largest),
                   "file", "message"]  # fmt: skip
         body = [
@@ -103,20 +101,6 @@ class Fleet:
             for run in self.runs
         ]  # fmt: skip
         return header, body
-
-    def table(self) -> pd.DataFrame:
-        """Return the table as a data frame."""
-        import pandas as pd
-
-        header, body = self.rows()
-        return pd.DataFrame(body, columns=header)
-
-    def csv(self) -> str:
-        """Return the table as CSV."""
-        header, body = self.rows()
-        stream = io.StringIO()
-        TableWriter(stream, header).write(body)
-        return stream.getvalue()
 
     def plot(self) -> Figure:
         """Draw the estimates (of residual filters the residuals) of the first runs over time, one panel each."""
@@ -199,16 +183,10 @@ def run_fleet(
         raise SpecError(f"{', '.join(wrong)}: use some of {', '.join(known)}.", path=wrong[0])
     place = folder_for(Path(folder))
     pairs = _pairs(_files(gains, (GAINS_ENDING,), "gains"), _files(data, LOG_ENDINGS, "data"), options)
-    found: dict[str, FleetRun] = {}
-    for pair in pairs:
-        if (run := _known(pair, place)) is not None:
-            found[pair.key] = run
-    waiting = [pair for pair in pairs if pair.key not in found]
-    for done, (pair, (run, text)) in enumerate(each(_run, waiting, executor), start=len(found) + 1):
-        found[pair.key] = _kept(pair, run, text, place)
-        if progress is not None:
-            progress(done, len(pairs))
-    return Fleet(tuple(found[pair.key] for pair in pairs))
+    return Fleet(carried_out(
+        pairs, _run, executor=executor, told=progress, known=lambda pair: _known(pair, place),
+        kept=lambda pair, outcome: _kept(pair, *outcome, place),
+    ))  # fmt: skip
 
 
 def _files(given: Any, endings: tuple[str, ...], what: str) -> list[Path]:
@@ -263,8 +241,8 @@ def _largest(text: str) -> dict[str, float]:
 
 
 def _targets(pair: _Pair, folder: Path) -> tuple[Path, Path]:
-    stem = "".join(letter if letter.isalnum() or letter in "-_." else "-" for letter in pair.name)[:80]
-    return folder / f"{stem}-{pair.key[:16]}.csv", folder / f"{stem}-{pair.key[:16]}.result.json"
+    stem = file_stem(pair.name, pair.key, most=LONGEST_STEM)
+    return folder / f"{stem}.csv", folder / f"{stem}.result.json"
 
 
 def _kept(pair: _Pair, run: FleetRun, text: str, folder: Path) -> FleetRun:
@@ -281,11 +259,8 @@ def _kept(pair: _Pair, run: FleetRun, text: str, folder: Path) -> FleetRun:
 def _known(pair: _Pair, folder: Path) -> FleetRun | None:
     """Return a run that is there already, whole and of the same files; a damaged one is made again."""
     table, result = _targets(pair, folder)
-    try:
-        body = read_json(result, where=str(result)) if result.is_file() else None
-    except SpecError:
-        return None
-    if not isinstance(body, dict) or body.get("kind") != _KIND or body.get("key") != pair.key:
+    body = result_in(result, _KIND, pair.key)
+    if body is None:
         return None
     if body["sha256"] is not None and (
         not table.is_file() or hashlib.sha256(table.read_bytes()).hexdigest() != body["sha256"]

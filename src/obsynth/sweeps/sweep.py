@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import io
 import json
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor, as_completed
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from obsynth.errors import ObsynthError, SpecError
 from obsynth.experiments.progress import Progress, shown_progress
-from obsynth.files.inputs import read_json
 from obsynth.files.outputs import write_atomically
-from obsynth.files.tables import TableWriter
 from obsynth.methods.designing import Plant, design
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
@@ -27,16 +24,14 @@ from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import gain_set_bytes, load, loaded, plain, restored
 from obsynth.spec.loader import spec_of
 from obsynth.sweeps.cases import SweepCase, plant_cases, spec_cases
+from obsynth.sweeps.kept_work import STATUSES, ResultTable, all_of, carried_out, file_stem, folder_for, result_in
 
 if TYPE_CHECKING:
-    import pandas as pd
     from matplotlib.figure import Figure
 
-#: What a case came to, by the exit code of its error.
-STATUSES = {0: "designed", 2: "malformed", 3: "impossible", 4: "infeasible", 5: "unknown", 6: "unverified"}
 _KIND = "obsynth sweep result"
-#: Digits of the digest of a case in the names of its files.
-DIGITS = 16
+#: Letters of a case's name in the names of its files.
+LONGEST_STEM = 60
 _PLANTS = (DescriptorSystem, TimeVaryingDescriptorSystem, DAEModel)
 
 
@@ -100,7 +95,7 @@ class SweepResult:
 
 
 @dataclass(frozen=True, eq=False)
-class Sweep:
+class Sweep(ResultTable):
     """All results of a sweep, in the order of its cases.
 
     Parameters
@@ -122,9 +117,9 @@ class Sweep:
 
     def rows(self) -> tuple[list[str], list[list[Any]]]:
         """Return the header and the rows of the table; what does not apply is empty."""
-        parameters = _in_order(result.parameters for result in self.results)
-        claims = _in_order(result.claims for result in self.results)
-        facts = _in_order(result.facts for result in self.results)
+        parameters = all_of(result.parameters for result in self.results)
+        claims = all_of(result.claims for result in self.results)
+        facts = all_of(result.facts for result in self.results)
         header = ["case", *parameters, "status", *facts, *claims, "condition", "signals", "message", "seconds", "file"]
         rows = [
             [
@@ -137,20 +132,6 @@ class Sweep:
             for result in self.results
         ]  # fmt: skip
         return header, rows
-
-    def table(self) -> pd.DataFrame:
-        """Return one row per case: parameters, what it came to, claims."""
-        import pandas as pd
-
-        header, rows = self.rows()
-        return pd.DataFrame(rows, columns=header)
-
-    def csv(self) -> str:
-        """Return the table as CSV."""
-        header, rows = self.rows()
-        stream = io.StringIO()
-        TableWriter(stream, header).write(rows)
-        return stream.getvalue()
 
     def plot(self, claim: str | None = None, *, parameter: str | None = None) -> Figure:
         """Draw a claim of every case over a parameter; cases without a design are marked by what they came to.
@@ -215,22 +196,16 @@ def sweep(
     """
     made = _cases(cases, parameters or {}, method)
     place = None if folder is None else folder_for(Path(folder))
-    found: dict[str, SweepResult] = {}
-    if place is not None:
-        found = {case.key: known for case in made if (known := _known(case, place)) is not None}
     with shown_progress(progress) as told:
-        waiting = [case for case in made if case.key not in found]
-        if told is not None:
-            told(len(found), len(made))
-        for case, result in each(run_case, waiting, executor):
-            found[case.key] = result if place is None else _kept(case, result, place)
-            if told is not None:
-                told(len(found), len(made))
-    return Sweep(tuple(found[case.key] for case in made))
+        return Sweep(carried_out(
+            made, run_case, executor=executor, told=told, at_start=True,
+            known=lambda case: None if place is None else _known(case, place),
+            kept=lambda case, result: result if place is None else _kept(case, result, place),
+        ))  # fmt: skip
 
 
 def _cases(cases: Any, parameters: Mapping[str, Sequence[Any]], method: str | None) -> list[SweepCase]:
-    from obsynth import __version__
+    from obsynth.version import __version__
 
     if not isinstance(parameters, Mapping):
         raise SpecError("parameters must be a mapping of names to lists of values.", path="parameters")
@@ -249,27 +224,6 @@ def _cases(cases: Any, parameters: Mapping[str, Sequence[Any]], method: str | No
     if not paths or not all(isinstance(path, (str, Path)) for path in paths):
         raise SpecError("Give one spec or several, or plants.", path="cases")
     return spec_cases([Path(path) for path in paths], parameters, __version__)
-
-
-_Item = TypeVar("_Item")
-_Outcome = TypeVar("_Outcome")
-
-
-def each(
-    work: Callable[[_Item], _Outcome], items: Sequence[_Item], executor: Executor | None
-) -> Iterator[tuple[_Item, _Outcome]]:
-    """Yield each item with what comes of it, as they come."""
-    if executor is None:
-        for item in items:
-            yield item, work(item)
-        return
-    waiting = {executor.submit(work, item): item for item in items}
-    try:
-        for future in as_completed(waiting):
-            yield waiting[future], future.result()
-    finally:
-        for future in waiting:
-            future.cancel()
 
 
 def run_case(case: SweepCase) -> SweepResult:
@@ -309,18 +263,8 @@ def _designed(case: SweepCase) -> ObserverDesign:
     return found.replace(notes=(*notes, *found.notes)) if notes else found
 
 
-def folder_for(folder: Path) -> Path:
-    """Return a folder for results, made where there is none."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise SpecError(f"{folder} cannot be used as a folder: {error.strerror}.", path=str(folder)) from error
-    return folder
-
-
 def _files(case: SweepCase, folder: Path) -> tuple[Path, Path]:
-    stem = "".join(letter if letter.isalnum() or letter in "-_." else "-" for letter in case.name)[:60]
-    name = f"{stem}-{case.key[:DIGITS]}"
+    name = file_stem(case.name, case.key, most=LONGEST_STEM)
     return folder / f"{name}.result.json", folder / f"{name}.gains.json"
 
 
@@ -341,15 +285,10 @@ def _kept(case: SweepCase, result: SweepResult, folder: Path) -> SweepResult:
 
 def _known(case: SweepCase, folder: Path) -> SweepResult | None:
     """Return the result of a case that is there already, whole and of the same data; a damaged one is made again."""
-    file, _ = _files(case, folder)
-    if not file.is_file():
+    found = result_in(_files(case, folder)[0], _KIND, case.key)
+    if found is None:
         return None
-    try:
-        body = restored(read_json(file, where=str(file)))
-    except SpecError:
-        return None
-    if not isinstance(body, dict) or body.get("kind") != _KIND or body.get("key") != case.key:
-        return None
+    body = restored(found)
     gains = None if body["gains"] is None else folder / str(body["gains"])
     if gains is not None:
         try:
@@ -360,11 +299,6 @@ def _known(case: SweepCase, folder: Path) -> SweepResult | None:
         case.name, case.parameters, body["status"], body["message"], body["condition"], tuple(body["signals"]),
         body["claims"], body["facts"], body["seconds"], gains,
     )  # fmt: skip
-
-
-def _in_order(mappings: Any) -> list[str]:
-    """Return every key once, in order of appearance."""
-    return list(dict.fromkeys(name for mapping in mappings for name in mapping))
 
 
 def _cell(value: Any) -> Any:

@@ -84,7 +84,7 @@ class ErrorStructure:
 
 def error_structure(
     observer: LinearObserver, affine: AffinePlant, tracking: Tracking, bounds: FloatArray, noise_bound: float, *,
-    faults: bool = False, states: bool = False, reading: FloatArray | None = None,
+    faults: bool = False, states: bool = False, reading: FloatArray | None = None, varying: bool = False,
 ) -> ErrorStructure:  # fmt: skip
     """Return the error system of an observer over a box.
 
@@ -93,7 +93,9 @@ def error_structure(
 
     ``bounds (nd,)`` of the disturbances; ``noise_bound`` in standard deviations.  With ``faults``, faults are unknown
     signals that are estimated like states, and the outputs are the errors of their estimates; else there is no fault,
-    and the outputs are fault estimates and residuals, or (``states``) the errors of the state estimates.
+    and the outputs are fault estimates and residuals, or (``states``) the errors of the state estimates.  What a fault
+    that is estimated one sample late did in a plant whose constants are ``varying``, it did with those of that sample:
+    they count as further constants, after all others.
     """
     plant, count = affine.plant, affine.count
     t, t0 = tracking
@@ -127,11 +129,18 @@ def error_structure(
     disturbances = affine_block([[stacked(affine.Bd, affine.Dd), stacked(*noise)]])
     if faults:
         direct = stacked(affine.Bf, affine.Df)
-        state = affine_block([[state, _fault_columns(direct, observer, c, n)]])
+        columns = _fault_columns(direct, observer, c, n, affine.offsets)
+        earlier = np.array(observer.fault_delays, dtype=np.int64) > 0 if varying else np.zeros(nf, dtype=bool)
+        if earlier.any():
+            state, known, disturbances = (_with_more(item, count) for item in (state, known, disturbances))
+            columns = _with_more(columns, count)
+            columns.parts[count:, :, earlier] = columns.parts[:count, :, earlier]
+            columns.parts[:count, :, earlier] = 0.0
+            offsets = np.concatenate([offsets, offsets])
+        state = affine_block([[state, columns]])
     if reading is not None:
         state, known = _with_missed(state, offsets), _with_missed(known, offsets)
-        more_parts = np.concatenate([disturbances.parts, np.zeros((1, *disturbances.shape))])
-        disturbances = AffineMatrix(disturbances.center, more_parts, disturbances.radius)
+        disturbances = _with_more(disturbances, 1)
         offsets = np.append(offsets, 0.0)
     parts, rest = _about_nominal(state, offsets)
     rows, effects, owner, left = _channels(parts, offsets)
@@ -157,8 +166,8 @@ def _sizes(observer: LinearObserver, affine: AffinePlant, t: FloatArray, c: Floa
 
 def require_identities(state: AffineMatrix, known: AffineMatrix, sizes: FloatArray, offsets: FloatArray) -> None:
     """Raise `PreconditionError` where the observer is none of the nominal plant."""
-    missed = float(np.max(np.abs(state.at(offsets)) / sizes, initial=0.0))
-    missed = max(missed, float(np.max(np.abs(known.at(offsets)) / (sizes + known.magnitude), initial=0.0)))
+    missed = float(np.max(_missed(state, offsets) / sizes, initial=0.0))
+    missed = max(missed, float(np.max(_missed(known, offsets) / (sizes + known.magnitude), initial=0.0)))
     if not missed <= IDENTITY_SHARE:
         raise PreconditionError(
             f"The observer's identities do not hold on the nominal plant (by {missed:.1e} of their terms): a bound "
@@ -166,7 +175,17 @@ def require_identities(state: AffineMatrix, known: AffineMatrix, sizes: FloatArr
         )  # fmt: skip
 
 
-def _fault_columns(direct: AffineMatrix, observer: LinearObserver, c: FloatArray, n: int) -> AffineMatrix:
+def _missed(matrix: AffineMatrix, offsets: FloatArray) -> FloatArray:
+    """Return what a matrix that should vanish at the nominal plant is there, at least.
+
+    Its affine part does not vanish there in a box whose middle is elsewhere: the remainder makes up for that.
+    """
+    return np.maximum(np.abs(matrix.at(offsets)) - matrix.radius, 0.0) if offsets.any() else np.abs(matrix.center)
+
+
+def _fault_columns(
+    direct: AffineMatrix, observer: LinearObserver, c: FloatArray, n: int, offsets: FloatArray
+) -> AffineMatrix:
     """Return the columns of faults as signals that are estimated, each at its delay: robust.md, correction 8.1.
 
     A fault that is estimated one sample late counts as a state of the sample after it: what it does to eps by then is
@@ -190,12 +209,17 @@ def _fault_columns(direct: AffineMatrix, observer: LinearObserver, c: FloatArray
         )  # fmt: skip
     chosen = [moved[:, [j]] if late[j] else direct[:, [j]] for j in range(nf)]
     found = affine_block([chosen]) + (-target)
-    if float(np.max(np.abs(found.center), initial=0.0)) > IDENTITY_SHARE:
+    if float(np.max(_missed(found, offsets), initial=0.0)) > IDENTITY_SHARE:
         raise PreconditionError(
             "The estimate of a fault, or of the state, depends on how the fault came about: it has no guaranteed "
             "interval (a filter that estimates each sample of a fault on its own has one).", condition="fault interval",
         )  # fmt: skip
     return found
+
+
+def _with_more(matrix: AffineMatrix, count: int) -> AffineMatrix:
+    """Return a matrix as a function of more constants, which it does not depend on."""
+    return AffineMatrix(matrix.center, np.concatenate([matrix.parts, np.zeros((count, *matrix.shape))]), matrix.radius)
 
 
 def _with_missed(matrix: AffineMatrix, offsets: FloatArray) -> AffineMatrix:

@@ -101,10 +101,10 @@ def ring_length(az: FloatArray) -> int:
     return length
 
 
-def responses_of(structure: ErrorStructure, length: int | None = None) -> Responses:
+def responses_of(structure: ErrorStructure) -> Responses:
     """Return the responses of an error system; the ring is as long as it must be, or as asked."""
     az = structure.Az
-    wanted = ring_length(az) if length is None else length
+    wanted = ring_length(az)
     nz = len(az)
     powers = np.empty((wanted + 1, nz, nz))
     powers[0] = np.eye(nz)

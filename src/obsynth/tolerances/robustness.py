@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
-from types import MappingProxyType
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
 from obsynth.analysis.transformations.uncertain_plant import (
     ROUNDING_SHARE,
     AffinePlant,
@@ -19,10 +15,9 @@ from obsynth.analysis.transformations.uncertain_plant import (
     moving_family,
     untouched_states,
 )
-from obsynth.errors import ObsynthError, PreconditionError, SpecError
+from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray
-from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.constants import ConstantsBox
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.uncertain_system import uncertain_system
@@ -31,162 +26,31 @@ from obsynth.proofs.affine import AffineMatrix
 from obsynth.results.design import ObserverDesign
 from obsynth.tolerances.directions import told_from_faults
 from obsynth.tolerances.error_structure import ErrorStructure, error_structure
-from obsynth.tolerances.exact_plant import is_sampled, moving_at, plant_at
-from obsynth.tolerances.responses import Responses, blame, blamed_rows, largest_factor, loop_radius, responses_of
-from obsynth.tolerances.subdivision import MOST_BOXES, BoxVerdict, index_one_on_box, proved_stable
+from obsynth.tolerances.exact_plant import is_sampled, moving_at
+from obsynth.tolerances.responses import (
+    Responses,
+    blame,
+    blamed_rows,
+    largest_factor,
+    loop_radius,
+    responses_of,
+    same_sample_inverse,
+)
+from obsynth.tolerances.result import EXACT_MODEL, Robustness
+from obsynth.tolerances.subdivision import MOST_BOXES, BoxVerdict, index_one_on_box, proved_stable, values_at
 from obsynth.tolerances.tracking import Tracking, tracking_of
+from obsynth.tolerances.vertex_gains import labels_of, vertex_gains
 
-#: A design without tolerances says this.
-EXACT_MODEL = "assumes an exact model"
-#: Vertices beyond this number are drawn at random.
-MOST_VERTICES = 32
 #: Boxes for stability after which it is left open where most states are algebraic: each elimination takes long.
 FEW_BOXES = 40
-#: Samples over which the gain at a vertex is summed up, at most.
-MOST_GAIN_SAMPLES = 5_000
-#: What is left of a response when its sum ends.
-_GAIN_LEFT = 1e-6
+#: Two plants are the same where entries agree so well, relatively and around zero.
+SAME_ENTRY, SAME_ZERO = 1e-9, 1e-12
 
 
-@dataclass(frozen=True, eq=False)
-class Robustness:
-    """What holds for every plant in the box; see `obsynth.robustness`.
-
-    Parameters
-    ----------
-    box : ConstantsBox
-        The constants, and where their tolerances come from.
-    assumes_exact_model : bool
-        No constant has a tolerance: nothing below says anything about another plant.
-    regular : str
-        ``proved``, ``refuted`` or ``open``: regular and of index 1 at every point of the box.
-    breaking : mapping of str to float
-        Constants at which the plant is not regular of index 1, or not stable; empty where none was found.
-    loop_radius : float or None
-        Upper bound of the loop's radius: below 1, bounds stay finite for ever.  `None` where no bound exists.
-    largest_factor : float or None
-        Largest common factor on all tolerances with a radius below 1.
-    blame : mapping of str to float
-        Share of each constant in the loop's radius; ``remainders`` for what is not affine.
-    rows : mapping of str to float
-        Share of each row of the plant (named by its state) in the loop's radius.
-    error_per_unit : mapping of str to mapping
-        By estimate or residual: what an amplitude of one unit of each state and input can add to it.
-    vertex_gains : mapping of str to float
-        By fault estimate and residual: the largest peak gain from the disturbances at the vertices; infinite where the
-        plant or the observer at a vertex is unstable.
-    stable : str
-        ``proved``, ``refuted`` or ``open``: the plant is stable at every point of the box.
-    boxes : int
-        Parts into which the box was cut for that.
-    reason : str
-        Why there is no bound; empty where there is one.
-    sharing : tuple of str
-        Constants that act where a fault acts: no observer can ever tell their tolerance from it.
-    untouched : tuple of complex
-        Modes of the plant that no constant touches and that are not stable: ``stable`` is about all others.
-    """
-
-    box: ConstantsBox
-    assumes_exact_model: bool
-    regular: str
-    breaking: Mapping[str, float]
-    loop_radius: float | None
-    largest_factor: float | None
-    blame: Mapping[str, float]
-    rows: Mapping[str, float]
-    error_per_unit: Mapping[str, Mapping[str, float]]
-    vertex_gains: Mapping[str, float]
-    stable: str
-    boxes: int
-    reason: str = ""
-    sharing: tuple[str, ...] = ()
-    untouched: tuple[complex, ...] = ()
-
-    def __post_init__(self) -> None:
-        for name in ("breaking", "blame", "rows", "error_per_unit", "vertex_gains"):
-            object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
-
-    @property
-    def finite_for_ever(self) -> bool:
-        """Whether bounds stay finite however long a run is."""
-        return self.loop_radius is not None and self.loop_radius < 1.0
-
-    @property
-    def largest_tolerance(self) -> float | None:
-        """The largest common tolerance as a share, where all tolerances are the same share of their nominal values."""
-        shares = [item.half / abs(item.nominal) for item in self.box.uncertain if item.nominal]
-        if self.largest_factor is None or len(shares) != len(self.box.uncertain) or not shares:
-            return None
-        common = max(shares) - min(shares) <= 1e-9 * max(shares)
-        return self.largest_factor * shares[0] if common else None
-
-    def facts(self) -> Iterator[tuple[str, str]]:
-        """Yield label and text of what a report shows."""
-        if self.assumes_exact_model:
-            yield "model", EXACT_MODEL
-            return
-        names = ", ".join(self.box.names[:6]) + (", ..." if len(self.box.names) > 6 else "")
-        yield "constants", f"{len(self.box.names)} with a tolerance ({names}), {self.box.variation}, {self.box.source}"
-        yield "regular, index 1", self.regular + (self._where() if self.regular == "refuted" else "")
-        where = self._where() if self.stable == "refuted" and self.regular != "refuted" else ""
-        lasting = ", ".join(f"{value.real:.4g}" if not value.imag else f"{value:.4g}" for value in self.untouched)
-        but = f", but for the mode at {lasting}, which no constant touches" if lasting else ""
-        yield "plant stable", self.stable + where + (f" ({self.boxes} boxes)" if self.boxes else "") + but
-        if self.sharing:
-            yield "never told from a fault", f"{', '.join(self.sharing)}: they act where a fault acts"
-        if self.loop_radius is None:
-            yield "bounds", f"none: {self.reason}"
-            return
-        ever = "bounds stay finite for ever" if self.finite_for_ever else "bounds hold at each sample, but may grow"
-        yield "loop radius", f"{self.loop_radius:.4g}: {ever}"
-        if self.largest_factor is not None:
-            share = self.largest_tolerance
-            percent = "" if share is None else f" ({100.0 * share:.3g} %)"
-            yield "largest tolerances", f"{self.largest_factor:.4g} times those stated{percent}"
-        yield "to blame", _top(self.blame)
-        yield "rows of the plant", _top(self.rows)
-        for name, gain in self.vertex_gains.items():
-            yield f"worst gain, {name}", f"{gain:.4g} at a vertex, from the disturbances"
-
-    def _where(self) -> str:
-        if not self.breaking:
-            return ""
-        return " at " + ", ".join(f"{name} = {value:.6g}" for name, value in self.breaking.items())
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return everything as plain data."""
-        return {
-            "box": self.box.as_dict(), "assumes_exact_model": self.assumes_exact_model, "regular": self.regular,
-            "breaking": dict(self.breaking), "loop_radius": self.loop_radius, "largest_factor": self.largest_factor,
-            "largest_tolerance": self.largest_tolerance, "blame": dict(self.blame), "rows": dict(self.rows),
-            "error_per_unit": {name: dict(row) for name, row in self.error_per_unit.items()},
-            "vertex_gains": dict(self.vertex_gains), "stable": self.stable, "boxes": self.boxes, "reason": self.reason,
-            "sharing": list(self.sharing), "untouched": [[value.real, value.imag] for value in self.untouched],
-        }  # fmt: skip
-
-    def __str__(self) -> str:
-        return "\n".join(f"{label}: {text}" for label, text in self.facts())
-
-    def _repr_html_(self) -> str:
-        from html import escape
-
-        rows = "".join(f"<tr><th>{escape(a)}</th><td>{escape(b)}</td></tr>" for a, b in self.facts())
-        return f"<table>{rows}</table>"
-
-
-def _top(shares: Mapping[str, float], most: int = 4) -> str:
-    found = sorted(shares.items(), key=lambda item: -item[1])[:most]
-    return ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in found if share > 5e-3) or "nothing"
-
-
-def with_tolerances(
-    design: ObserverDesign, constants: Any, sample_time: float | None = None
-) -> tuple[ObserverDesign, DescriptorSystem]:
+def with_tolerances(design: ObserverDesign, constants: Any) -> tuple[ObserverDesign, DescriptorSystem]:
     """Return a linear design and its plant with the tolerances that are asked for."""
     require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
     plant, _ = design.linear
-    del sample_time
     if constants is None:
         return design, plant
     if isinstance(constants, DescriptorSystem):
@@ -202,7 +66,7 @@ def _of_plant(design: ObserverDesign, given: DescriptorSystem) -> tuple[Observer
     plant, _ = design.linear
     same = all(
         getattr(plant, name).shape == getattr(given, name).shape
-        and np.allclose(getattr(plant, name), getattr(given, name), rtol=1e-9, atol=1e-12)
+        and np.allclose(getattr(plant, name), getattr(given, name), rtol=SAME_ENTRY, atol=SAME_ZERO)
         for name in ("E", "A", "B", "C", "D", "Bd", "Dd", "Bf", "Df")
     )
     own, other = plant.uncertainty, given.uncertainty
@@ -281,6 +145,7 @@ def robustness(
             tracking = tracking_of(design, affine)
             responses = responses_of(structure_of(design, affine, tracking))
             radius = loop_radius(responses)
+            reason = _no_bound(responses)
             told("largest tolerances")
             factor = largest_factor(
                 lambda t: structure_of(design, affine_plant(plant, uncertain.box.scaled(t)), tracking), radius
@@ -290,12 +155,13 @@ def robustness(
             rows = _named(plant.state_names, blamed_rows(responses, tracking.T, parts))
             errors = _error_per_unit(design, responses, affine)
             told("gains at the vertices")
-            gains = _vertex_gains(design, plant, affine, tracking)
+            gains = vertex_gains(design, plant, affine, tracking)
         except PreconditionError as error:
             reason = str(error)
     return Robustness(
         uncertain.box, False, regular.verdict, breaking, radius, factor, shares, rows, errors, gains, stable.verdict,
         stable.boxes, reason, tuple(name for name, found in told_from_faults(plant).items() if found.shares), untouched,
+        uncertain.not_covered,
     )  # fmt: skip
 
 
@@ -312,7 +178,19 @@ def structure_of(
             condition="discrete time",
         )  # fmt: skip
     sizes = np.zeros(plant.nd) if bounds is None else bounds
-    return error_structure(observer, affine, tracking, sizes, noise_bound, faults=faults, states=states)
+    return error_structure(
+        observer, affine, tracking, sizes, noise_bound, faults=faults, states=states,
+        varying=affine.box.variation == "varying",
+    )  # fmt: skip
+
+
+def _no_bound(responses: Responses) -> str:
+    """Return why no bound holds at a sample, or nothing where one does."""
+    try:
+        same_sample_inverse(responses)
+    except PreconditionError as error:
+        return str(error)
+    return ""
 
 
 def _named(names: tuple[str, ...], shares: FloatArray) -> dict[str, float]:
@@ -322,8 +200,7 @@ def _named(names: tuple[str, ...], shares: FloatArray) -> dict[str, float]:
 def _values(box: ConstantsBox, found: BoxVerdict) -> dict[str, float]:
     if found.at is None or found.verdict != "refuted":
         return {}
-    values = box.values(found.at)
-    return {name: values[name] for name in box.names}
+    return values_at(box, found.at)
 
 
 def _stability(plant: DescriptorSystem, affine: AffinePlant) -> tuple[BoxVerdict, tuple[complex, ...]]:
@@ -344,6 +221,8 @@ def _stability(plant: DescriptorSystem, affine: AffinePlant) -> tuple[BoxVerdict
     lasting = tuple(complex(value) for value in values[outside])
     # Stable modes that no constant touches are stable everywhere.
     rest = [i for i in range(len(whole.center)) if i not in apart]
+    if not rest:
+        return BoxVerdict("proved", 0), lasting
     back = 2.0 * np.eye(len(basis)) - basis
 
     def exactly(q: FloatArray) -> FloatArray:
@@ -376,68 +255,4 @@ def _error_per_unit(design: ObserverDesign, responses: Responses, affine: Affine
     rest = np.hstack([structure.state.radius @ np.abs(back), structure.inputs.radius])
     total += responses.absolute_gain(structure.Co, rest[inner]) + rest[outputs]
     names = (*plant.state_names, *plant.input_names)
-    labels = (*(f"fhat[{name}]" for name in observer.fault_names), *(f"r[{name}]" for name in observer.residual_names))
-    return {label: _named(names, row) for label, row in zip(labels, total, strict=True)}
-
-
-def _vertex_gains(
-    design: ObserverDesign, plant: DescriptorSystem, affine: AffinePlant, tracking: Tracking
-) -> dict[str, float]:
-    """Return the largest peak (l1) gain from disturbances at the vertices; some drawn where there are too many."""
-    observer, uncertain = design.linear[1], plant.uncertainty
-    labels = (*(f"fhat[{name}]" for name in observer.fault_names), *(f"r[{name}]" for name in observer.residual_names))
-    if uncertain is None or not plant.nd or not labels:
-        return {}
-    count = len(uncertain.box.names)
-    corners = np.array(list(itertools.product((-1.0, 1.0), repeat=count))) if 2**count <= MOST_VERTICES else (
-        np.random.default_rng(0).choice([-1.0, 1.0], (MOST_VERTICES, count))
-    )  # fmt: skip
-    followed, basis = tracking.T, affine.coordinates
-    nominal = eliminate_algebraic_states(plant)
-    if plant.nx != nominal.plant.nx:
-        followed, basis = followed @ plant.E @ nominal.recovery.from_state, np.eye(nominal.plant.nx)
-    worst = np.zeros(len(labels))
-    for corner in corners:
-        at = plant_at(plant, uncertain.box.values(corner))
-        worst = np.maximum(worst, _peak_gain(observer, at, followed, basis))
-    return _named(labels, worst)
-
-
-def _peak_gain(
-    observer: LinearObserver, plant: DescriptorSystem, followed: FloatArray, basis: FloatArray
-) -> FloatArray:
-    """Return the peak gain of plant and error in series, infinite where the series is unstable.
-
-    Directions of the state that reach neither error nor outputs are left out, whether or not they are stable.
-    """
-    shown = slice(observer.fault_rows.start, len(observer.Cz))
-    try:
-        smooth = eliminate_algebraic_states(plant).plant
-    except ObsynthError:
-        return np.full(len(observer.Cz) - observer.fault_rows.start, np.inf)
-    back = 2.0 * np.eye(len(basis)) - basis
-    into = observer.Az @ followed + observer.By @ smooth.C - followed @ smooth.A
-    through = observer.Cz[shown] @ followed + observer.Dy[shown] @ smooth.C
-    seen = np.vstack([back @ smooth.A, into, through])
-    terms = np.concatenate([
-        np.abs(back @ smooth.A).sum(axis=1),
-        (np.abs(observer.Az @ followed) + np.abs(observer.By) @ np.abs(smooth.C)).sum(axis=1),
-        (np.abs(observer.Cz[shown]) @ np.abs(followed) + np.abs(observer.Dy[shown]) @ np.abs(smooth.C)).sum(axis=1),
-    ])  # fmt: skip
-    apart = untouched_states(seen @ basis, terms)
-    kept = [i for i in range(smooth.nx) if i not in apart]
-    nx, nz = len(kept), observer.order
-    a = np.block([[(back @ smooth.A @ basis)[np.ix_(kept, kept)], np.zeros((nx, nz))],
-                  [(into @ basis)[:, kept], observer.Az]])  # fmt: skip
-    b = np.vstack([(back @ smooth.Bd)[kept], observer.By @ smooth.Dd - followed @ smooth.Bd])
-    c = np.hstack([(through @ basis)[:, kept], observer.Cz[shown]])
-    total = np.abs(observer.Dy[shown] @ smooth.Dd).sum(axis=1)
-    if np.max(np.abs(np.linalg.eigvals(a)), initial=0.0) >= 1.0:
-        return np.full(len(c), np.inf)
-    column, size = b, float(np.abs(b).max(initial=0.0))
-    for _ in range(MOST_GAIN_SAMPLES):
-        total = total + np.abs(c @ column).sum(axis=1)
-        column = a @ column
-        if np.abs(column).max(initial=0.0) <= _GAIN_LEFT * size:
-            break
-    return np.asarray(total)
+    return {label: _named(names, row) for label, row in zip(labels_of(observer), total, strict=True)}

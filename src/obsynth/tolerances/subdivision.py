@@ -14,6 +14,7 @@ import numpy as np
 
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
+from obsynth.plants.constants import ConstantsBox
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.uncertainty import Uncertainty, matrices_of
 from obsynth.proofs.affine import AffineMatrix, affine_block, affine_inverse
@@ -30,6 +31,10 @@ Build: TypeAlias = Callable[[FloatArray, FloatArray], AffineMatrix]
 BISECTIONS = 50
 #: With more constants than this, not all vertices are looked at first.
 MOST_VERTEX_CONSTANTS = 10
+
+
+#: A value below this share of the largest of its range is zero but for rounding.
+ROUNDED_ZERO = 1e-12
 
 
 #: Norms computed in double precision are multiplied by this before they are compared.
@@ -89,6 +94,13 @@ def _built(build: Build, lower: FloatArray, upper: FloatArray) -> AffineMatrix |
         return build(lower, upper)
     except PreconditionError:
         return None
+
+
+def values_at(box: ConstantsBox, q: FloatArray) -> dict[str, float]:
+    """Return the values of the uncertain constants at a point, without the rounding of zero."""
+    values = box.values(q)
+    sizes = {item.name: max(abs(item.low), abs(item.high)) for item in box.uncertain}
+    return {name: 0.0 if abs(values[name]) < ROUNDED_ZERO * size else values[name] for name, size in sizes.items()}
 
 
 def proved_regular(build: Build, count: int, exact_at: Callable[[FloatArray], FloatArray]) -> BoxVerdict:

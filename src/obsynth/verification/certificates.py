@@ -35,7 +35,7 @@ from obsynth.proofs.balls import Enclosed, block
 from obsynth.proofs.contraction import prove_contraction
 from obsynth.proofs.definiteness import DefinitenessProof, prove_positive_definite, unproved
 from obsynth.proofs.extended_balls import enclosed_eigenvalues
-from obsynth.results.report import Check, CheckKind
+from obsynth.results.checks import Check, CheckKind
 from obsynth.verification.error_system import LaggedPlant
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from obsynth.analysis.transformations import StateRecovery
 from obsynth.numerics.arguments import is_number
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.results.report import Check, information, upper_bound_check
+from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.verification.identities import EQUALITY_TOLERANCE
 
 if TYPE_CHECKING:

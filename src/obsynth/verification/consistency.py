@@ -13,10 +13,11 @@ from typing import NamedTuple
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.ranks import KNOWN_SHARE
 from obsynth.observers.recursive.gain_schedule import GainStep, gain_steps
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.recursive.step_model import EarlyConstraintSteps, StepMatrices
-from obsynth.results.report import Check, upper_bound_check
+from obsynth.results.checks import Check, upper_bound_check
 
 #: Trials and steps: a wrong variance of 10 % is 20 standard deviations away.
 TRIALS = 400
@@ -24,9 +25,6 @@ STEPS = 60
 SEED = 20130703
 #: Bands are this many standard deviations of the statistic wide: a sound design fails one time in two million.
 BAND = 5.0
-#: Deviations below this share of the terms they are computed from are zero: rounding is seven orders smaller, so that
-#: what is kept has seven digits.
-KNOWN_SHARE = 1e-9
 
 _SOURCE = "recomputed, Monte Carlo with a fixed seed"
 
@@ -68,9 +66,9 @@ def consistency(stated: RecursiveObserver, shipped: RecursiveObserver, steps: in
         yield _band("NIS", "squared whitened innovations per degree of freedom are one", squares)
         products = np.concatenate([found.ravel() for found in pairs])
         if products.size:
-            yield upper_bound_check(
-                "whiteness", "innovations of successive samples are uncorrelated", abs(float(products.mean())),
-                BAND / np.sqrt(products.size), source=_SOURCE, detail=f"{products.size} products",
+            yield _estimated(
+                "whiteness", "mean product of innovations of successive samples: they are uncorrelated",
+                float(products.mean()), 0.0, BAND / float(np.sqrt(products.size)), f"{products.size} products",
             )  # fmt: skip
 
 
@@ -142,7 +140,7 @@ def _error_rows(scores: dict[int, Scores]) -> Iterator[Check]:
         if found.normalised.size
     ]
     if rows:
-        yield max(rows, key=lambda row: row.value / row.bound)
+        yield min(rows, key=lambda row: row.margin / (row.bound - 1.0) * np.sign(row.bound - 1.0))
     exact = [float(np.max(np.abs(found.known))) for found in scores.values() if found.known.size]
     if exact:
         yield upper_bound_check(
@@ -153,8 +151,16 @@ def _error_rows(scores: dict[int, Scores]) -> Iterator[Check]:
 
 def _band(name: str, claim: str, squares: FloatArray, where: str = "") -> Check:
     """Return the row that the mean of squares of independent standard normal numbers is one."""
-    gap = abs(float(squares.mean()) - 1.0)
-    bound = BAND * float(np.sqrt(2.0 / squares.size))
-    return upper_bound_check(
-        name, claim, gap, bound, source=_SOURCE, detail=f"mean {squares.mean():.4f} of {squares.size}{where}"
-    )
+    width = BAND * float(np.sqrt(2.0 / squares.size))
+    return _estimated(name, claim, float(squares.mean()), 1.0, width, f"mean of {squares.size}{where}")
+
+
+def _estimated(name: str, claim: str, mean: float, expected: float, width: float, detail: str) -> Check:
+    """Return the row that a mean is within so much of what is expected."""
+    low, high = expected - width, expected + width
+    return Check(
+        name, claim, mean, high if mean >= expected else low, width - abs(mean - expected),
+        bool(low <= mean <= high), _SOURCE, "computed",
+        f"{detail}; chance alone keeps it within {low:.4g} to {high:.4g}, but one time in two million", "estimated",
+        (low, high),
+    )  # fmt: skip

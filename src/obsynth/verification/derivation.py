@@ -15,8 +15,8 @@ from obsynth.proofs.balls import Ball
 from obsynth.proofs.contraction import column_norms, prove_contraction
 from obsynth.proofs.exponentials import energy
 from obsynth.proofs.peak_sums import gathered, interval_pieces, peak_sums
+from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
-from obsynth.results.report import Check, information, upper_bound_check
 from obsynth.verification.remainder_channel import TrackedPlant
 
 #: Matrices found again may differ by this share of the largest entry of their row or column: another order of sums.
@@ -44,11 +44,14 @@ def derivation_rows(design: ObserverDesign, tracked: TrackedPlant) -> Iterator[C
         yield upper_bound_check("plant as written", "it can be eliminated and sampled again", 1.0, 0.0, source=_SOURCE,
                                 detail=str(error))  # fmt: skip
         return
-    yield upper_bound_check(
+    follows = upper_bound_check(
         "plant as written", "the plant of the design follows from it", _difference(found.plant, plant, _MATRICES),
         DERIVED_TOLERANCE, source=_SOURCE, kind="equality",
         detail=found.description or "nothing had to be done",
     )  # fmt: skip
+    yield follows
+    if not follows.passed:
+        return
     if design.recovery is not None and design.recovery.names == found.recovery.names:
         yield upper_bound_check(
             "recovery as written", "the states as written follow from those of the design as its recovery says",

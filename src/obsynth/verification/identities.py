@@ -14,7 +14,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.scaling import Scaling, balance_by_least_squares
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.results.report import Check, upper_bound_check
+from obsynth.results.checks import Check, upper_bound_check
 from obsynth.verification.error_system import LaggedPlant
 
 #: Equalities may miss by this much, relative to the terms they are made of.

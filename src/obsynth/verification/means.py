@@ -9,8 +9,8 @@ import numpy as np
 
 from obsynth.numerics.spectra import certain_noise_covariance
 from obsynth.observers.linear.averaging import unaveraged
+from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import Certificate, ObserverDesign
-from obsynth.results.report import Check, information, upper_bound_check
 
 
 def before_the_mean(design: ObserverDesign) -> tuple[ObserverDesign, tuple[Check, ...]]:

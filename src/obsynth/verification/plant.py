@@ -8,10 +8,12 @@ from obsynth.analysis.conditions import Condition
 from obsynth.analysis.zeros import are_outside
 from obsynth.numerics.pencils import FiniteZeros, PencilStructure, pencil_structure
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.results.report import Check, information
+from obsynth.results.checks import Check, information
 
 #: Imaginary parts below this are not shown.
 SHOWN_AS_REAL = 1e-12
+#: Eigenvalues that are listed; the others are counted.
+MOST_SHOWN = 6
 
 
 def plant_information(plant: DescriptorSystem, structure: PencilStructure | None = None) -> Iterator[Check]:
@@ -52,10 +54,12 @@ def plant_information(plant: DescriptorSystem, structure: PencilStructure | None
     )
 
 
-def _eigenvalue_text(values: Iterable[complex], most: int = 6) -> str:
+def _eigenvalue_text(values: Iterable[complex]) -> str:
     listed = sorted((complex(value) for value in values), key=abs, reverse=True)
-    shown = [f"{v.real:.4g}" if abs(v.imag) < SHOWN_AS_REAL else f"{v.real:.4g}{v.imag:+.4g}j" for v in listed[:most]]
-    return ", ".join(shown) + (f", and {len(listed) - most} more" if len(listed) > most else "")
+    shown = [
+        f"{v.real:.4g}" if abs(v.imag) < SHOWN_AS_REAL else f"{v.real:.4g}{v.imag:+.4g}j" for v in listed[:MOST_SHOWN]
+    ]
+    return ", ".join(shown) + (f", and {len(listed) - MOST_SHOWN} more" if len(listed) > MOST_SHOWN else "")
 
 
 def condition_rows(conditions: Iterable[Condition]) -> Iterator[Check]:

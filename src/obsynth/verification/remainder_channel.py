@@ -85,8 +85,8 @@ class RemainderChannel:
         for k, direct in pairs:
             bound = contraction.gain(observer.Cz, k.midpoint, k.radius)
             # The rows that matter most get a tighter one.
-            bound[rows] = np.minimum(bound[rows], rounded_up(gains @ magnitude(k), 2 * observer.order + 4))
-            found.append(np.asarray(rounded_up(bound + magnitude(direct), 2)))
+            bound[rows] = np.minimum(bound[rows], rounded_up(gains @ k.magnitude, 2 * observer.order + 4))
+            found.append(np.asarray(rounded_up(bound + direct.magnitude, 2)))
         return tuple(found)
 
     def rounding(self, tracked: TrackedPlant, observer: LinearObserver) -> float:
@@ -105,11 +105,6 @@ class RemainderChannel:
         return max(float(np.max(k / np.where(row > 0.0, row, 1.0), initial=0.0)) for k, row in largest)
 
 
-def magnitude(ball: Ball) -> FloatArray:
-    """Return upper bounds on the absolute values of the entries of every member."""
-    return np.asarray(rounded_up(np.abs(ball.midpoint) + ball.radius, 2))
-
-
 def remainder_channel(tracked: TrackedPlant, observer: LinearObserver) -> RemainderChannel:
     """Return what the identities of a shipped observer miss on a plant, in outward rounding."""
     exact = Ball.exact
@@ -124,7 +119,7 @@ def remainder_channel(tracked: TrackedPlant, observer: LinearObserver) -> Remain
         t0 = exact(tracked.T0)
         j, el, v = j + t0 @ a, el + t0 @ b, v + t0 @ exact(bd)
         # What T0 E leaves is driven by the next state, which keeps the bounds of x, or by its rate, which has none.
-        left = magnitude(t0 @ e)
+        left = (t0 @ e).magnitude
         if left.any():
             j = Ball(j.midpoint, j.radius + (left if observer.dt > 0.0 else np.where(left > 0.0, np.inf, 0.0)))
     return RemainderChannel(az @ te + by @ c - t @ a, bu + by @ d - t @ b, j, el, by @ exact(dd) - t @ exact(bd), v)

@@ -18,8 +18,8 @@ from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.spectra import boundary_points
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
-from obsynth.results.report import Check, information, upper_bound_check
 from obsynth.verification.remainder_channel import (
     RemainderChannel,
     TrackedPlant,

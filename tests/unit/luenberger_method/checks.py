@@ -4,15 +4,18 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from obsynth.results.checks import Check, upper_bound_check
 from obsynth.results.design import ObserverDesign
-from obsynth.results.report import Check, upper_bound_check
 
 
 def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check]:
     plant, observer = design.linear
-    gap = observer.Az + observer.By @ plant.C - plant.A
+    A = np.linalg.solve(plant.E, plant.A)
+    # Entry by entry against the terms of the sum, so that units do not matter.
+    terms = np.abs(observer.Az) + np.abs(observer.By) @ np.abs(plant.C) + np.abs(A)
+    gap = np.abs(observer.Az + observer.By @ plant.C - A) / np.where(terms > 0.0, terms, 1.0)
     yield upper_bound_check(
-        "error dynamics", "Az + By C = A", float(np.abs(gap).max()), 1e-12, source="Luenberger", kind="equality"
+        "error dynamics", "E (Az + By C) = A", float(gap.max()), 1e-12, source="Luenberger", kind="equality"
     )
     radius = float(np.abs(np.linalg.eigvals(observer.Az)).max())
     claimed = float(design.certificate.claims["radius"])

@@ -1,4 +1,4 @@
-"""Conditions and synthesis: with C = I the gain A - pole I leaves the error nothing but the pole."""
+"""Conditions and synthesis: where the sensors tell every state, a gain leaves the error nothing but the pole."""
 
 from collections.abc import Callable
 from typing import Any
@@ -9,6 +9,7 @@ from luenberger_method.options import LuenbergerOptions
 from obsynth.analysis.conditions import Condition, require_all
 from obsynth.methods.designing import design
 from obsynth.methods.method_spec import Synthesis
+from obsynth.numerics.ranks import decide_rank
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import Certificate, ObserverDesign
@@ -19,11 +20,14 @@ def luenberger_observer(plant: DescriptorSystem, *, name: str = "design", **opti
 
 
 def conditions(plant: DescriptorSystem) -> tuple[Condition, ...]:
-    discrete = plant.dt > 0.0 and np.array_equal(plant.E, np.eye(plant.nx))
-    seen = np.array_equal(plant.C, np.eye(plant.nx))
+    states, sensors = decide_rank(plant.E), decide_rank(plant.C, expected=plant.nx)
+    discrete = plant.dt > 0.0 and states.full
+    square = sensors.full and plant.ny == plant.nx
     return (
-        Condition("discrete time", "dt > 0 and E = I", discrete, plant.dt, 0.0, "Luenberger", "another plant."),
-        Condition("states measured", "C = I", seen, float(seen), 1.0, "Luenberger", "measure every state."),
+        Condition("discrete time", "dt > 0 and rank E = nx", discrete, plant.dt, 0.0, "Luenberger", "another plant."),
+        Condition(
+            "states measured", "C invertible", square, sensors.rank, plant.nx, "Luenberger", "measure every state."
+        ),
     )
 
 
@@ -31,9 +35,10 @@ def synthesise(plant: DescriptorSystem, asked: LuenbergerOptions, *, progress: C
     require_all(conditions(plant))
     progress("choosing the gain")
     nx = plant.nx
-    gain = plant.A - asked.pole * np.eye(nx)
+    A, B = (np.linalg.solve(plant.E, matrix) for matrix in (plant.A, plant.B))
+    gain = np.linalg.solve(plant.C.T, (A - asked.pole * np.eye(nx)).T).T
     observer = LinearObserver(
-        Az=plant.A - gain, Bu=plant.B - gain @ plant.D, By=gain, Cz=np.eye(nx), Du=np.zeros((nx, plant.nu)),
+        Az=asked.pole * np.eye(nx), Bu=B - gain @ plant.D, By=gain, Cz=np.eye(nx), Du=np.zeros((nx, plant.nu)),
         Dy=np.zeros((nx, nx)), dt=plant.dt, input_names=plant.input_names, output_names=plant.output_names,
         state_names=plant.state_names, fault_names=(), residual_names=(), state_delays=(0,) * nx, fault_delays=(),
     )  # fmt: skip

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from obsynth.analysis.diagnosis.decoupled import DecoupledPlant, decoupled
-from obsynth.analysis.diagnosis.fault_columns import TRACE_TOLERANCE, FaultColumn
+from obsynth.analysis.diagnosis.fault_columns import FaultColumn
 from obsynth.numerics.arrays import ComplexArray
-from obsynth.numerics.ranks import CLEAR_GAP
+from obsynth.numerics.ranks import CLEAR_GAP, TRACE_TOLERANCE
 from obsynth.plants.descriptor import DescriptorSystem
 
 

@@ -16,6 +16,7 @@ from obsynth.analysis.transformations.recovery import Transformation, linear_pla
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.pencils import pencil_structure
+from obsynth.numerics.ranks import REST_TOLERANCE
 from obsynth.numerics.threads import on_one_thread_if_small
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.exosystems import Exosystem, exosystem
@@ -159,7 +160,11 @@ def _sentences(
             seen = (shown.visible and not shown.shows_at(rest)) or (shown.visible and free.visible)
             then = " Not estimable; seen only while it changes." if seen else ""
             texts.append(f"{name}: {motion} ({letter} = {_number(rest)}).{then}")
-    hiding = [zero for zero in free.blocking if abs(zero - rest) > 1e-6 and zero.imag >= 0.0] if free.visible else []
+    hiding = (
+        [zero for zero in free.blocking if abs(zero - rest) > REST_TOLERANCE and zero.imag >= 0.0]
+        if free.visible
+        else []
+    )
     for zero in hiding[:MOST_ZEROS]:
         motion = hidden_motion(plant, shown.number, complex(zero), free.removed)
         how = (

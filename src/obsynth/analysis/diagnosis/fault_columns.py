@@ -17,10 +17,8 @@ from obsynth.analysis.diagnosis.reduction import finite_values, left_part
 from obsynth.analysis.zeros import are_outside
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.pencils import FiniteZeros
-from obsynth.numerics.ranks import MARKOV_TOLERANCE, RANK_TOLERANCE, rank_from
+from obsynth.numerics.ranks import MARKOV_TOLERANCE, RANK_TOLERANCE, TRACE_TOLERANCE, rank_from
 
-#: Size of a fault's column in a decoupled plant, relative to before the reduction, below which it left no trace.
-TRACE_TOLERANCE = 1e-9
 #: Parity spaces of a higher order than this are not formed: their powers hold no digits.
 MOST_PARITY_ORDER = 24
 

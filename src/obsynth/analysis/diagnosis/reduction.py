@@ -14,6 +14,7 @@ import numpy as np
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.ranks import RankDecision, rank_from
 from obsynth.numerics.scaling import LogBalance
+from obsynth.numerics.staircase import full_svd, largest_singular_value
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,18 +64,18 @@ class LeftPart:
 def left_part(E: FloatArray, A: FloatArray) -> LeftPart:
     """Return the left singular part of a balanced pencil ``(m, n)``."""
     decisions: list[RankDecision] = []
-    size_e, size_a = _norm(E), _norm(A)
+    size_e, size_a = largest_singular_value(E), largest_singular_value(A)
     left = np.eye(E.shape[0])
     right = np.eye(E.shape[1])
     while E.shape[1]:
-        _, values, basis = _svd(E)
+        _, values, basis = full_svd(E)
         decision = rank_from(values, expected=E.shape[1], scale=size_e)
         decisions.append(decision)
         if decision.rank == E.shape[1]:
             break
         # The columns that E does not see go, with the rows that A reaches from them.
         kernel, complement = basis[decision.rank :].T, basis[: decision.rank].T
-        reached, values, _ = _svd(A @ kernel)
+        reached, values, _ = full_svd(A @ kernel)
         decision = rank_from(values, expected=kernel.shape[1], scale=size_a)
         decisions.append(decision)
         rest = reached[:, decision.rank :].T
@@ -96,7 +97,7 @@ def _without_zeros(
     k, p = e.shape[0], c.shape[0]
     hidden = np.eye(k)
     if c.size:
-        _, values, basis = _svd(c)
+        _, values, basis = full_svd(c)
         decision = rank_from(values, expected=min(c.shape), scale=size)
         decisions.append(decision)
         hidden = basis[decision.rank :].T
@@ -104,7 +105,7 @@ def _without_zeros(
         span = np.linalg.qr(e @ hidden)[0]
         leaving = a @ hidden
         leaving = leaving - span @ (span.T @ leaving)
-        _, values, basis = _svd(leaving)
+        _, values, basis = full_svd(leaving)
         decision = rank_from(values, expected=hidden.shape[1], scale=size)
         decisions.append(decision)
         if decision.rank == 0:
@@ -132,14 +133,3 @@ def finite_values(left: LeftPart) -> ComplexArray:
         return np.zeros(0, dtype=np.complex128)
     alpha, beta = sl.eigvals(left.Az, left.Ez, homogeneous_eigvals=True)
     return np.asarray(alpha / beta, dtype=np.complex128)
-
-
-def _svd(matrix: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    if matrix.size == 0:
-        return np.eye(matrix.shape[0]), np.zeros(0), np.eye(matrix.shape[1])
-    left, values, right = np.linalg.svd(matrix)
-    return left, values, right
-
-
-def _norm(matrix: FloatArray) -> float:
-    return float(np.linalg.norm(matrix, 2)) if matrix.size else 0.0

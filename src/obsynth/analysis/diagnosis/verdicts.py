@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.analysis.diagnosis.banks import StructuredResidual
+from obsynth.files.tables import html_table
 from obsynth.numerics.arrays import ComplexArray
 
 
@@ -185,9 +186,9 @@ class Diagnosis:
         return "\n".join([*lines, *self.sentences, *(f"Warning: {text}" for text in self.warnings)])
 
     def _repr_html_(self) -> str:
-        parts = [f"<p><b>{escape(self.heading)}</b></p>", _html_table(self.verdict_rows())]
+        parts = [f"<p><b>{escape(self.heading)}</b></p>", html_table(self.verdict_rows())]
         if len(self.faults) > 1:
-            parts += [_html_table(self.isolability_rows()), _html_table(self.bank_rows())]
+            parts += [html_table(self.isolability_rows()), html_table(self.bank_rows())]
         texts = [*self.sentences, *(f"Warning: {text}" for text in self.warnings)]
         return "".join([*parts, *(f"<p>{escape(text)}</p>" for text in texts)])
 
@@ -211,9 +212,3 @@ def _isolability(weak: bool, strong: bool) -> str:
 def _aligned(rows: Sequence[Sequence[str]]) -> list[str]:
     widths = [max(len(row[j]) for row in rows) for j in range(len(rows[0]))]
     return ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]
-
-
-def _html_table(rows: Sequence[Sequence[str]]) -> str:
-    head = "".join(f"<th>{escape(text)}</th>" for text in rows[0])
-    body = "".join("<tr>" + "".join(f"<td>{escape(text)}</td>" for text in row) + "</tr>" for row in rows[1:])
-    return f"<table><tr>{head}</tr>{body}</table>"

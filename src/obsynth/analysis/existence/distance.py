@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from obsynth.analysis.far_zeros import equilibrated_at
 from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.numerics.scaling import equilibrate_pencil
 
 #: Below this distance, relative to the data, rounding of the data is as large as what a unit fault moves: gains of its
 #: inverse would be needed, which double precision drowns.
@@ -39,15 +40,21 @@ class Distance:
 
 
 def distance_to_loss(
-    E: FloatArray, A: FloatArray, *, nx: int, discrete: bool, zeros: tuple[complex, ...] = ()
-) -> Distance:
-    """Return how far ``A - s E (m, n)``, nx states, is from losing column rank on or outside the stability boundary."""
+    E: FloatArray, A: FloatArray, *, nx: int, discrete: bool, zeros: tuple[complex, ...] = (),
+    sizes: FloatArray | None = None,
+) -> Distance:  # fmt: skip
+    """Return how far ``A - s E (m, n)``, nx states, is from losing column rank on or outside the stability boundary.
+
+    ``sizes (m, n)`` of the terms of A: what rounding of the data behind it may change is relative to those.
+    """
     candidates = [*_boundary(E, A, discrete), *(_to_boundary(zero, discrete) for zero in zeros)]
     if A.shape[0] > A.shape[1]:
         candidates += _compressed_points(E, A, discrete)
     best = Distance(np.inf, 0j)
     for point in candidates:
         value = relative_singular_value(E, A, point, nx=nx)
+        if sizes is not None:
+            value = min(value, relative_singular_value(E, A, point, nx=nx, sizes=sizes))
         if value < best.value:
             best = Distance(value, point)
     return best
@@ -65,14 +72,31 @@ def drowned_zeros(
     ]
 
 
-def relative_singular_value(E: FloatArray, A: FloatArray, point: complex, *, nx: int) -> float:
-    """Return the least singular value of the pencil at a point relative to the largest, in units that suit it."""
-    pencil = equilibrated_at(E, A, point, nx=nx)
-    matrix: NDArray[Any] = pencil.A - (point if point.imag else point.real) * pencil.E
+def relative_singular_value(
+    E: FloatArray, A: FloatArray, point: complex, *, nx: int, sizes: FloatArray | None = None
+) -> float:
+    """Return the least singular value of the pencil at a point relative to the largest, in units that suit it.
+
+    With ``sizes`` in units that suit the terms which the entries of A are sums of.
+    """
+    pencil = equilibrated_at(E, A if sizes is None else sizes, point, nx=nx)
+    scaled = pencil.A if sizes is None else pencil.rows[:, None] * A * pencil.columns
+    matrix: NDArray[Any] = scaled - (point if point.imag else point.real) * pencil.E
     values = np.linalg.svd(matrix, compute_uv=False)
     if matrix.shape[0] < matrix.shape[1] or not values.size or values[0] == 0.0:
         return 0.0 if matrix.shape[1] else np.inf
-    return float(values[-1] / values[0])
+    largest = values[0] if sizes is None else np.linalg.norm(pencil.A + abs(point) * np.abs(pencil.E), 2)
+    return float(values[-1] / largest)
+
+
+def least_share(matrix: NDArray[Any], sizes: FloatArray, *, rank: int | None = None) -> float:
+    """Return the last singular value of a matrix ``(m, n)`` of a rank (full) relative to the terms of its entries."""
+    pencil = equilibrate_pencil(np.zeros_like(sizes), sizes)
+    values = np.linalg.svd(pencil.rows[:, None] * matrix * pencil.columns, compute_uv=False)
+    rank = matrix.shape[1] if rank is None else rank
+    if not 0 < rank <= len(values):
+        return 0.0 if rank else np.inf
+    return float(values[rank - 1] / (np.linalg.norm(pencil.A, 2) or 1.0))
 
 
 def _boundary(E: FloatArray, A: FloatArray, discrete: bool) -> list[complex]:

@@ -8,6 +8,7 @@ Modes that no output shows: those of the numbers as written, and those that only
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,31 +20,41 @@ from obsynth.analysis.existence.distance import (
     drowned_zeros,
     relative_singular_value,
 )
+from obsynth.analysis.existence.named_pencils import named_pencil, unclear
 from obsynth.analysis.existence.numbers import numbers_of
 from obsynth.analysis.existence.rational import SystemFacts
+from obsynth.analysis.existence.witnesses import Unclear
 from obsynth.analysis.far_zeros import system_zeros
 from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.zeros import are_outside, is_outside
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.pencils import finite_zeros
-from obsynth.numerics.ranks import RankDecision
+from obsynth.numerics.ranks import NAMED_SHARE, RankDecision
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.proofs.balls import UNIT_ROUNDOFF
 
 
-def settled_rank(decision: RankDecision, exact_rank: int | None) -> RankDecision:
-    """Return a rank decision with the exact rank in place of that by a tolerance, or unclear."""
+def settled_rank(decision: RankDecision, exact_rank: int | None, share: float = np.inf) -> RankDecision:
+    """Return a rank decision with the exact rank in place of that by a tolerance, or unclear.
+
+    ``share``: the least singular value beside the terms that the entries are sums of, where those are known.
+    """
     if exact_rank is None:
         return decision
     if exact_rank < decision.expected:
         return replace(decision, rank=exact_rank, means="exact")
     values = decision.singular_values
     needed = decision.expected - 1
-    enough = decision.expected == 0 or (len(values) > needed and values[needed] > DROWNED * values[0])
+    enough = decision.expected == 0 or (
+        len(values) > needed and values[needed] > DROWNED * values[0] and share > DROWNED
+    )
     if enough:
-        return replace(decision, rank=decision.expected, means="exact")
-    return replace(decision, rank=min(decision.rank, decision.expected - 1), means="unclear")
+        return replace(decision, rank=decision.expected, means="exact", share=share)
+    return replace(decision, rank=min(decision.rank, decision.expected - 1), means="unclear", share=share)
 
 
+#: What decides what rounding of the data leaves open.
+DECIDER = "Data with more digits, or an output in which this shows more, would decide it."
 #: Computed data hold more than one rounding: below this distance a zero of theirs is one.
 COMPUTED = 1e-12
 
@@ -71,12 +82,14 @@ class ZeroVerdict:
         )
 
 
-def zero_verdict(facts: SystemFacts, E: FloatArray, A: FloatArray, *, nx: int, discrete: bool) -> ZeroVerdict:
-    """Return the answer for the pencil ``A - s E (m, n)`` of which the facts are known."""
+def zero_verdict(
+    facts: SystemFacts, E: FloatArray, A: FloatArray, *, nx: int, discrete: bool, sizes: FloatArray | None = None
+) -> ZeroVerdict:
+    """Return the answer for the pencil ``A - s E (m, n)`` of which the facts are known; ``sizes`` of the terms of A."""
     facts = believed(facts, E, A, nx=nx)
     if not facts.full or facts.outside:
         return ZeroVerdict("no", facts)
-    distance = distance_to_loss(E, A, nx=nx, discrete=discrete, zeros=facts.zeros)
+    distance = distance_to_loss(E, A, nx=nx, discrete=discrete, zeros=facts.zeros, sizes=sizes)
     lost = _lost_in_computing(facts, E, A, nx=nx, discrete=discrete)
     distance = min(distance, lost or distance, key=lambda found: found.value)
     return ZeroVerdict("unclear" if distance.value <= DROWNED or lost else "yes", facts, distance)
@@ -122,16 +135,68 @@ def described_distance(verdict: ZeroVerdict) -> str:
 
 
 def unclear_detail(verdict: ZeroVerdict, what: str) -> str:
-    """Return what cannot be told apart, the tolerance, the witness, and what would decide it."""
-    found = verdict.distance
-    size = 0.0 if found is None else found.value
-    where = "" if found is None else f" near {found.point:.6g}"
+    """Return what cannot be told apart."""
+    size = 0.0 if verdict.distance is None else verdict.distance.value
     return (
-        f"{what} exists for the numbers as written ({verdict.means}), but a plant whose scaled entries differ by "
-        f"{size:.1g} of the largest has a zero{where} and none: rounding of the data or of any gains is about "
-        f"{DROWNED:.0e}. Data with more digits in other states or units, or an output in which this shows more, would "
-        "decide it."
+        f"{what} exists for the numbers as written ({verdict.means}), but the least singular value of the scaled "
+        f"pencil outside is {size:.1g}: rounding of the data, or of any gains, is as large."
     )
+
+
+def zero_doubt(
+    plant: DescriptorSystem, units: PlantUnits, verdict: ZeroVerdict, layout: Sequence[Sequence[str | None]],
+    *, kept: Mapping[str, Sequence[int]] | None = None, what: str,
+) -> Unclear:  # fmt: skip
+    """Return why it is unclear whether a pencil has a zero outside, with the point in the time of the plant."""
+    found = verdict.distance
+    point = 0j if found is None else found.point
+    where = f"{point.real:.6g}" if point.imag == 0.0 else f"{point:.6g}"
+    tolerance = DROWNED if found is None else max(DROWNED, found.value)
+    return unclear(
+        plant, named_pencil(plant, units, layout, kept=kept), tolerance=tolerance, point=point, dt=plant.dt,
+        other=f"has a zero at {where}, and no {what}", decider=DECIDER,
+    )  # fmt: skip
+
+
+def needed_gain(plant: DescriptorSystem, units: PlantUnits, point: complex, *, inputs: str = "") -> str:
+    """Return which gain any observer would need, were the last digits of data off that hide something only exactly.
+
+    Empty where no digits would help: with as many inputs as outputs (``inputs``: Bf, Bd or none) a zero stays.
+    """
+    entering = getattr(plant, inputs) if inputs else np.zeros((plant.nx, 0))
+    direct = getattr(plant, f"D{inputs[1:]}") if inputs else np.zeros((plant.ny, 0))
+    if plant.ny <= entering.shape[1]:
+        return ""
+    columns = np.concatenate([units.states, getattr(units, {"Bf": "faults", "Bd": "disturbances"}.get(inputs, ""), [])])
+    rows = np.concatenate([units.equations, units.outputs])[:, None]
+    pencil = np.block([[plant.A - point * plant.E, entering], [plant.C, direct]])
+    scaled = np.linalg.svd(rows * pencil * columns)[2][-1].conj()
+    signals = np.abs(columns * scaled)
+    terms = np.max(np.abs(np.hstack([plant.C, direct])) * signals, axis=1, initial=0.0)
+    names = (*plant.state_names, *({"Bf": plant.fault_names, "Bd": plant.disturbance_names}.get(inputs, ())))
+    # What a fault moves is asked for by the fault; a mode by the state that moves most.
+    faults = np.arange(len(signals)) >= plant.nx if inputs == "Bf" else np.zeros(len(signals), dtype=bool)
+    shares = np.abs(scaled) * (faults if np.any(np.abs(scaled[faults]) > NAMED_SHARE) else ~faults)
+    wanted, shown = int(np.argmax(shares)), int(np.argmax(terms))
+    if terms[shown] == 0.0:
+        return "No output holds anything of it: no digits of the data would show it."
+    gain = signals[wanted] / (UNIT_ROUNDOFF * terms[shown])
+    return (
+        "This holds exactly, on the numbers as written: were their last digits off, any observer would need a gain of "
+        f"about {gain:.0e} from {plant.output_names[shown]!r} to {names[wanted]!r}."
+    )
+
+
+def rank_doubt(
+    plant: DescriptorSystem, units: PlantUnits, decision: RankDecision, layout: Sequence[Sequence[str | None]],
+    *, rows: bool = False, kept: Mapping[str, Sequence[int]] | None = None,
+) -> Unclear:  # fmt: skip
+    """Return why it is unclear whether a block matrix has full column rank (row rank with ``rows``)."""
+    named = named_pencil(plant, units, layout, kept=kept)
+    return unclear(
+        plant, named.transposed if rows else named, tolerance=DROWNED,
+        other=f"has rank {decision.expected - 1}", decider=DECIDER,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)

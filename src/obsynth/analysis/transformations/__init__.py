@@ -9,9 +9,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from obsynth.analysis.transformations.augmentation import augment_faults
     from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
-    from obsynth.analysis.transformations.recovery import StateRecovery, Transformation
+    from obsynth.analysis.transformations.recovery import StateRecovery, Transformation, augment_faults
     from obsynth.analysis.transformations.sampling import discretise, sampling_zero_warnings
 
 __all__ = [
@@ -25,7 +24,7 @@ __all__ = [
 
 # Loaded when they are used: gain sets need the way back only.
 _HOMES = {
-    "StateRecovery": "recovery", "Transformation": "recovery", "augment_faults": "augmentation",
+    "StateRecovery": "recovery", "Transformation": "recovery", "augment_faults": "recovery",
     "discretise": "sampling", "eliminate_algebraic_states": "elimination", "sampling_zero_warnings": "sampling",
 }  # fmt: skip
 

@@ -149,13 +149,13 @@ def eliminated_exactly(plant: DescriptorSystem, basis: FloatArray | None = None)
     names = tuple(plant.state_names[i] for i in exact.pivots) if whole else tuple(f"xi {i + 1}" for i in range(count))
     if not whole and basis is None:
         basis = _coordinates(plant, count)[1]
-    matrices, states = rounded_once(exact, plant, None if whole else basis)
+    matrices, states, sizes = rounded_once(exact, plant, None if whole else basis)
     new = with_states(plant, names, E=None, **matrices)
     recovery = StateRecovery(
         plant.state_names, states["A"], states["B"], states["Bf"], states["Bd"], states["Bw"], np.eye(plant.nw),
         state_point(plant),
     )  # fmt: skip
-    return Transformation(plant, with_origin(new, exact.origin), _description(plant, count), recovery)
+    return Transformation(plant, with_origin(new, exact.origin(sizes)), _description(plant, count), recovery)
 
 
 def dynamic_coordinates(plant: DescriptorSystem) -> FloatArray | None:

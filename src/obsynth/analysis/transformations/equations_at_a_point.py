@@ -35,11 +35,16 @@ def local_equations(
     model: DAEModel, rates: FloatArray, x: FloatArray, u: FloatArray, theta: FloatArray
 ) -> LocalEquations:
     """Return the equations at derivatives ``(nx,)``, states ``(nx,)``, inputs ``(nu,)`` and parameters ``(nq,)``."""
-    if ("local",) not in model.graphs:
-        model.graphs[("local",)] = _function(model)
-    found = [np.array(part.full()) for part in model.graphs[("local",)](rates, x, u, theta)]
+    found = [np.array(part.full()) for part in symbolic_equations(model)(rates, x, u, theta)]
     value, E, by_state, by_input, by_parameter, y, C, outputs_by_parameter = found
     return LocalEquations(value[:, 0], E, by_state, by_input, by_parameter, y[:, 0], C, outputs_by_parameter)
+
+
+def symbolic_equations(model: DAEModel) -> Any:
+    """Return CasADi's function from derivatives, states, inputs and parameters to the fields of `LocalEquations`."""
+    if ("local",) not in model.graphs:
+        model.graphs[("local",)] = _function(model)
+    return model.graphs[("local",)]
 
 
 def _function(model: DAEModel) -> Any:

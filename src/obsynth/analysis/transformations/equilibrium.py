@@ -22,6 +22,10 @@ ROOT = 1e-9
 NAMED = 1e-6
 #: Newton steps after the least squares; they square the error, so that a few reach rounding.
 POLISH = 8
+#: Derivatives satisfy the equations where the weighted residual is below this.
+CONSISTENT = 1e-3 * ROOT
+#: Stands in a search for a residual that is not finite.
+HUGE = 1e10
 MOST_EVALUATIONS = 400
 
 
@@ -217,7 +221,7 @@ def consistent_point(model: DAEModel, point: Point, fixed: Collection[str] = ())
             break
         rates = rates - sizes * np.linalg.lstsq(E, weights * local.value, rcond=JACOBIAN_RANK_TOLERANCE)[0]
         local = local_equations(model, rates, x, point.u, point.theta)
-        if local.is_defined and np.abs(weights * local.value).max() < ROOT * 1e-3:
+        if local.is_defined and np.abs(weights * local.value).max() < CONSISTENT:
             return Point(x, point.u, point.theta, rates)
     raise PreconditionError(
         "No derivatives satisfy the equations at that point: the values that are given contradict the constraints, or "
@@ -239,7 +243,7 @@ def _algebraic_step(constraint: FloatArray, right: FloatArray, E: FloatArray, mo
 
 
 def _finite(values: FloatArray) -> FloatArray:
-    return np.asarray(np.nan_to_num(values, nan=1e10, posinf=1e10, neginf=-1e10), dtype=np.float64)
+    return np.asarray(np.nan_to_num(values, nan=HUGE, posinf=HUGE, neginf=-HUGE), dtype=np.float64)
 
 
 def _row_weights(matrix: FloatArray) -> FloatArray:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.holds import zero_order_hold
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.origin import DECISIVE, PlantOrigin, origin_of
@@ -37,22 +38,26 @@ class ExactElimination:
 
     Fields: matrices: ``A, B, Bf, Bd, Bw, C, D, Df, Dd, Dw`` of the reduced plant; recovery: ``x`` from the new states
     (``A``) and from the signals (``B, Bf, Bd, Bw``); pivots: States that stand for the dynamic ones; computed: Whether
-    some of the data were computed in floating point.
+    some of the data were computed in floating point; sizes: Of ``matrices``, the sums of the sizes of all terms.
     """
 
     matrices: Mapping[str, fmpq_mat]
     recovery: Mapping[str, fmpq_mat]
     pivots: tuple[int, ...]
     computed: bool
+    sizes: Mapping[str, FloatArray]
 
-    @property
-    def origin(self) -> PlantOrigin:
-        """What the reduced plant remembers of it."""
+    def origin(self, sizes: Mapping[str, FloatArray]) -> PlantOrigin:
+        """Return what the reduced plant remembers of it, with the sizes of the terms in its own coordinates."""
         from obsynth.proofs.exact_pencils import identity
         from obsynth.proofs.written_numbers import fractions_of
 
         found: dict[str, fmpq_mat] = {"E": identity(len(self.pivots)), **self.matrices}
-        return PlantOrigin({name: fractions_of(found[name]) for name in DECISIVE}, computed=self.computed)
+        kept = {name: sizes[name] for name in DECISIVE if name in sizes}
+        known = all(np.all(np.isfinite(part)) for part in kept.values())
+        exact = {name: fractions_of(found[name]) for name in DECISIVE}
+        states = int(self.recovery["A"].nrows())
+        return PlantOrigin(exact, computed=self.computed, sizes=kept if known else None, states=states)
 
 
 def exact_elimination(plant: DescriptorSystem) -> ExactElimination | None:
@@ -77,6 +82,8 @@ def exact_elimination(plant: DescriptorSystem) -> ExactElimination | None:
     direct = blocks([[c * keep, *(written_matrix(getattr(plant, name)) for name in _DIRECT)]])
     states = blocks([[keep, *(_zeros(plant.nx, int(signal.ncols())) for signal in signals)]])
     moving = take * right
+    with np.errstate(all="ignore"):
+        sizes = _term_sizes(left, right, coupling, (take, a * null), (direct, c * null), take * e * keep)
     if plant.nx > len(pivots):
         algebraic = _solved(-coupling, left * right, clean=computed)
         moving = _sum(moving, take * (a * null), algebraic, clean=computed)
@@ -90,13 +97,31 @@ def exact_elimination(plant: DescriptorSystem) -> ExactElimination | None:
         dict(zip(("A", *_SIGNALS), _split(states, widths), strict=True)),
         tuple(pivots),
         computed,
+        dict(zip(("A", *_SIGNALS), np.split(sizes[0], np.cumsum(widths)[:-1], axis=1), strict=True))
+        | dict(zip(("C", *_DIRECT), np.split(sizes[1], np.cumsum(widths)[:-1], axis=1), strict=True)),
     )
+
+
+def _term_sizes(
+    left: fmpq_mat, right: fmpq_mat, coupling: fmpq_mat, equations: tuple[fmpq_mat, fmpq_mat],
+    outputs: tuple[fmpq_mat, fmpq_mat], moving: fmpq_mat,
+) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+    """Return the sums of the sizes of all terms, of the dynamic equations and of the outputs."""
+    take, across = equations
+    direct, shown = outputs
+    inverse, dynamic = _sizes(moving.inv()), _sizes(take) @ _sizes(right)
+    if not coupling.nrows():
+        return inverse @ (_sizes(moving) @ (inverse @ dynamic)), _sizes(direct)
+    solver = _sizes(coupling.inv())
+    algebraic = solver @ (_sizes(coupling) @ (solver @ (_sizes(left) @ _sizes(right))))
+    dynamic = dynamic + _sizes(take * across) @ algebraic
+    return inverse @ (_sizes(moving) @ (inverse @ dynamic)), _sizes(direct) + _sizes(shown) @ algebraic
 
 
 def rounded_once(
     found: ExactElimination, plant: DescriptorSystem, dynamic: FloatArray | None
-) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
-    """Return the matrices and the recovery as doubles; states ``dynamic (nx, count)`` in place of the pivots."""
+) -> tuple[dict[str, FloatArray], dict[str, FloatArray], dict[str, FloatArray]]:
+    """Return matrices, recovery and sizes of terms as doubles; states ``dynamic (nx, count)`` instead of the pivots."""
     import flint
 
     from obsynth.proofs.enclosed_pencils import enclosed
@@ -106,6 +131,7 @@ def rounded_once(
         return (
             {name: nearest_doubles(matrix) for name, matrix in found.matrices.items()},
             {name: nearest_doubles(matrix) for name, matrix in found.recovery.items()},
+            dict(found.sizes),
         )
     e = written_matrix(plant.E)
     rows = _independent_rows(e, found.pivots)
@@ -129,7 +155,14 @@ def rounded_once(
         return (
             {name: moved(name, matrix, recovery=False) for name, matrix in found.matrices.items()},
             {name: moved(name, matrix, recovery=True) for name, matrix in found.recovery.items()},
+            _moved_sizes(found.sizes, np.abs(_doubles(change)), np.abs(_doubles(back))),
         )
+
+
+def _moved_sizes(sizes: Mapping[str, FloatArray], change: FloatArray, back: FloatArray) -> dict[str, FloatArray]:
+    """Return sizes of terms in other coordinates of the states."""
+    found = {name: size @ back if name in ("A", "C") else size for name, size in sizes.items()}
+    return {name: change @ size if name in ("A", *_SIGNALS) else size for name, size in found.items()}
 
 
 def _solved(matrix: fmpq_mat, right: fmpq_mat, *, clean: bool) -> fmpq_mat:
@@ -210,4 +243,19 @@ def sampled_origin(smooth: DescriptorSystem, sample_time: float) -> PlantOrigin:
         else {name: fractions_of(written_matrix(getattr(smooth, name))) for name in DECISIVE}
     )
     computed = origin.computed if origin else any(computed_entries(getattr(smooth, name)) for name in DECISIVE)
-    return PlantOrigin(exact, written_fraction(sample_time), computed)
+    sizes = None if origin is None or origin.sizes is None else _sampled_sizes(smooth, origin.sizes, sample_time)
+    return PlantOrigin(exact, written_fraction(sample_time), computed, sizes)
+
+
+def _sampled_sizes(
+    smooth: DescriptorSystem, sizes: Mapping[str, FloatArray], sample_time: float
+) -> dict[str, FloatArray] | None:
+    """Return the sizes of terms once sampled: what cancelled before goes through the integral of ``exp(A t)``."""
+    transition, held = zero_order_hold(
+        smooth.A, np.hstack([smooth.Bf, smooth.Bd, np.eye(smooth.nx)]), sample_time
+    )  # fmt: skip
+    faults, disturbances, integral = np.split(np.abs(held), [smooth.nf, smooth.nf + smooth.nd], axis=1)
+    found = dict(sizes)
+    for name, own in (("A", np.abs(transition)), ("Bf", faults), ("Bd", disturbances)):
+        found[name] = own + integral @ (sizes[name] - np.abs(getattr(smooth, name)))
+    return found if all(np.all(np.isfinite(part)) for part in found.values()) else None

@@ -50,14 +50,7 @@ class ActiveVariables:
 
 
 def active_variables(plant: DescriptorSystem) -> ActiveVariables:
-    """Return which equations and variables stay when those that act on nothing and cannot be solved for are left out.
-
-    Raises
-    ------
-    PreconditionError
-        A variable is in no equation, and no equation says what others say; or a part of the plant has more equations
-        than variables.  Both are named.
-    """
+    """Return which equations and variables stay: not those that act on nothing and cannot be solved for."""
     e, a, c = csr(plant.E), csr(plant.A), csr(plant.C)
     rows, columns = np.arange(plant.nx), np.arange(plant.nx)
     if not plant.ny:

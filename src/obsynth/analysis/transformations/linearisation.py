@@ -3,22 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
+from obsynth.analysis.transformations.entries_in_constants import at_nominal, box_of_model, entries_in_constants
 from obsynth.analysis.transformations.equations_at_a_point import LocalEquations, local_equations
 from obsynth.analysis.transformations.equilibrium import Point, consistent_point, equilibrium, nominal_point
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray
+from obsynth.plants.constants import ConstantsBox
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.names import index_of
+from obsynth.plants.uncertain_system import filled_plant
+from obsynth.plants.uncertainty import Uncertainty
 
 #: What E x' may be, in sizes of its row, where a point counts as resting.
 MOVING = 1e-9
 #: Input of a linear model at a moving point: it is one, always.
 DRIFT = "drift"
+#: Input of a linear model whose equilibrium depends on constants with tolerances: it is one, always.
+SHIFT = "shift"
 
 
 def linearise(
@@ -31,6 +39,7 @@ def linearise(
     disturbances: Sequence[str] = (),
     start: Mapping[str, float] | None = None,
     drift: bool = False,
+    constants: Mapping[str, Any] | ConstantsBox | None = None,
 ) -> DescriptorSystem:
     r"""Linearise a nonlinear plant: exact Jacobians, names, units and operating point.
 
@@ -61,12 +70,18 @@ def linearise(
         Where the search for an equilibrium begins: states by name; nominal values by default.
     drift : bool, optional
         Whether a point that moves is taken: its motion becomes an input ``drift``, which is 1 in every row.
+    constants : mapping, ConstantsBox or CalibratedBox, optional
+        Tolerances of constants and parameters of the model, as `obsynth.uncertain_system` takes them; parameters among
+        them are no faults.  Entries of the linear model are then expressions in them (CasADi's derivatives, at the one
+        point), and the equilibrium that others have acts as an input ``shift``, which is 1 in every row and zero for
+        the nominal ones.  What is not linear in the plant is not covered.
 
     Returns
     -------
     DescriptorSystem
         Continuous in time, in deviations from ``operating_point``.  A state whose name an output has, with another
-        value, is called ``"... (state)"``.
+        value, is called ``"... (state)"``.  With ``constants`` it knows its tolerances; those that stand in no entry
+        are left out.
 
     Raises
     ------
@@ -98,6 +113,14 @@ def linearise(
     if at not in ("equilibrium", "point"):
         raise SpecError(f"at is {at!r}: use 'equilibrium' or 'point'.", path="at")
     values, freed = dict(given or {}), _names(free, "free")
+    box = None
+    if constants is not None:
+        box = box_of_model(model, constants, values)
+        both = [name for name in box.names if name in freed or name in (faults or ())]
+        if both:
+            raise SpecError(f"{both[0]!r} has a tolerance, and is {'free' if both[0] in freed else 'a fault'}: choose "
+                            "one.", path=f"constants.{both[0]}")  # fmt: skip
+        model = at_nominal(model, box)
     if at == "equilibrium":
         point = equilibrium(model, values, freed, start)
         _require_bounds(model, point, free)
@@ -110,13 +133,14 @@ def linearise(
                 f"The output {wrong[0]!r} cannot be given at a point: give states.", path=f"given.{wrong[0]}"
             )
         point = consistent_point(model, nominal_point(model, values), values)
-    return linear_model(model, point, faults=faults, disturbances=disturbances, drift=drift)
+    return linear_model(model, point, faults=faults, disturbances=disturbances, drift=drift, box=box)
 
 
 def linear_model(
-    model: DAEModel, point: Point, *, faults: Sequence[str] | None, disturbances: Sequence[str], drift: bool
-) -> DescriptorSystem:
-    """Return the linear model at a point that satisfies the equations."""
+    model: DAEModel, point: Point, *, faults: Sequence[str] | None, disturbances: Sequence[str], drift: bool,
+    box: ConstantsBox | None = None,
+) -> DescriptorSystem:  # fmt: skip
+    """Return the linear model at a point that satisfies the equations, over the box of its constants if it has one."""
     local = local_equations(model, point.rates, point.x, point.u, point.theta)
     if not local.is_defined:
         raise PreconditionError("The derivatives of the model are not finite at the point: move it.",
@@ -125,7 +149,9 @@ def linear_model(
     moves = np.abs(motion) > MOVING * np.maximum(np.abs(local.by_state) @ model.state_scales, np.abs(motion).min())
     if moves.any() and not drift:
         raise _moving(model, motion, moves)
-    chosen = model.parameter_names if faults is None else _names(faults, "faults")
+    uncertain = () if box is None else box.names
+    every = [name for name in model.parameter_names if name not in uncertain]
+    chosen = every if faults is None else _names(faults, "faults")
     fault_columns = [index_of(name, model.parameter_names, what="faults") for name in chosen]
     unknown = [index_of(name, model.input_names, what="disturbances") for name in _names(disturbances, "disturbances")]
     known = [i for i in range(model.nu) if i not in unknown]
@@ -137,7 +163,7 @@ def linear_model(
     signals = {*names, *inputs, *model.output_names, *chosen, *disturbances}
     units = {name: unit for name, unit in model.units.items() if name in signals}
     units |= {name: model.units[given] for name, given in zip(names, model.state_names, strict=True)}
-    return DescriptorSystem(
+    linear = DescriptorSystem(
         local.E, -local.by_state, B if inputs else None, local.C, dt=0.0,
         Bf=-local.by_parameter[:, fault_columns] if fault_columns else None,
         Df=local.outputs_by_parameter[:, fault_columns] if fault_columns else None,
@@ -146,6 +172,35 @@ def linear_model(
         fault_names=list(chosen) or None, disturbance_names=list(disturbances) or None, units=units,
         operating_point={name: value for name, value in values.items() if name in signals},
     )  # fmt: skip
+    if box is None or not box.names:
+        return linear
+    columns = {"B": known, "Bd": unknown, "Bf": fault_columns}
+    return _over_box(linear, model, point, box, columns, moving=bool(moves.any()))
+
+
+def _over_box(
+    linear: DescriptorSystem, model: DAEModel, point: Point, box: ConstantsBox, columns: Mapping[str, Sequence[int]], *,
+    moving: bool,
+) -> DescriptorSystem:  # fmt: skip
+    """Return a linear model that knows the tolerances of its constants."""
+    entries, moved, shown = entries_in_constants(model, point, box, columns, moving=moving)
+    shift = ""
+    if moved or shown:
+        taken = {*linear.state_names, *linear.input_names, *linear.output_names, *linear.fault_names,
+                 *linear.disturbance_names}  # fmt: skip
+        shift = SHIFT if SHIFT not in taken else f"equilibrium {SHIFT}"
+        nu = linear.nu
+        for name, found in (("B", moved), ("D", shown)):
+            if found:
+                entries[name] = [*entries.get(name, []), *((i, nu, text) for i, _, text in found)]
+        linear = linear.replace(
+            B=np.column_stack([linear.B, np.zeros(linear.nx)]), D=np.column_stack([linear.D, np.zeros(linear.ny)]),
+            input_names=[*linear.input_names, shift], operating_point={**linear.operating_point, shift: 0.0},
+            units={**linear.units, shift: "1"} if linear.units else linear.units,
+        )  # fmt: skip
+    uncertainty = Uncertainty(box, entries, shift=shift)
+    kept = {name: item for name, item in box.constants.items() if name in uncertainty.used}
+    return filled_plant(linear, Uncertainty(replace(box, constants=kept), entries, shift=shift), set(kept))
 
 
 def _state_name(model: DAEModel, i: int, point: Point, local: LocalEquations) -> str:

@@ -1,4 +1,7 @@
-"""What a transformation did, and the map back to the states of the plant it started from."""
+"""What a transformation did, and the map back to the states of the plant it started from.
+
+Appending faults to the states.
+"""
 
 from __future__ import annotations
 
@@ -8,16 +11,24 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
+from obsynth.analysis.zeros import leading_names
+from obsynth.errors import PreconditionError
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.numerics.ranks import NEGLIGIBLE_INPUT, decide_rank
+from obsynth.numerics.scaling import equilibrate_pencil
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.names import index_of
 from obsynth.plants.uncertainty import matrices_of
 
 if TYPE_CHECKING:
     from obsynth.analysis.transformations.recovery_operator import RecoveryOperator
     from obsynth.numerics.sparse_factor import SolutionBounds
 
+
 _Value = TypeVar("_Value")
+
+
 #: Map of a recovery -> the signal that it maps.
 _MAPS = {
     "from_state": "state", "from_input": "input", "from_fault": "fault", "from_disturbance": "disturbance",
@@ -188,3 +199,46 @@ def with_states(plant: DescriptorSystem, names: Sequence[str], **changes: Any) -
 
     point, units = surviving(plant.operating_point), surviving(plant.units)
     return plant.replace(state_names=names, operating_point=point, units=units, **changes)
+
+
+def augment_faults(plant: DescriptorSystem, faults: Sequence[str]) -> Transformation:
+    """Append the chosen faults that act on the outputs as algebraic states ``phi = f``.
+
+    Shapes: ``plant (ny, nf)``.
+    """
+    columns = [index_of(name, plant.fault_names, what="The plant") for name in faults]
+    chosen = sorted({column for column in columns if plant.Df[:, column].any()})
+    nx, count = plant.nx, len(chosen)
+    chosen_names = [plant.fault_names[column] for column in chosen]
+    names = [f"fault:{name}" for name in chosen_names]
+    output = np.hstack([plant.C, plant.Df[:, chosen]])
+    E, A = np.zeros((nx + count, nx + count)), -np.eye(nx + count)
+    E[:nx, :nx], A[:nx, :nx] = plant.E, plant.A
+    _require_visible(np.vstack([E, output]), plant, chosen_names)
+    remaining = plant.Df.copy()
+    remaining[:, chosen] = 0.0
+    below = {name: np.zeros((count, getattr(plant, name).shape[1])) for name in ("B", "Bd", "Bw")}
+    below["Bf"] = np.eye(plant.nf)[chosen]
+    inputs = {name: np.vstack([getattr(plant, name), rows]) for name, rows in below.items()}
+    new = with_states(plant, (*plant.state_names, *names), E=E, A=A, C=output, Df=remaining, **inputs)
+    description = f"appended {', '.join(names)} as states" if names else ""
+    return Transformation(plant, new, description, unchanged_states(plant, new, from_state=np.eye(nx, nx + count)))
+
+
+def _require_visible(stacked: FloatArray, plant: DescriptorSystem, faults: Sequence[str]) -> None:
+    decision = decide_rank(stacked, expected=stacked.shape[1])
+    if decision.full or not faults:
+        return
+    scaled = equilibrate_pencil(np.zeros_like(stacked), stacked).A
+    shares = np.linalg.norm(np.linalg.svd(scaled)[2][decision.rank :], axis=0)
+    if np.max(shares[plant.nx :]) > NEGLIGIBLE_INPUT:
+        signals = leading_names(shares[plant.nx :], faults)
+        culprit = f"Faults {', '.join(signals)} look like algebraic states, or like each other, in the outputs."
+    else:
+        signals = leading_names(shares[: plant.nx], plant.state_names)
+        culprit = f"States {', '.join(signals)} show neither in E nor in the outputs."
+    raise PreconditionError(
+        f"Faults cannot be appended as states: {decision.describe()}. {culprit} Leave faults out, or add an output.",
+        condition="rank [E 0; 0 0; C Df]",
+        signals=signals,
+    )

@@ -11,7 +11,7 @@ from obsynth.analysis.transformations.idle_variables import equation_name, liste
 from obsynth.analysis.transformations.recovery_operator import RecoveryOperator, without_rounding
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, RANK_TOLERANCE
+from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, NAMED_SHARE, RANK_TOLERANCE
 from obsynth.numerics.scaling import power_of_two_below
 from obsynth.numerics.sparse import coarse_structure, components_of, csr, dense, selection
 from obsynth.numerics.sparse_factor import NullVectors, SolutionBounds, SparseFactor
@@ -19,8 +19,6 @@ from obsynth.plants.descriptor import DescriptorSystem
 
 #: Points without meaning, at which a pencil has its normal rank.
 GENERIC_POINTS = (0.7391, -1.3247)
-#: Entries of null vectors at least this large beside the largest are named.
-NAMED_SHARE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,13 +52,7 @@ class SparseReduction:
 
 
 def reduced_by_sparsity(plant: DescriptorSystem) -> SparseReduction:
-    """Solve the algebraic equations of an index-1 plant with sparse factors.
-
-    Raises
-    ------
-    PreconditionError
-        Not regular, index 2 or more, or no dynamic state: equations and variables are named.
-    """
+    """Solve the algebraic equations of an index-1 plant with sparse factors."""
     split = split_by_derivatives(plant)
     count = split.dynamic.shape[1]
     if count == 0:
@@ -195,13 +187,7 @@ def _scales(e: Any, a: Any) -> tuple[FloatArray, FloatArray]:
 
 
 def culprits(plant: DescriptorSystem) -> tuple[str, tuple[str, ...]]:
-    """Return what keeps a plant from having index 1, in words, and its variables; nothing for one that has.
-
-    Raises
-    ------
-    PreconditionError
-        The pattern alone leaves variables free: these are named.
-    """
+    """Return what keeps a plant from having index 1, in words, and its variables; nothing for one that has."""
     whole = coarse_structure(abs(csr(plant.E)) + abs(csr(plant.A)))
     if whole.structural_rank < plant.nx:
         raise_structurally_singular(plant, whole.over_rows, whole.under_columns)

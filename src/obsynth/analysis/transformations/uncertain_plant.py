@@ -10,13 +10,12 @@ import numpy as np
 from obsynth.analysis.transformations.elimination import algebraic_coordinates
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.ranks import UNTOUCHED_SHARE
 from obsynth.plants.constants import ConstantsBox
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.uncertainty import SAMPLED, UNCERTAIN_MATRICES, Uncertainty, matrices_of
 from obsynth.proofs.affine import AffineMatrix, affine_block, affine_inverse, affine_zero_order_hold
 
-#: Directions of the state that no constant touches are found down to this share of the others.
-UNTOUCHED_SHARE = 1e-7
 #: Their coordinates are rounded to this many digits: any invertible change of coordinates is exact.
 COORDINATE_DIGITS = 9
 #: What one state does to a row counts as rounding below this share of all that the row holds.
@@ -223,12 +222,15 @@ def _reduced(
 
 def _require_algebraic(rows: AffineMatrix, columns: AffineMatrix) -> None:
     """Refuse a box that puts a derivative into an algebraic row, or of an algebraic state."""
+    advice = {
+        "row": "The tolerances put a derivative into an algebraic equation (row {} of those that have none at the "
+        "nominal values): the plant's order would change in the box. Give E no tolerance there.",
+        "state": "The tolerances give a derivative to what is algebraic at the nominal values (state {} of those "
+        "without one): which states are dynamic would change in the box. Multiply whole rows of E by a "
+        "constant, or give E no tolerance there.",
+    }  # fmt: skip
     for what, found, axis in (("row", rows, 1), ("state", columns, 0)):
         moving = (np.abs(found.center) + found.spread + found.radius).any(axis=axis)
         if moving.any():
             numbers = ", ".join(str(i + 1) for i in np.flatnonzero(moving))
-            raise PreconditionError(
-                f"The tolerances put a derivative into an algebraic equation ({what} {numbers} of those that have "
-                "none at the nominal values): the plant's order would change in the box. Give E no tolerance there.",
-                condition="algebraic rows",
-            )  # fmt: skip
+            raise PreconditionError(advice[what].format(numbers), condition="algebraic rows")

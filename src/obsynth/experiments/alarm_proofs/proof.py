@@ -27,7 +27,8 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.names import index_of
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import digest_of
-from obsynth.tolerances.robustness import EXACT_MODEL, structure_of
+from obsynth.tolerances.result import EXACT_MODEL
+from obsynth.tolerances.robustness import structure_of
 from obsynth.tolerances.tracking import tracking_of
 
 #: Where the bounds of the state come from.
@@ -199,11 +200,12 @@ def statement(design: ObserverDesign, length: int, origin: str) -> str:
     uncertain = design.linear[0].uncertainty
     box = None if uncertain is None or not uncertain.box.names else uncertain.box
     outside = f"; it {EXACT_MODEL}" if box is None else f", or {box.sentence}"
+    linear = "" if box is None or uncertain is None or not uncertain.not_covered else f"; {uncertain.not_covered}"
     since = "since the start" if "start" in origin else "in the window (states within their stated bounds)"
     return (
         f"Proved: the last {length} samples are not explained without a fault {since} by any plant within its "
         f"tolerances, disturbances and noise within their bounds, and a start within its set (bounds of the state: "
-        f"{origin}): a fault{outside}."
+        f"{origin}): a fault{outside}{linear}."
     )
 
 

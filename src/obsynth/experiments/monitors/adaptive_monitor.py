@@ -21,8 +21,9 @@ from obsynth.plants.uncertainty import SAMPLED
 from obsynth.results.design import ObserverDesign
 from obsynth.tolerances.error_structure import error_structure
 from obsynth.tolerances.responses import loop_radius
-from obsynth.tolerances.robustness import EXACT_MODEL, structure_of, with_tolerances
-from obsynth.tolerances.subdivision import index_one_on_box
+from obsynth.tolerances.result import EXACT_MODEL
+from obsynth.tolerances.robustness import structure_of, with_tolerances
+from obsynth.tolerances.subdivision import index_one_on_box, values_at
 from obsynth.tolerances.tracking import Tracking, tracking_of
 
 #: Radii of a set are made larger by this share: more than the rounding of their sums.
@@ -114,8 +115,7 @@ def require_regular(plant: DescriptorSystem) -> None:
         return
     found = index_one_on_box(plant)
     if found.verdict == "refuted" and found.at is not None:
-        values = uncertain.box.values(found.at)
-        where = ", ".join(f"{name} = {values[name]:.6g}" for name in uncertain.box.names)
+        where = ", ".join(f"{name} = {value:.6g}" for name, value in values_at(uncertain.box, found.at).items())
         raise PreconditionError(
             f"The plant is singular, or not of index 1, inside the box: at {where}. Give smaller tolerances.",
             condition="regularity",
@@ -183,19 +183,22 @@ def adaptive_statement(plan: AdaptivePlan, design: ObserverDesign) -> str:
     )
     if box is None:
         return text + EXACT
+    steps = () if uncertain is None else uncertain.steps
+    sampled = any(kind == SAMPLED for kind, _ in steps)
     kept = "constants stay the same" if box.variation == "constant" else (
+        "constants may change at each sample (where the state does not jump)" if sampled else
         "constants may change at each sample (the value at k + 1 multiplies x(k+1))"
     )  # fmt: skip
     radius = loop_radius(plan.bound.responses)
     ever = "" if radius < 1.0 else (
         f"; the loop through the tolerances has radius {radius:.3g}: the threshold holds at each sample, but may grow"
     )  # fmt: skip
-    steps = () if uncertain is None else uncertain.steps
-    held = "; inputs and disturbances are held between samples" if any(kind == SAMPLED for kind, _ in steps) else ""
+    held = "; inputs and disturbances are held between samples" if sampled else ""
     if plan.sample_time is not None:
         held = "; known inputs are held between rows, which are the sample time apart, disturbances may move in between"
     missing = "" if plan.intervals or not plan.fault_names else f"; no guaranteed interval of faults: {plan.reason}"
-    return f"{text}; {kept}{held}{ever}{missing}"
+    linear = "" if uncertain is None or not uncertain.not_covered else f"; {uncertain.not_covered}"
+    return f"{text}; {kept}{held}{ever}{missing}{linear}"
 
 
 def tolerances_of(

@@ -42,22 +42,13 @@ def noisy_design(design: ObserverDesign, scenario: Scenario | None) -> ObserverD
 class AdaptiveMonitor(Monitor):
     """A monitor whose threshold adapts to the signals; `threshold` is the nominal one, which it is never below.
 
-    Parameters
-    ----------
-    plan : AdaptivePlan
-        The bounds.
+    Fields: plan: The bounds.
     """
 
     plan: AdaptivePlan | None = None
 
     def bounds(self, runs: Runs) -> tuple[FloatArray, FloatArray]:
-        """Return thresholds of fault estimates and residuals ``(runs, steps, no)``, and intervals of the faults.
-
-        Parameters
-        ----------
-        runs : Runs
-            What happened, as `Bench.run` gives it.
-        """
+        """Return thresholds of fault estimates and residuals ``(runs, steps, no)``, and intervals of the faults."""
         return record_columns(self._plan, *_by_run(runs, slice(None)))
 
     @property
@@ -71,18 +62,7 @@ class AdaptiveMonitor(Monitor):
         return Screening.of(self._plan)
 
     def passed_in(self, runs: Runs, residuals: slice, *, onset: int | None = None) -> np.ndarray:
-        """Return at which samples of which runs a threshold is passed, ``(steps, runs)``.
-
-        Parameters
-        ----------
-        runs : Runs
-            What happened.
-        residuals : slice
-            Rows of the observer that are residuals.
-        onset : int, optional
-            First sample at which something is wrong; with it, only whether a run passes before that, and where it
-            passes first after that, are right.
-        """
+        """Return at which samples of which runs a threshold is passed, ``(steps, runs)``."""
         plan = self._plan
         no, m = plan.bound.counts[4], plan.bound.counts[3]
         values = np.abs(runs.rows[:, :, runs.rows.shape[2] - no :])
@@ -135,18 +115,7 @@ class AdaptiveMonitor(Monitor):
         return np.asarray(passed & candidates)
 
     def watch(self, estimates: Estimates) -> Detection:
-        """Refuse: the threshold needs the record of inputs and outputs.
-
-        Parameters
-        ----------
-        estimates : Estimates
-            Alone they are not enough.
-
-        Raises
-        ------
-        SpecError
-            Always: use `obsynth.evaluate`, or `obsynth.online_monitor` with `obsynth.run_on_data`.
-        """
+        """Refuse: the threshold needs the record of inputs and outputs."""
         raise SpecError(
             "An adaptive threshold follows inputs and outputs, which estimates do not hold: use obsynth.evaluate, or "
             "obsynth.online_monitor with obsynth.run_on_data.", path="monitor",

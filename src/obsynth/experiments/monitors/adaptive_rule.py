@@ -249,7 +249,9 @@ class AdaptiveRule:
             middle = faults - error.shift[:nf]
             cells += np.stack([middle - width, middle + width], axis=1).ravel().tolist()
         watched = slice(0, nf) if nf else self.plan.residuals
-        shares = (error.first[:, watched] / error.total[watched]).mean(axis=1) if len(self.plan.names) else np.zeros(0)
+        count = len(self.plan.names)
+        first = error.first.reshape(-1, count, len(error.total)).sum(axis=0) if count else error.first
+        shares = (first[:, watched] / error.total[watched]).mean(axis=1) if count else np.zeros(0)
         return (*cells, *shares.tolist())
 
     def restart(self) -> None:

@@ -35,6 +35,8 @@ from obsynth.tolerances.tracking import Tracking, tracking_of
 
 #: Pieces of an interval in which a disturbance has a sign of its own.
 PIECES = 16
+#: Covers the rounding of a matrix exponential in double precision, and of a few sums.
+SERIES_SLACK, SUM_SLACK = 1.0 + 1e-9, 1.0 + 1e-12
 #: The name under which what the sampled observer misses counts among the constants.
 SAMPLING = "sampling"
 
@@ -72,7 +74,7 @@ class SampledProblem(NamedTuple):
         size = np.abs(t) @ radius + seen + self.unknown
         followed = (t + self.ramp @ self.affine.C.center) @ center
         far = np.abs(self.ramp) @ (np.abs(self.affine.C.center) @ radius)
-        return Start(len(z), center=z - followed, radius=(size + far) * (1.0 + 1e-12), state=z)
+        return Start(len(z), center=z - followed, radius=(size + far) * SUM_SLACK, state=z)
 
 
 def sampled_problem(design: ObserverDesign, dt: float, bounds: FloatArray, noise_bound: float) -> SampledProblem:
@@ -156,7 +158,7 @@ def _exponential_bound(size: FloatArray) -> FloatArray:
     """Return an upper bound of ``sum_k size^k / (k + 1)!`` for a nonnegative matrix."""
     from scipy.linalg import expm
 
-    return np.asarray(expm(size) * (1.0 + 1e-9))
+    return np.asarray(expm(size) * SERIES_SLACK)
 
 
 def _noise(smooth: DescriptorSystem, back: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:

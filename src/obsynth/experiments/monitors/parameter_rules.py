@@ -14,6 +14,7 @@ from obsynth.experiments.monitors.online import Evidence, OnlineMonitor, share_o
 from obsynth.experiments.monitors.residual_rules import require_same
 from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.alarms import alone
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.decisions import WALKING_FORMS
 from obsynth.observers.recursive.observer import RecursiveObserver
@@ -73,7 +74,7 @@ class ParameterRule:
         weights = np.linalg.pinv(found.covariance, hermitian=True)
         return (
             float(away @ weights @ away), float(chdtri(len(away), self._share())),
-            _alone(weights @ away, np.diag(weights)),
+            alone(weights @ away, np.diag(weights)),
         )  # fmt: skip
 
     def _nis(self, gap: FloatArray) -> tuple[float, float, int | None]:
@@ -114,11 +115,6 @@ class ParameterRule:
         self._levels, self._looks = data["levels"], data["looks"]
         self._squares.clear()
         self._squares.extend((value, int(count)) for value, count in data["squares"])
-
-
-def _alone(scores: FloatArray, information: FloatArray) -> int:
-    """Return the parameter whose change alone explains most."""
-    return int(np.argmax(scores**2 / np.maximum(information, np.finfo(np.float64).tiny)))
 
 
 def _whole_record(observer: RecursiveObserver | DAEObserver) -> str:

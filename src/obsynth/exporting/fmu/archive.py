@@ -14,8 +14,7 @@ from importlib.resources import files
 from pathlib import Path
 
 from obsynth.errors import SpecError
-from obsynth.exporting.c_source import header_text, source_text
-from obsynth.exporting.c_words import c_identifier, comment
+from obsynth.exporting.c_source import c_identifier, comment, header_text, source_text
 from obsynth.exporting.dae_c_source import dae_c_texts, require_no_sample_time
 from obsynth.exporting.fmu.description import (
     Model,

@@ -69,18 +69,8 @@ def adaptive_observer(
     reset : float, optional, dimensionless
         Detect and reset: when the innovations of 20 samples pass a threshold (with this probability per sample where
         nothing has changed, such as 1e-6), S and the covariance of theta start again from S_0.  0, the default, never.
-    outliers : {"none", "gate", "huber"}, optional
-        What is done with a sample that its prediction excludes: taken as it is; left out, at most twice in a row
-        of one sensor; or taken at the limit (Huber's weight).
-    outlier_limit : float, optional
-        In standard deviations of the prediction: 6 for ``gate`` and 3 for ``huber`` by default.
-    sensors : mapping, optional
-        ``{name: {"every": N, "delay": D}}``: a sensor that is sampled every N rows (k = 0, N, 2 N, ...; what a log
-        holds in the other rows is not used), or whose values arrive D rows late: the value in row k is then that of
-        ``k - D``, where the observer puts it, taking the rows after it again.
-    state_bounds : mapping or array_like, optional
-        ``{name: [low, high]}``, or ``(nx, 2)``: estimates are projected onto these bounds in the metric of their
-        covariance, which stays as it is without them. The recursion goes on without them.
+    outliers, outlier_limit, sensors, state_bounds
+        As for `descriptor_kalman`.
     name : str, optional
         Name of the design.
 

@@ -93,19 +93,23 @@ def _refused(method: str, reason: str, spent: float = 0.0) -> Candidate:
     return Candidate(method, None, None, (), spent, reason)
 
 
-def one_line(text: str, most: int = 160) -> str:
+#: Letters of a message that are shown.
+MOST_LETTERS = 160
+
+
+def one_line(text: str) -> str:
     """Return the start of a message in one line, with what would help, which stands at its end."""
     flat = " ".join(text.split())
     for mark in ("Add one of:", "Leave out one of:"):
         head, found, tail = flat.rpartition(mark)
         if found:
-            return f"{_cut(head, most)} {mark}{tail}"
-    return _cut(flat, most)
+            return f"{_cut(head)} {mark}{tail}"
+    return _cut(flat)
 
 
-def _cut(text: str, most: int) -> str:
+def _cut(text: str) -> str:
     short = text.removeprefix("No observer of this kind exists: ").strip()
-    return short if len(short) <= most else short[: most - 3].rstrip() + "..."
+    return short if len(short) <= MOST_LETTERS else short[: MOST_LETTERS - 3].rstrip() + "..."
 
 
 def linear_methods() -> Sequence[MethodSpec]:

@@ -197,7 +197,7 @@ def _version(solver: str) -> str:
     from importlib.metadata import PackageNotFoundError, version
 
     if solver == SCHUR:
-        from obsynth import __version__
+        from obsynth.version import __version__
 
         return __version__
     try:

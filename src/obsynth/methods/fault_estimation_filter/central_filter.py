@@ -72,7 +72,6 @@ def search_central_filter(
     start: Injection,
     gain: float | None = None,
     *,
-    tolerance: float | None = None,
     start_is_good: bool = False,
 ) -> tuple[Injection, float]:
     """Return the best central filter found, and (a bound on) its true gain.
@@ -80,8 +79,7 @@ def search_central_filter(
     The least level of the equation with little noise is found.  Less of it may cost less, and with more of it the
     equation is less sensitive to rounding: a level just below is tried, and if that is reached, the least from there.
     """
-    if tolerance is None:
-        tolerance = LEVEL_TOLERANCE if problem.order <= FEW_STATES else COARSE_LEVEL_TOLERANCE
+    tolerance = LEVEL_TOLERANCE if problem.order <= FEW_STATES else COARSE_LEVEL_TOLERANCE
     best, gain = start, problem.achieved_gain(start) if gain is None else gain
     low, most_noise = least_level(problem), np.inf
     if low <= DECOUPLED_GAIN * gain and (decoupled := _decoupling_filter(problem, gain)) is not None:

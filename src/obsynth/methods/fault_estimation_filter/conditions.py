@@ -13,15 +13,26 @@ from dataclasses import replace
 import numpy as np
 
 from obsynth.analysis.conditions import Condition, rank_condition
+from obsynth.analysis.existence.distance import least_share
 from obsynth.analysis.existence.numbers import numbers_of
-from obsynth.analysis.existence.verdicts import described_distance, settled_rank, unclear_detail, zero_verdict
-from obsynth.analysis.plant_units import PlantUnits
+from obsynth.analysis.existence.rational import PlantNumbers
+from obsynth.analysis.existence.verdicts import (
+    described_distance,
+    needed_gain,
+    rank_doubt,
+    settled_rank,
+    unclear_detail,
+    zero_doubt,
+    zero_verdict,
+)
+from obsynth.analysis.plant_units import PlantUnits, sized_plant
 from obsynth.analysis.zeros import Zero, fault_zeros, hidden_direction, leading_names, system_pencil, zero_at
 from obsynth.errors import PreconditionError
 from obsynth.methods.fault_estimation_filter.detectability_indexes import (
     detectability_conditions,
     numbers_with_fault_states,
 )
+from obsynth.methods.fault_estimation_filter.index_doubt import index_doubt
 from obsynth.methods.fault_estimation_filter.prepared_plant import PreparedPlant, prepare, with_sensor_faults_as_states
 from obsynth.numerics.pencils import PencilStructure, regularity
 from obsynth.numerics.ranks import decide_rank
@@ -50,7 +61,10 @@ def examine_fault_filter(
     def visibility_conditions() -> list[Condition]:
         nonlocal prepared
         prepared = prepare(plant)
-        return list(detectability_conditions(prepared.detectability, plant.fault_names, prepared.scaling.outputs))
+        seen = prepared.detectability
+        *first, last = detectability_conditions(seen, plant.fault_names, prepared.scaling.outputs)
+        doubt = None if last.holds else index_doubt(plant, seen)
+        return [*first, last if doubt is None else last.in_doubt(doubt, plant)]
 
     groups: tuple[Callable[[], list[Condition]], ...] = (
         lambda: _form_conditions(plant, structure),
@@ -125,22 +139,7 @@ def _rank_conditions(plant: DescriptorSystem) -> list[Condition]:
         signals=() if plant.nf <= plant.ny else plant.fault_names,
     )
     numbers = numbers_with_fault_states(plant)
-    natural = PlantUnits.of(plant).rounded().scaled_plant(plant)
-    faults = settled_rank(
-        decide_rank(np.vstack([natural.Bf, natural.Df]), expected=plant.nf),
-        # Faults that act on the outputs are columns of Bf too, once they are states.
-        None if numbers is None else numbers.rank(numbers.blocks([[numbers.matrix("Bf")]])),
-    )
-    ranks = [
-        enough,
-        rank_condition(
-            "rank F",
-            faults,
-            "some faults act nowhere, or in the same direction as others, and cannot be told apart.",
-            source="Wang 2015, below eq. (1)",
-            signals=_dependent_columns(plant),
-        ),
-    ]
+    ranks = [enough, _fault_rank(plant, numbers)]
     if not all(condition.holds for condition in ranks):
         return ranks
     try:
@@ -159,35 +158,63 @@ def _rank_conditions(plant: DescriptorSystem) -> list[Condition]:
                 signals=error.signals,
             ),
         ]
-    natural = PlantUnits.of(work).rounded().scaled_plant(work)
+    return [*ranks, *_output_ranks(work, plant.output_names, numbers)]
+
+
+def _fault_rank(plant: DescriptorSystem, numbers: PlantNumbers | None) -> Condition:
+    units, terms = PlantUnits.of(plant).rounded(), sized_plant(plant)
+    natural, sizes = units.scaled_plant(plant), None if terms is None else units.scaled_plant(terms)
+    columns = np.vstack([natural.Bf, natural.Df])
+    faults = settled_rank(
+        decide_rank(columns, expected=plant.nf),
+        # Faults that act on the outputs are columns of Bf too, once they are states.
+        None if numbers is None else numbers.rank(numbers.blocks([[numbers.matrix("Bf")]])),
+        np.inf if sizes is None else least_share(columns, np.vstack([sizes.Bf, sizes.Df])),
+    )
+    acting = rank_condition(
+        "rank F",
+        faults,
+        "some faults act nowhere, or in the same direction as others, and cannot be told apart.",
+        source="Wang 2015, below eq. (1)",
+        signals=_dependent_columns(plant),
+    )
+    if faults.means == "unclear":
+        acting = acting.in_doubt(rank_doubt(plant, units, faults, [["Bf"], ["Df"]]), plant)
+    return acting
+
+
+def _output_ranks(
+    work: DescriptorSystem, output_names: tuple[str, ...], numbers: PlantNumbers | None
+) -> list[Condition]:
+    """Return the conditions on C and [E; C] of a plant whose sensor faults are states."""
+    units = PlantUnits.of(work).rounded()
+    natural = units.scaled_plant(work)
     stacked = np.vstack([natural.E, natural.C])
     outputs, states = decide_rank(natural.C, expected=work.ny), decide_rank(stacked, expected=work.nx)
     if numbers is not None:
         c = numbers.matrix("C")
         outputs = settled_rank(outputs, numbers.rank(c))
         states = settled_rank(states, numbers.rank(numbers.blocks([[numbers.matrix("E")], [c]])))
-    ranks += [
-        rank_condition(
-            "rank C",
-            outputs,
-            "some outputs repeat others: leave them out.",
-            source="Wang 2015, below eq. (1)",
-            signals=()
-            if outputs.full
-            else leading_names(np.linalg.svd(work.C)[0][:, -1], plant.output_names, most=MOST_NAMES),
-        ),
-        rank_condition(
-            "rank [E; C]",
-            states,
-            "not every state is either dynamic or measured. Measure more, or eliminate the algebraic states first "
-            "(transform: {eliminate_algebraic_states: true} in a spec).",
-            source="Wang 2015, eq. (2)",
-            signals=()
-            if states.full
-            else leading_names(np.linalg.svd(stacked)[2][-1], work.state_names, most=MOST_NAMES),
-        ),
-    ]
-    return ranks
+    repeated = rank_condition(
+        "rank C",
+        outputs,
+        "some outputs repeat others: leave them out.",
+        source="Wang 2015, below eq. (1)",
+        signals=() if outputs.full else leading_names(np.linalg.svd(work.C)[0][:, -1], output_names, most=MOST_NAMES),
+    )
+    known = rank_condition(
+        "rank [E; C]",
+        states,
+        "not every state is either dynamic or measured. Measure more, or eliminate the algebraic states first "
+        "(transform: {eliminate_algebraic_states: true} in a spec).",
+        source="Wang 2015, eq. (2)",
+        signals=() if states.full else leading_names(np.linalg.svd(stacked)[2][-1], work.state_names, most=MOST_NAMES),
+    )
+    if outputs.means == "unclear":
+        repeated = repeated.in_doubt(rank_doubt(work, units, outputs, [["C"]], rows=True), work)
+    if states.means == "unclear":
+        known = known.in_doubt(rank_doubt(work, units, states, [["E"], ["C"]]), work)
+    return [repeated, known]
 
 
 def _zero_conditions(plant: DescriptorSystem) -> list[Condition]:
@@ -199,18 +226,27 @@ def _zero_conditions(plant: DescriptorSystem) -> list[Condition]:
         return [_never_shown(hidden_direction(plant, missing=facts.columns - facts.normal_rank)[1])]
     wide_e, wide_a = system_pencil(plant.E, plant.A, plant.Bf, plant.C, plant.Df)
     units = PlantUnits.of(plant).rounded()
-    verdict = zero_verdict(facts, *units.scaled_pencil(wide_e, wide_a, units.faults), nx=plant.nx, discrete=True)
+    terms, sizes = sized_plant(plant), None
+    if terms is not None:
+        sizes = units.scaled_pencil(wide_e, np.block([[terms.A, terms.Bf], [terms.C, terms.Df]]), units.faults)[1]
+    scaled = units.scaled_pencil(wide_e, wide_a, units.faults)
+    verdict = zero_verdict(facts, *scaled, nx=plant.nx, discrete=True, sizes=sizes)
     facts = verdict.facts
     if facts.outside:
-        return [_zero_failure(plant, zero_at(plant.E, plant.A, facts.outside[0], plant.Bf, plant.C, plant.Df))]
+        point = facts.outside[0]
+        lost = _zero_failure(plant, zero_at(plant.E, plant.A, point, plant.Bf, plant.C, plant.Df))
+        gain = needed_gain(plant, units, point, inputs="Bf")
+        return [replace(lost, detail=f"{lost.detail} {gain}".rstrip())]
     largest = max((abs(value) for value in facts.zeros), default=0.0)
     if verdict.answer == "unclear":
         detail = unclear_detail(verdict, "A filter")
+        doubt = zero_doubt(plant, units, verdict, [["A", "Bf"], ["C", "Df"]], what="filter")
         outside = fault_zeros(plant).outside
+        lost = Condition("fault zeros", _CLAIM, False, largest, 1.0, _SOURCE, detail)
         if outside:
             lost = _zero_failure(plant, max(outside, key=lambda zero: abs(zero.value)))
-            return [replace(lost, detail=f"{detail} In floating point, {lost.detail}", unclear=True)]
-        return [Condition("fault zeros", _CLAIM, False, largest, 1.0, _SOURCE, detail, unclear=True)]
+            lost = replace(lost, detail=f"{detail} In floating point, {lost.detail}")
+        return [lost.in_doubt(doubt, plant)]
     detail = f"{len(facts.zeros)} zero(s)" + (f", largest modulus {largest:.6g}" if facts.zeros else "")
     detail += f"; {described_distance(verdict)}"
     return [Condition("fault zeros", _CLAIM, True, largest, 1.0, _SOURCE, detail)]

@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 
 #: Random choices of T after which none is taken to be nonsingular.
 MOST_CHOICES = 20
+#: Faults with at least this share of the largest in a dependence are named.
+DEPENDENT_SHARE = 0.1
 
 
 _SEED = 45
@@ -85,7 +87,7 @@ def _decided_indexes(plant: DescriptorSystem) -> ExactIndexes | None:
     numbers = numbers_with_fault_states(plant)
     if numbers is None:
         return None
-    t = _nonsingular_t(numbers)
+    t = nonsingular_t(numbers)
     if t is None:
         return None
     left: Any = numbers.as_own(t)
@@ -106,7 +108,7 @@ def _decided_indexes(plant: DescriptorSystem) -> ExactIndexes | None:
     return ExactIndexes(tuple(indexes), rank)
 
 
-def _nonsingular_t(numbers: PlantNumbers) -> fmpq_mat | None:
+def nonsingular_t(numbers: PlantNumbers) -> fmpq_mat | None:
     """Return a rational nonsingular T with ``T E + N C = I``."""
     from flint import fmpq_mat
 
@@ -252,7 +254,6 @@ def detectability_conditions(
         f"||Upsilon|| = {float(np.linalg.norm(user_units, 2)):.3g}"
         + (f"; {_names(mixed)} cannot be told apart at first sight. Leave one out, or measure more." if mixed else "."),
         signals=mixed,
-        unclear=not usable and rank.means != "exact" and (rank.full or rank.means == "unclear"),
     )
     return finite, independent
 
@@ -264,4 +265,6 @@ def _names(faults: tuple[str, ...]) -> str:
 def _dependent_faults(upsilon: FloatArray, names: tuple[str, ...]) -> tuple[str, ...]:
     lengths = np.linalg.norm(upsilon, axis=0)
     direction = np.abs(np.linalg.svd(upsilon / lengths)[2][-1])
-    return tuple(name for name, size in zip(names, direction, strict=True) if size > 0.1 * np.max(direction))
+    return tuple(
+        name for name, size in zip(names, direction, strict=True) if size > DEPENDENT_SHARE * np.max(direction)
+    )

@@ -118,9 +118,7 @@ def _weight_constraint(limit: WeightLimit, v: Any) -> Any:
     return lmi.at_least(lmi.symmetric_blocks([[np.eye(weight.shape[1])], [weight, np.eye(weight.shape[0])]]))
 
 
-def _full_inequality(
-    problem: GainProblem, p: Any, squared: Any, *, ceiling: float = P_CEILING, decay: float = 1.0
-) -> _Inequality:
+def _full_inequality(problem: GainProblem, p: Any, squared: Any, *, decay: float = 1.0) -> _Inequality:
     n, m, q, nd = problem.order, problem.measured, problem.Z.shape[0], problem.disturbances
     y = lmi.matrix_variable(n, m)
     v = lmi.matrix_variable(q, m) if problem.weight_is_free else np.zeros((q, m))
@@ -132,7 +130,7 @@ def _full_inequality(
             [problem.Z + v @ problem.C, problem.Zd + v @ problem.D, np.zeros((q, n)), np.eye(q)],
         ]
     )
-    constraints = [lmi.at_least(p, P_FLOOR), lmi.at_most(p, ceiling), lmi.at_least(whole, MARGIN)]
+    constraints = [lmi.at_least(p, P_FLOOR), lmi.at_most(p, P_CEILING), lmi.at_least(whole, MARGIN)]
     if problem.weight_limit is not None:
         constraints.append(_weight_constraint(problem.weight_limit, v))
     return _Inequality(p, y, v, constraints)

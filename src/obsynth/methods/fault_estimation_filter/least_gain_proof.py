@@ -26,7 +26,7 @@ import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.results.report import Check, information
+from obsynth.results.checks import Check, information
 
 #: Filters of more states are not examined: exact null spaces of that many doubles take seconds.
 MOST_STATES = 64

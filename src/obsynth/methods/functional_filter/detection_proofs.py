@@ -27,6 +27,8 @@ STRICTNESS = 1e-9
 MOST_INTERVALS, REACH, FIRST_SHARE = 20_000, 0.9, 1e-3
 #: Intervals this short, relative to where they are, end at a frequency at which the pencil is singular.
 SHORTEST = 1e-8
+#: A range of frequencies that is shorter begins with intervals as if it had this length.
+LEAST_RANGE = 1e-9
 #: Weight of the equations that the frequency does not enter: a power of two.
 LIGHT = 2.0**-20
 
@@ -105,7 +107,7 @@ def _pencil(work: Transfer, level: float) -> Ball:
 
 def _is_never_singular(pencil: Ball, n: int, low: float, high: float) -> bool:
     """Whether ``M - jw diag(I, 0)`` is proved to be regular from ``low`` to ``high``, the identity of order 2 n."""
-    covered, length = low, FIRST_SHARE * max(high - low, 1e-9)
+    covered, length = low, FIRST_SHARE * max(high - low, LEAST_RANGE)
     for _ in range(MOST_INTERVALS):
         if covered >= high:
             return True

@@ -19,6 +19,7 @@ from obsynth.errors import PreconditionError, SolverError
 from obsynth.methods.riccati import riccati_solution
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import RANK_TOLERANCE, rank_from
+from obsynth.numerics.scaling import balanced_matrix
 from obsynth.numerics.spectra import abscissa
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.exosystems import Exosystem
@@ -111,6 +112,11 @@ SHARES_OF_NOISE = (0.0, 1e-6, 1e-4, 1e-2, 1.0)
 SHARES_OF_EXACT_ROWS = {True: (0.0, 1e-6, 1e-3), False: (1e-3, 1e-2, 0.1)}
 
 
+#: A pole this close to the boundary of stability, of a sampled filter, or relative to its matrix, is none that a proof
+#: could tell from one on it.
+PROVABLE = 1e-10
+
+
 @dataclass(frozen=True, eq=False)
 class KalmanGain:
     """A stable gain.
@@ -192,7 +198,7 @@ def _discrete(
     innovation = model.C @ p @ model.C.T + measured
     gain = np.linalg.solve(innovation, (model.A @ p @ model.C.T + cross).T).T
     closed = model.A - gain @ model.C
-    if not abscissa(closed, model.dt) < 1.0 / growth:
+    if not abscissa(closed, model.dt) < (1.0 - PROVABLE) / growth:
         return None
     gains, moved = [], p.copy()
     for _ in range(lag + 1):
@@ -214,9 +220,15 @@ def _continuous(
     except (np.linalg.LinAlgError, ValueError):
         return None
     gain = np.asarray(np.linalg.solve(measured, (p @ model.C.T + cross).T).T)
-    if not np.all(np.isfinite(gain)) or not abscissa(model.A - gain @ model.C, 0.0) < -decay:
+    closed = model.A - gain @ model.C
+    if not np.all(np.isfinite(gain)) or not abscissa(closed, 0.0) < -decay - PROVABLE * _size(closed):
         return None
     return gain, (), measured
+
+
+def _size(matrix: FloatArray) -> float:
+    """Return the norm of a matrix in the units of its states in which it is least."""
+    return float(np.linalg.norm(balanced_matrix(matrix)[0], 2))
 
 
 def whitening(innovation: FloatArray) -> FloatArray:

@@ -14,11 +14,20 @@ from dataclasses import replace
 import numpy as np
 
 from obsynth.analysis.conditions import Condition, rank_condition
+from obsynth.analysis.existence.distance import least_share
 from obsynth.analysis.existence.numbers import numbers_of
 from obsynth.analysis.existence.rational import PlantNumbers, WrittenNumbers
-from obsynth.analysis.existence.verdicts import described_distance, settled_rank, unclear_detail, zero_verdict
+from obsynth.analysis.existence.verdicts import (
+    described_distance,
+    needed_gain,
+    rank_doubt,
+    settled_rank,
+    unclear_detail,
+    zero_doubt,
+    zero_verdict,
+)
 from obsynth.analysis.far_zeros import equilibrated_at
-from obsynth.analysis.plant_units import PlantUnits
+from obsynth.analysis.plant_units import PlantUnits, sized_plant
 from obsynth.analysis.structure import analyse_structure
 from obsynth.analysis.transformations import Transformation, eliminate_algebraic_states
 from obsynth.analysis.zeros import leading_names, system_pencil
@@ -100,31 +109,50 @@ def _explicit_conditions(plant: DescriptorSystem) -> Iterator[Condition]:
         f"{plant.nf} faults and {plant.ny} output(s). Measure more, or leave a fault out.",
         signals=plant.fault_names,
     )  # fmt: skip
-    natural = PlantUnits.of(plant).rounded().scaled_plant(plant)
+    units, terms = PlantUnits.of(plant).rounded(), sized_plant(plant)
+    natural, sizes = units.scaled_plant(plant), None if terms is None else units.scaled_plant(terms)
     columns = np.vstack([natural.Bf, natural.Df])
-    yield rank_condition(
-        "rank F", settled_rank(
-            decide_rank(columns, expected=plant.nf),
-            None if numbers is None else numbers.rank(numbers.blocks([[numbers.matrix("Bf")], [numbers.matrix("Df")]])),
-        ),
-        "some faults act nowhere, or in the same direction as others, and cannot be told apart.",
+    acting = settled_rank(
+        decide_rank(columns, expected=plant.nf),
+        None if numbers is None else numbers.rank(numbers.blocks([[numbers.matrix("Bf")], [numbers.matrix("Df")]])),
+        np.inf if sizes is None else least_share(columns, np.vstack([sizes.Bf, sizes.Df])),
+    )
+    told_apart = rank_condition(
+        "rank F", acting, "some faults act nowhere, or in the same direction as others, and cannot be told apart.",
         source="Filasova et al., eq. (3)", signals=_null_names(columns, plant.fault_names),
     )  # fmt: skip
+    if acting.means == "unclear":
+        told_apart = told_apart.in_doubt(rank_doubt(plant, units, acting, [["Bf"], ["Df"]]), plant)
+    yield told_apart
     yield _detectability_in_floating_point(plant) if numbers is None else _detectability(plant, numbers)
+    yield _at_zero(plant, natural, sizes, numbers)
+
+
+def _at_zero(
+    plant: DescriptorSystem, natural: DescriptorSystem, sizes: DescriptorSystem | None, numbers: PlantNumbers | None
+) -> Condition:
+    """Return the condition that no constant fault is hidden: natural and sizes in units of the plant's own."""
     rosenbrock = np.block([[natural.A, natural.Bf], [natural.C, natural.Df]])
     hidden = leading_names(_null_vector(rosenbrock)[plant.nx :], plant.fault_names, most=MOST_NAMES)
-    at_zero = rank_condition(
-        "rank [A F; C Df]", settled_rank(
-            decide_rank(rosenbrock, expected=plant.nx + plant.nf),
-            None if numbers is None else numbers.rank(numbers.blocks([
-                [numbers.matrix("A"), numbers.matrix("Bf")], [numbers.matrix("C"), numbers.matrix("Df")],
-            ])),
-        ),
+    exact = None
+    if numbers is not None:
+        exact = numbers.rank(numbers.blocks([
+            [numbers.matrix("A"), numbers.matrix("Bf")], [numbers.matrix("C"), numbers.matrix("Df")],
+        ]))  # fmt: skip
+    decision = settled_rank(
+        decide_rank(rosenbrock, expected=plant.nx + plant.nf), exact,
+        np.inf if sizes is None else least_share(rosenbrock, np.block([[sizes.A, sizes.Bf], [sizes.C, sizes.Df]])),
+    )  # fmt: skip
+    found = rank_condition(
+        "rank [A F; C Df]", decision,
         f"there is a zero at s = 0, where a constant fault {', '.join(map(repr, hidden))} does not show in the outputs "
         "once the states have settled. Measure another signal.",
         source="Filasova et al., eq. (3)", signals=hidden,
     )  # fmt: skip
-    yield at_zero if at_zero.holds else replace(at_zero, mode=0j)
+    if decision.means == "unclear":
+        layout = [["A", "Bf"], ["C", "Df"]]
+        found = found.in_doubt(rank_doubt(plant, PlantUnits.of(plant).rounded(), decision, layout), plant)
+    return found if found.holds else replace(found, mode=0j)
 
 
 def _condition(
@@ -145,20 +173,24 @@ def _detectability(plant: DescriptorSystem, numbers: PlantNumbers) -> Condition:
     none = np.zeros((plant.nx, 0))
     facts = numbers.system(numbers.zeros(plant.nx, 0), numbers.zeros(plant.ny, 0))
     wide_e, wide_a = system_pencil(plant.E, plant.A, none, plant.C, np.zeros((plant.ny, 0)))
-    scaled = PlantUnits.of(plant).rounded().scaled_pencil(wide_e, wide_a)
-    verdict = zero_verdict(facts, *scaled, nx=plant.nx, discrete=False)
+    units, terms = PlantUnits.of(plant).rounded(), sized_plant(plant)
+    sizes = None if terms is None else units.scaled_pencil(wide_e, np.vstack([terms.A, terms.C]))[1]
+    verdict = zero_verdict(facts, *units.scaled_pencil(wide_e, wide_a), nx=plant.nx, discrete=False, sizes=sizes)
     facts = verdict.facts
     if verdict.answer == "no":
-        return _hidden_mode(plant, list(facts.outside))
+        lost = _hidden_mode(plant, list(facts.outside))
+        return replace(lost, detail=f"{lost.detail} {needed_gain(plant, units, lost.mode or 0j)}")
     if verdict.answer == "unclear":
         detail = unclear_detail(verdict, "An observer")
+        doubt = zero_doubt(plant, units, verdict, [["A"], ["C"]], what="observer")
         hidden = list(analyse_structure(plant).undetectable_modes)
         if not hidden and verdict.distance is not None:
             hidden = [verdict.distance.point]
+        lost = Condition("detectability", _CLAIM, False, 0.0, 0.0, _NEEDED_FOR, detail)
         if hidden:
             lost = _hidden_mode(plant, hidden)
-            return replace(lost, detail=f"{detail} In floating point, {lost.detail}", unclear=True)
-        return Condition("detectability", _CLAIM, False, 0.0, 0.0, _NEEDED_FOR, detail, unclear=True)
+            lost = replace(lost, detail=f"{detail} In floating point, {lost.detail}")
+        return lost.in_doubt(doubt, plant)
     detail = f"{len(facts.zeros)} unobservable mode(s)" + (
         f", slowest real part {max(value.real for value in facts.zeros):.6g}" if facts.zeros else ""
     )

@@ -16,7 +16,7 @@ from obsynth.methods.pd_observer.checks.certificate import (
     prove_shipped_stability,
     prove_symmetric_positive,
 )
-from obsynth.methods.pd_observer.inequalities import PdSolution
+from obsynth.methods.pd_observer.inequalities import PdSolution, symmetric
 from obsynth.methods.pd_observer.options import PdOptions
 from obsynth.methods.pd_observer.realisation import realise_pd_observer, with_faults_as_states, with_sensor_noise
 from obsynth.numerics.arrays import FloatArray
@@ -78,7 +78,7 @@ def certified(
     except np.linalg.LinAlgError:
         return None
     ends = asked.range_numbers
-    p1, p3 = _symmetric(found.P1[0]), _symmetric(found.P3) if asked.theorem == 2 else found.P3
+    p1, p3 = symmetric(found.P1[0]), symmetric(found.P3) if asked.theorem == 2 else found.P3
     gains = PdGains(
         found.J,
         found.L,
@@ -124,10 +124,6 @@ def _gain_certificates(plant: DescriptorSystem, asked: PdOptions, gains: PdGains
     return found
 
 
-def _symmetric(matrix: FloatArray) -> FloatArray:
-    return 0.5 * (matrix + matrix.T)
-
-
 def _judged(gains: PdGains) -> PdGains:
     """Return the gains with the outcome of proving their certificate."""
     proofs = [
@@ -148,7 +144,7 @@ def _certified_range(plant: DescriptorSystem, gains: PdGains, ends: tuple[float,
 
     What is shipped has g = 1 where the range holds it, else the end nearer to it; P1 is interpolated.
     """
-    p1 = tuple(map(_symmetric, gains.ends))
+    p1 = tuple(map(symmetric, gains.ends))
     plants = [with_faults_as_states(plant, end * np.eye(plant.nf)) for end in ends]
     proved = all(
         prove_symmetric_positive(matrix).proved
@@ -163,9 +159,9 @@ def _certified_range(plant: DescriptorSystem, gains: PdGains, ends: tuple[float,
     back = np.linalg.inv(loop)
     gain_j, gain_l = loop @ gains.J, loop @ gains.L
     p3 = back.T @ gains.P3 @ back
-    p3 = _symmetric(p3) if gains.theorem == 2 else p3
+    p3 = symmetric(p3) if gains.theorem == 2 else p3
     moved = replace(
-        gains, J=gain_j, L=gain_l, P1=_symmetric(back.T @ middle @ back), P3=p3, ends=p1,
+        gains, J=gain_j, L=gain_l, P1=symmetric(back.T @ middle @ back), P3=p3, ends=p1,
         observer=realise_pd_observer(plant, with_faults_as_states(plant), gain_j, gain_l),
     )  # fmt: skip
     moved = _judged(moved)

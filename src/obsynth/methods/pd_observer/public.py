@@ -261,8 +261,8 @@ def pd_delta_scan(
     """
     from obsynth.analysis.conditions import require_all
     from obsynth.methods.pd_observer.conditions import explicit_form, pd_observer_conditions
-    from obsynth.methods.pd_observer.delta_scan import scan_delta
     from obsynth.methods.pd_observer.options import PdOptions
+    from obsynth.methods.pd_observer.synthesis import scan_delta
 
     given: dict[str, Any] = {"theorem": theorem, "decay": decay, "delta_scan": delta, "solver": solver}
     asked = PdOptions(**given)

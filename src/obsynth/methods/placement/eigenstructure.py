@@ -27,8 +27,6 @@ from obsynth.errors import SolverError
 from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.numerics.spectra import SAME_POLE, spectrum_error
 
-#: Objectives of the choice among all gains with the same poles.
-OBJECTIVES = ("conditioning", "gain")
 #: Random starts of the search, and fewer for large pairs; each step costs two Sylvester equations.
 STARTS, FEW_STARTS, LARGE = 8, 2, 20
 #: Longest run of the search, and how often it is taken up again from where it ended, with eigenvectors of unit length,

@@ -1,162 +1,29 @@
 """Whether a recursive method can work for a plant: rank of H_k, detectability, parameters that show.
 
-Whether constant parameters of a plant leave traces in its outputs that can be told from each other.
+Of a plant whose matrices are constant this is decided on the numbers as written; of others in floating point along the
+horizon, as the rows say.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
 from obsynth.analysis.conditions import Condition, rank_condition
-from obsynth.analysis.time_varying import (
-    STEPS_WITHOUT_HORIZON,
-    HorizonRanks,
-    IntArray,
-    StepBlocks,
-    as_time_varying,
-    early_rows,
-    horizon_ranks,
-    step_blocks,
-)
+from obsynth.analysis.existence.verdicts import described_distance, needed_gain, unclear_detail
+from obsynth.analysis.time_varying import HorizonRanks, as_time_varying, early_rows, horizon_ranks, step_blocks
 from obsynth.analysis.zeros import are_outside, leading_names
 from obsynth.errors import SpecError
+from obsynth.methods.recursive.constant_plants import ConstantPlant
+from obsynth.methods.recursive.identifiability import identifiability_condition
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.least_squares_step import OUTGROWN, least_squares_step, rank_revealing_step
 from obsynth.numerics.pencils import finite_zeros
-from obsynth.numerics.ranks import (
-    CANCELLATION_TOLERANCE,
-    NAMED_SHARE,
-    RANK_TOLERANCE,
-    RankDecision,
-    decide_rank,
-)
+from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, RANK_TOLERANCE
 from obsynth.numerics.scaling import equilibrate_pencil
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
-
-_NAME = "identifiable parameters"
-
-
-_TRACES_SOURCE = "our finding: (26) needs it, Moussa Ali, Zhang 2013"
-
-
-class _Kernel(NamedTuple):
-    """Constant parameters, in their own units, that leave no trace, and the states that hide them.
-
-    ``parameters (nq,)`` and ``shares (nq,)`` (free of units), ``states``: names.
-    """
-
-    parameters: FloatArray
-    shares: FloatArray
-    states: tuple[str, ...]
-
-
-def identifiability_condition(plant: TimeVaryingDescriptorSystem, *, early: bool = False) -> Condition:
-    """Return the condition that outputs tell the parameters from each other and from the state.
-
-    Where these matrices are constant, parameters and state may stay constant together without a trace exactly where
-    ``[A - E, Phi; C, Psi]`` loses rank.  Of others, the outputs that each parameter alone leads to are compared along
-    the horizon.
-    """
-    still = all(matrix.is_constant for matrix in (plant.E, plant.A, plant.C, plant.Phi, plant.Psi))
-    decision, kernel = _steady(plant) if still else _along(plant, early=early)
-    wanted = "rank [A - E, Phi; C, Psi]" if still else "rank of the traces of all parameters"
-    claim = f"{wanted} = {decision.expected}"
-    value, bound = float(decision.rank), float(decision.expected)
-    if decision.full:
-        return Condition(_NAME, claim, True, value, bound, _TRACES_SOURCE, decision.describe())
-    names = leading_names(kernel.shares, plant.parameter_names)
-    detail = f"{decision.describe()}: {_explained(kernel, names, plant)}"
-    return Condition(_NAME, claim, False, value, bound, _TRACES_SOURCE, detail, signals=names)
-
-
-def _explained(kernel: _Kernel, names: tuple[str, ...], plant: TimeVaryingDescriptorSystem) -> str:
-    hidden = ", ".join(map(repr, kernel.states))
-    with_states = f" together with constant shifts of {hidden}" if hidden else ""
-    if len(names) == 1:
-        text = f"the parameter {names[0]!r} leaves no trace in the outputs"
-        text += f": it cannot be told from constant shifts of {hidden}" if hidden else ""
-    else:
-        values = [kernel.parameters[plant.parameter_names.index(name)] for name in names]
-        size = values[int(np.argmax(np.abs(values)))]
-        ratio = " : ".join(f"{value / size:.4g}" for value in values)
-        text = (
-            f"the parameters {', '.join(map(repr, names))} cannot be told from each other: in the ratio {ratio}"
-            f"{with_states} they leave no trace in the outputs"
-        )
-    return f"{text}. Estimate fewer parameters, or measure something that they act on."
-
-
-def _steady(plant: TimeVaryingDescriptorSystem) -> tuple[RankDecision, _Kernel]:
-    """Decide about a time-invariant plant by its state and parameters at rest."""
-    whole = np.block([[plant.A.at(0) - plant.E.at(1), plant.Phi.at(0)], [plant.C.at(1), plant.Psi.at(0)]])
-    pencil = equilibrate_pencil(np.zeros_like(whole), whole)
-    decision = decide_rank(pencil.A, expected=plant.nx + plant.nq, equilibrated=False)
-    shares = np.linalg.svd(pencil.A)[2][decision.rank :]
-    states, parameters = np.linalg.norm(shares[:, : plant.nx], axis=0), shares[:, plant.nx :]
-    largest = max(float(np.max(states, initial=0.0)), float(np.max(np.abs(parameters), initial=0.0)))
-    involved = leading_names(states, plant.state_names) if states.max(initial=0.0) > NAMED_SHARE * largest else ()
-    return decision, _kernel_of(parameters, pencil.columns[plant.nx :], involved)
-
-
-def _along(plant: TimeVaryingDescriptorSystem, *, early: bool) -> tuple[RankDecision, _Kernel]:
-    """Decide along the horizon, by the whitened traces of the parameters for noise of unit size everywhere."""
-    late = early_rows(plant, early=early)
-    steps = plant.horizon or STEPS_WITHOUT_HORIZON
-    steps = max(steps - 1, 1) if late.size else steps
-    largest = _largest(plant, steps, late)
-    ne = len(largest.E)
-    pencil = equilibrate_pencil(np.vstack([largest.E, np.zeros_like(largest.C)]), np.vstack([largest.A, largest.C]))
-    rows, columns = pencil.rows[:, None], pencil.columns
-    direct = np.linalg.norm(rows * np.vstack([largest.Phi, largest.Psi]), axis=0)
-    direct[direct == 0.0] = 1.0
-    nx, nq = plant.nx, plant.nq
-    factor, regressor, gathered, sizes = np.eye(nx), np.zeros((nx, nq)), np.zeros((0, nq)), np.zeros(nq)
-    for k in range(steps):
-        blocks = step_blocks(plant, k, late)
-        H, A = rows * np.vstack([blocks.E, blocks.C]) * columns, rows[:ne] * blocks.A * columns
-        Phi, Psi = rows[:ne] * blocks.Phi, rows[ne:] * blocks.Psi
-        noise = np.hstack([np.zeros((len(H), nx)), np.eye(len(H))])
-        noise[:ne, :nx] = A @ factor
-        right = np.vstack([A @ regressor + Phi, -Psi])
-        found = least_squares_step(H, noise, right) or rank_revealing_step(H, noise, right, np.zeros((len(H), 0)))
-        regressor, factor = found.estimate, found.factor
-        if not max(np.max(np.abs(regressor)), np.max(np.abs(factor))) < OUTGROWN:
-            # What nothing shows grows without bound: what has been seen until here decides.
-            break
-        here = np.linalg.norm(right, axis=0)
-        # A regressor that grows in a state which nothing shows must not drown what was seen before.
-        weight = 1.0 / max(1.0, float(np.max(here / direct)))
-        gathered = np.asarray(np.linalg.qr(np.vstack([gathered, weight * found.innovation]), mode="r"))
-        sizes = np.hypot(sizes, weight * here)
-    sizes[sizes == 0.0] = 1.0
-    # Relative to the terms that a trace is made of: rounding of a trace that vanishes is no trace.
-    relative = np.vstack([gathered, np.zeros((nq, nq))]) / sizes
-    decision = decide_rank(relative, expected=nq, scale=1.0, equilibrated=False)
-    parameters = np.linalg.svd(relative)[2][decision.rank :]
-    return decision, _kernel_of(parameters, 1.0 / sizes, ())
-
-
-def _kernel_of(parameters: FloatArray, columns: FloatArray, states: tuple[str, ...]) -> _Kernel:
-    """Return a kernel whose rows are given in scaled coordinates; the row with most parameters stands for its ratio."""
-    if not len(parameters):
-        return _Kernel(np.zeros(len(columns)), np.zeros(len(columns)), states)
-    strongest = parameters[int(np.argmax(np.linalg.norm(parameters, axis=1)))]
-    return _Kernel(strongest * columns, np.linalg.norm(parameters, axis=0), states)
-
-
-def _largest(plant: TimeVaryingDescriptorSystem, steps: int, late: IntArray) -> StepBlocks:
-    """Return the largest absolute value of each entry along the horizon: it tells what rows and states are like."""
-    found = [np.abs(matrix) for matrix in step_blocks(plant, 0, late)]
-    for k in range(1, steps):
-        for matrix, here in zip(found, step_blocks(plant, k, late), strict=True):
-            np.maximum(matrix, np.abs(here), out=matrix)
-    return StepBlocks(*found)
-
 
 _SOURCE = "Moussa Ali, Zhang 2013"
 
@@ -176,11 +43,13 @@ def recursive_conditions(
                         f"{_SOURCE}, eq. (4)", str(error))  # fmt: skip
         return
     ranks = horizon_ranks(varying, early=early)
-    yield _rank_of_steps(varying, ranks, early=early)
-    if not ranks.worst.full:
+    constant = ConstantPlant.of(plant, varying)
+    known = _rank_of_steps(varying, ranks, early=early, constant=constant)
+    yield known
+    if not known.holds:
         return
     if varying.E.is_constant and varying.A.is_constant and varying.C.is_constant:
-        detectable = detectability_condition(varying)
+        detectable = detectability_condition(varying) if constant is None else _decided_detectability(constant)
         yield detectable
         if not detectable.holds:
             return
@@ -190,15 +59,21 @@ def recursive_conditions(
                     f"{_SOURCE}, eq. (4)", f"{varying.nq} parameter(s)")  # fmt: skip
     if not varying.nq:
         return
-    yield identifiability_condition(varying, early=early)
+    yield identifiability_condition(varying, early=early, constant=constant)
     if literal:
         yield residual_condition(ranks)
 
 
-def _rank_of_steps(plant: TimeVaryingDescriptorSystem, ranks: HorizonRanks, *, early: bool) -> Condition:
+def _rank_of_steps(
+    plant: TimeVaryingDescriptorSystem, ranks: HorizonRanks, *, early: bool, constant: ConstantPlant | None
+) -> Condition:
     """Return the condition that equations and outputs determine the state at every step."""
     name = "rank [E; C; algebraic rows of A]" if early else "rank [E; C]"
-    condition = rank_condition(name, ranks.worst, "", source=f"{_SOURCE}, A2")
+    late = early_rows(plant, early=early)
+    worst = ranks.worst if constant is None else constant.settled_step(ranks.worst, late)
+    condition = rank_condition(name, worst, "", source=f"{_SOURCE}, A2")
+    if constant is None and ranks.steps > 1:
+        condition = replace(condition, detail=f"{condition.detail}, in floating point along the horizon")
     where = "for every k" if ranks.steps == 1 else f"for k = 1 ... {ranks.steps}, worst at k = {ranks.worst_k}"
     condition = replace(condition, claim=f"{condition.claim} {where}")
     if condition.holds:
@@ -217,10 +92,14 @@ def _rank_of_steps(plant: TimeVaryingDescriptorSystem, ranks: HorizonRanks, *, e
                             "continuous time, before sampling)")  # fmt: skip
     remedies.append("leave out states that nothing depends on")
     at = "" if ranks.steps == 1 else f"at k = {ranks.worst_k} "
-    detail = (
-        f"{ranks.worst.describe()}: {at}equations and outputs do not determine {_listed(names)}. {_sentence(remedies)}"
-    )
-    return replace(condition, detail=detail, signals=names)
+    detail = f"{worst.describe()}: {at}equations and outputs do not determine {_listed(names)}. {_sentence(remedies)}"
+    found = replace(condition, detail=detail, signals=names)
+    if constant is None or worst.means != "unclear":
+        return found
+    return found.in_doubt(constant.step_doubt(worst, late), constant.plant)
+
+
+_DETECTABLE = "Nikoukhah, Willsky, Levy 1992"
 
 
 def detectability_condition(plant: TimeVaryingDescriptorSystem) -> Condition:
@@ -229,14 +108,42 @@ def detectability_condition(plant: TimeVaryingDescriptorSystem) -> Condition:
     tall_e, tall_a = np.vstack([E, np.zeros_like(C)]), np.vstack([A, C])
     zeros = finite_zeros(tall_e, tall_a)
     outside = are_outside(tall_e, tall_a, zeros, plant.dt)
-    hidden = sorted(
-        (complex(z) for z, out in zip(zeros.values, outside, strict=True) if out), key=lambda z: (-abs(z), -z.imag)
-    )
-    claim = f"rank [A - zE; C] = {plant.nx} for all |z| >= 1"
-    source = "Nikoukhah, Willsky, Levy 1992"
-    if not hidden:
-        rest = f"{len(zeros.values)} unobservable mode(s), all of which die out" if len(zeros.values) else "observable"
-        return Condition("detectability", claim, True, 0.0, 0.0, source, rest)
+    hidden = [complex(z) for z, out in zip(zeros.values, outside, strict=True) if out]
+    if hidden:
+        return _hidden_modes(plant, tall_e, tall_a, hidden)
+    return Condition("detectability", _detectable(plant), True, 0.0, 0.0, _DETECTABLE, _dying(len(zeros.values)))
+
+
+def _decided_detectability(constant: ConstantPlant) -> Condition:
+    """Return the same, decided on the numbers of the plant as written."""
+    plant, verdict = constant.plant, constant.detectability
+    tall_e, tall_a = np.vstack([plant.E, np.zeros_like(plant.C)]), np.vstack([plant.A, plant.C])
+    if verdict.answer == "no":
+        hidden = list(verdict.facts.outside) or [1 + 0j]
+        found = _hidden_modes(plant, tall_e, tall_a, hidden)
+        gain = needed_gain(plant, constant.units, found.mode or 1 + 0j)
+        return replace(found, detail=f"{found.detail} {gain}")
+    if verdict.answer == "yes":
+        detail = f"{_dying(len(verdict.facts.zeros))}; {described_distance(verdict)}"
+        return Condition("detectability", _detectable(plant), True, 0.0, 0.0, _DETECTABLE, detail)
+    point = 1 + 0j if verdict.distance is None else verdict.distance.point
+    lost = _hidden_modes(plant, tall_e, tall_a, [point])
+    detail = f"{unclear_detail(verdict, 'A filter')} In floating point, {lost.detail}"
+    return replace(lost, detail=detail).in_doubt(constant.mode_doubt(), plant)
+
+
+def _detectable(plant: TimeVaryingDescriptorSystem | DescriptorSystem) -> str:
+    return f"rank [A - zE; C] = {plant.nx} for all |z| >= 1"
+
+
+def _dying(count: int) -> str:
+    return f"{count} unobservable mode(s), all of which die out" if count else "observable"
+
+
+def _hidden_modes(
+    plant: TimeVaryingDescriptorSystem | DescriptorSystem, tall_e: FloatArray, tall_a: FloatArray, modes: list[complex]
+) -> Condition:
+    hidden = sorted(modes, key=lambda z: (-abs(z), -z.imag))
     mode = hidden[0]
     names = _open_states(tall_e, tall_a, mode, plant)
     others = [described_mode(z) for z in hidden[1:] if z.imag >= 0.0 and z != mode]
@@ -246,7 +153,9 @@ def detectability_condition(plant: TimeVaryingDescriptorSystem) -> Condition:
         + f", so that an error in it {'grows' if abs(mode) > 1.0 + RANK_TOLERANCE else 'stays'} for ever. Measure "
         "something that it moves, or leave it out of the model."
     )
-    return Condition("detectability", claim, False, float(len(hidden)), 0.0, source, detail, mode, names)
+    return Condition(
+        "detectability", _detectable(plant), False, float(len(hidden)), 0.0, _DETECTABLE, detail, mode, names
+    )
 
 
 def residual_condition(ranks: HorizonRanks) -> Condition:
@@ -260,7 +169,9 @@ def residual_condition(ranks: HorizonRanks) -> Condition:
     )  # fmt: skip
 
 
-def _open_states(E: FloatArray, A: FloatArray, point: complex, plant: TimeVaryingDescriptorSystem) -> tuple[str, ...]:
+def _open_states(
+    E: FloatArray, A: FloatArray, point: complex, plant: TimeVaryingDescriptorSystem | DescriptorSystem
+) -> tuple[str, ...]:
     """Return the states in the null space of ``A - point E``, by their shares when the pencil is equilibrated."""
     pencil = equilibrate_pencil(E, A)
     _, values, right = np.linalg.svd(pencil.A - (point if point.imag else point.real) * pencil.E)

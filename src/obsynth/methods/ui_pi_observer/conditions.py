@@ -23,8 +23,16 @@ from obsynth.analysis.conditions import Condition
 from obsynth.analysis.existence.distance import drowned_zeros
 from obsynth.analysis.existence.numbers import numbers_of
 from obsynth.analysis.existence.rational import SystemFacts
-from obsynth.analysis.existence.verdicts import believed, described_distance, in_own_time, unclear_detail, zero_verdict
-from obsynth.analysis.plant_units import PlantUnits
+from obsynth.analysis.existence.verdicts import (
+    believed,
+    described_distance,
+    in_own_time,
+    needed_gain,
+    unclear_detail,
+    zero_doubt,
+    zero_verdict,
+)
+from obsynth.analysis.plant_units import PlantUnits, sized_plant
 from obsynth.analysis.transformations import Transformation
 from obsynth.analysis.zeros import Zero, leading_names, zero_at, zeros_of_system
 from obsynth.methods.ui_pi_observer.augmented_plant import AugmentedPlant
@@ -90,10 +98,10 @@ def existence(plant: DescriptorSystem, model: Exosystem) -> Existence:
     # (D1) and the others fail independently: a user wants to know both.
     found = [enough, solvable, _zero_condition(working, scaled, units)]
     if found[-1].holds:
-        found += model_conditions(working, model, scaled, courses, units, written=plant)
+        found += model_conditions(working, model, scaled, courses, units)
     if not all(condition.holds for condition in found):
         return Existence(tuple(found), working, transformation, nothing)
-    found += order_conditions(scaled, courses, units)
+    found += order_conditions(working, model, scaled, courses, units)
     if not found[-1].holds:
         return Existence(tuple(found), working, transformation, nothing)
     fixed, condition = _fixed_modes(working, model, scaled, courses, units)
@@ -131,20 +139,30 @@ def _zero_condition(given: DescriptorSystem, plant: DescriptorSystem, units: Pla
     if not facts.full:
         return _hidden_trajectories(facts.normal_rank, facts.columns)
     wide_e, wide_a = system_pencil(plant.E, plant.A, inputs, plant.C, direct)
-    verdict = zero_verdict(_timed(facts, units.rate), wide_e, wide_a, nx=plant.nx, discrete=plant.dt > 0.0)
+    terms, sizes = sized_plant(given), None
+    if terms is not None:
+        terms = units.scaled_plant(terms)
+        sizes = np.block([[terms.A, terms.Bd[:, kept]], [terms.C, terms.Dd[:, kept]]])
+    verdict = zero_verdict(_timed(facts, units.rate), wide_e, wide_a, nx=plant.nx, discrete=plant.dt > 0.0, sizes=sizes)
     if verdict.facts.outside:
         zero = zero_at(plant.E, plant.A, verdict.facts.outside[0], inputs, plant.C, direct)
-        return _zero_failure(plant, units, zero, inputs, direct)
+        lost = _zero_failure(plant, units, zero, inputs, direct)
+        gain = needed_gain(given, units, units.eigenvalue(zero.value), inputs="Bd" if given.nd else "")
+        return replace(lost, detail=f"{lost.detail} {gain}".rstrip())
     if verdict.answer == "unclear":
-        detail = unclear_detail(in_own_time(verdict, units.rate), "An observer")
+        own = in_own_time(verdict, units.rate)
+        detail, layout = unclear_detail(own, "An observer"), [["A", "Bd"], ["C", "Dd"]]
+        doubt = zero_doubt(given, units, own, layout, kept={"Bd": kept, "Dd": kept}, what="observer")
         _, _, outside = zeros_of_system(plant.E, plant.A, inputs, plant.C, direct, dt=plant.dt)
         if outside:
             worst = max(outside, key=lambda zero: instability(zero.value, plant.dt))
             lost = _zero_failure(plant, units, worst, inputs, direct)
-            return replace(lost, detail=f"{detail} In floating point, {lost.detail}", unclear=True)
-        return Condition(
-            "(D2) zeros", _D2, False, float(facts.normal_rank), float(facts.columns), _D2_SOURCE, detail, unclear=True
-        )
+            lost = replace(lost, detail=f"{detail} In floating point, {lost.detail}")
+        else:
+            lost = Condition(
+                "(D2) zeros", _D2, False, float(facts.normal_rank), float(facts.columns), _D2_SOURCE, detail
+            )
+        return lost.in_doubt(doubt, given)
     return Condition(
         "(D2) zeros", _D2, True, float(facts.normal_rank), float(facts.columns), _D2_SOURCE,
         f"{len(verdict.facts.zeros)} stable zero(s); {described_distance(in_own_time(verdict, units.rate))}",
@@ -218,9 +236,8 @@ def _fixed_modes(
         zeros = np.array([*map(units.eigenvalue, (*facts.zeros, *nearly))], dtype=np.complex128)
         verdict = zero_verdict(facts, *pencil, nx=augmented.order, discrete=plant.dt > 0.0)
         if verdict.answer == "unclear" and verdict.distance is not None:
-            return zeros, lost_in_rounding(
-                model, plant.fault_names, units.eigenvalue(verdict.distance.point), augmented.order
-            )
+            point = units.eigenvalue(verdict.distance.point)
+            return zeros, lost_in_rounding(given, courses, units, point, augmented.order)
     else:
         drops = finite_zeros(*pencil).values
         zeros = units.eigenvalues(drops)
@@ -229,9 +246,8 @@ def _fixed_modes(
         means = [np.mean(drops[np.abs(drops - value) <= SCATTER * max(1.0, abs(value))]) for value in drops]
         unstable = [mean for mean in means if instability(complex(mean), plant.dt) >= bound]
         if unstable:
-            return zeros, lost_in_rounding(
-                model, plant.fault_names, units.eigenvalue(complex(unstable[0])), augmented.order
-            )
+            point = units.eigenvalue(complex(unstable[0]))
+            return zeros, lost_in_rounding(given, courses, units, point, augmented.order)
     text = ", ".join(numbers(zeros))
     return zeros, Condition(
         "fixed modes",

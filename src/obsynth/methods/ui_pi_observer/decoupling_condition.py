@@ -10,9 +10,10 @@ from dataclasses import replace
 import numpy as np
 
 from obsynth.analysis.conditions import Condition
+from obsynth.analysis.existence.distance import least_share
 from obsynth.analysis.existence.numbers import numbers_of
-from obsynth.analysis.existence.verdicts import settled_rank
-from obsynth.analysis.plant_units import PlantUnits
+from obsynth.analysis.existence.verdicts import rank_doubt, settled_rank
+from obsynth.analysis.plant_units import PlantUnits, sized_plant
 from obsynth.analysis.transformations import StateRecovery, Transformation, eliminate_algebraic_states
 from obsynth.analysis.transformations.elimination import dynamic_coordinates, eliminated_exactly
 from obsynth.analysis.zeros import leading_names
@@ -54,8 +55,13 @@ def decoupling_rank(plant: DescriptorSystem) -> RankDecision:
             [tall, square, dd],
         ]
     )
-    decision = decide_rank(_decoupling_matrix(scaled), expected=plant.nx + numbers.rank(dd) + disturbance_rank(plant))
-    return settled_rank(decision, numbers.rank(matrix))
+    expected = plant.nx + numbers.rank(dd) + disturbance_rank(plant)
+    decision, terms = decide_rank(_decoupling_matrix(scaled), expected=expected), sized_plant(plant)
+    if terms is None:
+        return settled_rank(decision, numbers.rank(matrix))
+    sizes = PlantUnits.of(plant).rounded().scaled_plant(terms)
+    share = least_share(_decoupling_matrix(scaled), _decoupling_matrix(sizes), rank=expected)
+    return settled_rank(decision, numbers.rank(matrix), share)
 
 
 def _scaled(plant: DescriptorSystem) -> DescriptorSystem:
@@ -170,7 +176,7 @@ def _decoupling_condition(plant: DescriptorSystem, decision: RankDecision, detai
             if set(signals) & set(plant.disturbance_names)
             else f"the states {', '.join(map(repr, signals))} are neither dynamic nor measured."
         )
-    return Condition(
+    found = Condition(
         "(D1) decoupling",
         "rank [E 0 Bd; C Dd 0; 0 0 Dd] = nx + rank Dd + rank [Bd; Dd]",
         decision.full,
@@ -179,8 +185,18 @@ def _decoupling_condition(plant: DescriptorSystem, decision: RankDecision, detai
         SOURCE,
         detail,
         signals=signals,
-        unclear=decision.means == "unclear",
     )
+    if decision.means != "unclear":
+        return found
+    # Without direct parts, as almost always, the condition is that [E Bd; C 0] has full rank.
+    numbers = numbers_of(plant)
+    both = None if numbers is None else numbers.blocks([[numbers.matrix("Bd")], [numbers.matrix("Dd")]])
+    kept = list(range(plant.nd)) if numbers is None else numbers.independent_columns(both, plant.nd)
+    free = [j for j in kept if not plant.Dd[:, j].any()]
+    seen = [j for j in kept if j not in free]
+    layout = [["E", "Bd"], ["C", None]] if not seen else [["E", "Bd", None], ["C", None, "Dd"]]
+    doubt = rank_doubt(plant, PlantUnits.of(plant).rounded(), decision, layout, kept={"Bd": free, "Dd": seen})
+    return found.in_doubt(doubt, plant)
 
 
 def _undecoupled(plant: DescriptorSystem) -> tuple[str, ...]:

@@ -15,10 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.analysis.conditions import Condition
+from obsynth.analysis.existence.distance import DROWNED, least_share
+from obsynth.analysis.existence.named_pencils import named_augmented, unclear
 from obsynth.analysis.existence.numbers import numbers_of
 from obsynth.analysis.existence.rational import PlantNumbers, SystemFacts, WrittenNumbers
-from obsynth.analysis.existence.verdicts import settled_rank
-from obsynth.analysis.plant_units import PlantUnits
+from obsynth.analysis.existence.verdicts import DECIDER, settled_rank
+from obsynth.analysis.existence.witnesses import Unclear
+from obsynth.analysis.plant_units import PlantUnits, sized_plant
 from obsynth.analysis.zeros import is_outside, leading_names
 from obsynth.methods.ui_pi_observer.augmented_plant import AugmentedPlant
 from obsynth.methods.ui_pi_observer.pencils import (
@@ -32,7 +35,7 @@ from obsynth.methods.ui_pi_observer.pencils import (
 )
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.pencils import finite_zeros
-from obsynth.numerics.ranks import RankDecision, decide_rank
+from obsynth.numerics.ranks import RANK_TOLERANCE, RankDecision, decide_rank
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.exosystems import Exosystem
 
@@ -138,18 +141,21 @@ def _factor_of(model: Exosystem, value: complex) -> fmpz_poly | None:
 
 
 def model_conditions(
-    given: DescriptorSystem, courses: Exosystem, plant: DescriptorSystem, model: Exosystem, units: PlantUnits,
-    *, written: DescriptorSystem,
-) -> list[Condition]:  # fmt: skip
-    """Test (D3) at each unstable eigenvalue of the fault model, upper half plane only.
-
-    ``written`` is the plant behind ``given``, with its algebraic equations.
-    """
+    given: DescriptorSystem, courses: Exosystem, plant: DescriptorSystem, model: Exosystem, units: PlantUnits
+) -> list[Condition]:
+    """Test (D3) at each unstable eigenvalue of the fault model, upper half plane only."""
+    terms = sized_plant(given)
+    sizes = None if terms is None else units.scaled_plant(terms)
     unstable = [complex(value) for value in model.eigenvalues if value.imag >= 0.0 and is_outside(value, plant.dt)]
     found = []
     for value in sorted(unstable, key=lambda value: (value.real, value.imag)):
         lost = exact_loss(given, courses, units.eigenvalue(value))
-        found.append(_model_condition(plant, model, value, units, lost, (written, courses)))
+        condition, decision = _model_condition(plant, model, value, units, lost, sizes)
+        if decision.means == "unclear":
+            point = units.eigenvalue(value)
+            other = f"hides a fault that follows its model at {number(point)}, and no observer estimates it"
+            condition = condition.in_doubt(_model_doubt(given, courses, units, point, other=other), given)
+        found.append(condition)
         if not found[-1].holds:
             break
     return found
@@ -164,35 +170,41 @@ class _ModelPencil:
     courses: NDArray[Any]
     inputs: FloatArray
     direct: FloatArray
+    share: float = np.inf
 
     @classmethod
-    def of(cls, plant: DescriptorSystem, model: Exosystem, value: complex) -> _ModelPencil:
+    def of(
+        cls, plant: DescriptorSystem, model: Exosystem, value: complex, sizes: DescriptorSystem | None
+    ) -> _ModelPencil:
+        """Return the matrix; ``sizes`` of the terms that the entries of the plant are sums of."""
         inputs, direct = independent_disturbances(plant)
         courses = model.Cw @ kernel(model.Phi - value * np.eye(model.order))
         matrix = np.block([
             [value * plant.E - plant.A, -plant.Bf @ courses, -inputs],
             [plant.C.astype(complex), plant.Df @ courses, direct],
         ])  # fmt: skip
-        return cls(*equilibrated(matrix), courses, inputs, direct)
+        if sizes is None:
+            return cls(*equilibrated(matrix), courses, inputs, direct)
+        # Disturbances that are combinations of others are judged as those: their own terms are not known.
+        own = inputs.shape == plant.Bd.shape
+        whole = np.block([
+            [abs(value) * sizes.E + sizes.A, sizes.Bf @ np.abs(courses), sizes.Bd if own else np.abs(inputs)],
+            [sizes.C, sizes.Df @ np.abs(courses), sizes.Dd if own else np.abs(direct)],
+        ])  # fmt: skip
+        return cls(*equilibrated(matrix), courses, inputs, direct, least_share(matrix, whole))
 
     def decision(self, lost: int | None) -> RankDecision:
         width = self.scaled.shape[1]
         found = decide_rank(self.scaled, expected=width, equilibrated=False)
-        return settled_rank(found, None if lost is None else width - lost)
+        return settled_rank(found, None if lost is None else width - lost, self.share)
 
 
 def _model_condition(
     plant: DescriptorSystem, model: Exosystem, value: complex, units: PlantUnits, lost: int | None,
-    written: tuple[DescriptorSystem, Exosystem],
-) -> Condition:  # fmt: skip
-    pencil = _ModelPencil.of(plant, model, value)
+    sizes: DescriptorSystem | None,
+) -> tuple[Condition, RankDecision]:  # fmt: skip
+    pencil = _ModelPencil.of(plant, model, value, sizes)
     decision = pencil.decision(lost)
-    if decision.full and lost is not None and written[0].nx > plant.nx:
-        # Natural units make much of a fault of which elimination has left no more than rounding.
-        before = _ModelPencil.of(*written, units.eigenvalue(value))
-        again = before.decision(lost)
-        if not again.full:
-            plant, pencil, decision = written[0], before, again
     scaled, columns, courses = pencil.scaled, pencil.columns, pencil.courses
     inputs, direct, width = pencil.inputs, pencil.direct, courses.shape[1]
     own = units.eigenvalue(value)
@@ -225,11 +237,26 @@ def _model_condition(
         detail,
         mode=None if decision.full else own,
         signals=signals,
-        unclear=decision.means == "unclear",
+    ), decision
+
+
+def _model_doubt(
+    plant: DescriptorSystem, model: Exosystem, units: PlantUnits, value: complex, *, other: str,
+    decider: str = DECIDER, of_the_model: bool = False, tolerance: float = DROWNED, moving: bool = False,
+) -> Unclear:  # fmt: skip
+    """Return why it is unclear whether plant and fault model hide something at a point, in the plant's own time."""
+    numbers = numbers_of(plant)
+    both = None if numbers is None else numbers.blocks([[numbers.matrix("Bd")], [numbers.matrix("Dd")]])
+    kept = list(range(plant.nd)) if numbers is None else numbers.independent_columns(both, plant.nd)
+    named = named_augmented(plant, model, units, kept=kept, of_the_model=of_the_model)
+    return unclear(
+        plant, named, tolerance=tolerance, point=value, dt=plant.dt if moving else None, other=other, decider=decider
     )
 
 
-def order_conditions(plant: DescriptorSystem, model: Exosystem, units: PlantUnits) -> list[Condition]:
+def order_conditions(
+    given: DescriptorSystem, courses: Exosystem, plant: DescriptorSystem, model: Exosystem, units: PlantUnits
+) -> list[Condition]:
     """Test that the fault model is not lost in rounding, at the zeros where faults can hide longest.
 
     At a zero z0 of (f, d) -> y outside the region of stability, a polynomial model of order n is seen with a strength
@@ -258,25 +285,33 @@ def order_conditions(plant: DescriptorSystem, model: Exosystem, units: PlantUnit
         f": at the zero {number(point)} of (f, d) -> y the fault model (order {model.order}) cannot be told from "
         "nothing in double precision. Lower its order."
     )
-    return [
-        Condition(
-            "order of the fault model",
-            "the augmented plant is observable in double precision where faults can hide longest",
-            decision.full,
-            float(decision.rank),
-            float(decision.expected),
-            "ours: observable on paper is not enough",
-            f"{decision.describe()} at {number(point)}" + ("" if decision.full else lost),
-            mode=None if decision.full else point,
-            signals=() if decision.full else plant.fault_names,
-            unclear=not decision.full,
-        )
-    ]
+    found = Condition(
+        "order of the fault model",
+        "the augmented plant is observable in double precision where faults can hide longest",
+        decision.full,
+        float(decision.rank),
+        float(decision.expected),
+        "ours: observable on paper is not enough",
+        f"{decision.describe()} at {number(point)}" + ("" if decision.full else lost),
+        mode=None if decision.full else point,
+        signals=() if decision.full else plant.fault_names,
+    )
+    return [found if decision.full else found.in_doubt(_order_doubt(given, courses, units, point), given)]
 
 
-def lost_in_rounding(model: Exosystem, fault_names: tuple[str, ...], mode: complex, order: int) -> Condition:
+def _order_doubt(plant: DescriptorSystem, model: Exosystem, units: PlantUnits, point: complex) -> Unclear:
+    return _model_doubt(
+        plant, model, units, point, of_the_model=True, tolerance=RANK_TOLERANCE, moving=True,
+        other=f"hides a motion of plant and fault model at {number(point)}, and no observer sees it",
+        decider="A fault model of lower order, or an output nearer to the fault, would decide it.",
+    )  # fmt: skip
+
+
+def lost_in_rounding(
+    plant: DescriptorSystem, model: Exosystem, units: PlantUnits, mode: complex, order: int
+) -> Condition:
     """Return the failing condition for a mode that seems fixed and unstable, against all other conditions."""
-    return Condition(
+    found = Condition(
         "fault model in double precision",
         "no mode of plant and fault model seems hidden by rounding alone",
         False,
@@ -286,9 +321,9 @@ def lost_in_rounding(model: Exosystem, fault_names: tuple[str, ...], mode: compl
         f"plant and fault model (order {model.order}) seem to hide an unstable mode at {number(mode)}, which the "
         "conditions above exclude: in double precision the model is too long a chain. Lower its order.",
         mode=mode,
-        signals=fault_names,
-        unclear=True,
+        signals=plant.fault_names,
     )
+    return found.in_doubt(_order_doubt(plant, model, units, mode), plant)
 
 
 def _masking(scaled: NDArray[Any], plant: DescriptorSystem, width: int, shares: FloatArray) -> tuple[str, ...]:

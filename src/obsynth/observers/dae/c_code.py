@@ -1,11 +1,12 @@
 """An observer of a DAE as C99: CasADi writes its graph, and around it stands the loop of Newton and its homotopy.
 
-The loop is that of `obsynth.numerics.newton` and `obsynth.plants.dae.step`, with the same constants.
+The loop is that of `obsynth.numerics.newton` and `obsynth.plants.dae.step`, with the same constants; what is done about
+outliers, jumps, bounds of states and sensors of their own times is that of `obsynth.observers.dae.steps`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from importlib.resources import files
 from typing import Any
 
@@ -15,7 +16,14 @@ from obsynth.numerics import newton
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.memory_layout import initial_memory
 from obsynth.observers.dae.step_graph import ObserverGraph
-from obsynth.observers.dae.steps import PROJECTION_NOTICE, PROJECTION_SHARE, Steps
+from obsynth.observers.dae.steps import (
+    PROJECTION_NOTICE,
+    PROJECTION_SHARE,
+    RESET_WINDOW,
+    Steps,
+    chi_square_limit,
+)
+from obsynth.observers.outliers import LONGEST, OVERFLOW
 from obsynth.plants.dae import step as implicit_step
 from obsynth.plants.dae.functions import DAEFunctions
 from obsynth.plants.dae.step import step_graph
@@ -23,6 +31,10 @@ from obsynth.plants.dae.step import step_graph
 #: What ``record.c`` hands out of a batch, in this order.
 BATCH_PARTS = ("posterior", "theta", "spread", "innovation", "nis", "residual")
 _NUMBERS_PER_LINE = 4
+#: Bounds of states whose moves differ by less than this share are dependent.
+DEPENDENT = 1e-13
+#: A bound that is missed by less, in deviations of its state, is kept.
+SLACK = 1e-7
 
 
 def observer_code(steps: Steps) -> str:
@@ -30,10 +42,27 @@ def observer_code(steps: Steps) -> str:
     graph = steps.graph
     short = step_graph(DAEFunctions(steps.settings.model), PROJECTION_SHARE * steps.settings.dt, np.inf)
     functions = {"project": short.newton, "newton": graph.step.newton, "first": graph.first, "sample": graph.sample}
+    if steps.settings.outliers != "none":
+        functions["forecast"] = graph.forecast
     return "\n".join([
-        "#include <math.h>", "", *_constants(steps, graph, functions.values()), "", _generated(functions), "",
-        _template("advance"),
+        "#include <math.h>", "", *_constants(steps, graph, functions.values()), *_option_constants(steps), "",
+        _generated(functions), "", _template("advance"), _template("options"),
     ])  # fmt: skip
+
+
+def observer_struct(steps: Steps, name: str) -> Iterator[str]:
+    """Return lines of C that declare what an observer remembers as ``struct <name>``."""
+    graph, model, timing = steps.graph, steps.settings.model, steps.settings.timing
+    inner = name if timing.is_plain else f"{name}_memory"
+    yield from (f"struct {inner} {{", f"    double memory[{graph.memory.size}];", f"    double u[{max(model.nu, 1)}];")
+    yield "    /* number of the next sample; outliers of each output in a row, and at all; resets so far */"
+    yield from ("    long k;", f"    int in_a_row[{model.ny}];", f"    int refused[{model.ny}];", "    int resets;")
+    yield from ("    int watched;", f"    double surprises[{2 * RESET_WINDOW}];", "};")
+    if not timing.is_plain:
+        rows = timing.longest + 1
+        yield from (f"struct {name} {{", f"    struct {inner} before[{rows}];", f"    struct {inner} latest;")
+        yield from (f"    double u[{max(rows * model.nu, 1)}];", f"    double y[{rows * model.ny}];", "    int kept;")
+        yield "};"
 
 
 def record_code(steps: Steps) -> str:
@@ -45,9 +74,8 @@ def record_code(steps: Steps) -> str:
         size = part.stop - part.start
         copies.append(f"    copy(out + {total}, {source} + {part.start}, {size});")
         total += size
-    return observer_code(steps) + "\n" + _template("record").replace("/* PARTS */", "\n".join(copies)).replace(
-        "PARTS_SIZE", str(total)
-    )  # fmt: skip
+    loops = _template("record").replace("/* PARTS */", "\n".join(copies)).replace("PARTS_SIZE", str(total))
+    return "\n".join([*observer_struct(steps, "observer"), observer_code(steps), loops])
 
 
 def _template(name: str) -> str:
@@ -82,6 +110,40 @@ def _constants(steps: Steps, graph: ObserverGraph, functions: Iterable[Any]) -> 
         *c_table("SIZES", np.asarray(model.state_scales)),
         *c_table("START", initial_memory(steps.settings, steps.settings.initial_state)),
     ]  # fmt: skip
+
+
+def _option_constants(steps: Steps) -> list[str]:
+    """Return what the options of an observer are in C."""
+    settings, memory = steps.settings, steps.graph.memory
+    bounds = np.zeros((0, 2)) if settings.state_bounds is None else settings.state_bounds
+    ends = [(i, sign, float(pair[side])) for side, sign in ((0, 1.0), (1, -1.0)) for i, pair in enumerate(bounds)
+            if np.isfinite(pair[side])]  # fmt: skip
+    most = RESET_WINDOW * settings.model.ny
+    limits = [0.0, *(chi_square_limit(n, settings.reset) for n in range(1, most + 1))] if settings.reset else []
+    timing = settings.timing
+    numbers = {
+        "AT_S": memory.slices["S"].start if "S" in memory.shapes else -1,
+        "AT_CROSS": memory.slices["cross"].start if "cross" in memory.shapes else -1,
+        "OUTLIERS": int(settings.outliers != "none"), "GATE": int(settings.outliers == "gate"),
+        "OUTLIER_LIMIT": steps.limit if np.isfinite(steps.limit) else 0.0, "OVERFLOW_LIMIT": OVERFLOW,
+        "LONGEST_REFUSAL": LONGEST, "RESETS": int(bool(settings.reset)), "RESET_WINDOW": RESET_WINDOW,
+        "BOUNDS": len(ends), "DEPENDENT": DEPENDENT, "SLACK": SLACK, "WAITS": int(not timing.is_plain),
+        "LATEST": timing.longest,
+    }  # fmt: skip
+    lines = [f"#define {name} {value!r}" for name, value in numbers.items()]
+    if limits:
+        lines += c_table("RESET_LIMITS", np.array(limits))
+    if ends:
+        lines += [*_integers("BOUND_STATES", [i for i, _, _ in ends]),
+                  *c_table("BOUND_SIGNS", np.array([sign for _, sign, _ in ends])),
+                  *c_table("BOUND_ENDS", np.array([end for _, _, end in ends]))]  # fmt: skip
+    if not timing.is_plain:
+        lines += [*_integers("EVERY", timing.every.tolist()), *_integers("DELAYS", timing.delays.tolist())]
+    return lines
+
+
+def _integers(name: str, values: Sequence[int]) -> list[str]:
+    return [f"static const long {name}[{len(values)}] = {{{', '.join(map(str, values))}}};"]
 
 
 def c_table(name: str, values: FloatArray) -> list[str]:

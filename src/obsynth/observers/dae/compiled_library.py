@@ -59,14 +59,14 @@ class DAELibrary:
             self._library = ctypes.CDLL(str(library))
         pointer = ctypes.POINTER(ctypes.c_double)
         self._library.state_bytes.restype = ctypes.c_long
-        self._library.begin.argtypes = [ctypes.c_char_p]
+        self._library.start.argtypes = [ctypes.c_char_p]
         self._library.record.argtypes = [ctypes.c_char_p, ctypes.c_int, *[pointer] * 4]
         self._library.batch.argtypes = [ctypes.c_int, ctypes.c_int, ctypes.c_long, *[pointer] * 3]
 
     def started(self) -> ctypes.Array[ctypes.c_char]:
         """Return the memory of an observer at k = 0, for `record`."""
         state = ctypes.create_string_buffer(self._library.state_bytes())
-        self._library.begin(state)
+        self._library.start(state)
         return state
 
     def record(self, state: ctypes.Array[ctypes.c_char], y: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -9,7 +9,7 @@ import numpy as np
 from obsynth.analysis.dae_index import IndexReport, index_report
 from obsynth.analysis.identifiability import Identifiability, identifiability
 from obsynth.numerics.arrays import FloatArray, read_only
-from obsynth.observers.dae.estimates import GatheredRows
+from obsynth.observers.dae.estimates import DAERow, GatheredRows
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.dae.records import advanced
 
@@ -26,7 +26,8 @@ class DAEFacts:
     at the end; deviations: ``(nq,)``: standard deviations of the parameters at the end; correlations: ``(nq, nq)``: of
     the parameters' errors at the end: how much a change of one is taken for another; projection: ``(nx,)``: how far the
     initial state is moved onto its constraint; identifiable: Of states and parameters along the nominal trajectory; K:
-    ``(nx, ny)`` at the end; Upsilon: ``(nx, nq)`` at the end.
+    ``(nx, ny)`` at the end; Upsilon: ``(nx, nq)`` at the end; kept: ``(steps, nx, nx)``: F (I - K H) of every step;
+    parameter_covariance: ``(nq, nq)`` at the end.
     """
 
     index: IndexReport
@@ -40,6 +41,8 @@ class DAEFacts:
     identifiable: Identifiability
     K: FloatArray
     Upsilon: FloatArray
+    kept: FloatArray
+    parameter_covariance: FloatArray
 
     @property
     def decay_time(self) -> float:
@@ -54,8 +57,13 @@ def dae_facts(observer: DAEObserver) -> DAEFacts:
     model = observer.model
     u = np.array(model.nominal_input)
     truth = _nominal_outputs(observer, u)
-    gathered = GatheredRows(observer)
-    end = advanced(observer.steps, truth, np.tile(u, (len(truth), 1)), gathered.add)
+    gathered, kept = GatheredRows(observer), []
+
+    def add(rows: DAERow) -> None:
+        gathered.add(rows)
+        kept.append(np.array(rows.several.part("kept")))
+
+    end = advanced(observer.steps, truth, np.tile(u, (len(truth), 1)), add)
     found = gathered.estimates()
     covariance = found.parameter_covariances[-1]
     deviations = np.sqrt(np.diag(covariance))
@@ -70,7 +78,7 @@ def dae_facts(observer: DAEObserver) -> DAEFacts:
         float(found.conditions.max()), int(np.argmax(found.conditions)), float(found.residuals.max()),
         float(found.contraction[-1]), read_only(deviations), read_only(covariance / np.outer(safe, safe)),
         found.projection, identifiable, read_only(observer.steps.part(end, "K")),
-        read_only(observer.steps.part(end, "Upsilon")),
+        read_only(observer.steps.part(end, "Upsilon")), read_only(np.concatenate(kept)[1:]), read_only(covariance),
     )  # fmt: skip
 
 

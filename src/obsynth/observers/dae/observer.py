@@ -59,16 +59,8 @@ class DAEObserver(DAESettings, StepObserver[DAEState, DAERow]):
         In nominal sizes of the states; see `obsynth.plants.dae.step.ImplicitStep`.
     window : int
         Samples over which excitation is watched.
-    outliers : {"none", "gate", "huber"}
-        What is done with a sample that its prediction excludes: taken as it is; left out, at most twice in a row
-        of one sensor; or taken at the limit.
-    outlier_limit : float or None
-        In standard deviations of the prediction: 6 for ``gate`` and 3 for ``huber`` by default.
-    sensors : mapping or None
-        ``{name: {"every": rows, "delay": rows}}`` of the sensors that are sampled every so many rows, at k = 0, every,
-        2 every, ..., or whose values arrive so many rows late.
-    state_bounds : FloatArray or None
-        ``(nx, 2)``: lower and upper bounds of the states, infinite where there are none.
+    outliers, outlier_limit, sensors, state_bounds
+        As for `RecursiveObserver`.
     reset : float
         Detect and reset: probability, per sample, that innovations which no change has made larger pass the threshold
         above which the covariance of the parameters starts again from S_0.  Zero never resets.

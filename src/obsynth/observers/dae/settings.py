@@ -144,23 +144,11 @@ class DAESettings(Undelayed):
         return self.model.nx + self.model.nq
 
     def as_dict(self) -> dict[str, Any]:
-        """Return every field as data.
-
-        Raises
-        ------
-        SpecError
-            The model is given as Python functions.
-        """
+        """Return every field as data."""
         found = {field.name: getattr(self, field.name) for field in fields(self)}
         return {**found, "model": self.model.as_dict()}
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
-        """Return the observer that `as_dict` described.
-
-        Parameters
-        ----------
-        data : mapping
-            Every field by name.
-        """
+        """Return the observer that `as_dict` described."""
         return cls(**{**data, "model": DAEModel(**data["model"])})

@@ -29,7 +29,8 @@ class ObserverGraph:
     Fields: memory, row: Of what is carried on, and of what is said besides; functions: The model with its method of
     integration; step: Its implicit step; first: From memory, outputs and one for each that is seen, at k = 0, to memory
     and row; sample: From memory, stages of the solved step, input, outputs and what is seen to memory and row; whole:
-    The implicit step and `sample`: from memory and ``[u; y; seen]`` to memory and row.
+    The implicit step and `sample`: from memory and ``[u; y; seen]`` to memory and row; forecast: From memory and row of
+    a sample that nothing was seen of to mean and deviation of each output.
     """
 
     memory: Layout
@@ -39,6 +40,7 @@ class ObserverGraph:
     first: Any
     sample: Any
     whole: Any
+    forecast: Any
     _stretches: dict[int, Any] = field(default_factory=dict, repr=False)
 
     def over(self, samples: int) -> Any:
@@ -77,7 +79,22 @@ def observer_graph(observer: DAESettings) -> ObserverGraph:
     # The residual and the verdict are the last two entries of a row.
     said = ca.vertcat(said[: row.size - 2], residual, trusted)
     whole = ca.Function("whole", [packed, arriving], [after, said])
-    return ObserverGraph(memory, row, functions, step, first, sample, whole)
+    forecast = _forecast(observer, functions, memory, row)
+    return ObserverGraph(memory, row, functions, step, first, sample, whole, forecast)
+
+
+def _forecast(observer: DAESettings, functions: DAEFunctions, memory: Layout, row: Layout) -> Any:
+    """Return the function from memory and row of a sample to mean and deviation ``(ny,)`` of its outputs."""
+    import casadi as ca
+
+    packed, said = ca.MX.sym("memory", memory.size), ca.MX.sym("said", row.size)
+    found = {**memory.symbols(packed), **row.symbols(said)}
+    spread = found["spread"]
+    y, H, L = functions.output_function(found["posterior"], found["theta"])
+    cross = found["cross"] if observer.form == "augmented-kalman" else found["Upsilon"] @ spread
+    both = H @ cross @ L.T
+    whole = H @ found["covariance"] @ H.T + both + both.T + L @ spread @ L.T + ca.DM(observer.R)
+    return ca.Function("forecast", [packed, said], [ca.densify(y), ca.densify(ca.sqrt(ca.diag(whole)))])
 
 
 def _outcome(found: Arrays, memory: Layout, row: Layout) -> list[Any]:

@@ -122,13 +122,8 @@ class Steps:
     def predicted(self, state: DAEState, heard: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return mean and deviation of each output ``(ny,)`` from what is heard of the next sample."""
         after, row = self.plain(state, heard, u)
-        y, H, L = self.graph.functions.outputs(row.x, row.theta)
-        spread = row.parameter_covariance
-        joint = self.settings.form == "augmented-kalman"
-        cross = self.part(after, "cross") if joint else self.part(after, "Upsilon") @ spread
-        both = H @ cross @ L.T
-        whole = H @ row.covariance @ H.T + both + both.T + L @ spread @ L.T + self.settings.R
-        return y, np.sqrt(np.diag(whole))
+        mean, deviation = self._forecast(after.memory, row.said)
+        return mean[:, 0], deviation[:, 0]
 
     def plain(self, state: DAEState, y: FloatArray, u: FloatArray) -> tuple[DAEState, DAERow]:
         """Take a sample as it is."""
@@ -198,6 +193,10 @@ class Steps:
     @cached_property
     def _sample(self) -> Compiled:
         return Compiled(self.graph.sample)
+
+    @cached_property
+    def _forecast(self) -> Compiled:
+        return Compiled(self.graph.forecast)
 
     @cached_property
     def _whole(self) -> Compiled:

@@ -197,7 +197,7 @@ class LinearObserver:
         outputs = checked_sample(y, len(self.output_names), "y")
         inputs = checked_sample(u, len(self.input_names), "u")
         after, row = self.advance(state, outputs, inputs)
-        return after, Estimates.split(self, row[None, :])
+        return after, split_rows(self, row[None, :])
 
     def run(self, y: ArrayLike, u: ArrayLike | None = None, *, initial_state: ArrayLike | None = None) -> Estimates:
         """Run over a whole record of a discrete-time observer.
@@ -226,4 +226,13 @@ class LinearObserver:
         rows = np.empty((len(outputs), self.Cz.shape[0]))
         for k in range(len(outputs)):
             state, rows[k] = self.advance(state, outputs[k], inputs[k])
-        return Estimates.split(self, rows)
+        return split_rows(self, rows)
+
+
+def split_rows(observer: LinearObserver, rows: FloatArray) -> Estimates:
+    """Return the estimates in the output rows ``(..., samples, nx + nf + nr)`` of an observer."""
+    return Estimates(
+        read_only(rows[..., observer.state_rows]), read_only(rows[..., observer.fault_rows]),
+        read_only(rows[..., observer.residual_rows]), observer.state_names, observer.fault_names,
+        observer.residual_names, observer.state_delays, observer.fault_delays,
+    )  # fmt: skip

@@ -151,13 +151,7 @@ class RecursiveSettings(Undelayed):
         return self.plant.nx + len(self.fault_names)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return every field as data.
-
-        Raises
-        ------
-        SpecError
-            A matrix is a callable.
-        """
+        """Return every field as data."""
         adaptation = None
         if self.adaptation is not None:
             adaptation = {field.name: getattr(self.adaptation, field.name) for field in fields(self.adaptation)}
@@ -171,13 +165,7 @@ class RecursiveSettings(Undelayed):
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
-        """Return the observer that `as_dict` described.
-
-        Parameters
-        ----------
-        data : mapping
-            Every field by name.
-        """
+        """Return the observer that `as_dict` described."""
         constants = data["noise_constants"]
         return cls(
             TimeVaryingDescriptorSystem(**data["plant"]),

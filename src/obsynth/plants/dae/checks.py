@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -12,12 +12,9 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_finite_number, real_array
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.expressions import CONSTANTS, DECIDING_WORDS, FUNCTIONS, FUNCTIONS_OF_TWO
-from obsynth.plants.dae.symbols import DAESymbols, symbols_of
+from obsynth.plants.dae.symbols import DAEFields, DAESymbols, symbols_of
 from obsynth.plants.names import checked_names
 from obsynth.plants.validation import Problems
-
-if TYPE_CHECKING:
-    from obsynth.plants.dae.model import DAEModel
 
 #: Names that mean something else in the language.
 RESERVED = frozenset({*CONSTANTS, *FUNCTIONS, *FUNCTIONS_OF_TWO, *DECIDING_WORDS, "der", "where"})
@@ -66,7 +63,7 @@ def checked_equation_names(
     return checked_names(names, states, prefix="equation ", what=what)
 
 
-def check_distinct(model: DAEModel) -> None:
+def check_distinct(model: DAEFields) -> None:
     """Raise `SpecError` when a name stands for two things."""
     groups = (model.states, model.inputs, model.parameters, model.constants, model.definitions)
     names = [name for group in groups for name in group]
@@ -78,7 +75,7 @@ def check_distinct(model: DAEModel) -> None:
         )  # fmt: skip
 
 
-def check_structure(model: DAEModel, problems: Problems) -> None:
+def check_structure(model: DAEFields, problems: Problems) -> None:
     """Note what is wrong with the equations as a whole: their number, empty ones, signals that enter nothing."""
     symbols = problems.collect(lambda: symbols_of(model))
     problems.raise_if_any()
@@ -88,7 +85,7 @@ def check_structure(model: DAEModel, problems: Problems) -> None:
         problems.collect(partial(check, model, symbols))
 
 
-def _square(model: DAEModel, symbols: DAESymbols) -> None:
+def _square(model: DAEFields, symbols: DAESymbols) -> None:
     rows, ny = symbols.equations.numel(), symbols.outputs.numel()
     if rows != model.nx:
         few = "few" if rows < model.nx else "many"
@@ -103,7 +100,7 @@ def _square(model: DAEModel, symbols: DAESymbols) -> None:
                         path="outputs")  # fmt: skip
 
 
-def _only_states_stored(model: DAEModel, symbols: DAESymbols) -> None:
+def _only_states_stored(model: DAEFields, symbols: DAESymbols) -> None:
     found = _depends(symbols.stored, symbols.u)
     if found.any():
         name = model.input_names[int(np.argmax(found.any(axis=0)))]
@@ -120,7 +117,7 @@ def _only_states_stored(model: DAEModel, symbols: DAESymbols) -> None:
                         path="equations")  # fmt: skip
 
 
-def _no_empty_equation(model: DAEModel, symbols: DAESymbols) -> None:
+def _no_empty_equation(model: DAEFields, symbols: DAESymbols) -> None:
     import casadi as ca
 
     filled = _depends(symbols.equations, ca.vertcat(symbols.x, symbols.rates)).any(axis=1)
@@ -137,7 +134,7 @@ def _no_empty_equation(model: DAEModel, symbols: DAESymbols) -> None:
         raise SpecError(f"The state {name!r} enters no equation: nothing determines it.", path=f"states.{name}")
 
 
-def _every_input_used(model: DAEModel, symbols: DAESymbols) -> None:
+def _every_input_used(model: DAEFields, symbols: DAESymbols) -> None:
     import casadi as ca
 
     # What an output must not contain is said elsewhere.
@@ -147,7 +144,7 @@ def _every_input_used(model: DAEModel, symbols: DAESymbols) -> None:
             raise SpecError(f"The input {name!r} enters no equation: remove it, or use it.", path=f"inputs.{name}")
 
 
-def _every_parameter_used(model: DAEModel, symbols: DAESymbols) -> None:
+def _every_parameter_used(model: DAEFields, symbols: DAESymbols) -> None:
     import casadi as ca
 
     used = _depends(ca.vertcat(symbols.equations, symbols.stored, symbols.outputs), symbols.theta).any(axis=0)
@@ -157,7 +154,7 @@ def _every_parameter_used(model: DAEModel, symbols: DAESymbols) -> None:
                             path=f"parameters.{name}")  # fmt: skip
 
 
-def _every_output_sees(model: DAEModel, symbols: DAESymbols) -> None:
+def _every_output_sees(model: DAEFields, symbols: DAESymbols) -> None:
     import casadi as ca
 
     seen = _depends(symbols.outputs, ca.vertcat(symbols.x, symbols.theta)).any(axis=1)
@@ -174,7 +171,7 @@ def step_length(dt: Any) -> float:
     return float(dt)
 
 
-def checked_inputs(model: DAEModel, u: Any, samples: int | None = None) -> FloatArray:
+def checked_inputs(model: DAEFields, u: Any, samples: int | None = None) -> FloatArray:
     """Return known inputs ``(samples, nu)``; raise `SpecError` naming the signal and k where one is not finite."""
     if u is None and (model.nu or samples is None):
         raise SpecError(f"u is missing: the model has {model.nu} input(s), {', '.join(model.input_names)}.", path="u")
@@ -191,7 +188,7 @@ def checked_inputs(model: DAEModel, u: Any, samples: int | None = None) -> Float
     return array
 
 
-def require_known(model: DAEModel, u: FloatArray, first: int = 0) -> None:
+def require_known(model: DAEFields, u: FloatArray, first: int = 0) -> None:
     """Raise `SpecError` naming signal and k where an input ``(samples, nu)`` that begins at ``first`` is not finite."""
     if not np.isfinite(u).all():
         k, i = np.argwhere(~np.isfinite(u))[0]

@@ -21,13 +21,12 @@ from obsynth.plants.dae.checks import (
     checked_signals,
     checked_texts,
 )
+from obsynth.plants.dae.symbols import DAEFields, Equations
 from obsynth.plants.validation import Problems, checked_units
-
-Equations = Mapping[str, str] | Callable[..., Sequence[Any]]
 
 
 @dataclass(frozen=True, eq=False, init=False)
-class DAEModel:
+class DAEModel(DAEFields):
     r"""A nonlinear descriptor plant with constant or slowly changing parameters.
 
     .. math::
@@ -86,18 +85,6 @@ class DAEModel:
        2013, (3)-(4).  There h does not depend on theta only in the derivation; (21) needs it, and we allow it.
     """
 
-    equations: Equations
-    outputs: Equations
-    states: Mapping[str, float]
-    inputs: Mapping[str, float]
-    parameters: Mapping[str, float]
-    constants: Mapping[str, float]
-    definitions: Mapping[str, str]
-    units: Mapping[str, str]
-    storage: Callable[..., Sequence[Any]] | None
-    equation_names: tuple[str, ...]
-    output_names: tuple[str, ...]
-
     def __init__(
         self,
         equations: Equations,
@@ -135,41 +122,6 @@ class DAEModel:
         known = {*required, *self.constants, *self.definitions}
         object.__setattr__(self, "units", problems.collect(lambda: checked_units(units, known)))
         problems.raise_if_any()
-
-    @property
-    def state_names(self) -> tuple[str, ...]:
-        """Names of the states, in order."""
-        return tuple(self.states)
-
-    @property
-    def input_names(self) -> tuple[str, ...]:
-        """Names of the known inputs, in order."""
-        return tuple(self.inputs)
-
-    @property
-    def parameter_names(self) -> tuple[str, ...]:
-        """Names of the parameters, in order."""
-        return tuple(self.parameters)
-
-    @property
-    def nx(self) -> int:
-        """Number of states, and of equations."""
-        return len(self.states)
-
-    @property
-    def nu(self) -> int:
-        """Number of known inputs."""
-        return len(self.inputs)
-
-    @property
-    def ny(self) -> int:
-        """Number of outputs."""
-        return len(self.output_names)
-
-    @property
-    def nq(self) -> int:
-        """Number of parameters."""
-        return len(self.parameters)
 
     @property
     def nominal_state(self) -> FloatArray:

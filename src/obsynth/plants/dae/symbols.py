@@ -5,18 +5,68 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics.expressions import Expression, parse_expression, step_function
 
-if TYPE_CHECKING:
-    from obsynth.plants.dae.model import DAEModel
-
 #: The sign between two sides, which is no part of a comparison.
 _EQUALS = re.compile("(?<![<>=])=(?!=)")
+Equations = Mapping[str, str] | Callable[..., Sequence[Any]]
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class DAEFields:
+    """What a DAE is written as, before its equations are made into symbols: what `obsynth.DAEModel` is made of."""
+
+    equations: Equations
+    outputs: Equations
+    states: Mapping[str, float]
+    inputs: Mapping[str, float]
+    parameters: Mapping[str, float]
+    constants: Mapping[str, float]
+    definitions: Mapping[str, str]
+    units: Mapping[str, str]
+    storage: Callable[..., Sequence[Any]] | None
+    equation_names: tuple[str, ...]
+    output_names: tuple[str, ...]
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """Names of the states, in order."""
+        return tuple(self.states)
+
+    @property
+    def input_names(self) -> tuple[str, ...]:
+        """Names of the known inputs, in order."""
+        return tuple(self.inputs)
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of the parameters, in order."""
+        return tuple(self.parameters)
+
+    @property
+    def nx(self) -> int:
+        """Number of states, and of equations."""
+        return len(self.states)
+
+    @property
+    def nu(self) -> int:
+        """Number of known inputs."""
+        return len(self.inputs)
+
+    @property
+    def ny(self) -> int:
+        """Number of outputs."""
+        return len(self.output_names)
+
+    @property
+    def nq(self) -> int:
+        """Number of parameters."""
+        return len(self.parameters)
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,12 +86,12 @@ class DAESymbols:
     outputs: Any
 
 
-def symbols_of(model: DAEModel) -> DAESymbols:
+def symbols_of(model: DAEFields) -> DAESymbols:
     """Return the symbols of a model."""
     return _from_functions(model) if callable(model.equations) else _from_texts(model, model.equations)
 
 
-def _columns(model: DAEModel) -> tuple[Any, Any, Any]:
+def _columns(model: DAEFields) -> tuple[Any, Any, Any]:
     import casadi as ca
 
     return tuple(
@@ -50,7 +100,7 @@ def _columns(model: DAEModel) -> tuple[Any, Any, Any]:
     )  # type: ignore[return-value]
 
 
-def _from_texts(model: DAEModel, equations: Mapping[str, str]) -> DAESymbols:
+def _from_texts(model: DAEFields, equations: Mapping[str, str]) -> DAESymbols:
     import casadi as ca
 
     x, u, theta = _columns(model)
@@ -134,7 +184,7 @@ def _translation(operation: Callable[..., Any]) -> Callable[..., Any]:
     return applied
 
 
-def _from_functions(model: DAEModel) -> DAESymbols:
+def _from_functions(model: DAEFields) -> DAESymbols:
     import casadi as ca
 
     x, u, theta = _columns(model)

@@ -24,8 +24,8 @@ from obsynth.numerics.scaling import Scaling, balance_by_least_squares
 from obsynth.numerics.spectra import certain_noise_covariance
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
-from obsynth.results.report import Check, information, upper_bound_check
 from obsynth.verification.certificates import prove_bounded_real
 from obsynth.verification.claims import UNCERTAIN, claim_rows, claimed, recovery_rows
 from obsynth.verification.error_system import ErrorSystem, LaggedPlant

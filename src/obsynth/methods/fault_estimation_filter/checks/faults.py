@@ -15,7 +15,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.scaling import Scaling
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.results.report import Check
+from obsynth.results.checks import Check
 from obsynth.verification.error_system import ErrorSystem, LaggedPlant
 from obsynth.verification.identities import Identity, equality, worst
 

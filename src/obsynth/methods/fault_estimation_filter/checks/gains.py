@@ -22,7 +22,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.scaling import Scaling
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.results.report import Check, upper_bound_check
+from obsynth.results.checks import Check, upper_bound_check
 from obsynth.verification.error_system import ErrorSystem
 from obsynth.verification.identities import Identity, equality, tracking_identities, worst
 

@@ -18,8 +18,8 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.exosystems import Exosystem
 from obsynth.plants.fault_models import stated_eigenvalues
+from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
-from obsynth.results.report import Check, information, upper_bound_check
 from obsynth.verification.certificates import decay_row, prove_stable
 from obsynth.verification.identities import Identity, equality, relative_tolerance
 from obsynth.verification.plant import condition_rows, plant_information
@@ -220,9 +220,10 @@ def _tracking(
 
 def _claimed(design: ObserverDesign) -> Iterator[Check]:
     (plant, observer), claims = design.linear, design.certificate.claims
+    order = claims.get("order", float("nan"))
     yield upper_bound_check(
-        "order", "number of states of the filter", float(observer.order), claims.get("order", float("nan")),
-        source="shipped realisation",
+        "order", "the filter has as many states as claimed: difference", abs(observer.order - order), 0.0,
+        source="shipped realisation", kind="equality", detail=f"{observer.order} states",
     )  # fmt: skip
     if "decay" in claims:
         yield decay_row(observer.Az, plant.dt, claims["decay"])

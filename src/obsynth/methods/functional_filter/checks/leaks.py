@@ -14,8 +14,8 @@ from obsynth.numerics.scaling import balancing_factors
 from obsynth.numerics.spectra import boundary_points
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.results.checks import Check, upper_bound_check
 from obsynth.results.design import ObserverDesign
-from obsynth.results.report import Check, upper_bound_check
 
 #: Estimates at a frequency may miss by this much, relative to terms that pass through the inverse of ``sI - Az``.
 LEAK_TOLERANCE = 1e-7

@@ -13,7 +13,7 @@ import numpy as np
 
 from obsynth.analysis.plant_units import PlantUnits
 from obsynth.methods.pd_observer.checks.certificate import fitting_claims, proof_rows, stacked_gains
-from obsynth.methods.pd_observer.checks.error_system import PdErrorSystem, norm_rows
+from obsynth.methods.pd_observer.checks.error_system import PdErrorSystem, norm_rows, solved
 from obsynth.methods.pd_observer.conditions import pd_observer_conditions
 from obsynth.methods.pd_observer.realisation import with_faults_as_states, with_sensor_noise
 from obsynth.numerics.arrays import FloatArray
@@ -23,8 +23,8 @@ from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.numerics.scaling import balance_by_least_squares, balanced_matrix
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.results.checks import Check, information, lower_bound_check, upper_bound_check
 from obsynth.results.design import ObserverDesign
-from obsynth.results.report import Check, information, lower_bound_check, upper_bound_check
 from obsynth.verification.identities import equality, relative_tolerance, residual, tracking_identities, worst
 from obsynth.verification.plant import condition_rows, plant_information
 from obsynth.verification.remainder_channel import TrackedPlant
@@ -161,7 +161,7 @@ def _parts(plant: DescriptorSystem, errors: PdErrorSystem) -> Iterator[Check]:
     """Yield the two spectra that the paper prints besides; neither theorem says anything about the second."""
     nx = plant.nx
     proportional = plant.A - errors.J[:nx] @ plant.C
-    together = _quotient(np.eye(nx) + errors.L[:nx] @ plant.C, proportional)
+    together = solved(np.eye(nx) + errors.L[:nx] @ plant.C, proportional)
     yield information(
         "state part", "spectral abscissa of (I + L C)^-1 (A - J C), 1/s",
         spectral_abscissa(together), source="Filasova et al., eq. (28)",
@@ -172,13 +172,6 @@ def _parts(plant: DescriptorSystem, errors: PdErrorSystem) -> Iterator[Check]:
         spectral_abscissa(proportional), source="Filasova et al., eq. (27)",
         detail=f"eigenvalues {spectrum_text(proportional)}",
     )  # fmt: skip
-
-
-def _quotient(matrix: FloatArray, right: FloatArray) -> FloatArray:
-    try:
-        return np.asarray(np.linalg.solve(matrix, right))
-    except np.linalg.LinAlgError:
-        return np.full_like(right, np.nan)
 
 
 def spectrum_text(matrix: FloatArray, most: int = 8) -> str:

@@ -30,8 +30,8 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.balls import Ball, Enclosed, block
 from obsynth.proofs.definiteness import DefinitenessProof, prove_positive_definite, unproved
+from obsynth.results.checks import Check
 from obsynth.results.design import ObserverDesign
-from obsynth.results.report import Check
 
 
 def prove_shipped_stability(

@@ -21,8 +21,8 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import ContinuousHinfNorm, continuous_hinf_norm
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
-from obsynth.results.report import Check, information, upper_bound_check
 from obsynth.verification.error_system import ErrorSystem
 
 
@@ -51,7 +51,7 @@ class PdErrorSystem:
         rows = slice(0, n)
         direct = observer.Dy[rows]
         errors = ErrorSystem.of(augmented, observer, np.eye(n), 0)
-        gain_l = _solved(observer.Cz[rows], direct)
+        gain_l = solved(observer.Cz[rows], direct)
         return cls(
             observer.Az, observer.Cz[rows],
             (errors.fault, -direct @ augmented.Df),
@@ -83,7 +83,7 @@ class PdErrorSystem:
         return continuous_hinf_norm(inner, self.estimate @ b, shown, np.zeros((len(shown), b.shape[1])))
 
 
-def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
+def solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
     """Return ``matrix^-1 right``; NaN when the matrix is singular."""
     try:
         return np.asarray(np.linalg.solve(matrix, right))
@@ -93,7 +93,7 @@ def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
 
 def _similar(a: FloatArray, s: FloatArray) -> FloatArray:
     """Return ``s a s^-1``; NaN when s is singular."""
-    return _solved(s.T, (s @ a).T).T
+    return solved(s.T, (s @ a).T).T
 
 
 #: Norms of ``[J L]`` above this many times the norm of A are out of proportion to the plant, and worth a warning.

@@ -1,4 +1,4 @@
-"""Checks of a recursive observer: fit, a batch solution, contraction, excitation, and consistency by Monte Carlo.
+"""Checks of a recursive observer: fit, a batch solution, proofs, excitation, and consistency by Monte Carlo.
 
 Source of the claims: Moussa Ali, Zhang 2013, (6), (13), (26) and Lemma 3.1; the residual directions are our finding.
 """
@@ -12,6 +12,14 @@ import numpy as np
 from obsynth.analysis.time_varying import HorizonRanks, horizon_ranks
 from obsynth.errors import ObsynthError
 from obsynth.methods.recursive.checks.batch import BATCH_STEPS, batch_residuals, batch_steps
+from obsynth.methods.recursive.checks.horizon_proof import (
+    HorizonProof,
+    bias_row,
+    covariance_row,
+    horizon_proof,
+    parameter_row,
+)
+from obsynth.methods.recursive.checks.steady_state import steady_rows
 from obsynth.methods.recursive.conditions import recursive_conditions
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.observer import DAEObserver
@@ -26,8 +34,8 @@ from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.robustness import plain_recursion
 from obsynth.plants.sequences import MatrixSequence
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
-from obsynth.results.report import Check, information, upper_bound_check
 from obsynth.verification.consistency import consistency
 from obsynth.verification.plant import condition_rows
 
@@ -66,7 +74,7 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
         return
     try:
         # What is checked is the recursion; records that no plant made would seem full of outliers.
-        yield from _dynamic_rows(design, plain_recursion(observer), plain_recursion(stated))
+        yield from _dynamic_rows(design, plain_recursion(observer), plain_recursion(stated), same=not problem)
     except (ObsynthError, np.linalg.LinAlgError, ValueError) as error:
         yield upper_bound_check("runs", "the observer runs on its own model", 1.0, 0.0, source="shipped observer",
                                 detail=str(error))  # fmt: skip
@@ -93,7 +101,10 @@ def refinement_rows(observer: RecursiveObserver | DAEObserver) -> Iterator[Check
         )  # fmt: skip
 
 
-def _dynamic_rows(design: ObserverDesign, observer: RecursiveObserver, stated: RecursiveObserver) -> Iterator[Check]:
+def _dynamic_rows(
+    design: ObserverDesign, observer: RecursiveObserver, stated: RecursiveObserver, *, same: bool
+) -> Iterator[Check]:
+    """Yield the rows on what the observer does; ``same`` says that its matrices are those that are stated."""
     ranks = horizon_ranks(observer.plant, early=observer.early_constraints)
     facts = gain_schedule_summary(observer)
     yield information(
@@ -113,7 +124,14 @@ def _dynamic_rows(design: ObserverDesign, observer: RecursiveObserver, stated: R
             f"batch: {name}", "the recursion equals the least-squares solution of the whole record", found,
             BATCH_TOLERANCE * ranks.condition, source=f"{_SOURCE}, (6)-(10)", kind="equality", detail=said,
         )  # fmt: skip
-    yield from _contraction_rows(facts)
+    # Where both hold the same matrices, they need not be computed twice.
+    proof = horizon_proof(observer if same else stated, observer, looked_at(observer))
+    yield _contraction_row(facts, proof)
+    if proof is not None:
+        yield bias_row(proof, ranks.condition)
+        yield covariance_row(stated, proof.last)
+        yield from parameter_row(proof)
+        yield from steady_rows(stated, design.gains, proof.last, ranks.condition)
     if observer.adaptation is not None:
         yield information(
             "excitation", "least information on the parameters in a window", facts.excitation,
@@ -130,15 +148,21 @@ def _dynamic_rows(design: ObserverDesign, observer: RecursiveObserver, stated: R
     yield from consistency(stated, observer, looked_at(observer))
 
 
-def _contraction_rows(facts: GainScheduleSummary) -> Iterator[Check]:
-    claim = "mean factor per step of the product of L_k A_k"
+def _contraction_row(facts: GainScheduleSummary, proof: HorizonProof | None) -> Check:
+    claim, source = "mean factor per step of the product of L_k A_k", f"{_SOURCE}, (13)"
     detail = f"{facts.steps} steps, {facts.span}; an error grows at most by {facts.growth:.3g} on the way"
-    if facts.steps < STEPS_TO_CONTRACT:
-        yield information("contraction", claim, facts.contraction, source=f"{_SOURCE}, (13)", detail=detail)
-    else:
-        yield upper_bound_check(
-            "contraction", claim, facts.contraction, np.nextafter(1.0, 0.0), source=f"{_SOURCE}, (13)", detail=detail
+    proved = proof is not None and proof.contraction < 1.0
+    if proof is not None and proved:
+        detail = (
+            f"at most, in outward rounding of the gains as computed, {proof.span}; computed {facts.contraction:.6g}, "
+            f"{detail}"
         )
+    value = proof.contraction if proof is not None and proved else facts.contraction
+    if facts.steps < STEPS_TO_CONTRACT:
+        return information("contraction", claim, value, source=source, detail=detail,
+                           status="proved" if proved else "computed twice")  # fmt: skip
+    return upper_bound_check("contraction", claim, value, np.nextafter(1.0, 0.0), source=source, detail=detail,
+                             kind="proved" if proved else "computed")  # fmt: skip
 
 
 def listed_gains(design: ObserverDesign, found: Mapping[str, FloatArray]) -> Check:

@@ -13,16 +13,15 @@ from obsynth.analysis.plant_units import PlantUnits
 from obsynth.methods.ui_pi_observer.augmented_plant import AugmentedPlant
 from obsynth.methods.ui_pi_observer.checks.decoupling import decoupling_norm
 from obsynth.methods.ui_pi_observer.checks.fault_response import tracking_rows
-from obsynth.methods.ui_pi_observer.checks.gains import gain_rows
-from obsynth.methods.ui_pi_observer.checks.numbers import noise_rows, stability_rows
+from obsynth.methods.ui_pi_observer.checks.numbers import gain_rows, noise_rows, stability_rows
 from obsynth.methods.ui_pi_observer.conditions import existence
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.exosystems import Exosystem
 from obsynth.plants.fault_models import stated_eigenvalues
+from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
-from obsynth.results.report import Check, information, upper_bound_check
 from obsynth.verification.identities import Residual, equality, relative_tolerance, residual
 from obsynth.verification.plant import condition_rows, plant_information
 from obsynth.verification.remainder_channel import TrackedPlant

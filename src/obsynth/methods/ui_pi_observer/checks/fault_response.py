@@ -27,7 +27,7 @@ from obsynth.numerics.spectra import abscissa, boundary_points, decay_rates, eig
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import balanced_transition
-from obsynth.results.report import Check, information
+from obsynth.results.checks import Check, information
 from obsynth.verification.error_system import ErrorSystem
 
 if TYPE_CHECKING:

@@ -1,14 +1,6 @@
 
 typedef int (*generated)(const double **arg, double **res, int *iw, double *w, int mem);
 
-#ifndef OBSERVER_IS_DECLARED
-struct observer {
-    double memory[MEMORY];
-    double u[LENGTH(NU)];
-    int started;
-};
-#endif
-
 static void copy(double *to, const double *from, int n)
 {
     int i;
@@ -205,14 +197,9 @@ static int put_on_constraint(double *memory, const double *u)
     return 1;
 }
 
-static void reset(struct observer *state)
-{
-    copy(state->memory, START, MEMORY);
-    state->started = 0;
-}
-
-/* Take one sample: 0; 1 if an input is not finite or an output infinite; 2 if the step has no solution. */
-static int advance(struct observer *state, const double *u, const double *y, double *after, double *said)
+/* Take one sample as it is, from what is remembered: 0, or 2 if the step has no solution. */
+static int attempt(const double *given, const struct observer *state, const double *u, const double *y, double *after,
+                   double *said)
 {
     double memory[MEMORY];
     double X[NX * STAGES];
@@ -222,21 +209,15 @@ static int advance(struct observer *state, const double *u, const double *y, dou
     const double *inputs[5];
     double *outputs[2];
     int failed, i;
-    if (!all_finite(u, NU)) {
-        return 1;
-    }
     for (i = 0; i < NY; i++) {
-        if (isinf(y[i])) {
-            return 1;
-        }
         seen[i] = isnan(y[i]) ? 0.0 : 1.0;
         heard[i] = isnan(y[i]) ? 0.0 : y[i];
     }
-    copy(memory, state->memory, MEMORY);
+    copy(memory, given, MEMORY);
     outputs[0] = after;
     outputs[1] = said;
     inputs[0] = memory;
-    if (state->started) {
+    if (state->k > 0) {
         if (!solve(X, memory + AT_POSTERIOR, state->u, u, memory + AT_THETA, &residual)) {
             return 2;
         }
@@ -257,8 +238,5 @@ static int advance(struct observer *state, const double *u, const double *y, dou
         return 2;
     }
     said[AT_RESIDUAL] = residual;
-    copy(state->memory, after, MEMORY);
-    copy(state->u, u, NU);
-    state->started = 1;
     return 0;
 }

@@ -4,19 +4,21 @@ long state_bytes(void)
     return (long)sizeof(struct observer);
 }
 
-void begin(struct observer *state)
+void start(struct observer *state)
 {
-    reset(state);
+    begin(state);
 }
 
 /* Go on over some samples; returns the number of those that were taken. */
 int record(struct observer *state, int samples, const double *u, const double *y, double *after, double *said)
 {
     int k;
+    double heard[NY];
     for (k = 0; k < samples; k++) {
-        if (advance(state, u + k * NU, y + k * NY, after + (long)k * MEMORY, said + (long)k * ROW) != 0) {
+        if (advance(state, u + k * NU, y + k * NY, heard, said + (long)k * ROW) != 0) {
             return k;
         }
+        copy(after + (long)k * MEMORY, state->memory, MEMORY);
     }
     return samples;
 }
@@ -31,17 +33,17 @@ static void hand_out(double *out, const double *after, const double *said)
 int batch(int runs, int samples, long apart, const double *u, const double *y, double *out)
 {
     struct observer state;
-    double after[MEMORY];
+    double heard[NY];
     double said[ROW];
     int run, k;
     for (run = 0; run < runs; run++) {
-        reset(&state);
+        begin(&state);
         for (k = 0; k < samples; k++) {
             long row = (long)run * samples + k;
-            if (advance(&state, u + run * apart + (long)k * NU, y + row * NY, after, said) != 0) {
+            if (advance(&state, u + run * apart + (long)k * NU, y + row * NY, heard, said) != 0) {
                 return run;
             }
-            hand_out(out + row * PARTS_SIZE, after, said);
+            hand_out(out + row * PARTS_SIZE, state.memory, said);
         }
     }
     return runs;

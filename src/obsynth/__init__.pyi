@@ -1,0 +1,145 @@
+from obsynth import plotting as plotting
+from obsynth.analysis.diagnosis.banks import StructuredResidual as StructuredResidual
+from obsynth.analysis.diagnosis.decoupled import DecoupledPlant as DecoupledPlant
+from obsynth.analysis.diagnosis.decoupled import decouple as decouple
+from obsynth.analysis.diagnosis.diagnosing import diagnose as diagnose
+from obsynth.analysis.diagnosis.verdicts import Diagnosis as Diagnosis
+from obsynth.analysis.diagnosis.verdicts import FaultDiagnosis as FaultDiagnosis
+from obsynth.analysis.identifiability import Identifiability as Identifiability
+from obsynth.analysis.identifiability import identifiability as identifiability
+from obsynth.analysis.structure import analyse_structure as analyse_structure
+from obsynth.analysis.transformations import discretise as discretise
+from obsynth.analysis.transformations import eliminate_algebraic_states as eliminate_algebraic_states
+from obsynth.analysis.transformations.linearisation import linearise as linearise
+from obsynth.calibration.calibrating import calibrate as calibrate
+from obsynth.calibration.result import CalibratedBox as CalibratedBox
+from obsynth.calibration.result import Calibration as Calibration
+from obsynth.calibration.validating import validate as validate
+from obsynth.calibration.validation import Validation as Validation
+from obsynth.calibration.validity import Validity as Validity
+from obsynth.calibration.validity import validity as validity
+from obsynth.comparison.comparing import compare as compare
+from obsynth.comparison.result import ComparedMethod as ComparedMethod
+from obsynth.comparison.result import Comparison as Comparison
+from obsynth.comparison.result import FaultComparison as FaultComparison
+from obsynth.comparison.sensor_sets import SensorSet as SensorSet
+from obsynth.comparison.sensor_sets import SensorSets as SensorSets
+from obsynth.comparison.sensor_sets import sensor_sets as sensor_sets
+from obsynth.data.alarm_proof import prove_alarm as prove_alarm
+from obsynth.data.run import DataRun as DataRun
+from obsynth.data.run import run_on_data as run_on_data
+from obsynth.data.smoothing import smooth as smooth
+from obsynth.errors import InfeasibleError as InfeasibleError
+from obsynth.errors import ObsynthError as ObsynthError
+from obsynth.errors import PreconditionError as PreconditionError
+from obsynth.errors import SolverError as SolverError
+from obsynth.errors import SpecError as SpecError
+from obsynth.errors import VerificationError as VerificationError
+from obsynth.experiments.alarm_proofs.certificate import verify_alarm as verify_alarm
+from obsynth.experiments.alarm_proofs.proof import AlarmProof as AlarmProof
+from obsynth.experiments.intervals import Interval as Interval
+from obsynth.experiments.monitors.monitor import Detection as Detection
+from obsynth.experiments.monitors.monitor import Monitor as Monitor
+from obsynth.experiments.monitors.online import OnlineMonitor as OnlineMonitor
+from obsynth.experiments.monitors.online_monitor import online_monitor as online_monitor
+from obsynth.experiments.monitors.residual_monitor import monitor as monitor
+from obsynth.experiments.monte_carlo import Evaluation as Evaluation
+from obsynth.experiments.monte_carlo import evaluate as evaluate
+from obsynth.experiments.simulation import Simulation as Simulation
+from obsynth.experiments.simulation import simulate as simulate
+from obsynth.experiments.tolerance_study import ToleranceStudy as ToleranceStudy
+from obsynth.experiments.tolerance_study import tolerance_study as tolerance_study
+from obsynth.exporting.files import export as export
+from obsynth.importing.andes import from_andes as from_andes
+from obsynth.importing.fmu import from_fmu as from_fmu
+from obsynth.importing.matlab import from_matlab as from_matlab
+from obsynth.importing.matrices import from_pandas as from_pandas
+from obsynth.importing.matrices import from_sympy as from_sympy
+from obsynth.importing.modelica import from_modelica as from_modelica
+from obsynth.importing.state_space import from_control as from_control
+from obsynth.importing.state_space import from_scipy as from_scipy
+from obsynth.methods.adaptive_observer.public import adaptive_observer as adaptive_observer
+from obsynth.methods.choosing.figures import FaultFigures as FaultFigures
+from obsynth.methods.dae_adaptive_observer.public import dae_adaptive_observer as dae_adaptive_observer
+from obsynth.methods.descriptor_kalman.public import descriptor_kalman as descriptor_kalman
+from obsynth.methods.designing import check as check
+from obsynth.methods.designing import design as design
+from obsynth.methods.fault_estimation_filter.public import fault_estimation_filter as fault_estimation_filter
+from obsynth.methods.fault_estimation_filter.public import (
+    fault_estimation_filter_from_gains as fault_estimation_filter_from_gains,
+)
+from obsynth.methods.functional_filter.detection import DetectionFilter as DetectionFilter
+from obsynth.methods.functional_filter.detection import detection_filter as detection_filter
+from obsynth.methods.functional_filter.public import functional_filter as functional_filter
+from obsynth.methods.pd_observer.public import apply_adaptation_gain as apply_adaptation_gain
+from obsynth.methods.pd_observer.public import pd_delta_scan as pd_delta_scan
+from obsynth.methods.pd_observer.public import pd_observer as pd_observer
+from obsynth.methods.pd_observer.public import pd_observer_from_gains as pd_observer_from_gains
+from obsynth.methods.recursive.steady_filter import SteadyState as SteadyState
+from obsynth.methods.recursive.steady_filter import steady_state_filter as steady_state_filter
+from obsynth.methods.ui_pi_observer.checks.fault_response import fault_response as fault_response
+from obsynth.methods.ui_pi_observer.public import ui_pi_observer as ui_pi_observer
+from obsynth.methods.ui_pi_observer.public import ui_pi_observer_from_gains as ui_pi_observer_from_gains
+from obsynth.methods.verifying import verify as verify
+from obsynth.observers.alarms import Alarm as Alarm
+from obsynth.observers.alarms import Decision as Decision
+from obsynth.observers.batches import run_batch as run_batch
+from obsynth.observers.dae.observer import DAEObserver as DAEObserver
+from obsynth.observers.decisions import ParameterMonitor as ParameterMonitor
+from obsynth.observers.decisions import decide as decide
+from obsynth.observers.estimates import Estimates as Estimates
+from obsynth.observers.linear.observer import LinearObserver as LinearObserver
+from obsynth.observers.linear.sampling import sample_observer as sample_observer
+from obsynth.observers.recursive.observer import RecursiveObserver as RecursiveObserver
+from obsynth.observers.recursive.settings import Adaptation as Adaptation
+from obsynth.observers.running import RunningObserver as RunningObserver
+from obsynth.plants.constants import Constant as Constant
+from obsynth.plants.constants import ConstantsBox as ConstantsBox
+from obsynth.plants.dae.model import DAEModel as DAEModel
+from obsynth.plants.descriptor import DescriptorSystem as DescriptorSystem
+from obsynth.plants.fault_models import FaultModel as FaultModel
+from obsynth.plants.fault_models import fault_model as fault_model
+from obsynth.plants.time_varying import TimeVaryingDescriptorSystem as TimeVaryingDescriptorSystem
+from obsynth.plants.uncertain_system import uncertain_system as uncertain_system
+from obsynth.plants.uncertainty import Uncertainty as Uncertainty
+from obsynth.report.page import html_report as html_report
+from obsynth.results.checks import Check as Check
+from obsynth.results.delta_scan import DeltaScan as DeltaScan
+from obsynth.results.design import Certificate as Certificate
+from obsynth.results.design import ObserverDesign as ObserverDesign
+from obsynth.results.gain_sets import load as load
+from obsynth.results.report import VerificationReport as VerificationReport
+from obsynth.simulation.dae import simulate_dae as simulate_dae
+from obsynth.simulation.failures import Gaussian as Gaussian
+from obsynth.simulation.failures import LostEffectiveness as LostEffectiveness
+from obsynth.simulation.failures import Stuck as Stuck
+from obsynth.simulation.failures import Uniform as Uniform
+from obsynth.simulation.profiles import Drift as Drift
+from obsynth.simulation.profiles import Intermittent as Intermittent
+from obsynth.simulation.profiles import Ramp as Ramp
+from obsynth.simulation.profiles import Sine as Sine
+from obsynth.simulation.profiles import Step as Step
+from obsynth.simulation.scenario import Scenario as Scenario
+from obsynth.simulation.time_varying import simulate_time_varying as simulate_time_varying
+from obsynth.simulation.trajectory import Trajectory as Trajectory
+from obsynth.spec.loader import Spec as Spec
+from obsynth.spec.loader import load_spec as load_spec
+from obsynth.sweeps.fleet import Fleet as Fleet
+from obsynth.sweeps.fleet import FleetRun as FleetRun
+from obsynth.sweeps.fleet import run_fleet as run_fleet
+from obsynth.sweeps.sweep import Sweep as Sweep
+from obsynth.sweeps.sweep import SweepResult as SweepResult
+from obsynth.sweeps.sweep import sweep as sweep
+from obsynth.tolerances.result import Robustness as Robustness
+from obsynth.tolerances.robustness import robustness as robustness
+from obsynth.version import __version__ as __version__
+
+__all__: list[str]
+BatchEstimates = Estimates
+DAEBatchEstimates = Estimates
+DAEEstimates = Estimates
+DAETrajectory = Trajectory
+RecursiveEstimates = Estimates
+RecursiveSimulation = Simulation
+RunningDAEObserver = RunningObserver
+RunningRecursiveObserver = RunningObserver

@@ -1,0 +1,264 @@
+"""Pencils whose entries know where in the plant they stand, and the nearest plants for which they lose rank.
+
+A matrix that nearly loses column rank has a vector v with ``M v`` small.  With v rounded to a few digits, one entry in
+each row where ``(M v)_i`` is not zero is changed (two where v is complex) so that it is, in rational arithmetic: the
+changed matrix loses rank exactly, and the changed entries are named.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+
+import numpy as np
+
+from obsynth.analysis.existence.witnesses import (
+    EntryChange,
+    Rational,
+    Unclear,
+    Witness,
+    as_array,
+    nearest,
+    rational,
+    rational_matrices,
+)
+from obsynth.analysis.plant_units import PlantUnits, sized_plant
+from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.numerics.scaling import equilibrate_pencil
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.exosystems import Exosystem
+from obsynth.proofs.written_numbers import written_fraction
+
+#: Digits to which the vector of a witness is rounded, until the plant is within the tolerance.
+DIGITS = (1, 2, 3, 5, 8, 11, 14, 17)
+#: How much rather an entry is changed that is not zero, and one of E, whose ones are structure rather than data.
+KNOWN_ENTRY, STRUCTURE = 8.0, 1e-2
+
+#: What stands at a place of a block matrix: a matrix of the plant, or columns of it, or nothing.
+Cell = str | None
+
+
+@dataclass(frozen=True, eq=False)
+class NamedPencil:
+    """``A - s E`` with the entry of the plant that stands at each place of A: ``owners (m, n)``, ``None`` for none.
+
+    Fields: A, E: Rational, ``(m, n)``; owners; rows, columns: Powers of two in which entries are of like size; terms:
+    Sizes of the terms that the entries of A are sums of, ``(m, n)``, where these are known.
+    """
+
+    A: Rational
+    E: Rational
+    owners: Rational
+    rows: FloatArray
+    columns: FloatArray
+    terms: FloatArray | None = None
+
+    @property
+    def transposed(self) -> NamedPencil:
+        """The same with rows and columns exchanged."""
+        terms = None if self.terms is None else self.terms.T
+        return NamedPencil(self.A.T, self.E.T, self.owners.T, self.columns, self.rows, terms)
+
+    def witness(self, tolerance: float, point: complex | None = None, *, dt: float | None = None) -> Witness | None:
+        """Return a plant for which this loses column rank at a point: within the tolerance, or the nearest one found.
+
+        With ``dt`` the point may move, but stays on or outside the stability boundary.
+        """
+        at = 0j if point is None else complex(point)
+        matrix = nearest(self.A) - (at if at.imag else at.real) * nearest(self.E)
+        sizes = np.abs(matrix) if self.terms is None else self.terms + abs(at) * np.abs(nearest(self.E))
+        scaled = self.rows[:, None] * sizes * self.columns
+        pencil = equilibrate_pencil(np.zeros_like(scaled), scaled)
+        rows, columns = self.rows * pencil.rows, self.columns * pencil.columns
+        if not matrix.size or not np.all(np.isfinite(rows[:, None] * matrix * columns)):
+            return None
+        vector = np.linalg.svd(rows[:, None] * matrix * columns)[2][-1].conj()
+        vector = vector / vector[int(np.argmax(np.abs(vector)))]
+        best: Witness | None = None
+        for digits in DIGITS:
+            place = _placed(at, digits, dt)
+            changes, size = self._changes(_rounded(vector, digits), place, rows, columns)
+            if changes and (best is None or size < best.size):
+                best = Witness(changes, size, None if point is None else complex(float(place[0]), float(place[1])))
+            if best is not None and best.size <= tolerance:
+                break
+        return best
+
+    def _changes(
+        self, vector: tuple[Rational, Rational], point: tuple[Fraction, Fraction], rows: FloatArray, columns: FloatArray
+    ) -> tuple[tuple[EntryChange, ...], float]:
+        """Return the changes that make a scaled vector a null vector, nothing where that cannot be, and their size."""
+        scale = rational(columns)
+        real, imaginary = vector[0] * scale, vector[1] * scale
+        # (A - s E) v, s = a + b j.
+        of_e = (self.E @ real, self.E @ imaginary)
+        rest = (
+            self.A @ real - point[0] * of_e[0] + point[1] * of_e[1],
+            self.A @ imaginary - point[0] * of_e[1] - point[1] * of_e[0],
+        )
+        weights = np.asarray(vector[0] + 0.0, dtype=float) + 1j * np.asarray(vector[1] + 0.0, dtype=float)
+        found, size = list[EntryChange](), 0.0
+        for i in range(len(self.A)):
+            if not rest[0][i] and not rest[1][i]:
+                continue
+            solved = self._row_changes(i, (rest[0][i], rest[1][i]), (real, imaginary), weights)
+            if solved is None:
+                return (), np.inf
+            for j, delta in solved:
+                owner = self.owners[i, j]
+                found.append(EntryChange(*owner, self.A[i, j], self.A[i, j] + delta))
+                size = max(size, float(rows[i] * columns[j] * abs(float(delta))))
+        return tuple(change for change in found if change.before != change.after), size
+
+    def _row_changes(
+        self, i: int, rest: tuple[Fraction, Fraction], vector: tuple[Rational, Rational], weights: ComplexArray
+    ) -> list[tuple[int, Fraction]] | None:
+        """Return changes of one row or two entries of it that make its product with the vector zero."""
+        own = np.array([0.0 if owner is None else STRUCTURE if owner[0] == "E" else 1.0 for owner in self.owners[i]])
+        known = np.where([value != 0 for value in self.A[i]], KNOWN_ENTRY, 1.0) * own
+        scores = known * np.abs(weights)
+        j = int(np.argmax(scores))
+        if scores[j] == 0.0:
+            return None
+        real, imaginary = vector
+        if rest[0] * imaginary[j] == rest[1] * real[j]:
+            part = (rest[0], real[j]) if real[j] else (rest[1], imaginary[j])
+            return [(j, -part[0] / part[1])]
+        areas = known * np.abs(np.imag(np.conj(weights[j]) * weights))
+        k = int(np.argmax(areas))
+        area = real[j] * imaginary[k] - real[k] * imaginary[j]
+        if not area:
+            return None
+        return [
+            (j, -(rest[0] * imaginary[k] - rest[1] * real[k]) / area),
+            (k, -(rest[1] * real[j] - rest[0] * imaginary[j]) / area),
+        ]
+
+
+def _rounded(vector: ComplexArray | FloatArray, digits: int) -> tuple[Rational, Rational]:
+    parts = []
+    for part in (np.real(vector), np.imag(vector)):
+        values = [Fraction(round(Fraction(value) * 10**digits), 10**digits) for value in part.tolist()]
+        parts.append(as_array([values], (len(values),)))
+    return parts[0], parts[1]
+
+
+def _placed(point: complex, digits: int, dt: float | None) -> tuple[Fraction, Fraction]:
+    """Return a point rounded to some digits, on or outside the stability boundary; without ``dt`` to almost all."""
+    if dt is None and digits < DIGITS[-2]:
+        # An eigenvalue that was computed of a matrix of short numbers.
+        return Fraction(f"{point.real:.13g}"), Fraction(f"{point.imag:.13g}")
+    if dt is None:
+        return written_fraction(point.real), written_fraction(point.imag)
+    real, imaginary = (Fraction(f"{part:.{digits}e}") for part in (point.real, point.imag))
+    if dt == 0.0:
+        return max(real, Fraction(0)), imaginary
+    if not imaginary:
+        return (real if abs(real) >= 1 else Fraction(1 if real >= 0 else -1)), imaginary
+    while real * real + imaginary * imaginary < 1:
+        real, imaginary = (part * (1 + Fraction(1, 10**digits)) for part in (real, imaginary))
+    return real, imaginary
+
+
+def named_pencil(
+    plant: DescriptorSystem, units: PlantUnits, layout: Sequence[Sequence[Cell]], *,
+    kept: Mapping[str, Sequence[int]] | None = None,
+) -> NamedPencil:  # fmt: skip
+    """Return a block matrix of the plant's matrices by name, such as ``[["A", "Bf"], ["C", "Df"]]``, minus s times E.
+
+    ``kept``: the columns of a matrix that are taken, all by default.  Where E is named it stands for itself, not for s.
+    """
+    exact, chosen, sized = rational_matrices(plant), kept or {}, sized_plant(plant)
+    scale = {"x": units.states, "f": units.faults, "d": units.disturbances}
+    kinds = {"E": "x", "A": "x", "C": "x", "Bf": "f", "Df": "f", "Bd": "d", "Dd": "d"}
+    widths, columns = list[list[int]](), list[FloatArray]()
+    for position in range(len(layout[0])):
+        name = next(row[position] for row in layout if row[position] is not None)
+        every = range(exact[str(name)].shape[1])
+        picked = list(chosen.get(str(name), every))
+        widths.append(picked)
+        columns.append(scale[kinds[str(name)]][picked])
+    blocks: list[list[Rational]] = []
+    moving: list[list[Rational]] = []
+    owners: list[list[Rational]] = []
+    terms: list[list[FloatArray]] = []
+    rows: list[FloatArray] = []
+    for row in layout:
+        shown = next(name for name in row if name is not None) in ("C", "Df", "Dd")
+        rows.append(units.outputs if shown else units.equations)
+        height = plant.ny if shown else plant.nx
+        blocks.append([])
+        moving.append([])
+        owners.append([])
+        terms.append([])
+        for name, picked in zip(row, widths, strict=True):
+            nothing = as_array([[Fraction(0)] * (height * len(picked))], (height, len(picked)))
+            blocks[-1].append(nothing if name is None else exact[name][:, picked])
+            moving[-1].append(exact["E"] if name == "A" else nothing)
+            owners[-1].append(_owned(name, height, picked))
+            own = None if sized is None or name is None else np.abs(getattr(sized, name)[:, picked])
+            terms[-1].append(nearest(nothing) if own is None else own)
+    return NamedPencil(
+        np.block(blocks), np.block(moving), np.block(owners), np.concatenate(rows), np.concatenate(columns),
+        None if sized is None else np.block(terms),
+    )  # fmt: skip
+
+
+def named_augmented(
+    plant: DescriptorSystem, model: Exosystem, units: PlantUnits, *, kept: Sequence[int], of_the_model: bool
+) -> NamedPencil:
+    """Return ``[A - s E, Bf Cw, Bd; 0, Phi - s, 0; C, Df Cw, Dd]``; entries of Phi are named ``of_the_model`` only."""
+    layout = [["A", "Bf", "Bd"], ["C", "Df", "Dd"]]
+    whole = named_pencil(plant, units, layout, kept={"Bd": kept, "Dd": kept})
+    nx, nf, count = plant.nx, plant.nf, model.order
+    courses, phi = rational(model.Cw), rational(model.Phi)
+    states, faults, rest = np.split(np.arange(whole.A.shape[1]), [nx, nx + nf])
+    order = (np.arange(nx), np.arange(nx, nx + plant.ny))
+    width = nx + count + len(rest)
+    middle = as_array([[Fraction(0)] * (count * width)], (count, width))
+    slope, owners = middle.copy(), np.empty((count, width), dtype=object)
+    middle[:, nx : nx + count] = phi
+    slope[:, nx : nx + count] = rational(np.eye(count))
+    if of_the_model:
+        owners[:, nx : nx + count] = _owned("Phi", count, range(count))
+    # An entry of Bf or Df can be changed through a state of the model that is a fault by itself.
+    alone = [np.flatnonzero(courses[:, j] != 0) for j in range(count)]
+    single = [int(rows[0]) if len(rows) == 1 and courses[rows[0], j] == 1 else -1 for j, rows in enumerate(alone)]
+
+    def stacked(matrix: Rational, through: Rational, part: Rational) -> Rational:
+        top, bottom = (np.hstack([matrix[rows][:, states], through[rows], matrix[rows][:, rest]]) for rows in order)
+        return np.vstack([top, part, bottom])
+
+    named = np.empty((len(whole.A), count), dtype=object)
+    for j, fault in enumerate(single):
+        if fault >= 0:
+            named[:, j] = whole.owners[:, faults[fault]]
+    through = whole.A[:, faults] @ courses
+    terms = None
+    if whole.terms is not None:
+        between = whole.terms[:, faults] @ np.abs(model.Cw)
+        terms = stacked(whole.terms, between, np.abs(nearest(middle)))
+    columns = np.concatenate([whole.columns[states], units.model, whole.columns[rest]])
+    return NamedPencil(
+        stacked(whole.A, through, middle), stacked(whole.E, 0 * through, slope), stacked(whole.owners, named, owners),
+        np.concatenate([whole.rows[:nx], 1.0 / units.model, whole.rows[nx:]]), columns, terms,
+    )  # fmt: skip
+
+
+def _owned(name: Cell, height: int, columns: Sequence[int]) -> Rational:
+    found = np.empty((height, len(columns)), dtype=object)
+    if name is not None:
+        for i in range(height):
+            for place, j in enumerate(columns):
+                found[i, place] = (name, i, j)
+    return found
+
+
+def unclear(
+    plant: DescriptorSystem, named: NamedPencil, *, tolerance: float, other: str, decider: str,
+    point: complex | None = None, dt: float | None = None,
+) -> Unclear:  # fmt: skip
+    """Return why an answer is unclear: the tolerance is never less than what the witness needs."""
+    witness = named.witness(tolerance, point, dt=dt)
+    return Unclear(max(tolerance, 0.0 if witness is None else witness.size), witness, other, decider)

@@ -1,0 +1,237 @@
+"""What is proved of a recursive observer, in outward rounding: of its gains as they are computed, on the stated plant.
+
+With gains ``[L_k K_k]`` and ``H_k = [E_k; C_k]`` an error obeys ``e_k = L_k A e_(k-1) + ([L_k K_k] H_k - I) x_k`` and
+noise.  Proved are: that the last term is rounding (the row "unbiased"), that the product of the ``L_k A`` makes errors
+smaller over the horizon ("contraction"), and that the covariance is definite.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from itertools import chain, repeat
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.scaling import balance_by_least_squares
+from obsynth.observers.recursive.gain_schedule import GainStep, gain_steps
+from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.recursive.step_model import EarlyConstraintSteps, StepMatrices
+from obsynth.proofs.balls import Ball, rounded_up
+from obsynth.proofs.definiteness import prove_positive_definite
+from obsynth.proofs.error_products import AT_ONCE, logarithm_of_product, product_of_stack, stacked_product
+from obsynth.results.checks import Check, information, upper_bound_check
+from obsynth.verification.identities import EQUALITY_TOLERANCE
+
+#: Of more states nothing is proved: work goes with their cube, and bounds grow with them.
+MOST_STATES = 100
+
+_SOURCE = "Moussa Ali, Zhang 2013"
+
+
+@dataclass(frozen=True, eq=False)
+class HorizonProof:
+    """What is proved along the horizon.
+
+    Fields: steps: How many; bias: Largest entry of ``[L K] H - I``, in units of its terms; contraction: Upper bound on
+    the mean factor per step of the product of L A; span: Over which part of the horizon; with_parameters: The same for
+    errors of states and parameters together; NaN without parameters; last: The gains of the last step.
+    """
+
+    steps: int
+    bias: float
+    contraction: float
+    span: str
+    with_parameters: float
+    last: GainStep
+
+
+def horizon_proof(stated: RecursiveObserver, shipped: RecursiveObserver, steps: int) -> HorizonProof | None:
+    """Return what can be proved of the first steps of a shipped observer on the stated plant; `None` for nothing."""
+    if stated.plant.nx > MOST_STATES or _kind(stated) != _kind(shipped):
+        return None  # the rows on what fits say so
+    plain, joint = _without_walk(stated), None
+    found = _followed(plain, _without_walk(shipped), steps)
+    if stated.adaptation is not None and stated.adaptation.form == "random-walk":
+        joint = _followed(stated, shipped, steps)
+    mean, span = _mean_factor(found, found.last.factor)
+    nq = 0 if shipped.adaptation is None else shipped.plant.nq
+    whole = joint.errors if joint is not None else found.joint
+    bias = found.bias if joint is None else max(found.bias, joint.bias)
+    together = float(np.exp(min(logarithm_of_product(whole) / found.steps, 0.0))) if nq and whole else np.nan
+    return HorizonProof(found.steps, bias, mean, span, together, found.last)
+
+
+def _kind(observer: RecursiveObserver) -> tuple[object, ...]:
+    """Return what gains of two observers must have in common to be compared."""
+    form = None if observer.adaptation is None else observer.adaptation.form == "random-walk"
+    plant = observer.plant
+    return observer.early_constraints, form, plant.nx, plant.ne, plant.ny, plant.nq
+
+
+def _without_walk(observer: RecursiveObserver) -> RecursiveObserver:
+    """Return the observer whose state filter is that of the model without a walk of the parameters."""
+    if observer.adaptation is None or observer.adaptation.form != "random-walk":
+        return observer
+    return replace(observer, adaptation=replace(observer.adaptation, form="innovation", forgetting=1.0))
+
+
+@dataclass(frozen=True, eq=False)
+class _Followed:
+    """Products of so many steps each (``lengths``), of the states and of states with parameters."""
+
+    steps: int
+    bias: float
+    errors: list[Ball]
+    joint: list[Ball]
+    lengths: list[int]
+    last: GainStep
+
+
+def _followed(stated: RecursiveObserver, shipped: RecursiveObserver, steps: int) -> _Followed:
+    """Follow the gains of a shipped observer on the matrices of the stated plant."""
+    units = natural_units(stated)
+    bias = 0.0
+    errors: list[Ball] = []
+    joint: list[Ball] = []
+    lengths: list[int] = []
+    waiting: list[tuple[StepMatrices, GainStep]] = []
+    last: GainStep | None = None
+    for step, found in zip(_true_steps(stated, shipped, steps), gain_steps(shipped, steps), strict=False):
+        step = found.step if step is None else step
+        # Steps of another size (corrections of x(0)) are stacks of their own.
+        if len(waiting) == AT_ONCE or (waiting and waiting[0][0].H.shape != step.H.shape):
+            bias = max(bias, _closed(waiting, errors, joint, lengths, units))
+            waiting = []
+        waiting.append((step, found))
+        last = found
+    if last is None:
+        raise SpecError("The plant has no steps.", path="horizon")
+    bias = max(bias, _closed(waiting, errors, joint, lengths, units))
+    return _Followed(sum(lengths), bias, errors, joint, lengths, last)
+
+
+def natural_units(observer: RecursiveObserver) -> FloatArray:
+    """Return sizes of the states that equations and outputs suggest, ``(n,)``; of parameters that walk, one."""
+    plant, count = observer.plant, len(observer.recursion.first.x)
+    E, A, C = plant.E.at(1), plant.A.at(0), plant.C.at(1)
+    units = balance_by_least_squares(E, A, outputs=[C]).states if E.shape == A.shape else np.ones(plant.nx)
+    return np.concatenate([units, np.ones(count - plant.nx)])
+
+
+def _true_steps(stated: RecursiveObserver, shipped: RecursiveObserver, steps: int) -> Iterable[StepMatrices | None]:
+    """Return the matrices of the stated plant; `None` for those of the shipped observer."""
+    if stated.plant is shipped.plant:
+        return repeat(None)
+    model = stated.recursion.model
+    first = [model.first()] if isinstance(model, EarlyConstraintSteps) else []
+    return chain(first, (model.at(k) for k in range(steps)))
+
+
+def _closed(
+    pairs: list[tuple[StepMatrices, GainStep]], errors: list[Ball], joint: list[Ball], lengths: list[int],
+    units: FloatArray,
+) -> float:  # fmt: skip
+    """Multiply some steps, add the products to the lists, and return how far the gains are from unbiased."""
+    state, learned = _transitions(pairs)
+    errors.append(product_of_stack(*state))
+    lengths.append(len(pairs))
+    if learned is not None:
+        joint.append(product_of_stack(*learned))
+    return largest_bias(pairs, units)
+
+
+def largest_bias(pairs: list[tuple[StepMatrices, GainStep]], units: FloatArray) -> float:
+    """Return the largest entry of ``[L K] H - I`` in units of the terms of its row, rounded up."""
+    gains, matrices = np.array([found.gain for _, found in pairs]), np.array([step.H for step, _ in pairs])
+    middle, radius = stacked_product((gains, np.zeros_like(gains)), (matrices, np.zeros_like(matrices)))
+    one = np.eye(middle.shape[1])
+    missed = rounded_up(np.abs(middle - one) + radius, 3)
+    # An entry is judged by what rounding of its whole row does to it, in natural units of the states.
+    sizes = (np.abs(gains) @ np.abs(matrices) + one) * units
+    return float(np.max(missed * units / np.max(sizes, axis=2, keepdims=True), initial=0.0))
+
+
+_Stack = tuple[FloatArray, FloatArray]
+
+
+def _transitions(pairs: list[tuple[StepMatrices, GainStep]]) -> tuple[_Stack, _Stack | None]:
+    """Return balls of ``L A`` and, with parameters, of the transition of both errors."""
+    ne = pairs[0][0].A.shape[0]
+    a = np.array([step.A for step, _ in pairs])
+    zero = np.zeros_like(a)
+    gains = np.array([found.gain[:, :ne] for _, found in pairs])
+    middle, radius = stacked_product((gains, np.zeros_like(gains)), (a, zero))
+    nq, nx = pairs[0][1].forget.shape[0], middle.shape[1]
+    if not nq:
+        return (middle, radius), None
+    learn = np.array([found.learn[:, :ne] for _, found in pairs])
+    taken, taken_radius = stacked_product((learn, np.zeros_like(learn)), (a, zero))
+    whole, whole_radius = (np.zeros((len(pairs), nx + nq, nx + nq)) for _ in range(2))
+    whole[:, :nx, :nx], whole_radius[:, :nx, :nx] = middle, radius
+    whole[:, nx:, :nx], whole_radius[:, nx:, :nx] = taken, taken_radius
+    whole[:, nx:, nx:] = np.array([found.forget for _, found in pairs])
+    return (middle, radius), (whole, whole_radius)
+
+
+def _mean_factor(found: _Followed, factor: FloatArray) -> tuple[float, str]:
+    """Return a bound on the mean factor per step, and of what: of the horizon in the units given, or in deviations."""
+    errors, steps = found.errors, found.steps
+    bound = logarithm_of_product(errors)
+    if bound < 0.0:
+        return float(np.exp(bound / steps)), "from the start"
+    sizes = np.sqrt(np.einsum("ij,ij->i", factor, factor))
+    units = np.exp2(np.round(np.log2(np.where(sizes > 0.0, sizes, 1.0))))
+    bound = logarithm_of_product(errors, units)
+    if bound < 0.0:
+        return float(np.exp(bound / steps)), "from the start, in units of the last deviations"
+    half = len(errors) // 2
+    late = logarithm_of_product(errors[half:], units)
+    mean = late / sum(found.lengths[half:])
+    return float(np.exp(min(mean, 0.0))), "over the second half, in units of the last deviations"
+
+
+def bias_row(proof: HorizonProof, condition: float) -> Check:
+    """Return the row that the gains leave an exact estimate exact."""
+    return upper_bound_check(
+        "unbiased", "[L_k K_k] [E_k; C_k] = I at every step: without noise and start error there is no error",
+        proof.bias, EQUALITY_TOLERANCE * condition, source=f"{_SOURCE}, (10)-(11)", kind="proved",
+        detail=f"largest entry in units of its terms, of the gains as computed, outward rounded; {proof.steps} steps",
+    )  # fmt: skip
+
+
+def parameter_row(proof: HorizonProof) -> Iterator[Check]:
+    """Yield the row on errors of states and parameters together, where there are parameters."""
+    if np.isnan(proof.with_parameters):
+        return
+    proved = proof.with_parameters < 1.0
+    yield information(
+        "contraction with parameters", "bound on the mean factor per step of errors of states and constant parameters "
+        "together", proof.with_parameters, source=f"{_SOURCE}, Theorem 3.1",
+        status="proved" if proved else "assumed",
+        detail="of the gains as computed, in outward rounding" if proved else
+        "not proved: parameters that are not excited are not forgotten, and slow ones too little for the bound",
+    )  # fmt: skip
+
+
+def covariance_row(stated: RecursiveObserver, last: GainStep) -> Check:
+    """Return the row that the covariance of the state after the last step is definite, as it is with definite noise."""
+    factor = last.factor[: stated.plant.nx]
+    sizes = np.sqrt(np.einsum("ij,ij->i", factor, factor))
+    units = np.exp2(-np.round(np.log2(np.where(sizes > 0.0, sizes, 1.0))))
+    root = Ball.exact(units[:, None] * factor)
+    proof = prove_positive_definite(root @ root.T)
+    claim = "the covariance of the states after the last step is positive definite, in units of their deviations"
+    if proof.proved or noise_is_definite(stated):
+        return Check("covariance", claim, proof.lower_bound, 0.0, proof.lower_bound, proof.proved,
+                     "recomputed, the square root as computed", "proved", proof.text)  # fmt: skip
+    return information("covariance", claim, proof.lower_bound, source="recomputed", detail="not definite, or not "
+                       "proved to be: Q or R is singular, and what they hold exact is known exactly")  # fmt: skip
+
+
+def noise_is_definite(stated: RecursiveObserver) -> bool:
+    """Whether Q(0) and R(0) are proved positive definite, and stay as they are."""
+    constant = stated.Q.is_constant and stated.R.is_constant
+    return constant and all(prove_positive_definite(part.at(0)).proved for part in (stated.Q, stated.R))

@@ -1,0 +1,427 @@
+
+/* Outliers, resets and bounds on states, around a plain step. */
+
+/* Take a sample; where innovations have become too large, again with parameters known no better than at first. */
+static int watched(const struct observer *state, const double *u, const double *y, struct observer *after, double *said)
+{
+#if RESETS
+    int i, degrees = 0;
+#endif
+    *after = *state;
+    if (attempt(state->memory, state, u, y, after->memory, said) != 0) {
+        return 2;
+    }
+#if RESETS
+    for (i = 0; i < NY; i++) {
+        degrees += !isnan(y[i]);
+    }
+    if (state->k > 0) {
+        double total = 0.0;
+        int all = 0;
+        if (after->watched == RESET_WINDOW) {
+            copy(after->surprises, state->surprises + 2, 2 * (RESET_WINDOW - 1));
+            after->watched--;
+        }
+        after->surprises[2 * after->watched] = said[AT_NIS];
+        after->surprises[2 * after->watched + 1] = degrees;
+        after->watched++;
+        for (i = 0; i < after->watched; i++) {
+            total += after->surprises[2 * i];
+            all += (int)after->surprises[2 * i + 1];
+        }
+        if (all > 0 && !(total <= RESET_LIMITS[all])) {
+            double forgetful[MEMORY];
+            copy(forgetful, state->memory, MEMORY);
+            copy(forgetful + AT_SPREAD, START + AT_SPREAD, NQ * NQ);
+#if AT_CROSS >= 0
+            copy(forgetful + AT_CROSS, START + AT_CROSS, NX * NQ);
+#else
+            copy(forgetful + AT_S, START + AT_S, NQ * NQ);
+#endif
+            if (attempt(forgetful, state, u, y, after->memory, said) != 0) {
+                return 2;
+            }
+            after->watched = 0;
+            after->resets++;
+        }
+    }
+#endif
+    return 0;
+}
+
+#if OUTLIERS
+/* Mean and deviation of each output, from what is remembered alone. */
+static int forecasted(const struct observer *state, const double *u, double *mean, double *deviation)
+{
+    double nothing[NY];
+    double after[MEMORY];
+    double said[ROW];
+    const double *inputs[2];
+    double *outputs[2];
+    int i;
+    for (i = 0; i < NY; i++) {
+        nothing[i] = NAN;
+    }
+    if (attempt(state->memory, state, u, nothing, after, said) != 0) {
+        return 2;
+    }
+    inputs[0] = after;
+    inputs[1] = said;
+    outputs[0] = mean;
+    outputs[1] = deviation;
+    return call(forecast, inputs, 2, outputs, 2) == 0 ? 0 : 2;
+}
+
+/* Take a step; where its innovation is too long, ask each sensor and take the step again without the outliers. */
+static int robust(const struct observer *state, const double *u, const double *y, double *heard, struct observer *after,
+                  double *said)
+{
+    double mean[NY];
+    double deviation[NY];
+    int far[NY];
+    int failed, any = 0;
+    int i;
+    copy(heard, y, NY);
+    failed = watched(state, u, y, after, said);
+    if (!failed && said[AT_NIS] <= OUTLIER_LIMIT * OUTLIER_LIMIT) {
+        for (i = 0; i < NY; i++) {
+            after->in_a_row[i] = 0;
+        }
+        return 0;
+    }
+    if (forecasted(state, u, mean, deviation) != 0) {
+        return 2;
+    }
+    for (i = 0; i < NY; i++) {
+        int huge = fabs(y[i]) > OVERFLOW_LIMIT;
+        double pulled = mean[i] + OUTLIER_LIMIT * deviation[i] * (y[i] > mean[i] ? 1.0 : -1.0);
+        far[i] = fabs(y[i] - mean[i]) > OUTLIER_LIMIT * deviation[i] || huge;
+        if (GATE) {
+            far[i] = far[i] && (state->in_a_row[i] < LONGEST_REFUSAL || huge);
+        }
+        if (far[i]) {
+            heard[i] = !GATE && isfinite(pulled) ? pulled : NAN;
+        }
+        any = any || far[i];
+    }
+    if (failed || any) {
+        if (watched(state, u, heard, after, said) != 0) {
+            /* A sample that nothing predicts, and with which there is no step. */
+            for (i = 0; i < NY; i++) {
+                far[i] = !isnan(y[i]);
+                heard[i] = NAN;
+            }
+            if (watched(state, u, heard, after, said) != 0) {
+                return 2;
+            }
+        }
+    }
+    for (i = 0; i < NY; i++) {
+        if (!isnan(y[i])) {
+            after->in_a_row[i] = far[i] ? state->in_a_row[i] + 1 : 0;
+        }
+        after->refused[i] = state->refused[i] + far[i];
+    }
+    return 0;
+}
+#endif
+
+#if BOUNDS
+/* Solve M s = right on chosen rows by Cholesky; 0 where they are dependent. */
+static int chosen_solution(const double *M, const double *right, const int *chosen, double *s)
+{
+    double L[BOUNDS][BOUNDS];
+    int at[BOUNDS];
+    int n = 0;
+    int i, j, k;
+    for (i = 0; i < BOUNDS; i++) {
+        if (chosen[i]) {
+            at[n++] = i;
+        }
+    }
+    for (i = 0; i < n; i++) {
+        for (j = 0; j <= i; j++) {
+            double sum = M[at[i] * BOUNDS + at[j]];
+            for (k = 0; k < j; k++) {
+                sum -= L[i][k] * L[j][k];
+            }
+            if (i == j) {
+                if (!(sum > DEPENDENT * M[at[i] * BOUNDS + at[i]])) {
+                    return 0;
+                }
+                L[i][i] = sqrt(sum);
+            } else {
+                L[i][j] = sum / L[j][j];
+            }
+        }
+    }
+    for (i = 0; i < n; i++) {
+        double sum = right[at[i]];
+        for (k = 0; k < i; k++) {
+            sum -= L[i][k] * s[at[k]];
+        }
+        s[at[i]] = sum / L[i][i];
+    }
+    for (i = n - 1; i >= 0; i--) {
+        double sum = s[at[i]];
+        for (k = i + 1; k < n; k++) {
+            sum -= L[k][i] * s[at[k]];
+        }
+        s[at[i]] = sum / L[i][i];
+    }
+    return 1;
+}
+
+/* Weights of the bounds that keep all of them at the least cost: M weights >= right, with equality where a weight is
+   not zero (the active sets of Lawson and Hanson 1974, 23.3). */
+static void nonnegative(const double *M, const double *right, double *weights)
+{
+    double s[BOUNDS];
+    int chosen[BOUNDS];
+    int banned[BOUNDS];
+    int rounds, i, j;
+    for (i = 0; i < BOUNDS; i++) {
+        weights[i] = 0.0;
+        chosen[i] = banned[i] = 0;
+    }
+    for (rounds = 0; rounds < 6 * BOUNDS; rounds++) {
+        int best = -1;
+        double most = 0.0;
+        for (i = 0; i < BOUNDS; i++) {
+            double slope = right[i];
+            for (j = 0; j < BOUNDS; j++) {
+                slope -= M[i * BOUNDS + j] * weights[j];
+            }
+            if (!chosen[i] && !banned[i] && slope > DEPENDENT * (fabs(right[i]) + 1.0) && slope > most) {
+                most = slope;
+                best = i;
+            }
+        }
+        if (best < 0) {
+            return;
+        }
+        chosen[best] = 1;
+        if (!chosen_solution(M, right, chosen, s)) {
+            chosen[best] = 0;
+            banned[best] = 1;
+            continue;
+        }
+        for (;;) {
+            double share = 1.0;
+            int blocking = -1;
+            for (i = 0; i < BOUNDS; i++) {
+                if (chosen[i] && s[i] <= 0.0) {
+                    double reach = weights[i] / (weights[i] - s[i]);
+                    if (blocking < 0 || reach < share) {
+                        share = reach;
+                        blocking = i;
+                    }
+                }
+            }
+            for (i = 0; i < BOUNDS; i++) {
+                if (chosen[i]) {
+                    weights[i] += share * (s[i] - weights[i]);
+                }
+            }
+            if (blocking < 0) {
+                break;
+            }
+            weights[blocking] = 0.0;
+            chosen[blocking] = 0;
+            if (!chosen_solution(M, right, chosen, s)) {
+                break;
+            }
+        }
+    }
+}
+
+/* Project the states after a measurement onto their bounds, in the metric of their covariance. */
+static void project_onto_bounds(struct observer *state, const double *said)
+{
+    double M[BOUNDS * BOUNDS];
+    double gaps[BOUNDS];
+    double sizes[BOUNDS];
+    double weights[BOUNDS];
+    double moved[NX];
+    double *x = state->memory + AT_POSTERIOR;
+    const double *P = said + AT_COVARIANCE;
+    int outside = 0;
+    int kept = 1;
+    int i, j;
+    for (i = 0; i < BOUNDS; i++) {
+        outside = outside || BOUND_SIGNS[i] * x[BOUND_STATES[i]] < BOUND_SIGNS[i] * BOUND_ENDS[i];
+    }
+    if (!outside) {
+        return;
+    }
+    for (i = 0; i < BOUNDS; i++) {
+        long a = BOUND_STATES[i];
+        sizes[i] = sqrt(fmax(P[a * (NX + 1)], 0.0));
+        gaps[i] = sizes[i] > 0.0 ? BOUND_SIGNS[i] * (BOUND_ENDS[i] - x[a]) / sizes[i] : 0.0;
+    }
+    for (i = 0; i < BOUNDS; i++) {
+        for (j = 0; j < BOUNDS; j++) {
+            long a = BOUND_STATES[i], b = BOUND_STATES[j];
+            double both = 0.5 * (P[a + b * NX] + P[b + a * NX]) * BOUND_SIGNS[i] * BOUND_SIGNS[j];
+            double used = sizes[i] > 0.0 && sizes[j] > 0.0;
+            M[i * BOUNDS + j] = used ? both / (sizes[i] * sizes[j]) : 0.0;
+        }
+    }
+    nonnegative(M, gaps, weights);
+    for (i = 0; i < BOUNDS; i++) {
+        double left = gaps[i];
+        for (j = 0; j < BOUNDS; j++) {
+            left -= M[i * BOUNDS + j] * weights[j];
+        }
+        kept = kept && left <= SLACK * (fabs(gaps[i]) + 1.0);
+    }
+    for (i = 0; i < NX; i++) {
+        moved[i] = x[i];
+        for (j = 0; j < BOUNDS; j++) {
+            long b = BOUND_STATES[j];
+            /* Where no move keeps all of them, a state that is known exactly stands in the way. */
+            if (kept && weights[j] > 0.0) {
+                moved[i] += 0.5 * (P[i + b * NX] + P[b + i * NX]) * BOUND_SIGNS[j] * weights[j] / sizes[j];
+            }
+        }
+    }
+    copy(x, moved, NX);
+    for (i = 0; i < BOUNDS; i++) {
+        long a = BOUND_STATES[i];
+        x[a] = BOUND_SIGNS[i] > 0.0 ? fmax(x[a], BOUND_ENDS[i]) : fmin(x[a], BOUND_ENDS[i]);
+    }
+#if AT_CROSS >= 0
+    copy(state->memory + AT_X, x, NX);
+#endif
+}
+#endif
+
+static void reset(struct observer *state)
+{
+    int i;
+    copy(state->memory, START, MEMORY);
+    for (i = 0; i < NU; i++) {
+        state->u[i] = 0.0;
+    }
+    for (i = 0; i < NY; i++) {
+        state->in_a_row[i] = 0;
+        state->refused[i] = 0;
+    }
+    state->k = 0;
+    state->watched = 0;
+    state->resets = 0;
+}
+
+/* Take one sample by all that the observer does with it; `heard` is what was used of it. */
+static int taken(const struct observer *state, const double *u, const double *y, double *heard, struct observer *after,
+                 double *said)
+{
+#if OUTLIERS
+    if (robust(state, u, y, heard, after, said) != 0) {
+        return 2;
+    }
+#else
+    copy(heard, y, NY);
+    if (watched(state, u, y, after, said) != 0) {
+        return 2;
+    }
+#endif
+#if BOUNDS
+    project_onto_bounds(after, said);
+#endif
+    copy(after->u, u, NU);
+    after->k = state->k + 1;
+    return 0;
+}
+
+/* Whether a sample can be taken: inputs are finite, and outputs finite or missing. */
+static int is_sample(const double *u, const double *y)
+{
+    int i;
+    for (i = 0; i < NY; i++) {
+        if (isinf(y[i])) {
+            return 0;
+        }
+    }
+    return all_finite(u, NU);
+}
+
+#if WAITS
+static void begin(struct waiting *state)
+{
+    reset(&state->latest);
+    state->kept = 0;
+}
+
+static const struct observer *latest_of(const struct waiting *state)
+{
+    return &state->latest;
+}
+
+/* Take a row as it arrives: what is late is put where it belongs, and all samples from there are taken again. */
+static int advance(struct waiting *state, const double *u, const double *y, double *heard, double *said)
+{
+    struct waiting after = *state;
+    struct observer at;
+    int kept = state->kept;
+    int earliest = kept;
+    int dropped = kept + 1 > LATEST ? kept + 1 - LATEST : 0;
+    int i, t;
+    if (!is_sample(u, y)) {
+        return 1;
+    }
+    after.before[kept] = state->latest;
+    copy(after.u + kept * NU, u, NU);
+    for (i = 0; i < NY; i++) {
+        long row = state->latest.k - DELAYS[i];
+        int place = kept - (int)DELAYS[i];
+        double value = row >= 0 && row % EVERY[i] == 0 ? y[i] : NAN;
+        after.y[kept * NY + i] = DELAYS[i] == 0 ? value : NAN;
+        if (DELAYS[i] > 0 && place >= 0 && !isnan(value)) {
+            after.y[place * NY + i] = value;
+            earliest = place < earliest ? place : earliest;
+        }
+    }
+    for (t = earliest; t <= kept; t++) {
+        if (taken(&after.before[t], after.u + t * NU, after.y + t * NY, heard, &at, said) != 0) {
+            return 2;
+        }
+        if (t < kept) {
+            after.before[t + 1] = at;
+        }
+    }
+    for (t = dropped; t <= kept; t++) {
+        after.before[t - dropped] = after.before[t];
+        copy(after.u + (t - dropped) * NU, after.u + t * NU, NU);
+        copy(after.y + (t - dropped) * NY, after.y + t * NY, NY);
+    }
+    after.latest = at;
+    after.kept = kept + 1 - dropped;
+    *state = after;
+    return 0;
+}
+#else
+static void begin(struct observer *state)
+{
+    reset(state);
+}
+
+static const struct observer *latest_of(const struct observer *state)
+{
+    return state;
+}
+
+/* Take one sample: 0; 1 if an input is not finite or an output infinite; 2 if the step has no solution. */
+static int advance(struct observer *state, const double *u, const double *y, double *heard, double *said)
+{
+    struct observer after;
+    if (!is_sample(u, y)) {
+        return 1;
+    }
+    if (taken(state, u, y, heard, &after, said) != 0) {
+        return 2;
+    }
+    *state = after;
+    return 0;
+}
+#endif

@@ -1,0 +1,94 @@
+"""One row of a verification report: what is claimed, the number that was found, and whether it holds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+CheckKind = Literal["proved", "equality", "computed", "condition", "information"]
+Status = Literal["proved", "computed twice", "estimated", "assumed"]
+
+
+@dataclass(frozen=True)
+class Check:
+    """One row of a report.
+
+    Parameters
+    ----------
+    name : str
+        Short name, unique in the report.
+    claim : str
+        What is claimed, in words.
+    value : float
+        The number recomputed from the plant and the shipped realisation.
+    bound : float
+        What the number is compared with.
+    margin : float
+        How far the number is on the right side of the bound (negative when the check fails).
+    passed : bool
+        The verdict.
+    source : str
+        Where the claim comes from: paper and equation, or the audit's finding.
+    kind : str
+        ``proved`` (an inequality, rounding errors bounded), ``equality`` (a residual against a bound
+        scaled by the data: never called proved), ``computed`` (a number found by a second route),
+        ``condition`` (an existence condition) or ``information`` (never fails).
+    detail : str, optional
+        One more sentence for the reader.
+    status : str, optional
+        What the row is worth: ``proved`` (outward rounding, on the stored numbers), ``computed twice`` (double
+        precision, by a route that shares no intermediate result with the design), ``estimated`` (statistics: see
+        ``interval``) or ``assumed`` (stated by whoever made the design, and not checked).  That of the kind by default.
+    interval : tuple of float, optional
+        Of an estimate: where it lies by chance alone, with the probability that ``detail`` says.
+    """
+
+    name: str
+    claim: str
+    value: float
+    bound: float
+    margin: float
+    passed: bool
+    source: str
+    kind: CheckKind = "computed"
+    detail: str = ""
+    status: Status | Literal[""] = ""
+    interval: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        if not self.status:
+            object.__setattr__(self, "status", "proved" if self.kind == "proved" else "computed twice")
+        if self.interval is not None:
+            low, high = self.interval
+            object.__setattr__(self, "interval", (low, high))
+
+
+def upper_bound_check(
+    name: str, claim: str, value: float, bound: float, *, source: str, kind: CheckKind = "computed", detail: str = ""
+) -> Check:
+    """Return a check that passes when ``value <= bound``; NaN fails."""
+    passed = bool(value <= bound) and not math.isnan(value)
+    return Check(name, claim, float(value), float(bound), float(bound - value), passed, source, kind, detail)
+
+
+def lower_bound_check(
+    name: str, claim: str, value: float, bound: float, *, source: str, kind: CheckKind = "computed", detail: str = ""
+) -> Check:
+    """Return a check that passes when ``value >= bound``; NaN fails."""
+    passed = bool(value >= bound) and not math.isnan(value)
+    return Check(name, claim, float(value), float(bound), float(value - bound), passed, source, kind, detail)
+
+
+def information(
+    name: str, claim: str, value: float, *, source: str, detail: str = "", status: Status = "computed twice"
+) -> Check:
+    """Return a row that informs and cannot fail."""
+    return Check(name, claim, float(value), math.nan, math.nan, True, source, "information", detail, status)
+
+
+def all_hold(checks: Sequence[Check]) -> bool:
+    """Return whether there is at least one real check and all of them hold."""
+    verdicts = [check.passed for check in checks if check.kind != "information"]
+    return bool(verdicts) and all(verdicts)

@@ -1,0 +1,124 @@
+"""Logs as people have them: starts that nobody stated, wrong samples, other units, steps that are too long."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from test_calibrate import BOUNDS, LOG, tanks
+
+from obsynth import DAEModel, SpecError, calibrate, simulate_dae
+
+TRUE = {"C": 1e-3, "Rs": 100.0}
+WIDE = {"C": (1e-4, 1e-2), "Rs": (10.0, 1000.0)}
+
+
+def circuit() -> DAEModel:
+    return DAEModel(
+        {"node": "C * der(v) = i", "ohm": "src - v - Rs * i = 0"}, {"vm": "v", "im": "i"}, states={"v": 0.5, "i": 0.01},
+        inputs={"src": 1.0}, constants=TRUE,
+    )  # fmt: skip
+
+
+def circuit_log(samples: int = 300, **changes) -> dict[str, np.ndarray]:
+    """A source that switches; the capacitor begins at 1 V, where the model's nominal state is 0.5 V."""
+    u = 1.0 + 0.5 * np.repeat(np.random.default_rng(0).choice([-1.0, 1.0], samples // 20), 20)[:, None]
+    y = np.array(simulate_dae(circuit(), u, dt=0.01, R=np.diag([1e-4, 1e-8]), seed=1, initial_state=[1.0, 0.0]).outputs)
+    log = {"time": 0.01 * np.arange(samples), "src": u[:, 0], "vm": y[:, 0], "im": y[:, 1]}
+    return {**log, **{name: change(log[name].copy()) for name, change in changes.items()}}
+
+
+def said(found, text: str) -> bool:
+    return any(text in sentence for sentence in found.verdict)
+
+
+def test_a_log_that_begins_elsewhere_is_no_fault() -> None:
+    found = calibrate(circuit(), circuit_log(), WIDE)
+    assert found.box.holds(TRUE)
+    assert found.nis.holds
+    assert found.fault_free
+    assert said(found, "does not begin at the nominal state (v 0.9")
+
+
+def test_a_start_that_only_the_first_innovations_show() -> None:
+    model = DAEModel(
+        {"kin": "der(x) = v", "dyn": "M * der(v) = F - k * x - c * v"}, {"pos": "x"}, states={"x": 0.1, "v": 0.5},
+        inputs={"F": 0.0}, constants={"M": 2.0, "k": 50.0, "c": 1.5},
+    )  # fmt: skip
+    F = 5.0 * np.repeat(np.random.default_rng(3).choice([-1.0, 1.0], 34), 12)[:400, None]
+    y = np.array(simulate_dae(model, F, dt=0.2, R=1e-4 * np.eye(1), seed=2, initial_state=[0.0, 0.0]).outputs)[:, 0]
+    log = {"time": 0.2 * np.arange(400), "F": F[:, 0], "pos": y}
+    found = calibrate(model, log, {"M": (0.5, 5.0), "k": (10.0, 200.0), "c": (0.1, 10.0)}, starts=1)
+    assert found.box.holds({"M": 2.0, "k": 50.0, "c": 1.5})
+    assert found.fault_free
+    assert found.nis.holds
+    assert said(found, "does not begin at the nominal state")
+
+
+def test_single_samples_that_are_no_measurements_are_told_and_left_out() -> None:
+    def wrong(column):
+        column[77] += 1e6
+        column[[140, 141]] = -4e4
+        return column
+
+    found = calibrate(circuit(), circuit_log(vm=wrong), WIDE)
+    assert found.box.holds(TRUE)
+    assert found.nis.holds
+    assert said(found, "3 value(s) of vm are far from all others and count as not measured (row 77: 1e+06, row 140")
+    assert np.isnan(found.innovations[77, 0])
+    clean = calibrate(circuit(), circuit_log(), WIDE)
+    assert found.R["vm"] == pytest.approx(clean.R["vm"], rel=0.1)
+
+
+def test_a_sample_that_stands_out_is_named() -> None:
+    def wrong(column):
+        column[77] += 0.3
+        return column
+
+    found = calibrate(circuit(), circuit_log(vm=wrong), WIDE)
+    assert said(found, "Samples of vm stand out by more than 6 deviations (row 77)")
+
+
+def test_a_sensor_of_another_sign_and_one_with_a_bias_are_named() -> None:
+    turned = calibrate(circuit(), circuit_log(vm=lambda column: -column), WIDE, starts=1)
+    assert said(turned, "The best simulation leaves nearly all of what vm does")
+    biased = calibrate(circuit(), circuit_log(vm=lambda column: column + 0.3), WIDE, starts=1)
+    assert said(biased, "The innovations of vm have the mean +1.00 deviations: a bias")
+    assert not said(biased, "of im have the mean")
+
+
+def test_short_errors_of_steps_that_add_up_take_radau() -> None:
+    """A sixth of a deviation in a step moves a constant by five of its own: the true volume is outside of that box."""
+    model = DAEModel(
+        {"mass": "V * der(c) = q * (cin - c) - V * k0 * exp(-E / T) * c",
+         "heat": "rho * cp * V * der(T) = rho * cp * q * (Tin - T) + H * V * k0 * exp(-E / T) * c"}, {"Ts": "T"},
+        states={"c": 800.0, "T": 330.0}, inputs={"q": 1e-3, "Tin": 320.0},
+        constants={"V": 0.1, "k0": 7e7, "E": 8000.0, "rho": 1000.0, "cp": 4186.0, "H": 5e4, "cin": 1000.0},
+    )  # fmt: skip
+    flow, warm = (np.repeat(np.random.default_rng(seed).choice([-1.0, 1.0], 13), hold)[:250]
+                  for seed, hold in ((1, 25), (2, 20)))  # fmt: skip
+    u = np.column_stack([1e-3 * (1.0 + 0.3 * flow), 320.0 + 4.0 * warm])
+    y = np.array(simulate_dae(model, u, dt=5.0, R=0.01 * np.eye(1), seed=5).outputs)[:, 0]
+    log = {"time": 5.0 * np.arange(250), "q": u[:, 0], "Tin": u[:, 1], "Ts": y}
+    unknown = {"V": (0.05, 0.3), "H": (1e4, 2e5)}
+    found = calibrate(model, log, unknown, starts=1)
+    assert found.integration == "radau"
+    assert said(found, "of its own: Radau is taken")
+    assert found.box.holds({"V": 0.1, "H": 5e4})
+    euler = calibrate(model, log, unknown, starts=1, integration="backward-euler")
+    assert not euler.box.holds({"V": 0.1, "H": 5e4})
+
+
+def test_a_kink_of_the_model_at_the_maximum_spoils_no_box() -> None:
+    """With a start between the pairs of levels the likelihood's slope jumps at its maximum (abs of a difference)."""
+    found = calibrate(tanks(), LOG, BOUNDS, rows="0:56", starts=1)
+    stated = calibrate(tanks(), LOG, BOUNDS, rows="0:56", starts=1, initial_covariance=1e-4)
+    assert found.undetermined == ()
+    for name in BOUNDS:
+        width = stated.box.high[name] - stated.box.low[name]
+        assert abs(found.box.low[name] - stated.box.low[name]) < 0.1 * width
+        assert abs(found.box.high[name] - stated.box.high[name]) < 0.1 * width
+
+
+def test_rows_that_are_asked_for_are_named() -> None:
+    with pytest.raises(SpecError, match=r"rows 400:500 holds nothing: the log has 300 rows"):
+        calibrate(circuit(), circuit_log(), WIDE, rows="400:500")

@@ -1,0 +1,96 @@
+"""Outliers, resets, bounds on states and sensors of their own times in the exported C of nonlinear observers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_dae_c_export import run_c
+from test_validate import designed
+
+from obsynth import dae_adaptive_observer, simulate_dae
+
+OPTIONS = {
+    "gate": {"outliers": "gate"},
+    "huber": {"outliers": "huber", "outlier_limit": 2.5},
+    "reset": {"reset": 1e-4},
+    "bounds": {"state_bounds": {"h1": [0.0, 0.2], "h2": [0.0, 0.22], "h3": [-1.0, 0.155]}},
+    "late": {"sensors": {"v1": {"every": 3, "delay": 2}, "v3": {"delay": 4}}},
+    "slow": {"sensors": {"v2": {"every": 5}}},
+}
+FORMS = {"forgetting": {"forgetting": 0.95}, "random-walk": {"random_walk": [[1e-6]]},
+         "augmented-kalman": {"random_walk": [[1e-6]]}}  # fmt: skip
+BOTH = {**OPTIONS["gate"], **OPTIONS["reset"], **OPTIONS["bounds"], **OPTIONS["late"]}
+
+
+def tank_observer(form: str, options: dict):
+    made = designed()
+    return dae_adaptive_observer(
+        made.plant, dt=1.0, form=form, Q=made.observer.Q, R=made.observer.R, initial_covariance=1e-4 * np.eye(3),
+        initial_parameter_covariance=[[1e-4]], **FORMS[form], **options,
+    )  # fmt: skip
+
+
+def leaking(design, samples: int = 150) -> tuple[np.ndarray, np.ndarray]:
+    """A leak that opens at k = 70, with single wrong samples of any size, gaps, and one sensor that steps."""
+    u = np.tile(design.plant.nominal_input, (samples, 1))
+    leak = np.where(np.arange(samples) < 70, 0.0, 0.03)[:, None]
+    y = np.array(simulate_dae(design.plant, u, dt=1.0, parameters=leak, R=design.observer.R, seed=3).outputs)
+    y[20, 1] += 1e6
+    y[33, 0] -= 0.5
+    y[50:53] = np.nan
+    y[60] = [np.nan, 1e200, 3.0]
+    y[110:, 2] += 0.4
+    return y, u
+
+
+def assert_same(found: dict[str, np.ndarray], expected) -> None:
+    """A late sensor has no innovation at the sample that is shown."""
+    assert not found["returned"].any()
+    for name in ("states", "state_deviations", "parameters", "parameter_deviations", "innovations"):
+        values = getattr(expected, name)
+        assert np.array_equal(np.isnan(found[name]), np.isnan(values)), name
+        gaps, sizes = np.nan_to_num(found[name] - values), np.nan_to_num(values)
+        assert (np.abs(gaps).max(axis=0) <= 1e-10 * np.abs(sizes).max(axis=0)).all(), name
+    assert np.abs(found["nis"][:, 0] - expected.nis).max() <= 1e-9 * expected.nis.max()
+
+
+@pytest.mark.parametrize(("form", "name"), [("forgetting", "gate"), ("augmented-kalman", "gate"),
+                                            ("random-walk", "huber")])  # fmt: skip
+def test_outliers_in_c(form, name, tmp_path) -> None:
+    design = tank_observer(form, OPTIONS[name])
+    y, u = leaking(design)
+    expected = design.observer.run(y, u)
+    assert np.abs(expected.states[25:100]).max() < 5.0
+    assert_same(run_c(design, y, u, tmp_path), expected)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_everything_at_once_in_c(form, tmp_path) -> None:
+    design = tank_observer(form, BOTH)
+    y, u = leaking(design)
+    assert_same(run_c(design, y, u, tmp_path), design.observer.run(y, u))
+
+
+@pytest.mark.parametrize(("form", "name"), [("forgetting", "reset"), ("augmented-kalman", "reset"),
+                                            ("forgetting", "bounds"), ("random-walk", "late"),
+                                            ("augmented-kalman", "slow")])  # fmt: skip
+def test_each_option_in_c_does_what_it_does_in_python(form, name, tmp_path) -> None:
+    design, leak = tank_observer(form, OPTIONS[name]), np.where(np.arange(120) < 50, 0.0, 0.03)[:, None]
+    u = np.tile(design.plant.nominal_input, (120, 1))
+    y = np.array(simulate_dae(design.plant, u, dt=1.0, parameters=leak, R=design.observer.R, seed=3).outputs)
+    expected = design.observer.run(y, u)
+    plain = replace(design.observer, outliers="none", reset=0.0, state_bounds=None, sensors=None)
+    assert np.abs(plain.run(y, u).states - expected.states).max() > 1e-6
+    assert_same(run_c(design, y, u, tmp_path), expected)
+
+
+def test_bounds_that_many_states_break_at_once_and_one_that_is_known_exactly(tmp_path) -> None:
+    design = tank_observer("forgetting", {"state_bounds": {"h1": [0.1, 0.12], "h2": [0.1, 0.11], "h3": [0.1, 0.1005]}})
+    y, u = leaking(design)
+    known = replace(design.observer, initial_covariance=np.diag([0.0, 1e-4, 1e-4]), Q=np.diag([0.0, 1e-9, 1e-9]))
+    # Where h1 is known to be outside, at k = 0, no move keeps all bounds; later its deviation would be rounding alone.
+    for observer, samples in ((design.observer, 19), (known, 1)):
+        made = replace(design, observer=observer)
+        assert_same(run_c(made, y[:samples], u[:samples], tmp_path), observer.run(y[:samples], u[:samples]))

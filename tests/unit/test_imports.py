@@ -1,0 +1,113 @@
+"""The arrows between modules: none in a circle, none that runs up, whether written as an import or as a text."""
+
+from __future__ import annotations
+
+import ast
+import tomllib
+from collections.abc import Iterator, Mapping
+from graphlib import CycleError, TopologicalSorter
+from importlib import import_module
+from pathlib import Path
+
+import obsynth
+
+SOURCE = Path(obsynth.__file__).parent
+ROOT = "obsynth"
+
+
+def module_name(path: Path) -> str:
+    """Return the name of the module in a file."""
+    return ".".join((ROOT, *path.relative_to(SOURCE).with_suffix("").parts)).removesuffix(".__init__")
+
+
+FILES = {module_name(path): path for path in sorted(SOURCE.rglob("*.py"))}
+
+
+def imports(tree: ast.AST, modules: Mapping[str, object]) -> Iterator[str]:
+    """Yield the modules that a module imports: at once, late, or for types only."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").partition(".")[0] == ROOT:
+            for alias in node.names:
+                inner = f"{node.module}.{alias.name}"
+                yield inner if inner in modules else str(node.module)
+        elif isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names if alias.name in modules)
+
+
+def circle(graph: Mapping[str, set[str]]) -> list[str]:
+    """Return modules that import each other in a circle; empty where there is none."""
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        return list(error.args[1])
+    return []
+
+
+def levels() -> list[tuple[str, ...]]:
+    """Return the packages of each level as the contract says, the uppermost first."""
+    tool = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["tool"]["importlinter"]
+    (layers,) = (contract["layers"] for contract in tool["contracts"] if contract["type"] == "layers")
+    return [tuple(part.strip(" ()") for part in layer.split("|")) for layer in layers]
+
+
+def package_of(name: str) -> str:
+    """Return the package directly below the root."""
+    return ".".join(name.split(".")[:2])
+
+
+def texts_that_name_modules(tree: ast.AST, modules: Mapping[str, object]) -> Iterator[str]:
+    """Yield the modules that texts name, such as ``"obsynth.cli.main:run"``."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value.startswith(f"{ROOT}."):
+            found = node.value.partition(":")[0]
+            if found in modules:
+                yield found
+
+
+HEIGHT = {name: level for level, names in enumerate(levels()) for name in names}
+
+
+def runs_up(tree: ast.AST, package: str, modules: Mapping[str, object]) -> list[str]:
+    """Return the modules of upper packages that a module names, for types only or as a text."""
+    named = {*imports(tree, modules), *texts_that_name_modules(tree, modules)}
+    return sorted(name for name in named if HEIGHT.get(package_of(name), -1) < HEIGHT[package])
+
+
+def test_no_modules_import_each_other_in_a_circle() -> None:
+    graph = {
+        name: set(imports(ast.parse(path.read_text()), FILES)) - {name} for name, path in FILES.items() if name != ROOT
+    }
+    assert circle(graph) == []
+
+
+def test_a_circle_is_found_also_through_imports_for_types() -> None:
+    late = ast.parse("def f():\n    from obsynth.b import g\n")
+    typed = ast.parse("if TYPE_CHECKING:\n    from obsynth.a import f\n")
+    modules = {"obsynth.a": late, "obsynth.b": typed}
+    assert circle({name: set(imports(tree, modules)) for name, tree in modules.items()})
+
+
+def test_every_package_has_a_level() -> None:
+    assert {package_of(name) for name in FILES} - {ROOT, f"{ROOT}.__main__"} <= set(HEIGHT)
+
+
+def test_no_arrow_runs_up() -> None:
+    inner = (name for name in FILES if name not in (ROOT, f"{ROOT}.__main__"))
+    found = {name: runs_up(ast.parse(FILES[name].read_text()), package_of(name), FILES) for name in inner}
+    assert {name: up for name, up in found.items() if up} == {}
+
+
+def test_an_arrow_in_a_text_is_found() -> None:
+    tree = ast.parse('WAY = "obsynth.report.summary:summary"')
+    assert runs_up(tree, "obsynth.results", FILES) == ["obsynth.report.summary"]
+
+
+def test_types_are_told_of_every_public_name() -> None:
+    stub = ast.parse((SOURCE / "__init__.pyi").read_text())
+    told = {alias.asname: (str(node.module), alias.name) for node in stub.body if isinstance(node, ast.ImportFrom)
+            for alias in node.names if alias.name not in ("__version__", "plotting")}  # fmt: skip
+    told |= {ast.unparse(node.targets[0]): told[ast.unparse(node.value)] for node in stub.body
+             if isinstance(node, ast.Assign)}  # fmt: skip
+    assert set(told) == set(obsynth.__all__)
+    for name, (module, there) in told.items():
+        assert getattr(import_module(module), there) is getattr(obsynth, name), name
