@@ -34,7 +34,8 @@ class PlantOrigin:
     that one sampled with a zero-order hold; computed: Whether some of the numbers behind them were computed in floating
     point; sizes: Of the matrices of the plant itself, how large the terms are that each entry is a sum of (``A, Bf, Bd,
     C, Df, Dd``): what rounding of the data behind it may change is relative to those; states: How many the plant as
-    written has, algebraic ones included; 0 where that is not known.
+    written has, algebraic ones included; 0 where that is not known; uncleaned: Where data were computed and what
+    elimination left of them by their rounding alone was set to zero: the `DECISIVE` matrices before that.
     """
 
     exact: Mapping[str, tuple[tuple[Fraction, ...], ...]]
@@ -42,6 +43,7 @@ class PlantOrigin:
     computed: bool = False
     sizes: Mapping[str, FloatArray] | None = None
     states: int = 0
+    uncleaned: Mapping[str, tuple[tuple[Fraction, ...], ...]] | None = None
 
 
 def origin_of(plant: Written) -> PlantOrigin | None:

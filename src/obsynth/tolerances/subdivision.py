@@ -14,6 +14,7 @@ import numpy as np
 
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.ranks import ROUNDED_ZERO
 from obsynth.plants.constants import ConstantsBox
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.uncertainty import Uncertainty, matrices_of
@@ -31,10 +32,6 @@ Build: TypeAlias = Callable[[FloatArray, FloatArray], AffineMatrix]
 BISECTIONS = 50
 #: With more constants than this, not all vertices are looked at first.
 MOST_VERTEX_CONSTANTS = 10
-
-
-#: A value below this share of the largest of its range is zero but for rounding.
-ROUNDED_ZERO = 1e-12
 
 
 #: Norms computed in double precision are multiplied by this before they are compared.

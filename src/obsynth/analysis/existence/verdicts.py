@@ -29,7 +29,7 @@ from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.zeros import are_outside, is_outside
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.pencils import finite_zeros
-from obsynth.numerics.ranks import NAMED_SHARE, RankDecision
+from obsynth.numerics.ranks import NAMED_SHARE, RANK_TOLERANCE, RankDecision
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.balls import UNIT_ROUNDOFF
 
@@ -171,6 +171,7 @@ def needed_gain(plant: DescriptorSystem, units: PlantUnits, point: complex, *, i
     rows = np.concatenate([units.equations, units.outputs])[:, None]
     pencil = np.block([[plant.A - point * plant.E, entering], [plant.C, direct]])
     scaled = np.linalg.svd(rows * pencil * columns)[2][-1].conj()
+    scaled = np.where(np.abs(scaled) > RANK_TOLERANCE, scaled, 0.0)
     signals = np.abs(columns * scaled)
     terms = np.max(np.abs(np.hstack([plant.C, direct])) * signals, axis=1, initial=0.0)
     names = (*plant.state_names, *({"Bf": plant.fault_names, "Bd": plant.disturbance_names}.get(inputs, ())))

@@ -90,7 +90,7 @@ def _sampled_plan(
         problem.observer, problem.affine, problem.tracking, problem.bounds, noise, reading=problem.reading
     )
     reached = structure.disturbances.magnitude.max(axis=0, initial=0.0)[: len(problem.bounds)] > 0.0
-    if np.any(reached.reshape(-1, plant.nd).any(axis=0) & ~np.isfinite(bounds)):
+    if plant.nd and np.any(reached.reshape(-1, plant.nd).any(axis=0) & ~np.isfinite(bounds)):
         raise SpecError("A disturbance has no bound: give disturbance_bounds (--disturbance).",
                         path="disturbance_bounds")  # fmt: skip
     z = np.zeros(observer.order) if observer_state is None else observer_state

@@ -220,7 +220,8 @@ def _adaptive(
     )  # fmt: skip
     return OnlineMonitor(
         "pointwise", adaptive_statement(first, design) + start, AdaptiveRule(first, later, norm),
-        residuals=len(model.C), fault_names=design.linear[1].fault_names, fault_scales=model.fault_scales(),
+        residuals=len(design.linear[1].residual_names), fault_names=design.linear[1].fault_names,
+        fault_scales=model.fault_scales(),
     )  # fmt: skip
 
 

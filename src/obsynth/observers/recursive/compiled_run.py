@@ -123,7 +123,7 @@ SHORT_STRETCH = 8
 
 def kernel_covers(observer: RecursiveSettings) -> bool:
     """Return whether the kernel knows the recursion: that of a filter, with parameters as a random walk or none."""
-    return observer.adaptation is None or observer.adaptation.form == "random-walk"
+    return observer.form in ("", "random-walk")
 
 
 def kernel_is_chosen(observer: RecursiveSettings, samples: int, compiled: bool | None) -> bool:

@@ -135,6 +135,21 @@ class RecursiveSettings(Undelayed):
         """The parameters that are estimated, in order."""
         return () if self.adaptation is None else self.plant.parameter_names
 
+    @property
+    def form(self) -> str:
+        """How parameters are estimated; empty for a filter without any."""
+        return "" if self.adaptation is None else self.adaptation.form
+
+    @property
+    def initial_parameters(self) -> FloatArray:
+        """Mean of the parameters at the start ``(nq,)``; empty for a filter without any."""
+        return np.zeros(0) if self.adaptation is None else self.adaptation.initial_parameters
+
+    @property
+    def innovation_count(self) -> int:
+        """Numbers in an innovation: what equations and outputs say beyond the state."""
+        return self.plant.ne + self.plant.ny - self.plant.nx
+
     @cached_property
     def timing(self) -> SensorTiming:
         """When each sensor is sampled, and how late its values are."""

@@ -168,13 +168,17 @@ class EarlyConstraintSteps:
         )  # fmt: skip
 
     def first(self) -> StepMatrices:
-        """Return the correction of x(0) by the algebraic equations of step 0: the prior is the 'equation'."""
+        """Return the correction of x(0) by the algebraic equations of step 0."""
+        return self.correction(0)
+
+    def correction(self, k: int) -> StepMatrices:
+        """Return the correction of x(k) by the algebraic equations of step k: what is known is the 'equation'."""
         plant, late = self.plant, self.late
-        H = np.vstack([np.eye(plant.nx), plant.A.at(0)[late]])
-        noise = stacked_noise(np.zeros((plant.nx, 0)), self._factors(0)[1])
+        H = np.vstack([np.eye(plant.nx), plant.A.at(k)[late]])
+        noise = stacked_noise(np.zeros((plant.nx, 0)), self._factors(k)[1])
         return StepMatrices(
             H, np.eye(plant.nx), np.zeros((plant.nx, plant.nu)), np.zeros((plant.nx, plant.nq)),
-            plant.Phi.at(0)[late], -plant.B.at(0)[late], noise,
+            plant.Phi.at(k)[late], -plant.B.at(k)[late], noise,
         )  # fmt: skip
 
 
