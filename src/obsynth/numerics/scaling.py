@@ -19,8 +19,6 @@ from obsynth.numerics.arrays import FloatArray, read_only
 
 #: Sweeps of the balancing; each one must improve on the last, so few are ever used.
 MOST_SWEEPS = 10
-
-
 #: Makes the factors unique where one group of signals does not touch another; too small to move them.
 SMALL_RIDGE = 1e-9
 
@@ -206,16 +204,10 @@ def _row_peaks(matrix: FloatArray) -> FloatArray:
 
 #: Makes the factors unique where nothing determines them; too small to move them elsewhere.
 RIDGE = 1e-11
-
-
 #: Weight of a wish, which decides only what the entries leave open.
 WISH_WEIGHT = 1e-8
-
-
 #: An entry this many bits below one has half a say: what is far below is coupling that hardly counts, or rounding.
 HALF_SAY = 10.0
-
-
 #: Passes in which small entries lose their say.
 PASSES = 3
 
