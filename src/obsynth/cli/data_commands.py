@@ -160,8 +160,6 @@ def _target(options: argparse.Namespace) -> Path | TextIO:
 
 #: Formats of pictures, with the mark by which an older one may be replaced.
 PICTURES = {".png": rb"\A\x89PNG", ".svg": rb"<svg", ".pdf": rb"\A%PDF"}
-
-
 #: Dots per inch of a picture made of dots.
 _RESOLUTION = 160
 

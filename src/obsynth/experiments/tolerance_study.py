@@ -187,8 +187,11 @@ def _both(design: ObserverDesign, scenario: Scenario, fault: str, runs: int) -> 
 
 
 def _together(found: list[Runs]) -> Runs:
-    names = ("states", "outputs", "inputs", "faults", "disturbances", "rows")
-    return replace(found[0], **{name: np.concatenate([getattr(run, name) for run in found], axis=1) for name in names})
+    def joined(name: str) -> FloatArray:
+        return np.concatenate([getattr(run, name) for run in found], axis=1)
+
+    return Runs(joined("states"), joined("outputs"), joined("inputs"), joined("faults"), joined("disturbances"),
+                joined("rows"), found[0].observer)  # fmt: skip
 
 
 def _counted(watched: Monitor, without: Runs, with_one: Runs) -> tuple[float, float]:
@@ -196,13 +199,18 @@ def _counted(watched: Monitor, without: Runs, with_one: Runs) -> tuple[float, fl
     observer: Any = without.observer
     rows = observer.fault_rows if watched.watches_estimates else observer.residual_rows
     false = watched.passed_in(without, rows)
-    names = ("states", "outputs", "inputs", "faults", "rows")
 
     def told(size: float) -> bool:
+        def moved(one: FloatArray, other: FloatArray) -> FloatArray:
+            return np.asarray(one + size * (other - one))
+
         # Plant and observer are linear: what the fault does goes with its size.
-        changed = {name: getattr(without, name) + size * (getattr(with_one, name) - getattr(without, name))
-                   for name in names}  # fmt: skip
-        passed = watched.passed_in(replace(without, **changed), rows)
+        changed = replace(
+            without, states=moved(without.states, with_one.states), outputs=moved(without.outputs, with_one.outputs),
+            inputs=moved(without.inputs, with_one.inputs), faults=moved(without.faults, with_one.faults),
+            rows=moved(without.rows, with_one.rows),
+        )  # fmt: skip
+        passed = watched.passed_in(changed, rows)
         return bool((passed & ~false).any(axis=0).all())
 
     level = np.abs(watched.threshold[np.isfinite(watched.threshold)])

@@ -83,8 +83,6 @@ def _number(design: ObserverDesign, name: str) -> float:
 
 #: Inches: height of one panel.
 _SCAN_HEIGHT = 2.1
-
-
 #: One panel each: its label and the curves in it, with their names and styles.
 PANELS: tuple[tuple[str, tuple[tuple[str, str, dict[str, Any]], ...]], ...] = (
     ("decay (1/s)", (("decay", "rate at which errors die out", {"color": "black", "marker": "o"}),)),

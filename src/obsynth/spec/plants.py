@@ -25,18 +25,10 @@ if TYPE_CHECKING:
 
 
 _Plant = TypeVar("_Plant", DescriptorSystem, TimeVaryingDescriptorSystem, DAEModel)
-
-
 _MATRICES = ("E", "A", "B", "C", "D", "Bf", "Df", "Bd", "Dd", "Bw", "Dw")
-
-
 _NAME_LISTS = ("state_names", "input_names", "output_names", "fault_names", "disturbance_names", "noise_names")
-
-
 # Equations picked by name also name the signal that enters there.
 _SIGNAL_OF_PICK = {"B": "input_names", "Bw": "noise_names"}
-
-
 _LABELS = ("operating_point", "scales", "units")
 
 

@@ -22,22 +22,14 @@ from obsynth.proofs.affine import AffineMatrix, affine_block, affine_inverse
 
 #: Boxes after which a statement is left open.
 MOST_BOXES = 150
-
-
 #: The matrix over ``lower <= q <= upper``.
 Build: TypeAlias = Callable[[FloatArray, FloatArray], AffineMatrix]
-
-
 #: Halvings of the way to a point that fails.
 BISECTIONS = 50
 #: With more constants than this, not all vertices are looked at first.
 MOST_VERTEX_CONSTANTS = 10
-
-
 #: Norms computed in double precision are multiplied by this before they are compared.
 _OUTWARD = 1.0 + 1e-9
-
-
 #: What rounding takes from a product of matrices, beside its terms.
 _ROUNDING = 1e-14
 

@@ -57,8 +57,6 @@ def settled_rank(decision: RankDecision, exact_rank: int | None, share: float = 
 DECIDER = "Data with more digits, or an output in which this shows more, would decide it."
 #: Computed data hold more than one rounding: below this distance a zero of theirs is one.
 COMPUTED = 1e-12
-
-
 #: Rounding scatters a multiple zero by up to this, relative to its size or one.
 SCATTER = 1e-2
 

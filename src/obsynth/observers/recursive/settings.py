@@ -23,8 +23,6 @@ from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 
 Form: TypeAlias = Literal["innovation", "literal", "random-walk"]
 Guard: TypeAlias = Literal["regularise", "directional", "none"]
-
-
 _KINDS = {"form": Form, "guard": Guard, "forgetting": ForgettingFactor, "window": Count, "reset": Probability}
 
 
