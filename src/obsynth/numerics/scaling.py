@@ -158,9 +158,9 @@ def balance_by_least_squares(
     ----------
     R. C. Ward, *Balancing the generalized eigenvalue problem*, SIAM J. Sci. Stat. Comput. 2, 1981.
     """
-    nx = E.shape[0]
-    b, c = np.hstack([np.zeros((nx, 0)), *inputs]), np.vstack([np.zeros((0, nx)), *outputs])
-    ends = [0, nx, 2 * nx, 2 * nx + len(c), 2 * nx + len(c) + b.shape[1]]
+    ne, nx = E.shape
+    b, c = np.hstack([np.zeros((ne, 0)), *inputs]), np.vstack([np.zeros((0, nx)), *outputs])
+    ends = [0, ne, ne + nx, ne + nx + len(c), ne + nx + len(c) + b.shape[1]]
     equations, states, shown, entering = map(slice, ends[:-1], ends[1:])
     normal = SMALL_RIDGE * np.eye(ends[-1])
     diagonal, right = np.einsum("ii->i", normal), np.zeros(ends[-1])
