@@ -66,7 +66,11 @@ def _add_linearise(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--drift", action="store_true", help="take a moving point, with an input 'drift'")
     _add_log(parser, required=False)
-    parser.add_argument("--out", type=Path, metavar="FILE", help="write the linear plant to this file (YAML)")
+    parser.add_argument(
+        "--out", type=Path, metavar="FILE",
+        help="write the linear plant to this file (YAML), at nominal values: for designs that know tolerances, give "
+        "the equations and transform.linearise in the spec",
+    )  # fmt: skip
     _finish(parser, "linearise")
 
 

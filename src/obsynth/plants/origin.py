@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import Protocol, TypeVar
 
-import numpy as np
-
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.sparse import same_matrix
 
 
 class Written(Protocol):
@@ -70,12 +69,12 @@ def carry_origin(old: Written, new: Plant) -> Plant:
     """Note on a changed plant what the old one was made from, if nothing has changed that matters."""
     made = getattr(old, "_made_from", None)
     unchanged = old.dt == new.dt and all(
-        np.array_equal(getattr(old, name), getattr(new, name)) for name in (*DECISIVE, "B", "D")
+        same_matrix(getattr(old, name), getattr(new, name)) for name in (*DECISIVE, "B", "D")
     )
     if made is not None and unchanged:
         object.__setattr__(new, "_made_from", made)
     origin = origin_of(old)
     same = origin is not None and old.dt == new.dt
-    if same and all(np.array_equal(getattr(old, name), getattr(new, name)) for name in DECISIVE):
+    if same and all(same_matrix(getattr(old, name), getattr(new, name)) for name in DECISIVE):
         return with_origin(new, origin)
     return new

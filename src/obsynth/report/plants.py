@@ -214,4 +214,5 @@ def plant_document(plant: DescriptorSystem, source: str) -> str:
     yaml.width = 4096
     yaml.sort_base_mapping_type_on_output = False
     yaml.dump(data, text)
-    return f"# Linearised by obsynth from {source}, at the operating point below.\n{text.getvalue()}"
+    where = "at the operating point below and at nominal values of all constants"
+    return f"# Linearised by obsynth from {source}, {where}.\n{text.getvalue()}"
