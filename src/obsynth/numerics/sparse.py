@@ -57,7 +57,7 @@ def same_matrix(first: Any, second: Any) -> bool:
         return True
     if not (is_sparse(first) or is_sparse(second)):
         return np.array_equal(first, second)
-    return first.shape == second.shape and (csr(first) != csr(second)).nnz == 0
+    return bool(first.shape == second.shape and (csr(first) != csr(second)).nnz == 0)
 
 
 def csr(matrix: Any) -> Any:
