@@ -17,11 +17,19 @@ from obsynth.methods.fault_estimation_filter.injection_problem import (
     NormalisedProblem,
     normalise,
 )
-from obsynth.methods.fault_estimation_filter.least_gain_proof import ALONE, LAST, PAIRS, PROVED_SHARE, InvisiblePairs
+from obsynth.methods.fault_estimation_filter.least_gain_proof import (
+    ALONE,
+    LAST,
+    MOST_STATES,
+    PAIRS,
+    PROVED_SHARE,
+    InvisiblePairs,
+)
 from obsynth.methods.fault_estimation_filter.output_nulling import (
     invisible_pairs,
     null_space,
     output_nulling_part,
+    reached_from_rest,
     strict_point,
 )
 from obsynth.numerics.arrays import FloatArray
@@ -36,6 +44,8 @@ BOUND_MARGIN = 1e-6
 NEGLIGIBLE_DISTURBANCES = (1e-3, 3e-2)
 #: Errors that invisible disturbances reach from rest: with more of them the inequalities take seconds.
 MOST_REACHED = 24
+#: Where two steps show less than this share of the gain in double precision, they prove nothing exactly either.
+HOPEFUL_SHARE = 0.99
 _PARTS = ("S", "top", "bottom", "image", "shown", "Z", "Zd")
 
 
@@ -175,13 +185,16 @@ def _checked_bound(dual: _DualProblem, z1: FloatArray, corner: FloatArray, last:
 
 
 def least_gain_certificate(
-    work: DescriptorSystem, gains: Mapping[str, FloatArray], factor: FloatArray, *, gain: float, free_weight: bool,
+    problem: GainProblem, work: DescriptorSystem, gains: Mapping[str, FloatArray], factor: FloatArray, *, gain: float,
     solver: str,
 ) -> tuple[dict[str, FloatArray], float]:  # fmt: skip
     """Return the matrices of a proof that no such filter has a gain below ``gain``, and what they prove; else none.
 
     Shapes: ``factor (n, n)`` maps errors to coordinates in which they are of natural sizes.
     """
+    free_weight = problem.weight_is_free
+    if _is_hopeless(problem, gain):
+        return {}, 0.0
     pairs = InvisiblePairs.of(work, gains)
     if pairs is None:
         return {}, 0.0
@@ -214,24 +227,47 @@ def least_gain_certificate(
     return (best, least) if least >= gain * (1.0 - PROVED_SHARE) else ({}, 0.0)
 
 
+def _is_hopeless(problem: GainProblem, gain: float) -> bool:
+    """Return whether so many states are reached that two steps alone are tried, and these show too little.
+
+    In double precision, before the exact null spaces of many states, which take most of a second at 32 states.
+    """
+    if not MOST_REACHED < problem.order <= MOST_STATES:
+        return False
+    top, bottom, image = invisible_pairs(problem)
+    if reached_from_rest(top, image).shape[1] <= MOST_REACHED:
+        return False
+    _, both = _first_two(top, bottom, image, problem.Z @ top + problem.Zd @ bottom, problem.Z, problem.Zd)
+    most = both[:, : both.shape[1] - problem.Zd.shape[1]] if problem.weight_is_free else both
+    return not most.size or float(np.linalg.norm(most, 2)) < HOPEFUL_SHARE * gain
+
+
+def _first_two(
+    top: FloatArray, bottom: FloatArray, image: FloatArray, shown: FloatArray, z: FloatArray, zd: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the invisible pairs at rest in units of the disturbance, and what they and one disturbance more show.
+
+    The pairs show at once, in the first rows, and through the error they lead to, in the last.
+    """
+    starts = null_space(top) if top.shape[0] else np.eye(bottom.shape[1])
+    sizes = np.linalg.pinv(np.linalg.qr(bottom @ starts, mode="r")) if starts.shape[1] else np.zeros((0, 0))
+    starts = starts @ sizes
+    first = shown @ starts
+    return starts, np.block([[first, np.zeros((len(first), zd.shape[1]))], [z @ (image @ starts), zd]])
+
+
 def _two_steps(
     top: FloatArray, bottom: FloatArray, image: FloatArray, shown: FloatArray, z: FloatArray, zd: FloatArray,
     free_weight: bool,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:  # fmt: skip
     """Return the best disturbance of one sample from rest that no gain sees, with one more where W is fixed."""
-    starts = null_space(top) if top.shape[0] else np.eye(bottom.shape[1])
-    # In units of the disturbance.
-    sizes = np.linalg.pinv(np.linalg.qr(bottom @ starts, mode="r")) if starts.shape[1] else np.zeros((0, 0))
-    starts = starts @ sizes
+    starts, both = _first_two(top, bottom, image, shown, z, zd)
     nd, s = zd.shape[1], top.shape[0]
-    first = shown @ starts
     if free_weight:
-        return starts @ _strongest(first)[:, None], np.zeros((nd, s)), np.zeros((nd, 1))
-    moved = image @ starts
-    both = np.block([[first, np.zeros((len(first), nd))], [z @ moved, zd]])
+        return starts @ _strongest(shown @ starts)[:, None], np.zeros((nd, s)), np.zeros((nd, 1))
     strongest = _strongest(both)
     f, later = starts @ strongest[: starts.shape[1]], strongest[starts.shape[1] :]
-    reached = moved @ strongest[: starts.shape[1]]
+    reached = image @ f
     size = float(reached @ reached)
     last = np.outer(later, reached) / size if size > 0.0 else np.zeros((nd, s))
     return f[:, None], last, np.zeros((nd, 1)) if size > 0.0 else later[:, None]

@@ -43,7 +43,7 @@ def invisible_pairs(problem: GainProblem) -> tuple[FloatArray, FloatArray, Float
     return basis[: problem.order], basis[problem.order :], np.hstack([problem.A, problem.B]) @ basis
 
 
-def _reached_from_rest(top: FloatArray, image: FloatArray) -> FloatArray:
+def reached_from_rest(top: FloatArray, image: FloatArray) -> FloatArray:
     """Return a basis of the least subspace with the next state of each output-nulling pair whose state is in it."""
     subspace = np.zeros((top.shape[0], 0))
     while True:
@@ -81,7 +81,7 @@ def output_nulling_part(problem: GainProblem) -> GainProblem:
     Outside of them the dual inequalities have no strict solution; restricted to them they lose nothing.
     """
     top, _, image = invisible_pairs(problem)
-    reached = _reached_from_rest(top, image)
+    reached = reached_from_rest(top, image)
     subspace = _range(np.hstack([reached, _growing(top, image, reached)]))
     t = subspace.T
     return replace(

@@ -87,7 +87,7 @@ def synthesise(plant: DescriptorSystem, asked: FilterOptions, *, progress: Calla
     if plant.nd:
         progress("proving that no filter does better")
         proof, proved = least_gain_certificate(
-            prepared.plant, gains, factor, gain=least.gain, free_weight=free, solver=asked.solver
+            problem, prepared.plant, gains, factor, gain=least.gain, solver=asked.solver
         )
         witnesses |= proof
         # The search may end below what is proved, by its tolerance: no filter is there.
