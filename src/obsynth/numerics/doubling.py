@@ -112,18 +112,22 @@ def _doubled(
         for step in range(MOST_DOUBLINGS):
             if possible is not None and not possible(full):
                 return None
-            if step == FIRST_POWER and len(power) >= FEWEST_STATES:
+            # At first in the units of what drives the states, then in those of what it has reached.
+            if step in (0, FIRST_POWER) and len(power) >= FEWEST_STATES:
                 power, back, solution = lifts.balanced(power, back, solution)
             part = watch.slow_part(power)
-            found = _doubled_once(power, back, solution) if part is None else None
             if part is not None:
                 lifts.add(solution, part.basis)
-                found = slow_equation(part, power, back, solution)
+            found = _doubled_once(power, back, solution) if part is None else slow_equation(part, power, back, solution)
             if found is None:
                 return None
-            power, back, solution = found[0], 0.5 * (found[1] + found[1].T), 0.5 * (found[2] + found[2].T)
+            # A step adds to the last equation; the first of a lower order stands alone.
+            power, added, change = found[0], 0.5 * (found[1] + found[1].T), 0.5 * (found[2] + found[2].T)
+            back, solution = (back + added, solution + change) if part is None else (added, change)
             full, before = lifts.full(solution), full
-            size, changed = math.sqrt(np.vdot(full, full)), full - before
+            # The change itself is known far below rounding of the solution, where nothing was lifted.
+            changed = change if full is solution else full - before
+            size = math.sqrt(np.vdot(full, full))
             if not math.isfinite(size):
                 return None
             error, last = math.sqrt(np.vdot(changed, changed)) / max(size, SMALLEST), error
@@ -142,16 +146,14 @@ def _doubled(
 def _doubled_once(
     power: FloatArray, back: FloatArray, solution: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-    """Return the three matrices of the next step, their symmetric parts yet to be taken; ``None`` where it fails."""
+    """Return the next power and what a step adds to the other two, symmetric parts yet to be taken; else ``None``."""
     n = len(power)
     # `dot` is `@` with half the overhead, which for few states is most of the time.
     matrix, parts = solution.dot(back), np.concatenate([power, back])
     matrix.reshape(-1)[:: n + 1] += 1.0
     if not _solved_in_place(matrix, parts):
         return None
-    change = power.dot(solution.dot(parts[:n].T))
-    added: FloatArray = power.T.dot(parts[n:]).dot(power)
-    return parts[:n].dot(power), back + added, solution + change
+    return parts[:n].dot(power), power.T.dot(parts[n:]).dot(power), power.dot(solution.dot(parts[:n].T))
 
 
 def _solved_in_place(matrix: FloatArray, rows: FloatArray) -> bool:

@@ -104,7 +104,7 @@ class Lifts:
         if not 0.0 < least < np.inf:
             return power, back, solution
         units = power_of_two_below(np.sqrt(np.maximum(sizes, least)))
-        self.units = units
+        self.units = units if self.units is None else self.units * units
         column = units[:, None]
         return power / column * units, column * back * units, solution / column / units
 
