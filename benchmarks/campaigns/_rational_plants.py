@@ -17,6 +17,8 @@ from flint import fmpq, fmpq_mat, fmpq_poly
 
 #: Exponents of the powers of two that signals and equations are multiplied by.
 UNITS = 13
+#: Methods for plants whose faults are parameters, and which have no unknown inputs.
+RECURSIVE = ("descriptor-kalman", "adaptive-observer")
 #: Share of the plants in discrete time that are sampled by the package.
 SAMPLED = 0.3
 
@@ -46,7 +48,8 @@ def drawn_plant(method: str, seed: int) -> Drawn:
 def _draw(method: str, seed: str) -> Drawn | None:
     rng = random.Random(f"{method} {seed}")
     matrices = _base(rng, method)
-    dt = 0.0 if method == "pd-observer" else 1.0 if method == "fault-estimation-filter" else rng.choice([0.0, 1.0])
+    sampled = ("fault-estimation-filter", *RECURSIVE)
+    dt = 0.0 if method == "pd-observer" else 1.0 if method in sampled else rng.choice([0.0, 1.0])
     step = Fraction(1, rng.choice([1, 2])) if dt and rng.random() < SAMPLED else None
     _plant_obstacle(rng, matrices, 0.0 if step else dt)
     true = matrices
@@ -58,7 +61,8 @@ def _draw(method: str, seed: str) -> Drawn | None:
         true = _sampled(reduced, step)
     truth = {
         "pd-observer": _pd_truth, "fault-estimation-filter": _filter_truth, "ui-pi-observer": _ui_pi_truth,
-        "functional-filter": _functional_truth,
+        "functional-filter": _functional_truth, "descriptor-kalman": _kalman_truth,
+        "adaptive-observer": _adaptive_truth,
     }  # fmt: skip
     verdict = truth[method](true, dt)
     if verdict is None:
@@ -71,7 +75,7 @@ def _draw(method: str, seed: str) -> Drawn | None:
 def _base(rng: random.Random, method: str) -> dict[str, np.ndarray]:
     dynamic, algebraic = rng.choice([2, 3, 3]), rng.choice([0, 0, 1, 2])
     nx, ny, nf = dynamic + algebraic, rng.choice([1, 2, 2]), 1
-    nd = rng.choice([0, 1]) if method != "pd-observer" and ny == 2 else 0
+    nd = rng.choice([0, 1]) if method not in ("pd-observer", *RECURSIVE) and ny == 2 else 0
     if method == "fault-estimation-filter" and ny == 2:
         nf = rng.choice([1, 1, 2])
 
@@ -273,6 +277,22 @@ def _pd_truth(m: dict[str, np.ndarray], dt: float) -> tuple[bool, str] | None:
     n = len(reduced["A"]) + reduced["Bf"].shape[1]
     full = _rank([reduced["A"], reduced["Bf"]], [reduced["C"], reduced["Df"]]) == n
     return full, "exists" if full else "a constant fault is hidden"
+
+
+def _kalman_truth(m: dict[str, np.ndarray], dt: float) -> tuple[bool, str]:
+    if _rank([m["E"]], [m["C"]]) < len(m["A"]):
+        return False, "a state is neither dynamic nor measured"
+    zeros = divisor(_pencil(m, *_nothing(m)))
+    stable = zeros != 0 and is_stable(zeros, discrete=True)
+    return stable, "exists" if stable else "a mode that does not decay is hidden"
+
+
+def _adaptive_truth(m: dict[str, np.ndarray], dt: float) -> tuple[bool, str]:
+    found = _kalman_truth(m, dt)
+    if not found[0]:
+        return found
+    full = _rank([m["A"] - m["E"], m["Bf"]], [m["C"], m["Df"]]) == len(m["A"]) + m["Bf"].shape[1]
+    return full, "exists" if full else "a parameter leaves no trace"
 
 
 def _filter_truth(m: dict[str, np.ndarray], dt: float) -> tuple[bool, str] | None:

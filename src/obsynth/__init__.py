@@ -56,6 +56,7 @@ _NAMES = {
     "experiments.monitors.online_monitor": "online_monitor",
     "experiments.monitors.residual_monitor": "monitor",
     "experiments.monte_carlo": "evaluate Evaluation",
+    "experiments.tolerance_study": "tolerance_study ToleranceStudy",
     "experiments.simulation": "simulate Simulation RecursiveSimulation=Simulation",
     "exporting.files": "export",
     "importing.andes": "from_andes",

@@ -47,6 +47,8 @@ from obsynth.experiments.monte_carlo import Evaluation as Evaluation
 from obsynth.experiments.monte_carlo import evaluate as evaluate
 from obsynth.experiments.simulation import Simulation as Simulation
 from obsynth.experiments.simulation import simulate as simulate
+from obsynth.experiments.tolerance_study import ToleranceStudy as ToleranceStudy
+from obsynth.experiments.tolerance_study import tolerance_study as tolerance_study
 from obsynth.exporting.files import export as export
 from obsynth.importing.andes import from_andes as from_andes
 from obsynth.importing.fmu import from_fmu as from_fmu

@@ -63,6 +63,10 @@ def test_a_spec_linearises_its_plant_for_a_linear_method(folder):
 def test_calibrate_takes_everything_from_the_spec_and_can_be_made_again(folder, capsys):
     target = folder / "calibration.json"
     assert main(["calibrate", "--system", str(folder / "spec.yaml"), "--out", str(target), "--quiet"]) == 0
+    # Quiet is without progress, not without the answer.
+    said = capsys.readouterr()
+    assert "95 % box" in said.out
+    assert not said.err
     found = json.loads(target.read_text(encoding="utf-8"))
     assert found["constants"]["a1"]["nominal"] == pytest.approx(0.0163, abs=1e-4)
     assert found["log"]["rows"] == [0, 56]

@@ -360,3 +360,30 @@ def test_a_box_whose_middle_is_not_nominal_has_bounds(ranges) -> None:
         assert (intervals[0, 1:, 0, 0] <= 0.0).all()
         assert (intervals[0, 1:, 0, 1] >= 0.0).all()
     assert 0.5 < max(shares) <= 1.0
+
+
+def test_continuous_designs_without_a_disturbance_have_thresholds() -> None:
+    plant = obsynth.uncertain_system(
+        {"A": [["-p", 0.1], [0.0, -2.0]], "Bf": [[1.0], [0.3]], "C": [[1.0, 0.0], [0.0, 1.0]], "dt": 0.0},
+        {"p": {"nominal": 1.0, "tolerance": "5 %"}},
+    )
+    design = obsynth.pd_observer(plant)
+    monitor = obsynth.online_monitor(design, constants=plant, sample_time=0.1, initial_set={"x1": 1.0, "x2": 1.0})
+    log = pd.DataFrame({"time": 0.1 * np.arange(30), "y1": np.exp(-0.105 * np.arange(30)), "y2": np.zeros(30)})
+    table = obsynth.run_on_data(design, log, monitor=monitor, warm_up=0.0).table
+    assert (table["r[y1]"].abs() <= table["threshold r[y1]"]).all()
+
+
+def test_designs_without_residuals_are_watched_by_their_estimates() -> None:
+    plant = obsynth.uncertain_system(
+        {"A": [["p", 0.1], [0.0, 0.4]], "Bf": [[1.0], [0.3]], "C": [[1.0, 0.0], [0.0, 1.0]], "dt": 1.0},
+        {"p": {"nominal": 0.5, "tolerance": "5 %"}},
+    )
+    design = obsynth.ui_pi_observer(plant)
+    monitor = obsynth.online_monitor(design, constants=plant, initial_set={"x1": 1.0, "x2": 0.0})
+    log = pd.DataFrame({"time": np.arange(20.0), "y1": 0.52 ** np.arange(20), "y2": np.zeros(20)})
+    table = obsynth.run_on_data(design, log, monitor=monitor, warm_up=0.0).table
+    assert (table["fhat[f1]"].abs() <= table["threshold fhat[f1]"]).all()
+    assert (table["alarm"] == "").all()
+    log["y1"] += np.where(np.arange(20) >= 10, 3.0, 0.0)
+    assert (obsynth.run_on_data(design, log, monitor=monitor, warm_up=0.0).table["alarm"] != "").any()

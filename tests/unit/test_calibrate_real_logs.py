@@ -2,11 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from test_calibrate import BOUNDS, LOG, tanks
 
-from obsynth import DAEModel, SpecError, calibrate, simulate_dae
+from obsynth import (
+    DAEModel,
+    PreconditionError,
+    SpecError,
+    TimeVaryingDescriptorSystem,
+    calibrate,
+    dae_adaptive_observer,
+    simulate_dae,
+    validate,
+)
 
 TRUE = {"C": 1e-3, "Rs": 100.0}
 WIDE = {"C": (1e-4, 1e-2), "Rs": (10.0, 1000.0)}
@@ -122,3 +133,47 @@ def test_a_kink_of_the_model_at_the_maximum_spoils_no_box() -> None:
 def test_rows_that_are_asked_for_are_named() -> None:
     with pytest.raises(SpecError, match=r"rows 400:500 holds nothing: the log has 300 rows"):
         calibrate(circuit(), circuit_log(), WIDE, rows="400:500")
+
+
+def test_a_log_with_a_wrong_sample_is_compared_without_it_and_steps_that_are_too_long_are_told() -> None:
+    design = dae_adaptive_observer(
+        circuit().replace(constants={"C": 1e-3}, parameters={"Rs": 100.0}), dt=0.01, Q={"node": 1e-12, "ohm": 1e-12},
+        R={"vm": 1e-4, "im": 1e-8}, initial_state={"v": 1.0}, initial_covariance={"v": 0.01, "i": 1e-4},
+        initial_parameter_covariance={"Rs": 1.0}, integration="backward-euler",
+    )  # fmt: skip
+
+    def wrong(column):
+        column[77] += 1e6
+        return column
+
+    found = validate(design, circuit_log(vm=wrong))
+    assert said(found, "1 value(s) of vm are far from all others")
+    assert said(found, "A step of backward Euler errs by up to 0.4")
+    exact = validate(replace(design, observer=replace(design.observer, integration="radau")), circuit_log())
+    assert exact.nis.holds
+    assert not said(exact, "backward Euler")
+
+
+def test_another_unit_of_one_sensor_of_a_linear_plant_is_refused() -> None:
+    plant = TimeVaryingDescriptorSystem(
+        E=[[1, 0], [0, 0]], A=[["p", "0.1"], ["c", -1]], B=[["b"], [0]], C=[[1, 0], [0, 1]], Phi=[[0], [0]], dt=1.0,
+        constants={"p": 0.9, "c": 0.5, "b": 1.0},
+    )  # fmt: skip
+    rng = np.random.default_rng(0)
+    u, x, rows = np.repeat(rng.choice([-1.0, 1.0], 15), 10), 0.0, []
+    for k in range(150):
+        x = 0.95 * x + u[k - 1] + 0.05 * rng.standard_normal() if k else x
+        rows.append([x, 0.5 * x] + 0.02 * rng.standard_normal(2))
+    y = np.array(rows)
+    log = {"time": np.arange(150.0), "u1": u, "y1": y[:, 0], "y2": y[:, 1]}
+    unknown = {"p": (0.1, 1.2), "c": (0.0, 2.0), "b": (0.1, 3.0)}
+    assert calibrate(plant, log, unknown, starts=1).box.holds({"p": 0.9, "c": 0.5, "b": 1.0})
+    with pytest.raises(PreconditionError, match=r"y1: .* times what the model says") as caught:
+        calibrate(plant, {**log, "y1": 1000.0 * y[:, 0]}, unknown, starts=1)
+    assert caught.value.code == "explains-nothing"
+
+
+@pytest.mark.parametrize("unknown", [["C"], {"C": ["a", "b"]}, {"C": [1e-4, float("nan")]}, {"C": 1e-3}, {"C": [1, 0]}])
+def test_bounds_that_are_none_are_refused(unknown) -> None:
+    with pytest.raises(SpecError, match="unknown"):
+        calibrate(circuit(), circuit_log(), unknown)

@@ -126,6 +126,9 @@ def test_what_has_no_steady_state_is_refused(tmp_path):
     resetting = obsynth.adaptive_observer(PLANT, Q=Q, R=1e-2, reset=1e-6)
     with pytest.raises(SpecError, match="resets its gains"):
         obsynth.export(resetting, tmp_path / "a.c")
+    for option, value in (("outliers", "gate"), ("state_bounds", {"x1": [-1, 1]}), ("sensors", {"y1": {"delay": 2}})):
+        with pytest.raises(SpecError, match=option):
+            obsynth.export(obsynth.descriptor_kalman(PLANT, Q=Q, R=1e-2, **{option: value}), tmp_path / "a.c")
     with pytest.raises(SpecError, match="sampled already"):
         obsynth.export(DESIGNS["filter"], tmp_path / "a.c", sample_time=0.1)
     # A constant that nothing disturbs is learnt for ever: the gain goes to zero like 1 / k, and is never constant.

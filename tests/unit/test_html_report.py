@@ -265,3 +265,13 @@ def test_a_plant_that_is_not_regular_has_its_page_and_its_gains(dt: float, tmp_p
             np.testing.assert_allclose(found.gains["faults"], expected, rtol=1e-6, atol=1e-9)
         else:
             assert np.all(np.isfinite(found.gains["faults"]))
+
+
+def test_the_page_says_what_holds_within_the_tolerances(tmp_path: Path) -> None:
+    spec = load_spec(ROOT / "designs" / "drive" / "spec.yaml")
+    design = obsynth.design(spec.plant, spec.method, **dict(spec.options))
+    page = html_report(design, tmp_path / "p.html").read_text(encoding="utf-8")
+    assert "Within the tolerances of the plant" in page
+    assert "bounds stay finite for ever" in page
+    bare = design.replace(plant=design.plant.replace(uncertainty=None))
+    assert "assumes an exact model" in html_report(bare, tmp_path / "q.html").read_text(encoding="utf-8")

@@ -12,7 +12,14 @@ from paper_filter import paper_gains
 
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.covariances import covariance_factor
-from obsynth.numerics.least_squares_step import LeastSquaresStep, least_squares_step, rank_revealing_step
+from obsynth.numerics.least_squares_step import (
+    LeastSquaresStep,
+    least_squares_step,
+    noise_triangle,
+    projected_step,
+    projection_of,
+    rank_revealing_step,
+)
 
 #: Working digits of the reference: 50 are left after the worst cancellation below (sizes from 1e-32 to 1e20).
 DIGITS = 120
@@ -316,3 +323,22 @@ class TestCovarianceFactor:
         with pytest.raises(SpecError, match=part) as caught:
             covariance_factor(np.array(covariance), "Q(3)")
         assert caught.value.path == "Q(3)"
+
+
+@pytest.mark.parametrize("parity", [0, 7])
+def test_noise_that_stays_may_be_a_triangle(parity) -> None:
+    rng = np.random.default_rng(parity)
+    n, rows = 40, 40 + parity
+    projection = projection_of(rng.standard_normal((rows, n)))
+    assert projection is not None
+    moving, staying = rng.standard_normal((n, rows)), rng.standard_normal((25, rows))
+    data = rng.standard_normal((rows, 3))
+    whole = np.zeros((n + 25, rows))
+    whole[:n], whole[n:] = moving, staying
+    expected = projected_step(projection, whole, data)
+    found = projected_step(projection, moving, data, known=noise_triangle(staying))
+    assert expected is not None
+    assert found is not None
+    np.testing.assert_allclose(found.estimate, expected.estimate, atol=1e-9)
+    np.testing.assert_allclose(found.factor @ found.factor.T, expected.factor @ expected.factor.T, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(np.abs(found.innovation), np.abs(expected.innovation), atol=1e-9)

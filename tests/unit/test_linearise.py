@@ -167,3 +167,15 @@ def test_faults_and_disturbances_are_chosen_by_name():
 def test_bad_arguments_are_refused(arguments, told):
     with pytest.raises(SpecError, match=told):
         linearise(tanks(), **arguments)
+
+
+def test_a_model_without_units_and_one_that_is_not_defined_where_the_search_ends() -> None:
+    model = DAEModel(
+        {"tank": "area * der(h) = inflow - w", "valve": "w - sqrt(h) = 0"}, {"level": "h"}, states={"h": 1.0, "w": 1.0},
+        inputs={"inflow": 1.0}, constants={"area": 5.0},
+    )  # fmt: skip
+    linear = linearise(model, given={"h": 4.0}, free=["inflow"])
+    assert linear.operating_point["inflow"] == pytest.approx(2.0)
+    np.testing.assert_allclose(linear.A, [[0.0, -1.0], [0.25, -1.0]], atol=1e-12)
+    with pytest.raises(PreconditionError, match="'valve' are not defined where the search ends"):
+        linearise(model, given={"h": -4.0}, free=["inflow"])

@@ -124,3 +124,23 @@ def test_options_are_checked_and_kept(tmp_path):
     for options in ({"outliers": "some"}, {"outliers": "gate", "outlier_limit": -1.0}):
         with pytest.raises(SpecError, match="outlier"):
             filter_design(**options)
+
+
+@pytest.mark.parametrize("kind", ["gate", "huber"])
+@pytest.mark.parametrize("early", [False, True])
+@pytest.mark.parametrize("form", ["innovation", "literal", "random-walk"])
+def test_an_output_that_a_step_needs_is_judged_by_the_algebraic_equations(form, early, kind):
+    """y2 alone determines the algebraic state: without its equation a wrong value would pass, and stay for ever."""
+    walk = {"random_walk": [[1e-6]]} if form == "random-walk" else {}
+    design = filter_design(form=form, early_constraints=early, **walk)
+    observer = replace(design.observer, outliers=kind)
+    y, u = filter_record()
+    clean, wrong = design.observer.run(y, u), y.copy()
+    wrong[60, 1] += 1e6
+    found = observer.run(wrong, u)
+    gaps = np.abs(found.states - clean.states)[65:], np.abs(found.parameters - clean.parameters)[65:]
+    assert (gaps[0] < 2.0 * clean.state_deviations[65:]).all()
+    assert (gaps[1] < 2.0 * clean.parameter_deviations[65:]).all()
+    batch = obsynth.run_batch(observer, np.stack([wrong, y]), u)
+    assert np.array_equal(batch.states[0], found.states)
+    assert np.array_equal(batch.states[1], observer.run(y, u).states)

@@ -17,6 +17,7 @@ from obsynth.numerics.doubling import (
     gain_is_below,
 )
 from obsynth.numerics.norms import hinf_norm, spectral_radius
+from obsynth.numerics.slow_part import FIRST_POWER, RankWatch
 
 
 def random_problem(rng, n=5, m=2, q=1, nd=3, free_weight=False):
@@ -185,3 +186,37 @@ def test_a_level_that_is_exceeded_in_finitely_many_steps_has_no_certificate_and_
             assert np.linalg.eigvalsh(left)[0] > 0.0
             assert np.linalg.eigvalsh(0.5 * (rest + rest.T))[0] > 0.0
     assert asked == []
+
+
+@pytest.mark.parametrize("spread", [0.0, 12.0])
+@pytest.mark.parametrize("level", [np.inf, 3000.0])
+def test_an_equation_of_slow_and_fast_states_is_solved_in_fewer_of_them(spread, level):
+    # Of 240 states six are slow: after some doublings the power has their rank, whatever the units of the states.
+    rng = np.random.default_rng(3)
+    n, p = 240, 4
+    turn = np.linalg.qr(rng.normal(size=(n, n)))[0]
+    a = turn @ np.diag(np.concatenate([0.9999 - 0.002 * np.arange(6), np.linspace(-0.9, 0.9, n - 6)])) @ turn.T
+    h, b = rng.normal(size=(p, n)), rng.normal(size=(n, 8))
+    process, weight = b @ b.T, np.diag([1.0, 1.0, 1.0, 1.0 if level == np.inf else -(level**2)])
+    expected = solve_discrete_are(a.T, h.T, process, weight)
+    units = np.exp2(np.round(rng.uniform(-spread, spread, n)))
+    sizes = np.sqrt(np.abs(np.diag(expected)))
+    found = doubled_riccati_solution(
+        a * units / units[:, None], h * units, process / np.outer(units, units), weight, np.zeros((n, p))
+    )
+    assert found is not None
+    assert np.max(np.abs(found * np.outer(units, units) - expected) / np.outer(sizes, sizes)) <= 1e-8
+
+
+def test_what_is_left_of_a_power_is_found_and_a_full_power_is_left_alone():
+    rng = np.random.default_rng(4)
+    n = 220
+    slow = rng.normal(size=(n, 30)) @ rng.normal(size=(30, n))
+    watch = RankWatch()
+    assert [watch.slow_part(slow) is None for _ in range(FIRST_POWER)] == [True] * FIRST_POWER
+    part = watch.slow_part(slow)
+    assert part is not None
+    assert np.linalg.norm(part.basis @ part.rows - slow) <= 1e-13 * np.linalg.norm(slow)
+    full = RankWatch()
+    assert all(full.slow_part(np.eye(n) + 1e-3 * slow) is None for _ in range(2 * FIRST_POWER))
+    assert all(RankWatch().slow_part(np.full((n, n), np.nan)) is None for _ in range(2))

@@ -87,3 +87,41 @@ def test_untouched_directions_stay_untouched_through_sampling() -> None:
     both = np.linalg.solve(family.coordinates, [1.0, 1.0, 0.0, 0.0])
     assert np.abs(family.A.parts @ both).max() < 1e-14
     assert (family.A.radius @ np.abs(both)).max() < 1e-13
+
+
+def test_a_tolerance_of_a_sensor_alone_leaves_the_plant_stable() -> None:
+    plant = obsynth.uncertain_system(
+        {"A": [[0.5, 0.1], [0.0, 0.3]], "C": [["c", 0], [0, 1]], "Bf": [[1], [0]], "dt": 1.0},
+        {"c": {"nominal": 1.0, "tolerance": "5 %"}},
+    )
+    found = obsynth.robustness(obsynth.fault_estimation_filter(plant))
+    assert (found.regular, found.stable, found.untouched, found.reason) == ("proved", "proved", (), "")
+    assert found.finite_for_ever
+
+
+def test_a_loop_at_one_sample_that_does_not_contract_leaves_no_bound() -> None:
+    plant = obsynth.uncertain_system(
+        {"A": [[0.5, 0.1], [0.0, 0.3]], "C": [["c", 0], [0, 1]], "Bf": [[1], [0]], "dt": 1.0},
+        {"c": {"nominal": 1.0, "range": [0.2, 2.5]}},
+    )
+    design = obsynth.fault_estimation_filter(plant)
+    found = obsynth.robustness(design)
+    assert "same sample has radius 1.5" in dict(found.facts())["bounds"]
+    assert "may grow" not in str(found)
+    assert found.largest_factor == pytest.approx(1.0 / 1.5, rel=2e-3)
+    with pytest.raises(PreconditionError, match=r"same sample has radius 1\.5"):
+        obsynth.online_monitor(design, constants=plant, initial_set={"x1": 1.0, "x2": 1.0})
+
+
+def test_a_radius_above_one_is_no_refusal() -> None:
+    plant = obsynth.uncertain_system(
+        {"A": [["a", 0.1], [0.2, 0.3]], "C": [[1, 0]], "Bf": [[1], [0]], "dt": 1.0},
+        {"a": {"nominal": 0.5, "range": [-0.9, 2.5]}},
+    )
+    design = obsynth.ui_pi_observer(plant)
+    monitor = obsynth.online_monitor(design, constants=plant, initial_set={"x1": 1.0, "x2": 1.0})
+    assert "holds at each sample, but may grow" in monitor.statement
+    found = obsynth.robustness(design)
+    assert found.loop_radius > 1.0
+    assert "largest tolerances" in dict(found.facts())
+    assert "to blame" in dict(found.facts())

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
@@ -21,6 +23,36 @@ def test_a_fault_of_which_elimination_leaves_only_rounding_is_unclear() -> None:
     with pytest.raises(obsynth.PreconditionError, match=r"Unclear.*\(D3\)") as caught:
         obsynth.ui_pi_observer(plant)
     assert caught.value.condition == "(D3) fault model at 1"
+
+
+METHODS: dict[str, tuple[float, Callable[[obsynth.DescriptorSystem], obsynth.ObserverDesign]]] = {
+    "pd": (0.0, obsynth.pd_observer),
+    "filter": (1.0, lambda plant: obsynth.fault_estimation_filter(obsynth.eliminate_algebraic_states(plant))),
+    "filter, sampled": (0.0, lambda plant: obsynth.fault_estimation_filter(obsynth.discretise(plant, 0.5))),
+    "ui-pi": (1.0, obsynth.ui_pi_observer),
+    "ui-pi, continuous": (0.0, obsynth.ui_pi_observer),
+    "functional": (0.0, obsynth.functional_filter),
+}
+
+
+@pytest.mark.parametrize(("share", "entering"), [(1.0, -1 - 2.0**-51), (0.333333333333333, -3.0)])
+@pytest.mark.parametrize("spread", [0, 13])
+@pytest.mark.parametrize("method", METHODS)
+def test_no_method_makes_anything_of_what_elimination_leaves_by_rounding(
+    method: str, spread: int, share: float, entering: float
+) -> None:
+    """The algebraic equation takes the fault out of the dynamic one but for its last digit, written or computed."""
+    rng = np.random.default_rng(spread)
+    equations, states, outputs, faults = (2.0 ** rng.integers(-spread, spread + 1, size=size) for size in (3, 3, 2, 1))
+    left = equations[:, None]
+    dt, design = METHODS[method]
+    a = np.array([[-0.5, 0.25, share], [0.5, -0.25, 0], [0.25, 0, -1]])
+    plant = obsynth.DescriptorSystem(
+        left * np.diag([1.0, 1, 0]) * states, left * a * states, C=outputs[:, None] * np.eye(3)[:2] * states,
+        Bf=left * np.array([[1.0], [0], [entering]]) * faults, dt=dt,
+    )  # fmt: skip
+    with pytest.raises(obsynth.PreconditionError, match=r"^Unclear: .*Tolerance: .*Witness: the .*would decide it"):
+        design(plant)
 
 
 def cancelling() -> obsynth.DescriptorSystem:

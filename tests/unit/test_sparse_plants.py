@@ -291,3 +291,20 @@ class TestRounding:
         )
         np.testing.assert_array_equal(without_rounding(factor, solution), np.where(kept, solution, 0.0))
         assert sum(exact_rows) < size // 2
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_a_part_of_a_sparse_plant_is_replaced(kind):
+    rng = np.random.default_rng(0)
+    e, a = random_index_one(rng, mass=True, mixed=False)
+    plant = obsynth.DescriptorSystem(kind(e), kind(a), C=kind(np.eye(8)[:3]), Bf=kind(np.eye(8)[:, :1]))
+    changed = plant.replace(Bf=np.eye(8)[:, 5:6])
+    assert type(changed.A) is type(plant.A)
+    np.testing.assert_array_equal(changed.dense().A, a)
+    again = plant.replace(A=kind(2.0 * a))
+    np.testing.assert_array_equal(again.dense().A, 2.0 * a)
+    whole = obsynth.eliminate_algebraic_states(again).plant
+    expected = obsynth.eliminate_algebraic_states(obsynth.DescriptorSystem(e, 2.0 * a, C=np.eye(8)[:3])).plant
+    np.testing.assert_allclose(
+        np.sort_complex(np.linalg.eigvals(whole.A)), np.sort_complex(np.linalg.eigvals(expected.A))
+    )

@@ -193,3 +193,17 @@ def test_what_cannot_be_written_as_an_expression_is_refused_by_name() -> None:
                      units={"x": "1", "y": "1"})  # fmt: skip
     with pytest.raises(PreconditionError, match="A, row 1, column 1"):
         linearise(model, at="point", given={"x": 1.0}, drift=True, constants={"c": "1 %"})
+
+
+def test_drawn_plants_rest_elsewhere(tmp_path: Path) -> None:
+    """Plants of the box have another equilibrium: the fixed bound takes that for a fault, the adaptive one does not."""
+    (tmp_path / "spec.yaml").write_text(SPEC.replace("tolerance: 2 %", "tolerance: 5 %"), encoding="utf-8")
+    spec = load_spec(tmp_path / "spec.yaml")
+    design = obsynth.design(spec.plant, spec.method)
+    scenario = obsynth.Scenario(horizon=80.0, sensor_noise=dict.fromkeys(("v1", "v2", "v3"), 5e-5))
+    rates = []
+    for constants in (None, design.plant):
+        monitor = obsynth.monitor(design, scenario, constants=constants, noise_bound=5.0)
+        rates.append(obsynth.evaluate(design, scenario, plants=20, monitor=monitor).false_alarm_rate.value)
+    assert rates[0] > 0.3
+    assert rates[1] == 0.0

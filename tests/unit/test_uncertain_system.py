@@ -146,3 +146,20 @@ def test_inverse_and_exponential_hold_those_of_members() -> None:
         assert np.all(np.abs(expm(0.3 * member) - exponential.at(q)) <= exponential.radius)
     with pytest.raises(PreconditionError, match="not proved regular"):
         affine_inverse(AffineMatrix(np.eye(2), np.ones((1, 2, 2)), np.zeros((2, 2))))
+
+
+def test_tolerances_that_a_method_leaves_behind_are_told() -> None:
+    """A method that eliminates algebraic states in its own units ships a plant without tolerances, and says so."""
+    plant = obsynth.uncertain_system(
+        {
+            "E": [[1, 0, 0], [0, 1, 0], [0, 0, 0]], "A": [["0.5 * p", 0.1, 0.2], [0.1, 0.4, 0.3], [1.0, 0.5, 2.0]],
+            "Bf": [[1], [0], [0]], "Bd": [[0], [1], [1]], "C": [[1, 0, 0], [0, 1, 0]], "dt": 1.0,
+        },
+        {"p": {"nominal": 1.0, "tolerance": "5 %"}},
+    )  # fmt: skip
+    design = obsynth.ui_pi_observer(plant)
+    assert design.plant.uncertainty is None
+    assert any("left behind" in note for note in design.notes)
+    kept = obsynth.ui_pi_observer(obsynth.eliminate_algebraic_states(plant).plant)
+    assert kept.plant.uncertainty.box.names == ("p",)
+    assert obsynth.robustness(kept).finite_for_ever

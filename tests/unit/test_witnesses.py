@@ -5,16 +5,27 @@ The witness is confirmed by deciding existence on its exact numbers: the answer 
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.linalg import block_diag
 
-from obsynth import DescriptorSystem, PreconditionError, discretise, eliminate_algebraic_states
+from obsynth import (
+    DescriptorSystem,
+    PreconditionError,
+    check,
+    discretise,
+    eliminate_algebraic_states,
+    functional_filter,
+)
 from obsynth.analysis.conditions import Condition
 from obsynth.analysis.existence.witnesses import EntryChange, Unclear, Witness, rational_matrices
 from obsynth.methods.fault_estimation_filter.conditions import fault_filter_conditions
+from obsynth.methods.functional_filter.conditions import conditions as functional_conditions
 from obsynth.methods.pd_observer.conditions import pd_observer_conditions
 from obsynth.methods.recursive.conditions import recursive_conditions
 from obsynth.methods.ui_pi_observer.conditions import existence
@@ -24,9 +35,13 @@ from obsynth.plants.exosystems import exosystem
 #: A last digit or two of numbers near one.
 LITTLE = 2.0**-51
 #: The direction (1, 1) moves at 1 (1/s, or per sample: stays) and is all but hidden.
-NEARLY_HIDDEN = {"A": [[-1.0, 2.0], [0.0, 1.0]], "C": [[1.0, -1.0 + LITTLE]]}
+NEARLY_HIDDEN: dict[str, Any] = {"A": [[-1.0, 2.0], [0.0, 1.0]], "C": [[1.0, -1.0 + LITTLE]]}
 #: A constant fault is answered by x = (1, 1), which the outputs all but hide.
-NEARLY_MASKED = {"A": [[-1.0, -1.0], [0.5, -2.0]], "Bf": [[2.0], [1.5]], "C": [[1.0, -1.0 + LITTLE], [2.0, -2.0]]}
+NEARLY_MASKED: dict[str, Any] = {
+    "A": [[-1.0, -1.0], [0.5, -2.0]],
+    "Bf": [[2.0], [1.5]],
+    "C": [[1.0, -1.0 + LITTLE], [2.0, -2.0]],
+}
 #: Modes at 0.5 +- 1.5j, or 1.5 and 0.5, and 0.2, 0.1, in other integer coordinates: the first two are all but hidden.
 MIXED = np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 1, 1, 0], [1, 0, 0, 1]])
 BACK = np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, -1, 1, 0], [-1, 0, 0, 1]])
@@ -34,6 +49,11 @@ PAIR, TWO = ([[0.5, -1.5], [1.5, 0.5]], [[1.5, 0.5], [0, 0.5]])
 HIDING = np.array([[0.0, -1 + LITTLE, 1, 0], [-1 + LITTLE, 0, 0, 1]])
 #: A fault that oscillates with 2 rad/s is answered by x = (1, j, 1).
 NEARLY_SINE = [[-1.0, 2, 0], [-1, 0, -0.5], [0, 2, -3]]
+
+
+def made(E: Any, A: Any, **fields: Any) -> DescriptorSystem:
+    """Return a plant: integers and floats may be mixed."""
+    return DescriptorSystem(E, A, **fields)
 
 
 def ui_pi(plant: DescriptorSystem, fault_model: object = "step") -> tuple[Condition, ...]:
@@ -48,42 +68,53 @@ def adaptive(plant: DescriptorSystem) -> tuple[Condition, ...]:
     return tuple(recursive_conditions(plant, parameters=True))
 
 
-CASES = {
-    "pd: a mode": (pd_observer_conditions, DescriptorSystem(None, **NEARLY_HIDDEN, Bf=[[1], [0]]), "detectability"),
-    "pd: a constant fault": (pd_observer_conditions, DescriptorSystem(None, **NEARLY_MASKED), "rank [A F; C Df]"),
+def functional(plant: DescriptorSystem) -> tuple[Condition, ...]:
+    return functional_conditions(plant, exactly=True)
+
+
+def test_what_floating_point_does_not_see_is_no_refusal_of_what_shows_on_paper() -> None:
+    """With so many digits numbers are taken to be computed; they still are not those of a fault that never shows."""
+    plant = made(None, **NEARLY_MASKED)
+    with pytest.raises(PreconditionError, match=r"^Unclear: .*Witness: the plant with entry"):
+        functional_filter(plant)
+
+
+CASES: dict[str, tuple[Callable[[DescriptorSystem], tuple[Condition, ...]], DescriptorSystem, str]] = {
+    "pd: a mode": (pd_observer_conditions, made(None, **NEARLY_HIDDEN, Bf=[[1], [0]]), "detectability"),
+    "pd: a constant fault": (pd_observer_conditions, made(None, **NEARLY_MASKED), "rank [A F; C Df]"),
     "pd: like faults": (
         pd_observer_conditions,
-        DescriptorSystem(None, [[-1, 0], [0.5, -2]], C=np.eye(2), Bf=[[1, 1], [1, 1 + LITTLE]]),
+        made(None, [[-1, 0], [0.5, -2]], C=np.eye(2), Bf=[[1, 1], [1, 1 + LITTLE]]),
         "rank F",
     ),
     "filter: a mode": (
         fault_filter_conditions,
-        DescriptorSystem(None, MIXED @ block_diag(TWO, 0.2, 0.1) @ BACK, C=HIDING, Bf=[[0], [0], [1], [0]], dt=0.1),
+        made(None, MIXED @ block_diag(TWO, 0.2, 0.1) @ BACK, C=HIDING, Bf=[[0], [0], [1], [0]], dt=0.1),
         "fault zeros",
     ),
     "filter: a pair of modes": (
         fault_filter_conditions,
-        DescriptorSystem(None, MIXED @ block_diag(PAIR, 0.2, 0.1) @ BACK, C=HIDING, Bf=[[0], [0], [1], [0]], dt=0.1),
+        made(None, MIXED @ block_diag(PAIR, 0.2, 0.1) @ BACK, C=HIDING, Bf=[[0], [0], [1], [0]], dt=0.1),
         "fault zeros",
     ),
     "filter: like faults": (
         fault_filter_conditions,
-        DescriptorSystem(None, [[0.5, 0], [0.5, 0.2]], C=np.eye(2), Bf=[[1, 1], [1, 1 + LITTLE]], dt=0.1),
+        made(None, [[0.5, 0], [0.5, 0.2]], C=np.eye(2), Bf=[[1, 1], [1, 1 + LITTLE]], dt=0.1),
         "rank F",
     ),
     "filter: like outputs": (
         fault_filter_conditions,
-        DescriptorSystem(None, [[0.5, 0], [0.5, 0.2]], C=[[1, 1], [1, 1 + LITTLE]], Bf=[[1], [1]], dt=0.1),
+        made(None, [[0.5, 0], [0.5, 0.2]], C=[[1, 1], [1, 1 + LITTLE]], Bf=[[1], [1]], dt=0.1),
         "rank C",
     ),
     "filter: a state": (
         fault_filter_conditions,
-        DescriptorSystem([[1, 1], [1, 1 + LITTLE]], [[0.5, 0], [0.5, 0.2]], C=[[1, 1]], Bf=[[1], [1]], dt=0.1),
+        made([[1, 1], [1, 1 + LITTLE]], [[0.5, 0], [0.5, 0.2]], C=[[1, 1]], Bf=[[1], [1]], dt=0.1),
         "rank [E; C]",
     ),
     "filter: faults that look alike at first": (
         fault_filter_conditions,
-        DescriptorSystem(
+        made(
             None,
             [[0.5, 0, 0.25], [0.5, 0.2, 0], [0, 0.5, 0.1]],
             C=[[1, 1, 0], [1, 1 + LITTLE, 1]],
@@ -92,29 +123,35 @@ CASES = {
         ),
         "rank Upsilon",
     ),
-    "kalman: a mode": (kalman, DescriptorSystem(None, **NEARLY_HIDDEN, dt=0.1), "detectability"),
+    "functional: a constant fault": (functional, made(None, **NEARLY_MASKED), "f1 follows its model"),
+    "functional: like faults": (
+        functional,
+        made(None, [[-1, 0], [0.5, -2]], C=np.eye(2), Bf=[[1, 1], [1, 1 + LITTLE]]),
+        "f1 follows its model",
+    ),
+    "kalman: a mode": (kalman, made(None, **NEARLY_HIDDEN, dt=0.1), "detectability"),
     "kalman: a state": (
         kalman,
-        DescriptorSystem([[1, 1], [1, 1 + LITTLE]], [[0.5, 0], [0.5, 0.2]], C=[[1, 1]], dt=0.1),
+        made([[1, 1], [1, 1 + LITTLE]], [[0.5, 0], [0.5, 0.2]], C=[[1, 1]], dt=0.1),
         "rank [E; C]",
     ),
     "adaptive: parameters": (
         adaptive,
-        DescriptorSystem(None, [[0.5, 0], [0.5, 0.2]], C=np.eye(2), Bf=[[1, 1], [1, 1 + LITTLE]], dt=0.1),
+        made(None, [[0.5, 0], [0.5, 0.2]], C=np.eye(2), Bf=[[1, 1], [1, 1 + LITTLE]], dt=0.1),
         "identifiable parameters",
     ),
     "ui-pi: decoupling": (
         ui_pi,
-        DescriptorSystem(None, [[-1, 1], [0.5, -2]], C=[[1, 1]], Bf=[[1], [0]], Bd=[[1], [-1 + LITTLE]]),
+        made(None, [[-1, 1], [0.5, -2]], C=[[1, 1]], Bf=[[1], [0]], Bd=[[1], [-1 + LITTLE]]),
         "(D1) decoupling",
     ),
     "ui-pi: a sine": (
         lambda plant: ui_pi(plant, {"f1": {"sinusoid": 2.0}}),
-        DescriptorSystem(None, NEARLY_SINE, C=[[1, 0, -1.0 + LITTLE], [2, 0, -2]], Bf=[[1], [-0.5], [3]]),
+        made(None, NEARLY_SINE, C=[[1, 0, -1.0 + LITTLE], [2, 0, -2]], Bf=[[1], [-0.5], [3]]),
         "(D3) fault model at 0 +- 2j",
     ),
-    "ui-pi: a mode": (ui_pi, DescriptorSystem(None, **NEARLY_HIDDEN, Bf=[[1], [0]]), "(D2) zeros"),
-    "ui-pi: a constant fault": (ui_pi, DescriptorSystem(None, **NEARLY_MASKED), "(D3) fault model at 0"),
+    "ui-pi: a mode": (ui_pi, made(None, **NEARLY_HIDDEN, Bf=[[1], [0]]), "(D2) zeros"),
+    "ui-pi: a constant fault": (ui_pi, made(None, **NEARLY_MASKED), "(D3) fault model at 0"),
 }
 
 
@@ -135,12 +172,31 @@ def test_the_witness_has_the_other_answer(case: str) -> None:
     with pytest.raises(PreconditionError, match=r"^Unclear: .*Witness: "):
         condition.require()
     changed = [found for found in conditions(doubt.witness.plant(plant)) if not found.holds]
-    assert name in [found.name for found in changed]
-    assert all(found.unclear is None for found in changed if found.name == name)
+    # Faults that are alike do not show at all, at no pole of their models.
+    assert {name, f"{name.split()[0]} shows"} & {found.name for found in changed}
+    assert all(found.unclear is None for found in changed)
+
+
+@pytest.mark.parametrize("units", [1.0, 2.0**20])
+def test_a_no_that_holds_only_exactly_names_the_gain_it_would_take(units: float) -> None:
+    """With a last digit off, the outputs show x = (1, 1) by 2e-16 or less: a gain of 1e16 or more undoes that."""
+    hidden = made(None, NEARLY_HIDDEN["A"], C=[[units, -units]], Bf=[[1], [0]])
+    lost = pd_observer_conditions(hidden)[-1]
+    assert (lost.holds, lost.unclear) == (False, None)
+    told = re.search(r"any observer would need a gain of about (\S+) from 'y1' to 'x[12]'", lost.detail)
+    assert told is not None
+    assert float(told[1]) * units == pytest.approx(1e16, rel=0.2)
+    with pytest.raises(PreconditionError, match=r"^No observer of this kind exists: .*detectability"):
+        lost.require()
+
+
+def test_what_no_output_holds_anything_of_no_digits_would_show() -> None:
+    plant = made(None, [[0.5, 0], [0, 1.5]], C=[[1, 0]], dt=0.1)
+    assert "No output holds anything of it" in kalman(plant)[-1].detail
 
 
 def test_a_long_fault_model_has_a_witness_of_its_own() -> None:
-    plant = DescriptorSystem(
+    plant = made(
         [[1, 0, 0], [0, 0, 1], [0, 0, 0]], [[-5, 0, 0], [0, -2, 0], [0, -3, -1]], C=[[1, 0, 0], [0, 1, 0]],
         Bf=[[1], [1], [1]], Bd=[[1], [0], [-1]],
     )  # fmt: skip
@@ -156,7 +212,7 @@ def test_a_long_fault_model_has_a_witness_of_its_own() -> None:
 
 
 def test_a_plant_that_was_sampled_or_reduced_is_named_so() -> None:
-    chain = DescriptorSystem(
+    chain = made(
         np.diag([1.0, 1, 0]), [[0, 0, 0], [1, 0, 0], [0, 1, -1]], C=[[0, 0, 1], [0, 0, 2]], Bf=[[1], [1 + LITTLE], [-1]]
     )
     reduced = eliminate_algebraic_states(chain).plant
@@ -165,6 +221,13 @@ def test_a_plant_that_was_sampled_or_reduced_is_named_so() -> None:
             plant
         )
         assert kind in text
+
+
+def test_the_rows_of_a_check_say_that_they_are_unclear() -> None:
+    row = check(CASES["pd: a mode"][1])["pd-observer"].failures[0]
+    assert row.name == "exists: detectability"
+    assert row.detail.startswith("Unclear: ")
+    assert "Witness: the plant with entry (" in row.detail
 
 
 def test_a_witness_is_named_entry_by_entry() -> None:

@@ -53,6 +53,17 @@ class Condition:
         return replace(self, holds=False, unclear=found, detail=f"{self.detail.rstrip()} {found.described(plant)}")
 
 
+def is_refused(conditions: Iterable[Condition]) -> bool:
+    """Whether a condition fails beyond doubt."""
+    return any(not condition.holds and condition.unclear is None for condition in conditions)
+
+
+def is_doubted(conditions: Iterable[Condition]) -> bool:
+    """Whether conditions fail, and all that do in doubt."""
+    failed = [condition for condition in conditions if not condition.holds]
+    return bool(failed) and all(condition.unclear is not None for condition in failed)
+
+
 def _involved(signals: tuple[str, ...], detail: str) -> str:
     """Name the signals that the detail does not name already."""
     missing = [repr(name) for name in signals if repr(name) not in detail]

@@ -8,11 +8,10 @@ import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.newton import ScaledMatrix
+from obsynth.numerics.ranks import SINGULAR_CONDITION
 from obsynth.plants.dae.functions import DAEFunctions
 from obsynth.plants.dae.model import DAEModel
 
-#: A matrix of (7) whose condition is above this is singular: three digits are left of sixteen.
-SINGULAR_CONDITION = 1e13
 #: The step is shortened by these factors.  Short enough that dF/dx' rules, long enough that index 3 stays countable.
 SHORTENINGS = (1e-2, 1e-3)
 #: Equations and states with at least this share of the largest entry of a singular vector are named.

@@ -142,8 +142,6 @@ def _impulse_matrix(E: FloatArray, A: FloatArray, C: FloatArray) -> FloatArray:
 
 #: A sampled plant with an eigenvalue this far from zero grows so fast that it is hardly one.
 _FAR = 3.0
-
-
 #: Larger plants are not asked: their eigenvalues would take too long for a question.
 _MOST_STATES = 200
 #: Signals that a question lists.

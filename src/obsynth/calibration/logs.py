@@ -129,7 +129,8 @@ def parsed_rows(rows: str | slice | Sequence[int] | None, count: int) -> tuple[i
     if step != 1 or last <= first:
         asked = rows if isinstance(rows, slice) else slice(None)
         told = ":".join("" if end is None else str(end) for end in (asked.start, asked.stop))
-        raise SpecError(f"rows {told} holds nothing: the log has {count} rows.", path="rows")
+        asked_for = f"rows {told} holds nothing" if told != ":" else "The log is empty"
+        raise SpecError(f"{asked_for}: the log has {count} rows.", path="rows")
     if isinstance(rows, slice) and any(end is not None and abs(end) > count for end in (rows.start, rows.stop)):
         raise SpecError(f"rows asks for {rows.start}:{rows.stop}, but the log has {count} rows.", path="rows")
     return first, last

@@ -99,6 +99,8 @@ def calibration_problem(
         raise SpecError(f"substeps is {substeps!r}: give a whole number, at least 1.", path="substeps")
     if not log.samples > 1:
         raise bad_log("too-short", f"The log has {log.samples} row(s): a calibration needs more.")
+    if not isinstance(unknown, Mapping):
+        raise SpecError("unknown must be a mapping from names to [low, high], such as {k: [0.5, 2]}.", path="unknown")
     names = tuple(unknown)
     for name in names:
         index_of(name, list(plant.values), what="unknown")
@@ -139,15 +141,20 @@ def _started(unknown: Mapping[str, Sequence[float]], plant: CalibrationPlant) ->
     values = dict(plant.values)
     for name in plant.unstated.intersection(unknown):
         pair = unknown[name]
-        if np.shape(pair) == (2,) and not pair[0] <= values[name] <= pair[1]:
+        if _is_pair(pair) and not pair[0] <= values[name] <= pair[1]:
             values[name] = 0.5 * (float(pair[0]) + float(pair[1]))
     return values
+
+
+def _is_pair(pair: Any) -> bool:
+    """Whether a value is two finite numbers."""
+    return np.shape(pair) == (2,) and all(is_number(entry) and np.isfinite(entry) for entry in pair)
 
 
 def _bounds(unknown: Mapping[str, Sequence[float]], values: Mapping[str, float]) -> tuple[FloatArray, FloatArray]:
     rows = []
     for name, pair in unknown.items():
-        if np.shape(pair) != (2,) or not np.isfinite(np.asarray(pair, dtype=np.float64)).all() or not pair[0] < pair[1]:
+        if not _is_pair(pair) or not pair[0] < pair[1]:
             raise SpecError(f"unknown.{name} is {pair!r}: give [low, high], finite, the lower one first.",
                             path=f"unknown.{name}")  # fmt: skip
         if not pair[0] <= values[name] <= pair[1]:
@@ -164,7 +171,7 @@ def _priors(
     means, weights = np.array([values[name] for name in names]), np.zeros(len(names))
     for name, pair in (priors or {}).items():
         i = index_of(name, names, what="priors")
-        if np.shape(pair) != (2,) or not np.isfinite(np.asarray(pair, dtype=np.float64)).all() or not pair[1] > 0.0:
+        if not _is_pair(pair) or not pair[1] > 0.0:
             raise SpecError(f"priors.{name} is {pair!r}: give [mean, standard deviation].", path=f"priors.{name}")
         means[i], weights[i] = float(pair[0]), float(pair[1]) ** -2
     return means, weights

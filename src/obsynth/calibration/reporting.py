@@ -32,8 +32,6 @@ from obsynth.plants.dae.step import ImplicitStep
 
 #: A step whose error in an output exceeds this share of the sensor's deviation is not exact enough.
 TOLERATED = 0.25
-
-
 #: Samples at which both methods are compared, spread over the record.
 COMPARED = 100
 
@@ -75,12 +73,8 @@ def integration_error(
 
 #: Constants whose correlation exceeds this are named together.
 CORRELATED = 0.9
-
-
 #: A sensor's variance below this multiple of its quantisation's is told.
 AT_QUANTISATION = 1.5
-
-
 #: A timing that is better by this many nats is told, even where it is not taken.
 NOTED_NATS = 2.0
 #: A constant within this share of the bounds' width from one of them is at it.

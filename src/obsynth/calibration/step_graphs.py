@@ -50,11 +50,7 @@ def compiled(functions: Sequence[Any]) -> list[Any]:
 
 #: Newton iterations of every step, from the last sample's state, and further ones where the residual is above `SOLVED`.
 ITERATIONS, FURTHER = 3, 8
-
-
 SOLVED = 1e-11
-
-
 #: Operations in one evaluation above which functions are compiled: a second or so, before a thousand evaluations.
 COMPILED_OPERATIONS = 200_000
 

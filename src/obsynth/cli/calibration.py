@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from obsynth.cli.arguments import add_force, add_gains, add_json, add_quiet, add_system, output_file
-from obsynth.cli.data_arguments import pair
+from obsynth.cli.data_arguments import add_map, pair
 from obsynth.cli.output import print_json, progress
 from obsynth.errors import SpecError
 from obsynth.files.inputs import protect
@@ -66,17 +66,18 @@ def _add_linearise(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--drift", action="store_true", help="take a moving point, with an input 'drift'")
     _add_log(parser, required=False)
-    parser.add_argument("--out", type=Path, metavar="FILE", help="write the linear plant to this file (YAML)")
+    parser.add_argument(
+        "--out", type=Path, metavar="FILE",
+        help="write the linear plant to this file (YAML), at nominal values: for designs that know tolerances, give "
+        "the equations and transform.linearise in the spec",
+    )  # fmt: skip
     _finish(parser, "linearise")
 
 
 def _add_log(parser: argparse.ArgumentParser, *, required: bool) -> None:
     parser.add_argument("--data", type=Path, required=required, metavar="FILE", help="the log (CSV or Parquet)")
     parser.add_argument("--rows", metavar="A:B", help="rows of the log without faults, as Python counts (default: all)")
-    parser.add_argument(
-        "--map", type=pair, action="append", default=[], metavar="SIGNAL=COLUMN",
-        help="column of a signal (or of time) where the names differ; may be repeated",
-    )  # fmt: skip
+    add_map(parser)
     parser.add_argument(
         "--scale", type=pair, action="append", default=[], metavar="SIGNAL=FACTOR",
         help="the column's value times the factor is in the signal's unit; may be repeated",
@@ -144,7 +145,7 @@ def run_linearise(options: argparse.Namespace) -> int:
             **{name: list(getattr(linear, name)) for name in (
                 "state_names", "input_names", "output_names", "fault_names", "disturbance_names")},
         })  # fmt: skip
-    elif not options.quiet:
+    else:
         print(linear_plant_text(linear))
         if found is not None:
             print(found)
@@ -182,7 +183,7 @@ def run_calibrate(options: argparse.Namespace) -> int:
         write_atomically(target, json.dumps(plain(data), indent=1, allow_nan=False) + "\n")
     if options.json:
         print_json({"command": "calibrate", "file": None if target is None else str(target), **data})
-    elif not options.quiet:
+    else:
         print(found)
         print(f"  digest of the log: {found.box.digest}")
         if target is not None:

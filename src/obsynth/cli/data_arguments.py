@@ -162,10 +162,7 @@ def _add_scenario(parser: argparse.ArgumentParser) -> None:
 
 def _add_data_options(parser: argparse.ArgumentParser) -> None:
     """Add what says how a log is read, and what is watched in it."""
-    parser.add_argument(
-        "--map", type=pair, action="append", default=[], metavar="SIGNAL=COLUMN",
-        help="column of a signal (or of time) where the names differ; may be repeated",
-    )  # fmt: skip
+    add_map(parser)
     parser.add_argument(
         "--time-column", metavar="COLUMN", help="column of the time, in seconds or as dates (ISO 8601); default: time"
     )
@@ -211,6 +208,14 @@ def add_monitor_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--change", type=float, default=1.0, metavar="X",
         help="cusum: change to be found, in deviations of the residual, or in parameter units (default: 1)",
+    )  # fmt: skip
+
+
+def add_map(parser: argparse.ArgumentParser) -> None:
+    """Add ``--map``."""
+    parser.add_argument(
+        "--map", type=pair, action="append", default=[], metavar="SIGNAL=COLUMN",
+        help="column of a signal (or of time) where the names differ; may be repeated",
     )  # fmt: skip
 
 

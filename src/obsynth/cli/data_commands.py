@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import io
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
@@ -25,10 +26,9 @@ from obsynth.cli.output import print_json
 from obsynth.cli.prove_alarm import alarm_of_run, certificate_target
 from obsynth.errors import SpecError, VerificationError
 from obsynth.files.inputs import protect, protect_stream
-from obsynth.files.outputs import require_distinct
+from obsynth.files.outputs import FileKind, require_distinct
 
 if TYPE_CHECKING:
-    pass
     from obsynth.data.run import DataRun
     from obsynth.results.design import ObserverDesign
 
@@ -160,24 +160,19 @@ def _target(options: argparse.Namespace) -> Path | TextIO:
 
 #: Formats of pictures, with the mark by which an older one may be replaced.
 PICTURES = {".png": rb"\A\x89PNG", ".svg": rb"<svg", ".pdf": rb"\A%PDF"}
-
-
 #: Dots per inch of a picture made of dots.
 _RESOLUTION = 160
 
 
 def run_plot(options: argparse.Namespace) -> int:
     """Run ``plot``: gain set and data in, a picture or a window out."""
-    from obsynth.files.outputs import FileKind
     from obsynth.results.gain_sets import load
 
     target: Path | None = options.out
     if target is not None:
-        suffix = target.suffix.lower()
-        if suffix not in PICTURES:
-            raise SpecError(f"{target} has an unknown suffix: use one of {', '.join(PICTURES)}.", path=str(target))
+        kind = picture_kind(target)
         protect_inputs(options)
-        output_file(target, FileKind(f"a picture ({suffix})", PICTURES[suffix]), options)
+        output_file(target, kind, options)
     parts = [part.strip() for part in options.show.split(",") if part.strip()]
     design = load(options.gains)
     found, watched = run_in_memory(design, options)
@@ -193,21 +188,11 @@ def run_plot(options: argparse.Namespace) -> int:
 
 
 def _draw(found: DataRun, design: ObserverDesign, parts: list[str], target: Path | None) -> None:
-    from obsynth.files.outputs import write_atomically
     from obsynth.plotting.data import panel_count, plot_data
 
     if target is not None:
-        from matplotlib.figure import Figure
-
-        from obsynth.plotting.panels import PANEL_HEIGHT, WIDTH
-
         count = panel_count(found, parts)
-        figure = Figure(figsize=(WIDTH, PANEL_HEIGHT * max(count, 1) + 0.6), layout="constrained")
-        axes = list(figure.subplots(max(count, 1), 1, sharex=True, squeeze=False)[:, 0])
-        plot_data(found, design=design, show=parts, axes=axes[:count])
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format=target.suffix[1:].lower(), dpi=_RESOLUTION, metadata=_undated(target))
-        write_atomically(target, buffer.getvalue())
+        written_picture(target, count, lambda axes: plot_data(found, design=design, show=parts, axes=axes))
         return
     import matplotlib as mpl
     import matplotlib.pyplot as plt
@@ -216,6 +201,29 @@ def _draw(found: DataRun, design: ObserverDesign, parts: list[str], target: Path
         raise SpecError("There is no screen to open a window on: give --out a file (.png, .svg or .pdf).", path="--out")
     plot_data(found, design=design, show=parts)
     plt.show()
+
+
+def picture_kind(target: Path) -> FileKind:
+    """Return what kind of picture a file is to be, by its suffix."""
+    suffix = target.suffix.lower()
+    if suffix not in PICTURES:
+        raise SpecError(f"{target} has an unknown suffix: use one of {', '.join(PICTURES)}.", path=str(target))
+    return FileKind(f"a picture ({suffix})", PICTURES[suffix])
+
+
+def written_picture(target: Path, count: int, draw: Callable[[list[Any]], Any]) -> None:
+    """Write a picture of so many panels, one above the other; ``draw`` fills them."""
+    from matplotlib.figure import Figure
+
+    from obsynth.files.outputs import write_atomically
+    from obsynth.plotting.panels import PANEL_HEIGHT, WIDTH
+
+    figure = Figure(figsize=(WIDTH, PANEL_HEIGHT * max(count, 1) + 0.6), layout="constrained")
+    axes = list(figure.subplots(max(count, 1), 1, sharex=True, squeeze=False)[:, 0])
+    draw(axes[:count])
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format=target.suffix[1:].lower(), dpi=_RESOLUTION, metadata=_undated(target))
+    write_atomically(target, buffer.getvalue())
 
 
 def _undated(target: Path) -> dict[str, Any] | None:

@@ -107,11 +107,7 @@ def design_command(arguments: Sequence[str] | None = None) -> int:
 
 
 _DESIGN = "Design an observer from a spec, prove it, print a report and write the gain set."
-
-
 _CHECK = "Analyse the plant of a spec, and check for every method whether a design can exist."
-
-
 _VERIFY = "Verify a saved gain set again, from the plant and the shipped realisation alone."
 
 

@@ -79,13 +79,72 @@ def add_evaluate_verb(verbs: Any) -> None:
         "--plants", type=int, metavar="N", help="draw N plants from the tolerances, half of them vertices"
     )
     evaluate.add_argument("--jobs", type=int, default=1, metavar="N", help="processes (default: 1)")
+    evaluate.add_argument(
+        "--tolerances", metavar="LIST",
+        help="instead, a fixed bound beside the adaptive threshold for these tolerances, such as 0,1%%,2%%,5%%",
+    )  # fmt: skip
+    evaluate.add_argument(
+        "--out", type=Path, metavar="FILE", help="with --tolerances: write the picture (.png, .svg or .pdf)"
+    )
     add_monitor_arguments(evaluate)
     add_json(evaluate)
+    add_force(evaluate)
     add_quiet(evaluate)
+
+
+def _run_tolerances(options: argparse.Namespace) -> int:
+    """Run ``evaluate --tolerances``: spec in, a table and a picture out."""
+    from obsynth.cli.commands import designed_or_loaded, spec_output
+    from obsynth.cli.data_commands import picture_kind, written_picture
+    from obsynth.cli.data_run import numbers_of, required_scenario
+    from obsynth.spec import load_spec
+
+    if options.plants is not None or options.monitor not in (None, "pointwise"):
+        raise SpecError("--tolerances compares two pointwise monitors on plants that it draws itself: leave out "
+                        "--plants and --monitor.", path="--tolerances")  # fmt: skip
+    with progress(quiet=options.quiet) as report_stage:
+        report_stage(f"reading {options.system}")
+        spec = load_spec(options.system)
+        scenario = required_scenario(spec)
+        target = options.out
+        if target is not None:
+            spec_output(target, picture_kind(target), spec, options, option="--out")
+        design = designed_or_loaded(spec, options.gains, report_stage)
+        from obsynth.experiments.tolerance_study import tolerance_study
+
+        found = tolerance_study(
+            design, scenario, tolerances=[_tolerance(item) for item in options.tolerances.split(",")],
+            runs=options.runs, disturbance_bounds=numbers_of(options.disturbance) or None,
+            noise_bound=options.noise_bound, progress=report_stage,
+        )  # fmt: skip
+    if target is not None:
+        from obsynth.plotting.trade_off import plot_tolerances
+
+        written_picture(target, 2, lambda axes: plot_tolerances(found, axes=axes))
+    if options.json:
+        file = None if target is None else str(target)
+        print_json({"command": "evaluate", "spec": str(spec.path), "file": file, **found.as_dict()})
+        return 0
+    print(found)
+    if target is not None:
+        print(f"Written: {target}")
+    return 0
+
+
+def _tolerance(text: str) -> float | str:
+    """Return a tolerance as a share, or as a text with its per cent."""
+    try:
+        return float(text)
+    except ValueError:
+        return text.strip()
 
 
 def run_evaluate(options: argparse.Namespace) -> int:
     """Run ``evaluate``: spec in, table of rates and errors out."""
+    if options.tolerances is not None:
+        return _run_tolerances(options)
+    if options.out is not None:
+        raise SpecError("--out is for the picture of --tolerances.", path="--out")
     from obsynth.cli.commands import designed_or_loaded
     from obsynth.cli.data_run import numbers_of, own_tolerances, ranges_of, required_scenario
     from obsynth.spec import load_spec

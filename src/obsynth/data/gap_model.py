@@ -77,8 +77,6 @@ class GapModel:
 
 #: How many lengths of an interval are kept discretised.
 KEPT_INTERVALS = 64
-
-
 Hold: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
 
 

@@ -24,8 +24,6 @@ from obsynth.numerics.arrays import FloatArray
 
 #: Seconds of data that are compared with the operating point.
 FIRST = 1.0
-
-
 #: A signal is far from its operating point when its mean differs by this share of it.
 FAR = 0.2
 

@@ -16,14 +16,8 @@ from obsynth.numerics.arrays import FloatArray
 
 #: What a missing sample may look like in a log.
 MISSING = frozenset({"", "nan", "na", "n/a", "null", "none"})
-
-
 _ZERO = datetime(1970, 1, 1, tzinfo=UTC)
-
-
 _EXPECTED = "seconds, such as 12.5, or a date and a time, such as 2026-05-01T08:30:00.5+02:00"
-
-
 _MICROSECOND = timedelta(microseconds=1)
 #: Seconds in a nanosecond, a microsecond and a day; microseconds in a second.
 _NANO, _MICRO, _DAY, _MICROSECONDS = 1e-9, 1e-6, 86400.0, 1e6
@@ -117,12 +111,8 @@ def _date(cell: str) -> datetime | None:
 
 #: A sampled design accepts intervals that differ from a multiple of dt by this share of dt.
 FITTING_SHARE = 0.01
-
-
 #: Without another word, an interval is a gap when it is longer than this many times the longest one before.
 GAP_FACTOR = 10.0
-
-
 #: A gap of more samples than this cannot be counted in double precision.
 MOST_SAMPLES = 2.0**53
 

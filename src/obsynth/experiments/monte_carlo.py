@@ -15,13 +15,13 @@ from obsynth.experiments.batch_simulation import Bench, LinearBench, Runs, make_
 from obsynth.experiments.benches import bench_of
 from obsynth.experiments.intervals import Interval, mean, share
 from obsynth.experiments.monitors.monitor import Monitor
-from obsynth.experiments.progress import Progress, shown_progress
 from obsynth.experiments.simulation import aligned_errors
 from obsynth.numerics.arguments import is_finite_number, is_whole, require_kind
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.decisions import ParameterMonitor
 from obsynth.observers.estimates import Estimates
+from obsynth.observers.progress import RunsProgress, progress_of_runs
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario
@@ -112,7 +112,7 @@ def evaluate(
     runs: int = 100,
     monitor: Monitor | ParameterMonitor | None = None,
     executor: Executor | None = None,
-    progress: Progress | bool | None = None,
+    progress: RunsProgress | bool | None = None,
     confidence: float = 0.95,
     plants: int | None = None,
 ) -> Evaluation:
@@ -172,7 +172,7 @@ def evaluate(
         for number, one in enumerate(benches)
         for i in range(number * share, min((number + 1) * share, len(seeds)), size)
     ]
-    with shown_progress(progress) as told:
+    with progress_of_runs(progress) as told:
         parts = _done(tasks, executor, told, runs)
     return _summed(parts, design, bench.onset, bench.drive.dt, watched=monitor is not None, level=confidence)
 
@@ -205,7 +205,7 @@ def _drawn_benches(design: ObserverDesign, scenario: Scenario, plants: int) -> l
 def _done(
     tasks: Sequence[Callable[[], dict[str, FloatArray]]],
     executor: Executor | None,
-    progress: Progress | None,
+    progress: RunsProgress | None,
     runs: int,
 ) -> dict[str, FloatArray]:
     """Return the numbers of all runs in the order of their seeds."""

@@ -45,23 +45,13 @@ def comment(text: str) -> str:
 
 
 _NUMBERS_PER_LINE = 4
-
-
 #: Matrices with fewer entries are multiplied row by row: nothing is gained by more.
 LARGE_TABLE = 1024
-
-
 #: At most this share of entries that are not zero makes a matrix sparse.
 SPARSE_SHARE = 0.25
-
-
 #: Columns that are added in one pass over the rows.
 UNROLLED = 4
-
-
 PLAIN, ENTRIES, COLUMNS = "plain", "entries", "columns"
-
-
 ADVICE = (
     "Compile with -O3, and with -march=native where it runs on the same machine: the products are written so that rows "
     "are independent, and sums keep their order."

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
-from itertools import combinations
 from typing import Any
 
 import numpy as np
 
 from obsynth.analysis.conditions import Condition
-from obsynth.analysis.diagnosis.additions import listed, state_sensors, with_sensors
+from obsynth.analysis.diagnosis.additions import least_additions, listed, state_sensors
 from obsynth.errors import ObsynthError, PreconditionError
 from obsynth.methods.method_spec import MethodSpec
 from obsynth.plants.descriptor import DescriptorSystem
@@ -28,7 +27,7 @@ def with_advice(
     holds = _asker(method, options)
     if holds(plant):
         return error
-    sets = _additions(plant, holds)
+    sets = least_additions(plant, state_sensors(plant), holds, most=(MOST_FOR_ONE, MOST_FOR_PAIRS))
     if sets:
         text = f"Add one of: {listed(sets)}."
     elif drops := _drops(plant, holds):
@@ -66,22 +65,6 @@ def _fitting(given: Mapping[str, Any], plant: DescriptorSystem) -> dict[str, Any
     if faults is None or isinstance(faults, str):
         return dict(given)
     return {**given, "faults": [name for name in faults if name in plant.fault_names]}
-
-
-def _additions(plant: DescriptorSystem, holds: Callable[[DescriptorSystem], bool]) -> tuple[tuple[str, ...], ...]:
-    """Return single states to measure that help, or else pairs."""
-    if plant.nx > MOST_FOR_ONE:
-        return ()
-    sensors = state_sensors(plant)
-    for size in (1, 2) if plant.nx <= MOST_FOR_PAIRS else (1,):
-        found = [
-            tuple(sensor.name for sensor in chosen)
-            for chosen in combinations(sensors, size)
-            if holds(with_sensors(plant, chosen))
-        ]
-        if found:
-            return tuple(found)
-    return ()
 
 
 def _drops(plant: DescriptorSystem, holds: Callable[[DescriptorSystem], bool]) -> list[str]:

@@ -285,7 +285,20 @@ def verified(
     if isinstance(draft.observer, LinearObserver) and isinstance(draft.plant, DescriptorSystem):
         require_above_rounding(draft.plant, draft.observer)
         draft = draft.replace(notes=(*draft.notes, *rounding_notes(draft.plant, draft.observer)))
-    return draft.replace(report=report)
+    return draft.replace(report=report, notes=(*draft.notes, *_lost_tolerances(plant, draft.plant)))
+
+
+def _lost_tolerances(given: Plant, shipped: Plant) -> tuple[str, ...]:
+    """Return a note where a method has left a plant's tolerances behind."""
+    if not (isinstance(given, DescriptorSystem) and isinstance(shipped, DescriptorSystem)):
+        return ()
+    if given.uncertainty is None or shipped.uncertainty is not None:
+        return ()
+    return (
+        f"The tolerances of the constants ({', '.join(given.uncertainty.box.names)}) were left behind as this method "
+        "eliminated algebraic states: thresholds assume an exact model. Eliminate these states first (transform: "
+        "eliminate_algebraic_states, obsynth.eliminate_algebraic_states), and the tolerances go along.",
+    )
 
 
 def with_stored_errors(draft: ObserverDesign) -> ObserverDesign:

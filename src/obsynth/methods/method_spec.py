@@ -71,12 +71,14 @@ class ClaimMeaning:
 class MethodSpec:
     """One method; callables are named by path ``module:name`` and loaded when they are used.
 
+    A path that begins with a dot is in the method's folder; what stands where it usually does need not be said.
+
     Fields: id: As in specs and gain sets; plants: Kinds of plants it takes; time: In words, for lists of methods;
     summary: One line; source: The paper whose letters its gains have; public: The function of `obsynth`; options: A
     `MethodOptions`; conditions: Existence, from the plant; synthesise: ``(plant, options, progress=)`` -> `Synthesis`;
     checks: ``(design, printed_digits)`` -> rows; claims: Every claim that it may make; witnesses: Matrices that its
-    certificate may hold; tracked: ``(design)`` -> `TrackedPlant`, of a linear observer; averaged: Its option
-    ``mean`` puts registers behind the observer, which the checks are not about.
+    certificate may hold; tracked: ``(design)`` -> `TrackedPlant`, of a linear observer; folder: Its package;
+    averaged: Its option ``mean`` puts registers behind the observer, which the checks are not about.
     """
 
     id: str
@@ -84,12 +86,13 @@ class MethodSpec:
     time: str
     summary: str
     source: str
-    public: str
     options: str
-    conditions: str
-    synthesise: str
-    checks: str
     claims: Mapping[str, ClaimMeaning]
+    public: str = ""
+    conditions: str = ".synthesis:conditions"
+    synthesise: str = ".synthesis:synthesise"
+    checks: str = ".checks:checks"
+    folder: str | None = None
     witnesses: frozenset[str] = frozenset()
     tracked: str = ""
     averaged: bool = False
@@ -98,8 +101,9 @@ class MethodSpec:
         self, part: Literal["public", "options", "conditions", "synthesise", "checks", "tracked"]
     ) -> Callable[..., Any]:
         """Return what a path names."""
-        module, name = str(getattr(self, part)).split(":")
-        found: Callable[..., Any] = getattr(import_module(module), name)
+        path = str(getattr(self, part)) or f".public:{self.id.replace('-', '_')}"
+        module, name = path.split(":")
+        found: Callable[..., Any] = getattr(import_module(module, self.folder), name)
         return found
 
     @property

@@ -23,12 +23,8 @@ from obsynth.verification.certificates import prove_stable
 LEAST_PROCESS = 1e-8
 #: Relative sizes of the fictitious process and measurement noise, tried in turn, that make the equation regular.
 REGULARISATIONS = (1e-6, 1e-4, 1e-2, 1.0)
-
-
 #: A starting filter with this spectral radius forgets fast enough.
 FAST_ENOUGH = 0.999
-
-
 #: Eigenvalues of a normalising matrix are kept above this fraction of the largest.
 CONDITION_LIMIT = 1e-20
 
@@ -189,8 +185,6 @@ def normalising_change(p: FloatArray) -> FloatArray:
 #: Shares of the decay that the Lyapunov function is asked to show, largest first: more makes a tighter fit to the slow
 #: modes and a larger condition number.
 SHARES = (0.9, 0.5, 0.99, 0.0)
-
-
 #: Times the equation is solved again in the coordinates of its last solution.
 ROUNDS = 3
 

@@ -70,16 +70,10 @@ def continuous_hinf_norm(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatAr
 
 #: Intervals of each length; the length doubles after them, as fast modes have died out by then.
 INTERVALS_PER_LENGTH = 64
-
-
 #: First length, in units of one over the norm of A.
 FIRST_LENGTH = 0.02
-
-
 #: The intervals end when no more than this share of the response can be left.
 LEFT_SHARE = 1e-4
-
-
 #: Doublings of the length before the response is held to have ended.
 MOST_LENGTHS = 60
 

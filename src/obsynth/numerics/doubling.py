@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.slow_part import FEWEST_STATES, FIRST_POWER, Lifts, RankWatch, slow_equation
 
 #: Doubling stops when a step changes the solution by less than this, relative to it; each step squares the error.
 DOUBLING_TOLERANCE = 1e-14
@@ -104,36 +105,53 @@ def _doubled(
 
     ``power`` (transposed in the papers) is in C order, so that its transpose is what LAPACK works on in place.
     """
-    n = len(power)
     back, solution = 0.5 * (back + back.T), 0.5 * (solution + solution.T)
-    error, jumps = np.inf, 0
+    error, jumps, full = np.inf, 0, solution
+    watch, lifts = RankWatch(), Lifts()
     with np.errstate(over="ignore", invalid="ignore"):
         for step in range(MOST_DOUBLINGS):
-            if possible is not None and not possible(solution):
+            if possible is not None and not possible(full):
                 return None
-            # `dot` is `@` with half the overhead, which for few states is most of the time.
-            matrix, parts = solution.dot(back), np.concatenate([power, back])
-            matrix.reshape(-1)[:: n + 1] += 1.0
-            if not _solved_in_place(matrix, parts):
+            if step == FIRST_POWER and len(power) >= FEWEST_STATES:
+                power, back, solution = lifts.balanced(power, back, solution)
+            part = watch.slow_part(power)
+            found = _doubled_once(power, back, solution) if part is None else None
+            if part is not None:
+                lifts.add(solution, part.basis)
+                found = slow_equation(part, power, back, solution)
+            if found is None:
                 return None
-            change = power.dot(solution.dot(parts[:n].T))
-            added: FloatArray = power.T.dot(parts[n:]).dot(power)
-            back, solution = back + 0.5 * (added + added.T), solution + 0.5 * (change + change.T)
-            power = parts[:n].dot(power)
-            size = math.sqrt(np.vdot(solution, solution))
+            power, back, solution = found[0], 0.5 * (found[1] + found[1].T), 0.5 * (found[2] + found[2].T)
+            full, before = lifts.full(solution), full
+            size, changed = math.sqrt(np.vdot(full, full)), full - before
             if not math.isfinite(size):
                 return None
-            error, last = math.sqrt(np.vdot(change, change)) / max(size, SMALLEST), error
+            error, last = math.sqrt(np.vdot(changed, changed)) / max(size, SMALLEST), error
             jumps += step >= FIRST_STEPS and error > LARGE_CHANGE
             if jumps > most_jumps:
                 return None
             # Rounding leaves changes that shrink no more; small ones are as good as none.
             if error <= DOUBLING_TOLERANCE or last <= error <= STAGNATION:
-                return solution
+                return full
             # Each step squares the change, up to a factor that the last two show: the next adds nothing.
             if error <= SETTLED and error * max(error, (error / last) ** 2) <= NOTHING:
-                return solution
+                return full
     return None
+
+
+def _doubled_once(
+    power: FloatArray, back: FloatArray, solution: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+    """Return the three matrices of the next step, their symmetric parts yet to be taken; ``None`` where it fails."""
+    n = len(power)
+    # `dot` is `@` with half the overhead, which for few states is most of the time.
+    matrix, parts = solution.dot(back), np.concatenate([power, back])
+    matrix.reshape(-1)[:: n + 1] += 1.0
+    if not _solved_in_place(matrix, parts):
+        return None
+    change = power.dot(solution.dot(parts[:n].T))
+    added: FloatArray = power.T.dot(parts[n:]).dot(power)
+    return parts[:n].dot(power), back + added, solution + change
 
 
 def _solved_in_place(matrix: FloatArray, rows: FloatArray) -> bool:

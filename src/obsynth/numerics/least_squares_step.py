@@ -25,6 +25,8 @@ SUSPECT_COLUMN = RANK_TOLERANCE
 #: The same for a row of the parity covariance, relative to the whole noise: the rank-revealing step then decides. It
 #: must lie above `PERFECT_PARITY`, or rounding passes for noise.
 SUSPECT_PARITY = 1e-12
+#: Columns that LAPACK's ``tpqrt`` treats at once.
+BLOCK = 32
 #: Noise-free parity directions must vanish to this share of their terms; rounding of data in double precision.
 CONSISTENCY = 1e-9
 
@@ -74,24 +76,39 @@ def projection_of(H: FloatArray, *, least: float = DEPENDENT_COLUMN) -> Projecti
     return Projection(rotation, np.asfortranarray(packed[:n]), np.tri(n))
 
 
-def projected_step(projection: Projection, noise: FloatArray, data: FloatArray) -> LeastSquaresStep | None:
+def noise_triangle(noise: FloatArray) -> FloatArray:
+    """Return the triangular factor ``(rows, rows)`` of rotated noise ``(any, rows)``, for `projected_step`."""
+    from scipy.linalg.lapack import dgeqrf
+
+    rows = noise.shape[1]
+    padded = np.zeros((max(len(noise), rows), rows), order="F")
+    padded[: len(noise)] = noise
+    return np.asfortranarray(np.triu(dgeqrf(padded, overwrite_a=1)[0][:rows]))
+
+
+def projected_step(
+    projection: Projection, noise: FloatArray, data: FloatArray, *, known: FloatArray | None = None
+) -> LeastSquaresStep | None:
     """Solve one step from rotated noise and data, or return ``None`` where the rank of the noise has to be decided.
 
     Noise that outgrows double precision is left to the caller too.
 
-    Shapes: ``noise (s, rows)``, ``data (rows, columns)``.
+    Shapes: ``noise (s, rows)``, ``data (rows, columns)``; ``known (rows, rows)``: triangular factor of more noise.
     """
-    from scipy.linalg.lapack import dgeqrf, dtrtrs
+    from scipy.linalg.lapack import dgeqrf, dtpqrt, dtrtrs
 
     n = len(projection.head)
     rows, columns = data.shape
     m = rows - n
     flat = noise.ravel(order="K")
-    squares = flat.dot(flat)
+    squares = flat.dot(flat) + (0.0 if known is None else float(np.vdot(known, known)))
     if not squares < OUTGROWN * OUTGROWN:
         return None
     suspect = SUSPECT_PARITY * math.sqrt(squares)
-    triangle = dgeqrf(noise, overwrite_a=1)[0]
+    if known is None:
+        triangle = dgeqrf(noise, overwrite_a=1)[0]
+    else:
+        triangle = dtpqrt(0, min(BLOCK, rows), known, np.asfortranarray(noise), overwrite_b=1)[0]
     right = np.empty((n, columns + n), order="F")
     innovation = data[:m]
     if m:

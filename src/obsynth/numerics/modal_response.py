@@ -14,26 +14,14 @@ from obsynth.numerics.arrays import ComplexArray, FloatArray
 
 #: Poles of at least this modulus may make a peak of their own.
 NEAR = 0.5
-
-
 #: How many peaks are refined, by how many points on either side, and how often.
 MOST_PEAKS = 3
-
-
 POINTS_BESIDE = 4
-
-
 REFINEMENTS = 3
-
-
 #: Rows or columns up to which the largest singular value has a formula.
 TWO = 2
-
-
 #: From so many states on, steps of power iteration take the place of eigenvalues.
 MANY_STATES = 60
-
-
 POWER_STEPS, ROUGH_STEPS = 8, 4
 
 
@@ -161,8 +149,6 @@ class ModalResponse:
 #: Eigenvalues of the symplectic pencil this close to the unit circle are looked at as crossings: a false one costs
 #: one more look, a missed one would cost the bound.
 CIRCLE_TOLERANCE = 1e-3
-
-
 #: Reciprocal condition number down to which a matrix may be inverted on the way to those eigenvalues.
 SAFE_CONDITION = 1e-7
 

@@ -22,8 +22,6 @@ from obsynth.numerics.ranks import RANK_TOLERANCE
 
 #: Matrices with fewer columns are decomposed as a whole.
 FEW_COLUMNS = 80
-
-
 #: Steps of inverse iteration: values that decide are smaller than the next by many digits, and each step squares that.
 STEPS = 4
 
@@ -75,20 +73,12 @@ def iterated(triangle: NDArray[Any], count: int) -> SmallestSingular:
 
 #: Above this condition of its leading part the Schur basis is not orthonormal enough to judge the pencil in it.
 SAFE_CONDITION = 1e5
-
-
 #: Columns that LAPACK's ``tpqrt`` treats at once.
 BLOCK = 32
-
-
 #: Most null directions that are looked for at a point.
 MOST_DIRECTIONS = 4
-
-
 #: Steps in which a computed zero is improved before the pencil there is judged.
 NEWTON_STEPS = 4
-
-
 #: A zero that moves further than this, relative to its size or one, is another one.
 NEWTON_REACH = 1e-2
 

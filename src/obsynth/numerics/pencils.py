@@ -173,9 +173,10 @@ def _clearly_no_zeros(parts: _SquarePart, scales: tuple[float, float]) -> tuple[
 
     Suppose it maps ``x`` of unit norm to no more than t.  Let V hold eigenvectors of the square part, F their residual,
     w_j be the rows of ``(square_e V)^-1``, and ``x = V y``.  Then ``|y_j| <= |w_j| (t + |F| |V^-1|) / |lambda_j - z|``.
-    So x is a multiple of the eigenvector v whose lambda is closest to z, but for r, the sum of these over the others,
-    and ``rest`` cannot map it to less than ``|rest v| (1 - r) - |rest| r``.  Where that is more than t for a v, no
-    zero is closest to its lambda.  Ill-conditioned eigenvectors and close eigenvalues leave the question open.
+    So x is a multiple of the eigenvector v whose lambda is closest to z, but for ``y_j v_j`` of the others.  With r the
+    sum of these ``|y_j|``, ``rest`` maps it to ``|rest v| (1 - r)`` at least, less the sum of ``|y_j| |rest v_j|``.
+    Where that is more than t for a v, no zero is closest to its lambda.  Ill-conditioned eigenvectors and close
+    eigenvalues leave the question open.
     """
     square_e, square_a, rest = parts
     # What overflows is not clear.
@@ -191,8 +192,9 @@ def _clearly_no_zeros(parts: _SquarePart, scales: tuple[float, float]) -> tuple[
         apart = np.abs(values - values[:, None])
         np.fill_diagonal(apart, np.inf)
         # Closest to lambda_i means up to half way to the others.
-        away = (tolerances + residual * spread) * np.sum(2.0 * weights / apart, axis=1)
-        least = np.linalg.norm(rest @ vectors, axis=0) * (1.0 - away) - float(np.linalg.norm(rest)) * away
+        reach = 2.0 * (tolerances + residual * spread)[:, None] * (weights / apart)
+        away, shown = np.sum(reach, axis=1), np.linalg.norm(rest @ vectors, axis=0)
+        least = shown * (1.0 - away) - reach @ shown
         clear = np.asarray((away < 1.0) & (least > 2.0 * tolerances))
     if not np.all(clear) and _safe_inverse(square_e) is None:
         return _candidates(parts)

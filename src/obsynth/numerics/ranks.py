@@ -71,6 +71,10 @@ KNOWN_SHARE = 1e-9
 TRACE_TOLERANCE = 1e-9
 #: Parity directions whose noise is below this share of the terms it is made of are free of noise: a few roundings.
 PERFECT_PARITY = 1e-14
+#: A matrix of (7) whose condition is above this is singular: three digits are left of sixteen.
+SINGULAR_CONDITION = 1e13
+#: A value below this share of the largest of its range is zero but for rounding.
+ROUNDED_ZERO = 1e-12
 
 
 def rounding_rank(matrix: FloatArray) -> int:

@@ -19,8 +19,6 @@ from obsynth.numerics.arrays import FloatArray, read_only
 
 #: Sweeps of the balancing; each one must improve on the last, so few are ever used.
 MOST_SWEEPS = 10
-
-
 #: Makes the factors unique where one group of signals does not touch another; too small to move them.
 SMALL_RIDGE = 1e-9
 
@@ -160,9 +158,9 @@ def balance_by_least_squares(
     ----------
     R. C. Ward, *Balancing the generalized eigenvalue problem*, SIAM J. Sci. Stat. Comput. 2, 1981.
     """
-    nx = E.shape[0]
-    b, c = np.hstack([np.zeros((nx, 0)), *inputs]), np.vstack([np.zeros((0, nx)), *outputs])
-    ends = [0, nx, 2 * nx, 2 * nx + len(c), 2 * nx + len(c) + b.shape[1]]
+    ne, nx = E.shape
+    b, c = np.hstack([np.zeros((ne, 0)), *inputs]), np.vstack([np.zeros((0, nx)), *outputs])
+    ends = [0, ne, ne + nx, ne + nx + len(c), ne + nx + len(c) + b.shape[1]]
     equations, states, shown, entering = map(slice, ends[:-1], ends[1:])
     normal = SMALL_RIDGE * np.eye(ends[-1])
     diagonal, right = np.einsum("ii->i", normal), np.zeros(ends[-1])
@@ -206,16 +204,10 @@ def _row_peaks(matrix: FloatArray) -> FloatArray:
 
 #: Makes the factors unique where nothing determines them; too small to move them elsewhere.
 RIDGE = 1e-11
-
-
 #: Weight of a wish, which decides only what the entries leave open.
 WISH_WEIGHT = 1e-8
-
-
 #: An entry this many bits below one has half a say: what is far below is coupling that hardly counts, or rounding.
 HALF_SAY = 10.0
-
-
 #: Passes in which small entries lose their say.
 PASSES = 3
 

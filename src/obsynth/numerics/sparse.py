@@ -51,6 +51,15 @@ def dense(matrix: Any) -> FloatArray:
     return read_only(matrix.toarray()) if is_sparse(matrix) else matrix
 
 
+def same_matrix(first: Any, second: Any) -> bool:
+    """Return whether two matrices, each sparse or an array, hold the same numbers."""
+    if first is second:
+        return True
+    if not (is_sparse(first) or is_sparse(second)):
+        return np.array_equal(first, second)
+    return bool(first.shape == second.shape and (csr(first) != csr(second)).nnz == 0)
+
+
 def csr(matrix: Any) -> Any:
     """Return a sparse or dense matrix as a new ``scipy.sparse.csr_array``."""
     from scipy.sparse import csr_array

@@ -51,7 +51,9 @@ def run_batch(
     SolverError
         A step of a DAE has no solution; the trial, k and the worst equation are named.
     """
-    if not observer.is_plain:
+    # The gains of a recursive observer that judges its samples depend on them.
+    judges = isinstance(observer, RecursiveObserver) and observer.outliers != "none"
+    if judges or not observer.is_plain:
         return _one_by_one(observer, y, u)
     if isinstance(observer, DAEObserver):
         return run_dae_batch(observer, y, u, **options)
@@ -59,7 +61,7 @@ def run_batch(
 
 
 def _one_by_one(observer: RecursiveObserver | DAEObserver, y: ArrayLike, u: ArrayLike | None) -> Estimates:
-    """Run trials one after another, as sensors of their own times and bounds on states need it."""
+    """Run trials one after another: sensors of their own times, bounds on states and judged samples need it."""
     outputs, inputs = np.asarray(y, dtype=np.float64), None if u is None else np.asarray(u, dtype=np.float64)
     if outputs.ndim != 3 or not len(outputs):
         raise SpecError(f"y has shape {outputs.shape}, but (trials, samples, ny) is needed.", path="y")

@@ -69,9 +69,8 @@ def decide(
         The statistic is unknown or does not go with the observer's form, an option is out of range, or the estimates
         are of another observer.
     """
-    nonlinear = isinstance(observer, DAEObserver)
     chosen(statistic, "statistic", STATISTICS)
-    start, form = _start_and_form(observer)
+    start, form = observer.initial_parameters, observer.form
     if not len(start) and statistic != "nis":
         raise SpecError("A decision on parameters needs an observer that estimates them; of a filter alone, statistic "
                         "'nis' tells whether the model still explains the data.", path="observer")  # fmt: skip
@@ -81,7 +80,7 @@ def decide(
     if form in WALKING_FORMS and statistic in ("cusum", "glr"):
         raise SpecError(f"{statistic} needs regressors, which form {form!r} does not have: use a form that forgets.",
                         path="statistic")  # fmt: skip
-    if nonlinear and statistic == "glr":
+    if isinstance(observer, DAEObserver) and statistic == "glr":
         raise SpecError("glr restarts signatures, which nonlinear observers do not carry: use chi-square, cusum or "
                         "nis.", path="statistic")  # fmt: skip
     nq = len(start)
@@ -112,14 +111,6 @@ def decide(
         along = np.einsum("kmq,km->kq", regressors, np.nan_to_num(gaps))
         return _cusum(estimates, along, np.einsum("kmq,kmq->kq", regressors, regressors), size, false_alarms)
     return likelihood_ratio(observer, estimates, gaps, false_alarms)
-
-
-def _start_and_form(observer: RecursiveObserver | DAEObserver) -> tuple[FloatArray, str]:
-    """Return the parameters at the start, and how they are estimated."""
-    if isinstance(observer, DAEObserver):
-        return observer.initial_parameters, observer.form
-    adaptation = observer.adaptation
-    return (np.zeros(0), "") if adaptation is None else (adaptation.initial_parameters, adaptation.form)
 
 
 @dataclass(frozen=True)
@@ -177,7 +168,7 @@ def _chi_square(
     observer: RecursiveObserver | DAEObserver, estimates: Estimates, nominal: FloatArray, false_alarms: float
 ) -> Decision:
     gaps, nq = estimates.parameters - nominal, len(nominal)
-    start = _start_and_form(observer)[0] - nominal
+    start = observer.initial_parameters - nominal
     if start.any():
         # Where the observer starts is no evidence: only what data have said since may raise an alarm.
         if isinstance(observer, DAEObserver):

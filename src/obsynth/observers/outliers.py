@@ -26,6 +26,9 @@ LIMITS = {"gate": 6.0, "huber": 3.0}
 OVERFLOW = 1e150
 #: Samples of one sensor in a row that are left out; the next is believed.
 LONGEST = 2
+#: How many times further off than the limit a sample must be that nothing contradicts but the equations of the model;
+#: and what rounding makes of a prediction without noise.
+BLIND, ROUNDING = 10.0, 1e-6
 
 State = TypeVar("State", bound=Any)
 Row = TypeVar("Row", bound=Any)
@@ -51,21 +54,28 @@ def no_refusals(outputs: int) -> FloatArray:
 def robust_advance(
     kind: str, limit: float, plain: Callable[[State, FloatArray, FloatArray], tuple[State, Row]],
     predicted: Callable[[State, FloatArray, FloatArray], tuple[FloatArray, FloatArray]], state: State, y: FloatArray,
-    u: FloatArray,
+    u: FloatArray, *, foreseen: Callable[[State, FloatArray], tuple[FloatArray, FloatArray]] | None = None,
 ) -> tuple[State, Row]:  # fmt: skip
     """Take a step; where its innovation is too long, ask each sensor and take the step again without the outliers.
 
     ``predicted(state, heard, u)`` returns mean and deviation of each output ``(ny,)`` from the samples that are heard.
+    An output that a step needs to determine its state has no innovation there; ``foreseen(state, u)`` says what the
+    equations of the model expect of it, and what is `BLIND` times further off than the limit is left out as well.
     """
-    failed = False
+    failed, mean, deviation, far = False, y, y, np.zeros(len(y), dtype=bool)
     try:
         with np.errstate(all="ignore"):
             after, row = plain(state, y, u)
-        if float(row.nis) <= limit**2:
+            passes = float(row.nis) <= limit**2
+            if passes and foreseen is not None:
+                mean, deviation = foreseen(state, u)
+                far = np.abs(y - mean) > BLIND * limit * deviation + ROUNDING * (np.abs(y) + np.abs(mean).max())
+        if passes and not far.any():
             return after._replace(refused=np.stack([np.zeros(len(y)), state.refused[1]])), row
     except (SolverError, np.linalg.LinAlgError, ValueError):
         failed = True
-    mean, deviation, far = _judged(limit, predicted, state, y, u)
+    if not far.any():
+        mean, deviation, far = _judged(limit, predicted, state, y, u)
     if kind == "gate":
         far &= (state.refused[0] < LONGEST) | (np.abs(y) > OVERFLOW)
         heard = np.where(far, np.nan, y)

@@ -1,4 +1,4 @@
-"""A bar on the terminal for runs that take long."""
+"""Bars on the terminal for runs that take long, and for many of them."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from obsynth.errors import SpecError
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
+#: Called with the number of runs done and their total.
+RunsProgress = Callable[[int, int], None]
 #: Seconds after which a bar appears.
 PATIENCE = 2.0
 
@@ -66,3 +68,21 @@ class _Bar:
         """Take the bar away."""
         if self.shown is not None:
             self.shown[0].stop()
+
+
+@contextmanager
+def progress_of_runs(wanted: RunsProgress | bool | None) -> Iterator[RunsProgress | None]:
+    """Yield what is to be called after each batch of runs."""
+    if not isinstance(wanted, bool):
+        yield wanted
+        return
+    if not wanted:
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = TextColumn("runs"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    with Progress(*columns, console=Console(stderr=True)) as bar:
+        task = bar.add_task("runs", total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)

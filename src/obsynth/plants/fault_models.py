@@ -24,8 +24,6 @@ from obsynth.numerics.scaling import LogBalance
 #: Distance, relative to the norm of a given matrix, below which computed eigenvalues count as one multiple eigenvalue:
 #: a triple one scatters by the cube root of the unit roundoff.
 MULTIPLE_EIGENVALUE = 1e-4
-
-
 #: The same for built-in models, whose matrices are triangular or diagonalisable: only rounding separates copies.
 SAME_EIGENVALUE = 1e-9
 
@@ -74,12 +72,8 @@ def balanced_transition(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 #: Words for polynomials, and their orders.
 POLYNOMIAL_WORDS = {"step": 0, "ramp": 1, "parabola": 2}
-
-
 #: Keys of a model given as data; the last two come together.
 MODEL_KEYS = ("polynomial", "sinusoid", "exponential", "sum", "Phi", "Cw")
-
-
 #: A polynomial of higher order has no meaning in data of double precision.
 HIGHEST_ORDER = 60
 

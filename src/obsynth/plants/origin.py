@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import Protocol, TypeVar
 
-import numpy as np
-
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.sparse import same_matrix
 
 
 class Written(Protocol):
@@ -34,7 +33,8 @@ class PlantOrigin:
     that one sampled with a zero-order hold; computed: Whether some of the numbers behind them were computed in floating
     point; sizes: Of the matrices of the plant itself, how large the terms are that each entry is a sum of (``A, Bf, Bd,
     C, Df, Dd``): what rounding of the data behind it may change is relative to those; states: How many the plant as
-    written has, algebraic ones included; 0 where that is not known.
+    written has, algebraic ones included; 0 where that is not known; uncleaned: Where data were computed and what
+    elimination left of them by their rounding alone was set to zero: the `DECISIVE` matrices before that.
     """
 
     exact: Mapping[str, tuple[tuple[Fraction, ...], ...]]
@@ -42,6 +42,7 @@ class PlantOrigin:
     computed: bool = False
     sizes: Mapping[str, FloatArray] | None = None
     states: int = 0
+    uncleaned: Mapping[str, tuple[tuple[Fraction, ...], ...]] | None = None
 
 
 def origin_of(plant: Written) -> PlantOrigin | None:
@@ -68,12 +69,12 @@ def carry_origin(old: Written, new: Plant) -> Plant:
     """Note on a changed plant what the old one was made from, if nothing has changed that matters."""
     made = getattr(old, "_made_from", None)
     unchanged = old.dt == new.dt and all(
-        np.array_equal(getattr(old, name), getattr(new, name)) for name in (*DECISIVE, "B", "D")
+        same_matrix(getattr(old, name), getattr(new, name)) for name in (*DECISIVE, "B", "D")
     )
     if made is not None and unchanged:
         object.__setattr__(new, "_made_from", made)
     origin = origin_of(old)
     same = origin is not None and old.dt == new.dt
-    if same and all(np.array_equal(getattr(old, name), getattr(new, name)) for name in DECISIVE):
+    if same and all(same_matrix(getattr(old, name), getattr(new, name)) for name in DECISIVE):
         return with_origin(new, origin)
     return new

@@ -32,12 +32,8 @@ from obsynth.plants.validation import (
 
 _ROWS = {"E": "state", "A": "state", "C": "output", "B": "state", "D": "output", "Bf": "state", "Df": "output",
          "Bd": "state", "Dd": "output", "Bw": "state", "Dw": "output"}  # fmt: skip
-
-
 _COLUMNS = {"E": "state", "A": "state", "C": "state", "B": "input", "D": "input", "Bf": "fault", "Df": "fault",
             "Bd": "disturbance", "Dd": "disturbance", "Bw": "noise", "Dw": "noise"}  # fmt: skip
-
-
 # A names the states, C the outputs; the first frame with a label decides on an order.
 _ORDER = ("A", "C", "E", "B", "D", "Bf", "Df", "Bd", "Dd", "Bw", "Dw")
 
@@ -82,8 +78,6 @@ def _order(labels: Any, kind: str, known: dict[str, Sequence[str] | None], what:
 
 #: Names of the signals of each kind, besides the states.
 _SIGNALS = {"input_names": "u", "output_names": "y", "fault_names": "f", "disturbance_names": "d", "noise_names": "w"}
-
-
 # Where a matrix picked by names names the signal as well.
 _NAMED_BY = {"output_names": "C", "fault_names": "Bf", "disturbance_names": "Bd"}
 

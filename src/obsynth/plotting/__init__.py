@@ -6,7 +6,7 @@ from obsynth.plotting.frequency import estimate_gains, plot_gains
 from obsynth.plotting.simulation import plot_decision, plot_detection, plot_simulation
 from obsynth.plotting.spectra import plot_poles
 from obsynth.plotting.states import plot_parameters, plot_states
-from obsynth.plotting.trade_off import plot_delta_scan, plot_trade_off
+from obsynth.plotting.trade_off import plot_delta_scan, plot_tolerances, plot_trade_off
 
 __all__ = [
     "estimate_gains",
@@ -21,5 +21,6 @@ __all__ = [
     "plot_residuals",
     "plot_simulation",
     "plot_states",
+    "plot_tolerances",
     "plot_trade_off",
 ]

@@ -29,8 +29,6 @@ _DECISION_LABELS = {
     "glr": "likelihood ratio",
     "nis": "NIS over a window",
 }
-
-
 #: Values below this share of the threshold say nothing, and would stretch a logarithmic axis.
 LEAST_SHARE = 1e-3
 
@@ -87,8 +85,6 @@ _LABELS = {
     "chi-square": "chi-square",
     "cusum": "CUSUM",
 }
-
-
 _THRESHOLDS = {
     "paper": "(66): not a pointwise bound",
     "pointwise": "pointwise bound",
@@ -96,19 +92,11 @@ _THRESHOLDS = {
     "chi-square": "threshold for Gaussian noise",
     "cusum": "threshold for Gaussian noise",
 }
-
-
 #: An estimate whose typical step from sample to sample is this share of its range is a band, not a line.
 NOISY_SHARE = 0.05
-
-
 #: Such a band lies under the truth.
 _BAND = {"color": "0.7", "linewidth": 0.6, "linestyle": "-", "zorder": 1.8}
-
-
 _TRUTH_ON_BAND = {"color": "black", "linewidth": 1.8, "zorder": 2.5}
-
-
 #: Decades that a logarithmic axis shows below the lowest threshold.
 DECADES_BELOW = 3
 

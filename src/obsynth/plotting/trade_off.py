@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import is_number
+from obsynth.experiments.tolerance_study import ADAPTIVE, FIXED, ToleranceStudy
+from obsynth.numerics.arguments import is_number, require_kind
 from obsynth.plotting.panels import PANEL_HEIGHT, WIDTH, legend_above, new_panels, plain_decades, tidy
 from obsynth.results.delta_scan import DeltaScan
 from obsynth.results.design import ObserverDesign
@@ -82,8 +83,6 @@ def _number(design: ObserverDesign, name: str) -> float:
 
 #: Inches: height of one panel.
 _SCAN_HEIGHT = 2.1
-
-
 #: One panel each: its label and the curves in it, with their names and styles.
 PANELS: tuple[tuple[str, tuple[tuple[str, str, dict[str, Any]], ...]], ...] = (
     ("decay (1/s)", (("decay", "rate at which errors die out", {"color": "black", "marker": "o"}),)),
@@ -133,4 +132,53 @@ def plot_delta_scan(scan: DeltaScan, *, axes: Iterable[Axes] | None = None) -> l
     panels[-1].set_xlabel("delta (s)")
     if (figure := panels[0].get_figure()) is not None:
         figure.align_ylabels(panels)
+    return panels
+
+
+_MONITORS: tuple[dict[str, Any], ...] = (
+    {"label": FIXED, "color": "tab:red", "linestyle": "--", "marker": "x"},
+    {"label": ADAPTIVE, "color": "black", "linestyle": "-", "marker": "o"},
+)
+
+
+def plot_tolerances(study: ToleranceStudy, *, axes: Iterable[Axes] | None = None) -> list[Axes]:
+    """Plot false alarms, and the least fault that is told in every run, against the tolerance.
+
+    Parameters
+    ----------
+    study : ToleranceStudy
+        From `obsynth.tolerance_study`.
+    axes : iterable of Axes, optional
+        Two; new ones, one above the other, by default.
+
+    Returns
+    -------
+    list of Axes
+        The fixed bound beside the adaptive threshold: false alarms above, least faults below; a monitor that tells no
+        fault at some tolerance has no point there.
+
+    Raises
+    ------
+    SpecError
+        The argument is something else, or there are too few or too many axes.
+    """
+    require_kind(study, ToleranceStudy, "study", "what obsynth.tolerance_study returns")
+    panels = new_panels(axes, 2, size=(WIDTH, 2.0 * PANEL_HEIGHT + 0.8))
+    unit = f" ({study.unit})" if study.unit else ""
+    labels = ("runs with a\nfalse alarm (%)", f"least {study.fault}\ntold in every run{unit}")
+    across = 100.0 * study.tolerances
+    least = np.where(np.isfinite(study.least_faults), study.least_faults, np.nan)
+    for panel, values, label in zip(panels, (100.0 * study.false_alarms, least), labels, strict=True):
+        for j, style in enumerate(_MONITORS):
+            panel.plot(across, values[:, j], linewidth=1.2, markersize=5.0, **style)
+        panel.set_ylabel(label)
+        legend_above(panel)
+        tidy(panel)
+    panels[0].set_ylim(-4.0, 104.0)
+    known = least[np.isfinite(least)]
+    if known.size and known.max() > WIDE_SPREAD * known.min():
+        plain_decades(panels[1])
+    else:
+        panels[1].set_ylim(bottom=0.0)
+    panels[-1].set_xlabel("largest tolerance of a constant (%)")
     return panels

@@ -185,8 +185,6 @@ def _lyapunov_factor(a: FloatArray, rate: float, *, discrete: bool) -> FloatArra
 
 #: What is added to a matrix, as a share of its largest entry, so that it has a positive eigenvector.
 _SHIFTS = (1e-4, 1e-7, 1e-10, 1e-13)
-
-
 #: The inverse is given up where its residual is larger.
 _LARGEST_RESIDUAL = 0.5
 

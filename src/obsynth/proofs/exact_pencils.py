@@ -37,8 +37,6 @@ _COMPRESSION_SIZE = 1 << 12
 _SEED = 20150709
 #: Compressions after which a factor that all of them share is a factor of all minors.
 _MOST_COMPRESSIONS = 6
-
-
 __all__ = ["ExactPencil", "blocks", "identity", "null_basis", "pivot_columns", "system_pencil", "zeros_matrix"]
 
 

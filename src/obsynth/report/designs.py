@@ -13,6 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from obsynth.analysis.transformations import StateRecovery
+from obsynth.errors import PreconditionError
 from obsynth.methods.functional_filter.delay_curve import DelayCurve, delay_curve
 from obsynth.methods.registry import REGISTRY, method_spec
 from obsynth.observers.linear.observer import LinearObserver
@@ -34,16 +35,28 @@ def verification_report(report: VerificationReport, *, console: Console) -> None
 
 def tolerances_report(design: ObserverDesign, *, console: Console) -> None:
     """Print what holds for every plant within its tolerances, or that the design assumes an exact model."""
+    facts = tolerance_facts(design)
+    if len(facts) == 1 and facts[0][0] == "model":
+        console.print(Text(f"Model: {facts[0][1]}"))
+    elif facts:
+        print_section(console, "Within the tolerances of the plant", facts_table(facts))
+
+
+def tolerance_facts(design: ObserverDesign) -> list[tuple[str, str]]:
+    """Return what holds for every plant within its tolerances, as label and text; none for other designs."""
     from obsynth.tolerances.result import EXACT_MODEL
     from obsynth.tolerances.robustness import robustness
 
     if not isinstance(design.plant, DescriptorSystem) or not isinstance(design.observer, LinearObserver):
-        return
+        return []
     uncertain = design.plant.uncertainty
     if uncertain is None or not uncertain.box.names:
-        console.print(Text(f"Model: {EXACT_MODEL} (no constant has a tolerance)."))
-        return
-    print_section(console, "Within the tolerances of the plant", facts_table(robustness(design).facts()))
+        return [("model", f"{EXACT_MODEL} (no constant has a tolerance).")]
+    try:
+        return list(robustness(design).facts())
+    except PreconditionError as error:
+        # The design is one for the nominal plant whatever the box may be.
+        return [("bounds", f"none: {error}")]
 
 
 def plant_facts(plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel) -> Iterator[tuple[str, str]]:

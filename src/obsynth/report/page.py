@@ -10,7 +10,14 @@ from pathlib import Path
 from obsynth.data.run import DataRun
 from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.methods.registry import REGISTRY, method_spec
-from obsynth.report.designs import delay_curves, fault_estimates_table, plant_facts, promises, recovered_states
+from obsynth.report.designs import (
+    delay_curves,
+    fault_estimates_table,
+    plant_facts,
+    promises,
+    recovered_states,
+    tolerance_facts,
+)
 from obsynth.report.log_agreement import agreement_section
 from obsynth.report.page_tables import check_rows, copied_table, fact_rows, matrix_rows, value_text
 from obsynth.report.pictures import data_section, pictures_of
@@ -93,6 +100,7 @@ def _page_text(
         "In short": list(_in_short(design.replace(report=report))),
         "Pictures": list(_pictures(design, scenario, report)),
         "What is promised": [*fact_rows(promises(design)), *_fault_estimates(design), *_recovered(design)],
+        "Within the tolerances of the plant": list(_tolerances(design, report)),
         "What delay buys": list(_delay(design)),
         "Notes": list(_notes(design.notes)),
         "The plant": list(fact_rows(plant_facts(design.plant))),
@@ -137,6 +145,13 @@ def _recovered(design: ObserverDesign) -> Iterator[str]:
     if design.recovery is not None:
         yield "<h3>States of the plant as written</h3>"
         yield from fact_rows(recovered_states(design.recovery))
+
+
+def _tolerances(design: ObserverDesign, report: VerificationReport) -> Iterator[str]:
+    if any(check.name == FITS for check in report.failures):
+        return
+    if facts := tolerance_facts(design):
+        yield from fact_rows(facts)
 
 
 def _delay(design: ObserverDesign) -> Iterator[str]:

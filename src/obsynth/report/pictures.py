@@ -42,16 +42,10 @@ if TYPE_CHECKING:
 
 #: Dots per inch: sharp on a screen that shows two for each pixel.
 RESOLUTION = 160
-
-
 #: Inches: a picture beside another one, and one of a row of its own; small, so that texts stay readable on a phone.
 HALF, WIDE = 5.6, 6.6
-
-
 #: Inches: a panel of several, and what the axis of time takes.
 PANEL, MARGIN = 1.5, 0.6
-
-
 #: More states than this are not drawn.
 MOST_STATES = 6
 

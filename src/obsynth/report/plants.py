@@ -90,8 +90,6 @@ def _yes(value: bool) -> str:
 
 #: Of a bank of residuals so many rows are shown.
 MOST_ROWS = 12
-
-
 #: What the columns of numbers mean.
 _COLUMNS = (
     "delay: samples, or derivatives in continuous time; residual, filter: states of the smallest residual that shows "
@@ -135,8 +133,6 @@ _TIME = {
     "and sample the observer afterwards (obsynth.sample_observer)",
     "exists: discrete time": "discrete only: sample the plant first (transform: {sample_time: ...})",
 }
-
-
 _KIND, _OF_THIS_KIND = "exists: kind of plant", "exists: plant of this kind"
 
 
@@ -181,8 +177,6 @@ def _reason(failed: Sequence[Check]) -> str:
 
 
 _MATRICES = ("E", "A", "B", "C", "D", "Bf", "Df", "Bd", "Dd")
-
-
 _NAMES = ("state_names", "input_names", "output_names", "fault_names", "disturbance_names")
 
 
@@ -220,4 +214,5 @@ def plant_document(plant: DescriptorSystem, source: str) -> str:
     yaml.width = 4096
     yaml.sort_base_mapping_type_on_output = False
     yaml.dump(data, text)
-    return f"# Linearised by obsynth from {source}, at the operating point below.\n{text.getvalue()}"
+    where = "at the operating point below and at nominal values of all constants"
+    return f"# Linearised by obsynth from {source}, {where}.\n{text.getvalue()}"

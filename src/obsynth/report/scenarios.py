@@ -25,8 +25,6 @@ from obsynth.results.layout import headed_table, number, print_section
 
 #: Rows of a table; of a large plant the worst estimates are shown.
 SHOWN = 12
-
-
 _DECISIONS = {
     "false_alarm_rate": ("false alarms", "share of runs"),
     "missed_detection_rate": ("missed detections", "share of runs"),
@@ -94,8 +92,6 @@ def _interval(item: Interval) -> str:
 
 #: Columns left out where the console is narrower than so many characters.
 NARROW = 130
-
-
 _LESS = ("order", "50 % s", "peak", "bias", "alarm s", "smallest", "ms")
 
 

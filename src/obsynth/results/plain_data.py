@@ -20,20 +20,12 @@ import numpy as np
 from obsynth.errors import SpecError
 
 DOCUMENT, ARRAYS = "gain_set.json", "arrays.npz"
-
-
 #: Marks an array that is a member, by its name; see the marks of `obsynth.results.gain_sets`.
 MEMBER = {"member"}
-
-
 #: Arrays with fewer numbers stay in the document, where they can be read.
 SMALL_ARRAY = 64
-
-
 #: Larger members are refused before they fill the memory.
 MAXIMUM_BYTES = 4_000_000_000
-
-
 _DATE = (1980, 1, 1, 0, 0, 0)
 
 
@@ -130,8 +122,6 @@ def with_arrays(value: Any, arrays: bytes) -> Any:
 
 # What JSON does not have is marked by these sets of keys; a mapping that happens to have one of them is wrapped.
 _ARRAY, _FLOAT, _MAPPING = {"shape", "data"}, {"float"}, {"mapping"}
-
-
 _MARKS = (_ARRAY, _FLOAT, _MAPPING, MEMBER)
 
 

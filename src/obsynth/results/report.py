@@ -6,7 +6,20 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from obsynth.results.checks import Check, all_hold
+from obsynth.results.checks import (
+    Check,
+    CheckKind,
+    Status,
+    all_hold,
+    information,
+    lower_bound_check,
+    upper_bound_check,
+)
+
+#: A report, and the rows it is made of.
+__all__ = [
+    "Check", "CheckKind", "Status", "VerificationReport", "information", "lower_bound_check", "upper_bound_check",
+]  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -26,8 +26,6 @@ from obsynth.numerics.sparse import as_sparse_matrix, is_sparse
 
 #: Larger matrices are refused; of sparse ones, the entries that are stored count.
 MAXIMUM_ENTRIES = 50_000_000
-
-
 # What the readers of numpy and scipy raise for a damaged file.
 _READING_ERRORS = (
     OSError, ValueError, TypeError, KeyError, IndexError, EOFError, OverflowError, RuntimeError, MemoryError,
@@ -157,12 +155,8 @@ def _reason(error: BaseException) -> str:
 
 #: Smaller matrices become arrays: nothing is gained by sparsity.
 SPARSE_FROM = 300
-
-
 #: A sparse matrix needs memory for each row and column as well: this many entries' worth, generously.
 ENTRIES_PER_LINE = 1000
-
-
 #: Whole numbers with more digits are damage.
 MOST_DIGITS = 15
 

@@ -1,7 +1,4 @@
-"""From the sections of a checked document to plants.
-
-Constants with tolerances in the plant of a spec: expressions in its matrices, entry by entry.
-"""
+"""From the sections of a checked document to plants."""
 
 from __future__ import annotations
 
@@ -28,18 +25,10 @@ if TYPE_CHECKING:
 
 
 _Plant = TypeVar("_Plant", DescriptorSystem, TimeVaryingDescriptorSystem, DAEModel)
-
-
 _MATRICES = ("E", "A", "B", "C", "D", "Bf", "Df", "Bd", "Dd", "Bw", "Dw")
-
-
 _NAME_LISTS = ("state_names", "input_names", "output_names", "fault_names", "disturbance_names", "noise_names")
-
-
 # Equations picked by name also name the signal that enters there.
 _SIGNAL_OF_PICK = {"B": "input_names", "Bw": "noise_names"}
-
-
 _LABELS = ("operating_point", "scales", "units")
 
 

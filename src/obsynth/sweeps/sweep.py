@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from obsynth.errors import ObsynthError, SpecError
-from obsynth.experiments.progress import Progress, shown_progress
 from obsynth.files.outputs import write_atomically
 from obsynth.methods.designing import Plant, design
+from obsynth.observers.progress import RunsProgress, progress_of_runs
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
@@ -160,7 +160,7 @@ def sweep(
     method: str | None = None,
     executor: Executor | None = None,
     folder: str | Path | None = None,
-    progress: Progress | bool | None = None,
+    progress: RunsProgress | bool | None = None,
 ) -> Sweep:
     """Design and verify for every combination of plants and parameters; what fails is a row, not an error.
 
@@ -196,7 +196,7 @@ def sweep(
     """
     made = _cases(cases, parameters or {}, method)
     place = None if folder is None else folder_for(Path(folder))
-    with shown_progress(progress) as told:
+    with progress_of_runs(progress) as told:
         return Sweep(carried_out(
             made, run_case, executor=executor, told=told, at_start=True,
             known=lambda case: None if place is None else _known(case, place),

@@ -10,8 +10,9 @@ import numpy as np
 from obsynth.analysis.transformations import discretise
 from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
 from obsynth.numerics.arrays import FloatArray
+from obsynth.plants.constants import ConstantsBox
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.uncertainty import SAMPLED, UNCERTAIN_MATRICES, matrices_of
+from obsynth.plants.uncertainty import SAMPLED, UNCERTAIN_MATRICES, Uncertainty, matrices_of
 
 
 def plant_at(plant: DescriptorSystem, values: Mapping[str, float]) -> DescriptorSystem:
@@ -23,13 +24,22 @@ def plant_at(plant: DescriptorSystem, values: Mapping[str, float]) -> Descriptor
     if uncertain is None:
         return plant
     if uncertain.written is None:
-        return plant.replace(**uncertain.filled(matrices_of(plant), values))
+        return _with_shift(plant.replace(**uncertain.filled(matrices_of(plant), values)), uncertain)
     matrices = uncertain.filled(uncertain.written, values)
     arguments: dict[str, Any] = {**matrices, "dt": 0.0 if is_sampled(uncertain.steps) else plant.dt}
     bare = DescriptorSystem(**arguments)
     for kind, size in uncertain.steps:
         bare = discretise(bare, size).plant if kind == SAMPLED else eliminate_algebraic_states(bare).plant
-    return plant.replace(**{name: getattr(bare, name) for name in UNCERTAIN_MATRICES})
+    return _with_shift(plant.replace(**{name: getattr(bare, name) for name in UNCERTAIN_MATRICES}), uncertain)
+
+
+def _with_shift(plant: DescriptorSystem, uncertain: Uncertainty) -> DescriptorSystem:
+    """Return a plant that is no family any more, but knows which of its inputs is one in every row, if one is."""
+    return (
+        plant.replace(uncertainty=Uncertainty(ConstantsBox({}), {}, shift=uncertain.shift))
+        if uncertain.shift
+        else plant
+    )
 
 
 def moving_at(plant: DescriptorSystem, values: Mapping[str, float]) -> FloatArray:

@@ -18,12 +18,8 @@ from obsynth.tolerances.error_structure import ErrorStructure, owners
 
 #: A ring of L samples is long enough when ``|Az^L|`` is proved to contract this much.
 CONTRACTION = 1e-2
-
-
 #: Shortest and longest ring.
 SHORTEST, LONGEST = 8, 8192
-
-
 #: Sums of products of doubles are multiplied by this: more than rounding can take from them.
 OUTWARD = 1.0 + 1e-12
 
@@ -170,12 +166,8 @@ def decay_weights(responses: Responses) -> tuple[float, FloatArray]:
 
 #: The largest tolerance is found to this share.
 FACTOR_SHARE = 1e-3
-
-
 #: Factors beyond this are as good as infinite.
 LARGEST_FACTOR = 1e6
-
-
 #: Added to the loop, as a share of its largest entry, so that its eigenvector is positive.
 _SHIFT = 1e-12
 

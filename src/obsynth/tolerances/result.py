@@ -107,11 +107,12 @@ class Robustness:
         yield "plant stable", self.stable + where + (f" ({self.boxes} boxes)" if self.boxes else "") + but
         if self.sharing:
             yield "never told from a fault", f"{', '.join(self.sharing)}: they act where a fault acts"
-        if self.loop_radius is None:
+        if self.reason:
             yield "bounds", f"none: {self.reason}"
+        if self.loop_radius is None:
             return
-        ever = "bounds stay finite for ever" if self.finite_for_ever else "bounds hold at each sample, but may grow"
-        yield "loop radius", f"{self.loop_radius:.4g}: {ever}"
+        ever = ": bounds stay finite for ever" if self.finite_for_ever else ": bounds hold at each sample, but may grow"
+        yield "loop radius", f"{self.loop_radius:.4g}{'' if self.reason else ever}"
         if self.largest_factor is not None:
             share = self.largest_tolerance
             percent = "" if share is None else f" ({100.0 * share:.3g} %)"

@@ -27,9 +27,17 @@ from obsynth.results.design import ObserverDesign
 from obsynth.tolerances.directions import told_from_faults
 from obsynth.tolerances.error_structure import ErrorStructure, error_structure
 from obsynth.tolerances.exact_plant import is_sampled, moving_at
-from obsynth.tolerances.responses import Responses, blame, blamed_rows, largest_factor, loop_radius, responses_of
+from obsynth.tolerances.responses import (
+    Responses,
+    blame,
+    blamed_rows,
+    largest_factor,
+    loop_radius,
+    responses_of,
+    same_sample_inverse,
+)
 from obsynth.tolerances.result import EXACT_MODEL, Robustness
-from obsynth.tolerances.subdivision import MOST_BOXES, BoxVerdict, index_one_on_box, proved_stable
+from obsynth.tolerances.subdivision import MOST_BOXES, BoxVerdict, index_one_on_box, proved_stable, values_at
 from obsynth.tolerances.tracking import Tracking, tracking_of
 from obsynth.tolerances.vertex_gains import labels_of, vertex_gains
 
@@ -137,6 +145,7 @@ def robustness(
             tracking = tracking_of(design, affine)
             responses = responses_of(structure_of(design, affine, tracking))
             radius = loop_radius(responses)
+            reason = _no_bound(responses)
             told("largest tolerances")
             factor = largest_factor(
                 lambda t: structure_of(design, affine_plant(plant, uncertain.box.scaled(t)), tracking), radius
@@ -175,6 +184,15 @@ def structure_of(
     )  # fmt: skip
 
 
+def _no_bound(responses: Responses) -> str:
+    """Return why no bound holds at a sample, or nothing where one does."""
+    try:
+        same_sample_inverse(responses)
+    except PreconditionError as error:
+        return str(error)
+    return ""
+
+
 def _named(names: tuple[str, ...], shares: FloatArray) -> dict[str, float]:
     return {name: float(share) for name, share in zip(names, shares, strict=True)}
 
@@ -182,8 +200,7 @@ def _named(names: tuple[str, ...], shares: FloatArray) -> dict[str, float]:
 def _values(box: ConstantsBox, found: BoxVerdict) -> dict[str, float]:
     if found.at is None or found.verdict != "refuted":
         return {}
-    values = box.values(found.at)
-    return {name: values[name] for name in box.names}
+    return values_at(box, found.at)
 
 
 def _stability(plant: DescriptorSystem, affine: AffinePlant) -> tuple[BoxVerdict, tuple[complex, ...]]:
@@ -204,6 +221,8 @@ def _stability(plant: DescriptorSystem, affine: AffinePlant) -> tuple[BoxVerdict
     lasting = tuple(complex(value) for value in values[outside])
     # Stable modes that no constant touches are stable everywhere.
     rest = [i for i in range(len(whole.center)) if i not in apart]
+    if not rest:
+        return BoxVerdict("proved", 0), lasting
     back = 2.0 * np.eye(len(basis)) - basis
 
     def exactly(q: FloatArray) -> FloatArray:

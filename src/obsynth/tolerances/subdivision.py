@@ -14,28 +14,22 @@ import numpy as np
 
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.ranks import ROUNDED_ZERO
+from obsynth.plants.constants import ConstantsBox
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.uncertainty import Uncertainty, matrices_of
 from obsynth.proofs.affine import AffineMatrix, affine_block, affine_inverse
 
 #: Boxes after which a statement is left open.
 MOST_BOXES = 150
-
-
 #: The matrix over ``lower <= q <= upper``.
 Build: TypeAlias = Callable[[FloatArray, FloatArray], AffineMatrix]
-
-
 #: Halvings of the way to a point that fails.
 BISECTIONS = 50
 #: With more constants than this, not all vertices are looked at first.
 MOST_VERTEX_CONSTANTS = 10
-
-
 #: Norms computed in double precision are multiplied by this before they are compared.
 _OUTWARD = 1.0 + 1e-9
-
-
 #: What rounding takes from a product of matrices, beside its terms.
 _ROUNDING = 1e-14
 
@@ -89,6 +83,13 @@ def _built(build: Build, lower: FloatArray, upper: FloatArray) -> AffineMatrix |
         return build(lower, upper)
     except PreconditionError:
         return None
+
+
+def values_at(box: ConstantsBox, q: FloatArray) -> dict[str, float]:
+    """Return the values of the uncertain constants at a point, without the rounding of zero."""
+    values = box.values(q)
+    sizes = {item.name: max(abs(item.low), abs(item.high)) for item in box.uncertain}
+    return {name: 0.0 if abs(values[name]) < ROUNDED_ZERO * size else values[name] for name, size in sizes.items()}
 
 
 def proved_regular(build: Build, count: int, exact_at: Callable[[FloatArray], FloatArray]) -> BoxVerdict:

@@ -25,12 +25,8 @@ if TYPE_CHECKING:
 
 #: Every claim a fault-estimation filter can make.
 KNOWN_CLAIMS = ("gamma", "gamma_min", "gamma_bracket_low", "gamma_bracket_high", "state_lag")
-
-
 #: Gains are norms found in different coordinates: they may be out of order by this share of the claimed one.
 ORDER_TOLERANCE = 1e-6
-
-
 #: Why a variance is not known.
 UNCERTAIN = "rounding leaves no digit: two ways of computing it disagree"
 
@@ -137,8 +133,6 @@ def _misfits(plant: DescriptorSystem, recovery: StateRecovery) -> list[str]:
 
 #: In place of a row: what the search stated, which no check recomputes.  Such a claim has a row that says so.
 STATED = "stated by the search"
-
-
 #: Matrices that the certificate of any linear design may hold, with the rows that cover them.
 WITNESS_CLAIMS: Mapping[str, str] = {
     "state_error": "stored numbers: states", "input_error": "stored numbers: inputs",

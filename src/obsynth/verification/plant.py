@@ -74,5 +74,5 @@ def condition_rows(conditions: Iterable[Condition]) -> Iterator[Check]:
             condition.holds,
             condition.source,
             "condition",
-            condition.detail,
+            f"Unclear: {condition.detail}" if condition.unclear else condition.detail,
         )

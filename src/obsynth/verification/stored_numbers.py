@@ -15,6 +15,7 @@ import numpy as np
 from obsynth.numerics.arrays import SMALLEST, ComplexArray, FloatArray
 from obsynth.numerics.norms import MOST_ENTRIES_AT_ONCE, resolved
 from obsynth.numerics.pencils import pencil_structure
+from obsynth.numerics.ranks import BOUNDARY_TOLERANCE
 from obsynth.numerics.spectra import boundary_points
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
@@ -35,8 +36,6 @@ SLOWEST, POINTS = 1e-7, 120
 MANY_STATES, FEWER_POINTS = 300, 40
 #: Frequencies beyond that at which the time is looked for after which stored numbers matter, rad per sample.
 SLOWER = tuple(10.0**-k for k in range(8, 17))
-#: Eigenvalues within this of the boundary of stability (relative to the unit circle, or to the largest) may be on it.
-BOUNDARY = 1e-8
 #: Multiple poles scatter; those this close to the boundary may be on it, and this far apart they are different ones.
 ABOUT_THE_BOUNDARY, APART, MOST_ANGLES = 1e-2, 1e-2, 8
 #: Beyond this distance (rad per sample) from such poles a gain is none that takes long to build up.
@@ -260,9 +259,9 @@ def _when_it_matters(system: _Composite, level: float, unit: float, beyond: floa
     per_unit = dt if dt > 0.0 else 1.0 / unit
     size = max(float(np.max(np.abs(poles), initial=0.0)), np.finfo(np.float64).tiny)
     distance = np.abs(poles) - 1.0 if dt > 0.0 else poles.real / size
-    outside = distance > BOUNDARY
+    outside = distance > BOUNDARY_TOLERANCE
     seconds = per_unit / beyond if beyond > 0.0 else np.inf
-    if not poles.size or np.all(distance < -BOUNDARY):
+    if not poles.size or np.all(distance < -BOUNDARY_TOLERANCE):
         return "the plant forgets: a finite gain exists", np.inf
     if outside.any():
         rate = float(np.max(np.log(np.abs(poles[outside])) / dt if dt > 0.0 else poles[outside].real))

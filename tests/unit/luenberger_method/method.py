@@ -4,14 +4,12 @@ from obsynth.methods.method_spec import ClaimMeaning, MethodSpec
 
 METHOD = MethodSpec(
     id="luenberger-observer",
+    folder=__package__,
     plants=("time-invariant",),
     time="discrete",
     summary="states, where every state is measured",
     source="Luenberger 1964",
-    public="luenberger_method.synthesis:luenberger_observer",
-    options="luenberger_method.options:LuenbergerOptions",
-    conditions="luenberger_method.synthesis:conditions",
-    synthesise="luenberger_method.synthesis:synthesise",
-    checks="luenberger_method.checks:checks",
+    public=".synthesis:luenberger_observer",
+    options=".options:LuenbergerOptions",
     claims={"radius": ClaimMeaning("", "spectral radius of the error", "radius")},
 )

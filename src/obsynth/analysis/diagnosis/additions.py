@@ -61,12 +61,16 @@ def with_sensors(plant: DescriptorSystem, sensors: Sequence[Sensor]) -> Descript
 
 
 def least_additions(
-    plant: DescriptorSystem, sensors: Sequence[Sensor], reached: Callable[[DescriptorSystem], bool]
-) -> tuple[tuple[str, ...], ...]:
-    """Return all single sensors that do it, or else all pairs; nothing where none of them does."""
-    if plant.nx > MOST_FOR_ONE:
+    plant: DescriptorSystem, sensors: Sequence[Sensor], reached: Callable[[DescriptorSystem], bool],
+    *, most: tuple[int, int] = (MOST_FOR_ONE, MOST_FOR_PAIRS),
+) -> tuple[tuple[str, ...], ...]:  # fmt: skip
+    """Return all single sensors that do it, or else all pairs; nothing where none of them does.
+
+    Plants of more than ``most`` states are not searched for one, and not for pairs.
+    """
+    if plant.nx > most[0]:
         return ()
-    for size in (1, 2) if plant.nx <= MOST_FOR_PAIRS else (1,):
+    for size in (1, 2) if plant.nx <= most[1] else (1,):
         found = [
             tuple(sensor.name for sensor in chosen)
             for chosen in combinations(sensors, size)

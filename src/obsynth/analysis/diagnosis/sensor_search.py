@@ -29,8 +29,6 @@ from obsynth.plants.descriptor import DescriptorSystem
 
 #: Points without meaning, in units of the plant's own time scale.
 GENERIC_POINTS = (0.7391 + 0.2j, 0.31 + 1.3247j)
-
-
 #: Part of a fault's column outside the span of the others, relative to it, below which it does not show.
 SHOWN = 1e-9
 
@@ -102,12 +100,8 @@ def _outside(span: ComplexArray, vector: ComplexArray) -> NDArray[np.float64]:
 
 #: What sensors may be wanted for.
 GOALS = ("detect", "isolate", "estimate-step", "estimate")
-
-
 #: Sets of one size are enumerated up to so many; the best of each size are confirmed until so many fail in a row.
 MOST_SETS = 40_000
-
-
 MOST_CONFIRMED = 400
 
 

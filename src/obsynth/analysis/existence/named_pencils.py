@@ -25,6 +25,7 @@ from obsynth.analysis.existence.witnesses import (
 )
 from obsynth.analysis.plant_units import PlantUnits, sized_plant
 from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.numerics.scaling import equilibrate_pencil
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.exosystems import Exosystem
@@ -60,10 +61,13 @@ class NamedPencil:
         terms = None if self.terms is None else self.terms.T
         return NamedPencil(self.A.T, self.E.T, self.owners.T, self.columns, self.rows, terms)
 
-    def witness(self, tolerance: float, point: complex | None = None, *, dt: float | None = None) -> Witness | None:
+    def witness(
+        self, tolerance: float, point: complex | None = None, *, dt: float | None = None, last: bool = False
+    ) -> Witness | None:
         """Return a plant for which this loses column rank at a point: within the tolerance, or the nearest one found.
 
-        With ``dt`` the point may move, but stays on or outside the stability boundary.
+        With ``dt`` the point may move, but stays on or outside the stability boundary.  With ``last`` the last column
+        becomes a combination of the others, whatever the rank of those.
         """
         at = 0j if point is None else complex(point)
         matrix = nearest(self.A) - (at if at.imag else at.real) * nearest(self.E)
@@ -73,17 +77,32 @@ class NamedPencil:
         rows, columns = self.rows * pencil.rows, self.columns * pencil.columns
         if not matrix.size or not np.all(np.isfinite(rows[:, None] * matrix * columns)):
             return None
-        vector = np.linalg.svd(rows[:, None] * matrix * columns)[2][-1].conj()
+        whole = rows[:, None] * matrix * columns
+        if last:
+            vector = np.append(-np.linalg.lstsq(whole[:, :-1], whole[:, -1], rcond=RANK_TOLERANCE)[0], 1.0)
+        else:
+            vector = np.linalg.svd(whole)[2][-1].conj()
         vector = vector / vector[int(np.argmax(np.abs(vector)))]
         best: Witness | None = None
         for digits in DIGITS:
             place = _placed(at, digits, dt)
             changes, size = self._changes(_rounded(vector, digits), place, rows, columns)
-            if changes and (best is None or size < best.size):
+            if best is None or size < best.size:
                 best = Witness(changes, size, None if point is None else complex(float(place[0]), float(place[1])))
-            if best is not None and best.size <= tolerance:
+            if best.size <= tolerance:
                 break
-        return best
+        return best if best is not None and np.isfinite(best.size) else None
+
+    def last_share(self, point: complex) -> float:
+        """Return how much of the last column no combination of the others makes, beside the terms it is made of."""
+        matrix = nearest(self.A) - (point if point.imag else point.real) * nearest(self.E)
+        whole = self.rows[:, None] * matrix * self.columns
+        sizes = np.abs(whole) if self.terms is None else self.rows[:, None] * self.terms * self.columns
+        left, values, _ = np.linalg.svd(whole[:, :-1], full_matrices=False)
+        basis = left[:, values > RANK_TOLERANCE * np.max(values, initial=0.0)]
+        rest = whole[:, -1] - basis @ (basis.conj().T @ whole[:, -1])
+        size = float(np.linalg.norm(sizes[:, -1]))
+        return float(np.linalg.norm(rest)) / size if size > 0.0 else 0.0
 
     def _changes(
         self, vector: tuple[Rational, Rational], point: tuple[Fraction, Fraction], rows: FloatArray, columns: FloatArray
@@ -106,8 +125,8 @@ class NamedPencil:
             if solved is None:
                 return (), np.inf
             for j, delta in solved:
-                owner = self.owners[i, j]
-                found.append(EntryChange(*owner, self.A[i, j], self.A[i, j] + delta))
+                name, row, column = self.owners[i, j]
+                found.append(EntryChange(name, row, column, self.A[i, j], self.A[i, j] + delta))
                 size = max(size, float(rows[i] * columns[j] * abs(float(delta))))
         return tuple(change for change in found if change.before != change.after), size
 
@@ -257,8 +276,8 @@ def _owned(name: Cell, height: int, columns: Sequence[int]) -> Rational:
 
 def unclear(
     plant: DescriptorSystem, named: NamedPencil, *, tolerance: float, other: str, decider: str,
-    point: complex | None = None, dt: float | None = None,
+    point: complex | None = None, dt: float | None = None, last: bool = False,
 ) -> Unclear:  # fmt: skip
     """Return why an answer is unclear: the tolerance is never less than what the witness needs."""
-    witness = named.witness(tolerance, point, dt=dt)
+    witness = named.witness(tolerance, point, dt=dt, last=last)
     return Unclear(max(tolerance, 0.0 if witness is None else witness.size), witness, other, decider)

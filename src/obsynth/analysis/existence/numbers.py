@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import TypeVar
 
 from obsynth.analysis.existence.rational import PlantNumbers, WrittenNumbers
 from obsynth.analysis.existence.sampled import sampled_numbers
@@ -18,6 +19,8 @@ EXACT_STATES = 64
 SAMPLED_STATES = 24
 #: Of computed data an exact answer says little more than floating point does, and takes longer.
 COMPUTED_STATES = 24
+
+Found = TypeVar("Found")
 
 _EXACTLY: ContextVar[bool] = ContextVar("existence is decided exactly", default=True)
 
@@ -32,9 +35,45 @@ def decided(*, exactly: bool) -> Iterator[None]:
         _EXACTLY.reset(token)
 
 
+#: Whether numbers are asked for as they were before what elimination left by rounding was set to zero, and for which
+#: plants that was done.
+_UNCLEANED: ContextVar[bool] = ContextVar("numbers are not cleaned", default=False)
+_CLEANED: ContextVar[list[DescriptorSystem] | None] = ContextVar("plants whose numbers were cleaned", default=None)
+
+
+def reconsidered(
+    decide: Callable[[], Found], refused: Callable[[Found], bool], doubted: Callable[[Found], bool]
+) -> Found:
+    """Return a decision; a refusal that rests on what was taken for rounding gives way to the doubt without that."""
+    cleaned: list[DescriptorSystem] = []
+    token = _CLEANED.set(cleaned)
+    try:
+        found = decide()
+    finally:
+        _CLEANED.reset(token)
+    if not cleaned or not refused(found):
+        return found
+    again = _UNCLEANED.set(True)
+    try:
+        other = decide()
+    finally:
+        _UNCLEANED.reset(again)
+    return other if doubted(other) else found
+
+
+def uncleaned() -> bool:
+    """Whether numbers are asked for as they were before any were taken for rounding."""
+    return _UNCLEANED.get()
+
+
 def numbers_of(plant: DescriptorSystem) -> PlantNumbers | None:
     """Return the numbers on which existence is decided; ``None`` where it is decided in floating point."""
-    return _numbers_of(_Content.of(plant)) if _EXACTLY.get() and plant.nx <= EXACT_STATES else None
+    if not _EXACTLY.get() or plant.nx > EXACT_STATES:
+        return None
+    origin, cleaned = origin_of(plant), _CLEANED.get()
+    if cleaned is not None and origin is not None and origin.uncleaned is not None:
+        cleaned.append(plant)
+    return _numbers_of(_Content.of(plant), _UNCLEANED.get())
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,15 +100,16 @@ class _Content:
 
 # Conditions, synthesis and verification ask for the same plant's several times; plants never change.
 @lru_cache(maxsize=8)
-def _numbers_of(content: _Content) -> PlantNumbers | None:
+def _numbers_of(content: _Content, uncleaned: bool) -> PlantNumbers | None:
     plant = content.plant
     from obsynth.proofs.written_numbers import computed_entries, rational_matrix, written_matrix
 
     origin = origin_of(plant)
     if origin is not None:
-        states = len(origin.exact["A"])
+        rows = origin.uncleaned if uncleaned and origin.uncleaned is not None else origin.exact
+        states = len(rows["A"])
         sizes = {"E": states, "A": states, "C": states, "Bf": plant.nf, "Df": plant.nf, "Bd": plant.nd, "Dd": plant.nd}
-        exact = {name: rational_matrix(origin.exact[name], sizes[name]) for name in DECISIVE}
+        exact = {name: rational_matrix(rows[name], sizes[name]) for name in DECISIVE}
         if origin.sample_time is None:
             written = WrittenNumbers(exact, plant.is_discrete, computed=origin.computed)
             return written if states <= (COMPUTED_STATES if origin.computed else EXACT_STATES) else None

@@ -29,7 +29,7 @@ from obsynth.analysis.plant_units import PlantUnits
 from obsynth.analysis.zeros import are_outside, is_outside
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.pencils import finite_zeros
-from obsynth.numerics.ranks import NAMED_SHARE, RankDecision
+from obsynth.numerics.ranks import NAMED_SHARE, RANK_TOLERANCE, RankDecision
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.balls import UNIT_ROUNDOFF
 
@@ -57,8 +57,6 @@ def settled_rank(decision: RankDecision, exact_rank: int | None, share: float = 
 DECIDER = "Data with more digits, or an output in which this shows more, would decide it."
 #: Computed data hold more than one rounding: below this distance a zero of theirs is one.
 COMPUTED = 1e-12
-
-
 #: Rounding scatters a multiple zero by up to this, relative to its size or one.
 SCATTER = 1e-2
 
@@ -171,6 +169,7 @@ def needed_gain(plant: DescriptorSystem, units: PlantUnits, point: complex, *, i
     rows = np.concatenate([units.equations, units.outputs])[:, None]
     pencil = np.block([[plant.A - point * plant.E, entering], [plant.C, direct]])
     scaled = np.linalg.svd(rows * pencil * columns)[2][-1].conj()
+    scaled = np.where(np.abs(scaled) > RANK_TOLERANCE, scaled, 0.0)
     signals = np.abs(columns * scaled)
     terms = np.max(np.abs(np.hstack([plant.C, direct])) * signals, axis=1, initial=0.0)
     names = (*plant.state_names, *({"Bf": plant.fault_names, "Bd": plant.disturbance_names}.get(inputs, ())))

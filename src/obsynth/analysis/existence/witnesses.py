@@ -10,6 +10,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from obsynth.analysis.existence.numbers import uncleaned
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.exosystems import Exosystem
@@ -113,6 +114,8 @@ class Unclear:
         """Return all of it in words."""
         if self.witness is None:
             shown = f"{self.other}; no single entries were found that do it."
+        elif not self.witness.changes:
+            shown = f"the {_kind(plant)} as it is rounded to double precision {self.other}."
         else:
             shown = f"the {_kind(plant)} with {self.witness.described(plant, parameters=self.parameters)} {self.other}."
         return f"Tolerance: {self.tolerance:.1g} of the largest scaled entry. Witness: {shown} {self.decider}"
@@ -130,6 +133,8 @@ def _kind(plant: DescriptorSystem) -> str:
 def rational_matrices(plant: DescriptorSystem) -> dict[str, Rational]:
     """Return the decisive matrices of a plant in its own coordinates, as written, or as they were rounded."""
     origin = origin_of(plant)
+    if origin is not None and origin.sample_time is None and origin.uncleaned is not None and uncleaned():
+        return {name: as_array(origin.uncleaned[name], getattr(plant, name).shape) for name in DECISIVE}
     if origin is not None and origin.sample_time is None:
         exact = {name: as_array(origin.exact[name], getattr(plant, name).shape) for name in DECISIVE}
         # Dynamic states that are combinations of those given were changed to others since.

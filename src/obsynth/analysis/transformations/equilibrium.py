@@ -69,6 +69,8 @@ def equilibrium(
     problem = _Problem(model, given, free, start or {})
     z = problem.solved()
     residual, jacobian = problem.scaled(z)
+    if not (np.isfinite(residual).all() and np.isfinite(jacobian).all()):
+        raise problem.undefined(residual, jacobian)
     left, values, right = np.linalg.svd(jacobian)
     rank = int((values > JACOBIAN_RANK_TOLERANCE * values.max()).sum()) if values.size else 0
     if not np.abs(residual).max(initial=0.0) <= ROOT:
@@ -156,6 +158,16 @@ class _Problem:
                 break
             z = after
         return z
+
+    def undefined(self, residual: FloatArray, jacobian: FloatArray) -> PreconditionError:
+        """Return the refusal of a place where equations have no value."""
+        bad = [name for name, value, row in zip(self.rows, residual, jacobian, strict=True)
+               if not (np.isfinite(value) and np.isfinite(row).all())]  # fmt: skip
+        return PreconditionError(
+            f"There is no equilibrium: the equations {', '.join(map(repr, bad))} are not defined where the search ends "
+            "(a root or a logarithm of a negative number, a division by zero?). Give other values, or a start.",
+            condition="no-equilibrium", signals=bad,
+        )  # fmt: skip
 
     def without_root(self, residual: FloatArray, left: FloatArray) -> PreconditionError:
         """Return the refusal: what is left, and the combination of equations that no unknown changes."""

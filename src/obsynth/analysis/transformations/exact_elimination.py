@@ -8,7 +8,7 @@ Where the dynamic states are combinations of those given, ``z`` is changed to th
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
@@ -38,7 +38,8 @@ class ExactElimination:
 
     Fields: matrices: ``A, B, Bf, Bd, Bw, C, D, Df, Dd, Dw`` of the reduced plant; recovery: ``x`` from the new states
     (``A``) and from the signals (``B, Bf, Bd, Bw``); pivots: States that stand for the dynamic ones; computed: Whether
-    some of the data were computed in floating point; sizes: Of ``matrices``, the sums of the sizes of all terms.
+    some of the data were computed in floating point; sizes: Of ``matrices``, the sums of the sizes of all terms;
+    uncleaned: What ``matrices`` were before what rounding may have left was set to zero, where that was done.
     """
 
     matrices: Mapping[str, fmpq_mat]
@@ -46,6 +47,7 @@ class ExactElimination:
     pivots: tuple[int, ...]
     computed: bool
     sizes: Mapping[str, FloatArray]
+    uncleaned: Mapping[str, fmpq_mat] | None = None
 
     def origin(self, sizes: Mapping[str, FloatArray]) -> PlantOrigin:
         """Return what the reduced plant remembers of it, with the sizes of the terms in its own coordinates."""
@@ -56,17 +58,34 @@ class ExactElimination:
         kept = {name: sizes[name] for name in DECISIVE if name in sizes}
         known = all(np.all(np.isfinite(part)) for part in kept.values())
         exact = {name: fractions_of(found[name]) for name in DECISIVE}
-        states = int(self.recovery["A"].nrows())
-        return PlantOrigin(exact, computed=self.computed, sizes=kept if known else None, states=states)
+        before = None if self.uncleaned is None else {"E": found["E"], **self.uncleaned}
+        return PlantOrigin(
+            exact, computed=self.computed, sizes=kept if known else None, states=int(self.recovery["A"].nrows()),
+            uncleaned=None if before is None else {name: fractions_of(before[name]) for name in DECISIVE},
+        )  # fmt: skip
 
 
 def exact_elimination(plant: DescriptorSystem) -> ExactElimination | None:
     """Return the elimination; ``None`` for too many states, or where no state can be eliminated so."""
-    from obsynth.proofs.exact_pencils import blocks, null_basis, pivot_columns
-    from obsynth.proofs.written_numbers import computed_entries, written_matrix
+    from obsynth.proofs.written_numbers import computed_entries
 
     if plant.nx > MOST_STATES or origin_of(plant) is not None:
         return None
+    computed = any(computed_entries(getattr(plant, name)) for name in ("E", "A", "C", *_SIGNALS, *_DIRECT))
+    found = _eliminated(plant, clean=computed)
+    if found is None or not computed:
+        return found
+    before = _eliminated(plant, clean=False)
+    if before is None or all(found.matrices[name] == before.matrices[name] for name in found.matrices):
+        return replace(found, computed=True)
+    return replace(found, computed=True, uncleaned=before.matrices)
+
+
+def _eliminated(plant: DescriptorSystem, *, clean: bool) -> ExactElimination | None:
+    """Return the elimination; with ``clean`` what rounding of computed data may have left is zero."""
+    from obsynth.proofs.exact_pencils import blocks, null_basis, pivot_columns
+    from obsynth.proofs.written_numbers import written_matrix
+
     e, a, c = (written_matrix(matrix) for matrix in (plant.E, plant.A, plant.C))
     pivots, rows = pivot_columns(e), pivot_columns(e.transpose())
     if not pivots:
@@ -75,7 +94,6 @@ def exact_elimination(plant: DescriptorSystem) -> ExactElimination | None:
     signals = [written_matrix(getattr(plant, name)) for name in _SIGNALS]
     keep, take = _units(plant.nx, pivots), _units(plant.nx, rows).transpose()
     right = blocks([[a * keep, *signals]])
-    computed = any(computed_entries(getattr(plant, name)) for name in ("E", "A", "C", *_SIGNALS, *_DIRECT))
     coupling = left * a * null
     if plant.nx > len(pivots) and coupling.det() == 0:
         return None
@@ -85,18 +103,18 @@ def exact_elimination(plant: DescriptorSystem) -> ExactElimination | None:
     with np.errstate(all="ignore"):
         sizes = _term_sizes(left, right, coupling, (take, a * null), (direct, c * null), take * e * keep)
     if plant.nx > len(pivots):
-        algebraic = _solved(-coupling, left * right, clean=computed)
-        moving = _sum(moving, take * (a * null), algebraic, clean=computed)
-        direct = _sum(direct, c * null, algebraic, clean=computed)
-        states = _sum(states, null, algebraic, clean=computed)
-    moving = _solved(take * e * keep, moving, clean=computed)
+        algebraic = _solved(-coupling, left * right, clean=clean)
+        moving = _sum(moving, take * (a * null), algebraic, clean=clean)
+        direct = _sum(direct, c * null, algebraic, clean=clean)
+        states = _sum(states, null, algebraic, clean=clean)
+    moving = _solved(take * e * keep, moving, clean=clean)
     widths = [len(pivots), *(int(signal.ncols()) for signal in signals)]
     return ExactElimination(
         dict(zip(("A", *_SIGNALS), _split(moving, widths), strict=True))
         | dict(zip(("C", *_DIRECT), _split(direct, widths), strict=True)),
         dict(zip(("A", *_SIGNALS), _split(states, widths), strict=True)),
         tuple(pivots),
-        computed,
+        clean,
         dict(zip(("A", *_SIGNALS), np.split(sizes[0], np.cumsum(widths)[:-1], axis=1), strict=True))
         | dict(zip(("C", *_DIRECT), np.split(sizes[1], np.cumsum(widths)[:-1], axis=1), strict=True)),
     )
@@ -244,7 +262,8 @@ def sampled_origin(smooth: DescriptorSystem, sample_time: float) -> PlantOrigin:
     )
     computed = origin.computed if origin else any(computed_entries(getattr(smooth, name)) for name in DECISIVE)
     sizes = None if origin is None or origin.sizes is None else _sampled_sizes(smooth, origin.sizes, sample_time)
-    return PlantOrigin(exact, written_fraction(sample_time), computed, sizes)
+    uncleaned = None if origin is None else origin.uncleaned
+    return PlantOrigin(exact, written_fraction(sample_time), computed, sizes, uncleaned=uncleaned)
 
 
 def _sampled_sizes(

@@ -165,7 +165,8 @@ def linear_model(
     values = _operating_point(model, point, local, names) | ({DRIFT: 0.0} if moves.any() else {})
     signals = {*names, *inputs, *model.output_names, *chosen, *disturbances}
     units = {name: unit for name, unit in model.units.items() if name in signals}
-    units |= {name: model.units[given] for name, given in zip(names, model.state_names, strict=True)}
+    units |= {name: model.units[given] for name, given in zip(names, model.state_names, strict=True)
+              if given in model.units}  # fmt: skip
     linear = DescriptorSystem(
         local.E, -local.by_state, B if inputs else None, local.C, dt=0.0,
         Bf=-local.by_parameter[:, fault_columns] if fault_columns else None,
@@ -201,9 +202,9 @@ def _over_box(
             input_names=[*linear.input_names, shift], operating_point={**linear.operating_point, shift: 0.0},
             units={**linear.units, shift: "1"} if linear.units else linear.units,
         )  # fmt: skip
-    uncertainty = Uncertainty(box, entries, shift=shift)
+    uncertainty = Uncertainty(box, {name: tuple(found) for name, found in entries.items()}, shift=shift)
     kept = {name: item for name, item in box.constants.items() if name in uncertainty.used}
-    return filled_plant(linear, Uncertainty(replace(box, constants=kept), entries, shift=shift), set(kept))
+    return filled_plant(linear, uncertainty.with_box(replace(box, constants=kept)), set(kept))
 
 
 def _state_name(model: DAEModel, i: int, point: Point, local: LocalEquations) -> str:

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 
 
 _Value = TypeVar("_Value")
-
-
 #: Map of a recovery -> the signal that it maps.
 _MAPS = {
     "from_state": "state", "from_input": "input", "from_fault": "fault", "from_disturbance": "disturbance",

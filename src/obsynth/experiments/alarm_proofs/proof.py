@@ -82,11 +82,7 @@ def _stated(affine: AffinePlant, given: Mapping[str, Any], steps: int) -> tuple[
 
 
 SCHEMA_VERSION = 1
-
-
 KIND = "obsynth alarm certificate"
-
-
 CERTIFICATE = FileKind("an alarm certificate", b'"kind": "obsynth alarm certificate"')
 
 
@@ -99,12 +95,8 @@ def document(certificate: Mapping[str, Any]) -> str:
 
 #: Samples of a window.
 WINDOW = 20
-
-
 #: The solver of linear programmes may take so long; without an answer nothing is proved.
 SOLVER_SECONDS = 60.0
-
-
 #: Multipliers are kept to this many significant digits: any numbers prove a bound, and few digits stay readable.
 MULTIPLIER_DIGITS = 12
 

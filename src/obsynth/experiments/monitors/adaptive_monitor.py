@@ -23,7 +23,7 @@ from obsynth.tolerances.error_structure import error_structure
 from obsynth.tolerances.responses import loop_radius
 from obsynth.tolerances.result import EXACT_MODEL
 from obsynth.tolerances.robustness import structure_of, with_tolerances
-from obsynth.tolerances.subdivision import index_one_on_box
+from obsynth.tolerances.subdivision import index_one_on_box, values_at
 from obsynth.tolerances.tracking import Tracking, tracking_of
 
 #: Radii of a set are made larger by this share: more than the rounding of their sums.
@@ -90,7 +90,7 @@ def _sampled_plan(
         problem.observer, problem.affine, problem.tracking, problem.bounds, noise, reading=problem.reading
     )
     reached = structure.disturbances.magnitude.max(axis=0, initial=0.0)[: len(problem.bounds)] > 0.0
-    if np.any(reached.reshape(-1, plant.nd).any(axis=0) & ~np.isfinite(bounds)):
+    if plant.nd and np.any(reached.reshape(-1, plant.nd).any(axis=0) & ~np.isfinite(bounds)):
         raise SpecError("A disturbance has no bound: give disturbance_bounds (--disturbance).",
                         path="disturbance_bounds")  # fmt: skip
     z = np.zeros(observer.order) if observer_state is None else observer_state
@@ -115,8 +115,7 @@ def require_regular(plant: DescriptorSystem) -> None:
         return
     found = index_one_on_box(plant)
     if found.verdict == "refuted" and found.at is not None:
-        values = uncertain.box.values(found.at)
-        where = ", ".join(f"{name} = {values[name]:.6g}" for name in uncertain.box.names)
+        where = ", ".join(f"{name} = {value:.6g}" for name, value in values_at(uncertain.box, found.at).items())
         raise PreconditionError(
             f"The plant is singular, or not of index 1, inside the box: at {where}. Give smaller tolerances.",
             condition="regularity",

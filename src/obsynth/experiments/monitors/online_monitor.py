@@ -119,10 +119,11 @@ def online_monitor(
     if kind in ("pointwise", "window", "paper"):
         start = 0.0 if initial_error is None else float(initial_error)
         norm, limit = _norm_rule(
-            design, kind, model, bounds, noise_bound, start, gamma, window, dt, estimates=estimates, adaptive=adaptive
+            design, kind, model, bounds, noise_bound, start, gamma, window, dt, estimates=estimates
         )
         if adaptive:
             return _adaptive(design, scenario, norm, model, bounds, noise_bound, initial_error, initial_set, dt)
+        _require_above_zero(limit)
         rule = norm
         ending = (_FORGOTTEN if initial_error is None else _AFTER_A_GAP) + _more_words(kind, model, limit)
     else:
@@ -159,9 +160,18 @@ def _expected_bounds(
     return np.where(np.array(stated, dtype=bool), bounds, np.inf)
 
 
+def _require_above_zero(limit: float) -> None:
+    if not limit > 0.0:
+        raise SpecError(
+            "As stated, no disturbance and no noise reaches the residual: its bound would be zero, which rounding "
+            "passes. State noise (noise_bound, sensor_noise of the plant), or give a level of your own (thresholds).",
+            path="noise_bound",
+        )
+
+
 def _norm_rule(
     design: ObserverDesign, kind: str, model: ResidualModel, bounds: FloatArray, noise_bound: float | None,
-    start: float, gamma: float | None, window: int, dt: float, *, estimates: bool, adaptive: bool,
+    start: float, gamma: float | None, window: int, dt: float, *, estimates: bool,
 ) -> tuple[NormRule, float]:  # fmt: skip
     """Return the rule of a bound on the norm of the residual, or of the fault estimates, and the bound in the end."""
     irregular = None
@@ -172,12 +182,6 @@ def _norm_rule(
         if model.flow is not None:
             inputs = scaled_inputs(model, bounds, noise_bound, any_stamps=True)
             irregular = unlimited_bound(kind, model, inputs, start, window)
-    if not (limit > 0.0 or adaptive):
-        raise SpecError(
-            "As stated, no disturbance and no noise reaches the residual: its bound would be zero, which rounding "
-            "passes. State noise (noise_bound, sensor_noise of the plant), or give a level of your own (thresholds).",
-            path="noise_bound",
-        )
     driven = None
     if kind != "paper" and model.continuous is not None and design.linear[0].nu:
         driven = model.continuous.between.input_response(model.continuous.observer)
@@ -220,7 +224,8 @@ def _adaptive(
     )  # fmt: skip
     return OnlineMonitor(
         "pointwise", adaptive_statement(first, design) + start, AdaptiveRule(first, later, norm),
-        residuals=len(model.C), fault_names=design.linear[1].fault_names, fault_scales=model.fault_scales(),
+        residuals=len(design.linear[1].residual_names), fault_names=design.linear[1].fault_names,
+        fault_scales=model.fault_scales(),
     )  # fmt: skip
 
 

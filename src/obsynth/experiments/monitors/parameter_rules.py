@@ -122,7 +122,7 @@ def _whole_record(observer: RecursiveObserver | DAEObserver) -> str:
     why = " glr compares every time at which a change may have begun, which takes a whole record"
     if isinstance(observer, DAEObserver):
         return f"{why}, and regressors, which a nonlinear design does not have: chi-square, cusum or nis serve here."
-    if observer.adaptation is None or observer.adaptation.form == "random-walk":
+    if observer.form in ("", "random-walk"):
         return f"{why}, and regressors, which this design does not have: chi-square or nis serve here."
     return f"{why}: obsynth.decide(..., statistic='glr') has it for recorded estimates; row by row, use cusum."
 
@@ -139,13 +139,7 @@ def parameter_monitor(
             path="kind",
         )
     names = observer.fault_names
-    if isinstance(observer, DAEObserver):
-        start, residuals, form = observer.initial_parameters, observer.model.ny, observer.form
-    else:
-        adaptation, plant = observer.adaptation, observer.plant
-        start = np.zeros(0) if adaptation is None else adaptation.initial_parameters
-        residuals, form = plant.ne + plant.ny - plant.nx, "" if adaptation is None else adaptation.form
-    theta = np.array(start, dtype=np.float64)
+    theta = np.array(observer.initial_parameters, dtype=np.float64)
     for name, value in nominal.items():
         place = index_of(name, names, what="nominal")
         if not is_finite_number(value):
@@ -153,11 +147,11 @@ def parameter_monitor(
         theta[place] = float(value)
     if kind != "nis" and not len(theta):
         raise SpecError(f"{kind} watches parameters, and this design estimates none: use nis.", path="kind")
-    if kind == "cusum" and form in WALKING_FORMS:
-        raise SpecError(f"cusum needs regressors, which a {form} design does not have: use chi-square or nis.",
+    if kind == "cusum" and observer.form in WALKING_FORMS:
+        raise SpecError(f"cusum needs regressors, which a {observer.form} design does not have: use chi-square or nis.",
                         path="kind")  # fmt: skip
     rule = ParameterRule(kind, theta, np.full(len(theta), float(change)), false_alarms)
     return OnlineMonitor(
-        kind, _PARAMETER_STATEMENTS[kind] + ANY_LENGTH, rule, residuals=residuals, fault_names=names,
+        kind, _PARAMETER_STATEMENTS[kind] + ANY_LENGTH, rule, residuals=observer.innovation_count, fault_names=names,
         fault_scales=np.ones(len(names)),
     )  # fmt: skip

@@ -153,8 +153,6 @@ def window_threshold(model: ResidualModel, inputs: ScaledInputs, initial_error: 
 
 #: What is left of an error after the table.
 LEFT = 1e-3
-
-
 #: Longest table, and most numbers in its powers.
 MOST_SAMPLES, MOST_NUMBERS = 16_384, 20_000_000
 

@@ -15,14 +15,12 @@ CLAIMS = {
 
 METHOD = MethodSpec(
     id="adaptive-observer",
+    folder=__package__,
     plants=("time-invariant", "time-varying"),
     time="discrete, time-varying",
     summary="states and parameters with honest deviations",
     source="Moussa Ali, Zhang 2013",
-    public="obsynth.methods.adaptive_observer.public:adaptive_observer",
-    options="obsynth.methods.adaptive_observer.options:AdaptiveObserverOptions",
-    conditions="obsynth.methods.adaptive_observer.synthesis:conditions",
-    synthesise="obsynth.methods.adaptive_observer.synthesis:synthesise",
+    options=".options:AdaptiveObserverOptions",
     checks="obsynth.methods.recursive.checks:checks",
     claims=CLAIMS,
 )

@@ -34,8 +34,6 @@ from obsynth.numerics.arrays import FloatArray
 
 #: Relative shifts of the diagonal, tried in turn, that let a matrix through which rounding has made indefinite.
 SHIFTS = (0.0, 1e-15, 1e-14, 1e-13, 1e-12, 1e-11)
-
-
 REFINEMENTS = 2
 
 
@@ -77,44 +75,22 @@ class NormalEquations:
 
 #: Relative gap, and relative residuals of both equations, at which the search ends.
 TOLERANCE = 1e-6
-
-
 #: The gap is relative to the objective, or to this where that is smaller.
 SMALLEST_OBJECTIVE = 1e-2
-
-
 #: What a search that cannot go on must have reached to count as an inaccurate answer.
 INACCURATE_GAP = 1e-2
-
-
 INACCURATE_RESIDUAL = 1e-4
-
-
 #: Multipliers whose equation is met to this accuracy, relative to the objective, show that there is no solution.
 INFEASIBLE_RAY = 1e-8
-
-
 MOST_ITERATIONS = 80
-
-
 #: Steps without coming closer than ever before, after which rounding has the upper hand; only close to the end.
 PATIENCE = 5
-
-
 #: Share of the way to the boundary; the step below which a plain one towards the middle is tried, and this share of the
 #: mean of s z as its target; and the step below which nothing moves any more.
 STEP_SHARE = 0.98
-
-
 SHORT_STEP = 0.1
-
-
 CENTRING = 0.5
-
-
 SHORTEST_STEP = 1e-4
-
-
 #: Distance to the boundary, relative to the size, below which a starting point is moved inside.
 START_MARGIN = 1e-8
 

@@ -13,14 +13,11 @@ CLAIMS = {
 
 METHOD = MethodSpec(
     id="dae-adaptive-observer",
+    folder=__package__,
     plants=("nonlinear",),
     time="discrete, nonlinear",
     summary="states and parameters of nonlinear plants",
     source="Moussa Ali, Zhang 2013 (differential-algebraic systems)",
-    public="obsynth.methods.dae_adaptive_observer.public:dae_adaptive_observer",
-    options="obsynth.methods.dae_adaptive_observer.options:DaeAdaptiveObserverOptions",
-    conditions="obsynth.methods.dae_adaptive_observer.synthesis:conditions",
-    synthesise="obsynth.methods.dae_adaptive_observer.synthesis:synthesise",
-    checks="obsynth.methods.dae_adaptive_observer.checks:checks",
+    options=".options:DaeAdaptiveObserverOptions",
     claims=CLAIMS,
 )

@@ -7,14 +7,12 @@ from obsynth.methods.recursive import RECURSIVE_CLAIMS
 
 METHOD = MethodSpec(
     id="descriptor-kalman",
+    folder=__package__,
     plants=("time-invariant", "time-varying"),
     time="discrete, time-varying",
     summary="states with honest deviations",
     source="Nikoukhah, Willsky, Levy 1992",
-    public="obsynth.methods.descriptor_kalman.public:descriptor_kalman",
-    options="obsynth.methods.descriptor_kalman.options:DescriptorKalmanOptions",
-    conditions="obsynth.methods.descriptor_kalman.synthesis:conditions",
-    synthesise="obsynth.methods.descriptor_kalman.synthesis:synthesise",
+    options=".options:DescriptorKalmanOptions",
     checks="obsynth.methods.recursive.checks:checks",
     claims=RECURSIVE_CLAIMS,
 )

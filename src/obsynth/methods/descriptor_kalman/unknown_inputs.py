@@ -25,7 +25,7 @@ from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 
 #: Prior deviation of an unknown input at the first sample, relative to the one that moves a state by its own prior
 #: deviation: as good as none, and its square far from overflow.
-UNKNOWN = 1e6
+UNKNOWN = 1e4
 
 
 @dataclass(frozen=True, eq=False)

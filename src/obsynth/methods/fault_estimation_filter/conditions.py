@@ -12,9 +12,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from obsynth.analysis.conditions import Condition, rank_condition
+from obsynth.analysis.conditions import Condition, is_doubted, is_refused, rank_condition
 from obsynth.analysis.existence.distance import least_share
-from obsynth.analysis.existence.numbers import numbers_of
+from obsynth.analysis.existence.numbers import numbers_of, reconsidered
 from obsynth.analysis.existence.rational import PlantNumbers
 from obsynth.analysis.existence.verdicts import (
     described_distance,
@@ -56,6 +56,14 @@ def examine_fault_filter(
 ) -> tuple[tuple[Condition, ...], PreparedPlant | None]:
     """Return the existence conditions, and the prepared plant on which the last of them were decided."""
     plant = plant.dense()
+    return reconsidered(
+        lambda: _examined(plant, structure), lambda found: is_refused(found[0]), lambda found: is_doubted(found[0])
+    )
+
+
+def _examined(
+    plant: DescriptorSystem, structure: PencilStructure | None
+) -> tuple[tuple[Condition, ...], PreparedPlant | None]:
     prepared: PreparedPlant | None = None
 
     def visibility_conditions() -> list[Condition]:

@@ -33,8 +33,6 @@ if TYPE_CHECKING:
 MOST_CHOICES = 20
 #: Faults with at least this share of the largest in a dependence are named.
 DEPENDENT_SHARE = 0.1
-
-
 _SEED = 45
 
 
@@ -131,8 +129,6 @@ def nonsingular_t(numbers: PlantNumbers) -> fmpq_mat | None:
 
 #: A fault detectability matrix with a larger condition number is usable but noisy: a note says so.
 WARN_CONDITION = 1e4
-
-
 #: Above this rounding of data and gains is as large as what tells the faults apart.
 REFUSE_CONDITION = 1e12
 

@@ -71,28 +71,16 @@ def search_by_bisection(problem: GainProblem, *, tolerance: float, solver: str, 
 
 #: Asking for a gain above this multiple of the starting filter's adds nothing but bad scaling.
 LARGEST_USEFUL_GAIN = 1e3
-
-
 #: The gains are designed for a slightly smaller gamma than claimed, so that the claim has a well-conditioned proof.
 CERTIFICATE_MARGIN = 5e-3
-
-
 CERTIFICATE_SHARE = 0.2
-
-
 #: Gains below this, relative to the disturbance and the output it could reach, are rounding errors.
 ROUNDING_GAIN = 1e-11
-
-
 #: Level of the certificate, relative to the same, when no disturbance reaches the fault estimate at all.
 NOMINAL_GAIN = 1e-3
-
-
 #: A gamma between these multiples of the least gain found by the equations calls the inequality by default, up to so
 #: many states: far below the least no polish helps, and far above none is needed.
 BELOW_LEAST, ABOVE_LEAST = 0.95, 1.0 + 1e-4
-
-
 MOST_STATES_TO_POLISH = 64
 
 

@@ -15,17 +15,14 @@ CLAIMS = {
 
 METHOD = MethodSpec(
     id="fault-estimation-filter",
+    folder=__package__,
     plants=("time-invariant",),
     time="discrete",
     summary="fault estimates with a bounded gain from the disturbances",
     source="Wang, Rodrigues, Theilliol, Shen 2015",
-    public="obsynth.methods.fault_estimation_filter.public:fault_estimation_filter",
-    options="obsynth.methods.fault_estimation_filter.options:FilterOptions",
-    conditions="obsynth.methods.fault_estimation_filter.synthesis:conditions",
-    synthesise="obsynth.methods.fault_estimation_filter.synthesis:synthesise",
-    checks="obsynth.methods.fault_estimation_filter.checks:checks",
+    options=".options:FilterOptions",
     claims=CLAIMS,
     witnesses=WITNESSES | {"P_factor", "tracking", "T0"},
-    tracked="obsynth.methods.fault_estimation_filter.checks:tracked_plant",
+    tracked=".checks:tracked_plant",
     averaged=True,
 )

@@ -79,19 +79,11 @@ def _reaches(problem: GainProblem, injection: Injection, gain: float) -> bool:
 
 #: Descent in steps: ratios of successive levels, tried in turn, and how many steps at most.
 STEP_RATIOS = (0.6, 0.9)
-
-
 MOST_STEPS = 24
-
-
 #: A step counts when its level is met to this relative accuracy.
 LEVEL_ACCURACY = 1e-6
-
-
 #: Further solutions of the inequality at most, and the ratio of costs below which another one is worth its time.
 MOST_REPETITIONS = 2
-
-
 WORTH_REPEATING = 0.95
 
 

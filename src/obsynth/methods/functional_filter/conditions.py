@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,8 +12,14 @@ from obsynth.analysis.conditions import Condition
 from obsynth.analysis.diagnosis.columns import Question, question
 from obsynth.analysis.diagnosis.diagnosing import model_points, rest_point
 from obsynth.analysis.diagnosis.hidden_motions import hidden_motion
+from obsynth.analysis.existence.distance import DROWNED
+from obsynth.analysis.existence.named_pencils import NamedPencil, named_pencil, unclear
+from obsynth.analysis.existence.numbers import COMPUTED_STATES
+from obsynth.analysis.existence.verdicts import DECIDER
+from obsynth.analysis.plant_units import PlantUnits
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.exosystems import Exosystem, exosystem
+from obsynth.plants.origin import origin_of
 
 _SOURCE = "left null space of [A - sE, Bd, Bf; C, Dd, Df]"
 
@@ -51,21 +58,61 @@ def fault_conditions(
     """Return whether one fault can be estimated, free of the unknown inputs and of every other fault."""
     name = plant.fault_names[fault]
     asked = _asked(plant, [j for j in range(plant.nf) if j != fault], fault, exactly)
+    rest = rest_point(plant.dt)
     seen = Condition(
         f"{name} shows", f"{name} shows free of {_rest(plant, fault)}", asked.visible, float(asked.visible), 1.0,
-        _SOURCE, _gap(asked) if asked.visible else _hidden(plant, asked, rest_point(plant.dt)),
+        _SOURCE, _gap(asked) if asked.visible else _hidden(plant, asked, rest),
         signals=() if asked.visible else (name,),
     )  # fmt: skip
     if not asked.visible:
-        return (seen,)
-    lost = [point for point in model_points(model, fault) if not asked.shows_at(point)]
+        return (_in_doubt(seen, plant, asked, rest) if _may_show(asked) else seen,)
+    points = model_points(model, fault)
+    lost = [point for point in points if not asked.shows_at(point)]
+    doubtful = [point for point in lost if _may_show(asked, point)]
+    shares = {point: _named(plant, asked).last_share(point) for point in points}
+    least = min(points, key=lambda point: shares[point], default=rest)
+    share = f", {shares[least]:.2g} of it at least at the poles of its model" if shares else ""
     kept = Condition(
         f"{name} follows its model", f"{name} has no zero at a pole of its model ({model.descriptions[fault]})",
         not lost, float(len(lost)), 0.0, _SOURCE,
-        _gap(asked) if not lost else _hidden(plant, asked, lost[0]),
+        f"{_gap(asked)}{share}" if not lost else _hidden(plant, asked, lost[0]),
         mode=lost[0] if lost else None, signals=(name,) if lost else (),
     )  # fmt: skip
-    return seen, kept
+    if doubtful and len(doubtful) == len(lost):
+        return seen, _in_doubt(kept, plant, asked, doubtful[0])
+    drowned = not lost and bool(shares) and shares[least] <= DROWNED
+    return seen, _in_doubt(kept, plant, asked, least) if drowned else kept
+
+
+def _may_show(asked: Question, point: complex | None = None) -> bool:
+    """Whether a fault that floating point does not see shows on paper (at a point), or may for all that can be told."""
+    if asked.exactly:
+        return False
+    if not asked.clear:
+        return True
+    plant = asked.source
+    if plant.nx + plant.nd + plant.nf > COMPUTED_STATES or origin_of(plant) is not None:
+        return False
+    exact = Question(plant, asked.removed, asked.number, True)
+    return exact.visible if point is None else exact.shows_at(point)
+
+
+def _named(plant: DescriptorSystem, asked: Question) -> NamedPencil:
+    """Return what the fault must not be a combination of, and the fault itself in the last column."""
+    kept = {name: [*asked.removed, asked.number] for name in ("Bf", "Df")}
+    return named_pencil(plant, PlantUnits.of(plant).rounded(), [["A", "Bd", "Bf"], ["C", "Dd", "Df"]], kept=kept)
+
+
+def _in_doubt(condition: Condition, plant: DescriptorSystem, asked: Question, point: complex) -> Condition:
+    """Return the condition as one that rounding of the data could change."""
+    named, name = _named(plant, asked), plant.fault_names[asked.number]
+    share = named.last_share(point)
+    doubt = unclear(
+        plant, named, tolerance=max(DROWNED, share), point=point, last=True, decider=DECIDER,
+        other=f"hides {name} at {'z' if plant.dt > 0.0 else 's'} = {_place(point)}, and no filter estimates it",
+    )  # fmt: skip
+    detail = f"{share:.1g} of {name} shows at {_place(point)}: rounding of the data is as large."
+    return replace(condition, detail=detail, mode=point, signals=(name,)).in_doubt(doubt, plant)
 
 
 def _residual_conditions(plant: DescriptorSystem, seen: Sequence[int], exactly: bool | None) -> list[Condition]:
@@ -76,18 +123,14 @@ def _residual_conditions(plant: DescriptorSystem, seen: Sequence[int], exactly: 
         asked = _asked(plant, removed, fault, exactly)
         name = plant.fault_names[fault]
         blind = [*plant.disturbance_names, *(plant.fault_names[j] for j in removed)]
-        found.append(
-            Condition(
-                f"{name} shows" + (f" without {', '.join(plant.fault_names[j] for j in removed)}" if removed else ""),
-                f"{name} shows free of {', '.join(blind) or 'the initial state'}",
-                asked.visible,
-                float(asked.visible),
-                1.0,
-                _SOURCE,
-                _gap(asked) if asked.visible else _hidden(plant, asked, rest_point(plant.dt)),
-                signals=() if asked.visible else (name,),
-            )
-        )
+        rest = rest_point(plant.dt)
+        shown = Condition(
+            f"{name} shows" + (f" without {', '.join(plant.fault_names[j] for j in removed)}" if removed else ""),
+            f"{name} shows free of {', '.join(blind) or 'the initial state'}", asked.visible, float(asked.visible), 1.0,
+            _SOURCE, _gap(asked) if asked.visible else _hidden(plant, asked, rest),
+            signals=() if asked.visible else (name,),
+        )  # fmt: skip
+        found.append(_in_doubt(shown, plant, asked, rest) if not asked.visible and _may_show(asked) else shown)
     return found
 
 
@@ -104,8 +147,11 @@ def _hidden(plant: DescriptorSystem, asked: Question, point: complex) -> str:
     motion = hidden_motion(plant, asked.number, point, asked.removed)
     if motion is None:
         return "nothing shows it."
-    place = f"{point.real:.4g}{f'{point.imag:+.4g}j' if point.imag else ''}"
-    return f"{motion} ({'z' if plant.dt > 0.0 else 's'} = {place})."
+    return f"{motion} ({'z' if plant.dt > 0.0 else 's'} = {_place(point)})."
+
+
+def _place(point: complex) -> str:
+    return f"{point.real:.4g}{f'{point.imag:+.4g}j' if point.imag else ''}"
 
 
 def _asked(plant: DescriptorSystem, removed: Sequence[int], fault: int, exactly: bool | None) -> Question:

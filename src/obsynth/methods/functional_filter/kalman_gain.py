@@ -105,13 +105,9 @@ def _telling_rows(whole: FloatArray) -> FloatArray:
 #: Noise that every state gets besides the stated one, as a share of the sensors', where the equation has no stable
 #: solution without: a mode that nothing drives would never be corrected.
 SHARES_OF_NOISE = (0.0, 1e-6, 1e-4, 1e-2, 1.0)
-
-
 #: Noise that exact rows (equations without outputs and noise) are held to have, as a share of the sensors', by whether
 #: the plant is sampled: a continuous gain would be infinite without, a sampled one need not be.
 SHARES_OF_EXACT_ROWS = {True: (0.0, 1e-6, 1e-3), False: (1e-3, 1e-2, 0.1)}
-
-
 #: A pole this close to the boundary of stability, of a sampled filter, or relative to its matrix, is none that a proof
 #: could tell from one on it.
 PROVABLE = 1e-10

@@ -11,16 +11,14 @@ CLAIMS = {
 
 METHOD = MethodSpec(
     id="functional-filter",
+    folder=__package__,
     plants=("time-invariant",),
     time="both",
     summary="the faults asked for and nothing else, untouched by any unknown input; needs not the whole state",
     source="ours, after Frisk, Nyberg 2001 and Anderson, Moore 1979",
-    public="obsynth.methods.functional_filter.public:functional_filter",
-    options="obsynth.methods.functional_filter.options:FunctionalFilterOptions",
-    conditions="obsynth.methods.functional_filter.conditions:conditions",
-    synthesise="obsynth.methods.functional_filter.synthesis:synthesise",
-    checks="obsynth.methods.functional_filter.checks:checks",
+    options=".options:FunctionalFilterOptions",
+    conditions=".conditions:conditions",
     claims=CLAIMS,
     witnesses=frozenset({"T", "T0", "Phi", "Cw", "walks", "stability", "tracking", "deviations"}),
-    tracked="obsynth.methods.functional_filter.checks:tracked_plant",
+    tracked=".checks:tracked_plant",
 )

@@ -17,6 +17,8 @@ STANDING = 1e-6
 TIME_CONSTANTS, LEAST_SAMPLES = 7.0, 4.0
 #: Estimates of a step within this of one count as there; asked at these multiples of the time.
 REACHED, ASKED_AT = 0.1, (1.0, 1.5, 2.5)
+#: Where no walk shows a step in time: walks that miss it by so much more than the best are as good.
+AS_CLOSE = 0.05
 #: Decades of the search around a rate of the size of the noise, and its steps per decade at the end.
 DECADES, BISECTIONS = 8, 9
 
@@ -56,11 +58,11 @@ def default_rates(model: FilterModel, seconds: float, *, lag: int) -> tuple[Floa
     low = float(-DECADES)
     high = next((float(e) for e in range(-DECADES, DECADES + 1) if in_time(float(e))), None)
     if high is None:
-        # Some zero keeps every estimate from a step for long: the one that comes closest.
-        usable = [e for e, found in tried.items() if found is not None]
-        if not usable:
+        # Some zero keeps every estimate from a step for long: the slowest walk that comes about as close as any.
+        misses = {e: step_misses(model, found, seconds) for e, found in tried.items() if found is not None}
+        if not misses:
             raise SolverError("No walk of the fault gives a stable filter: give fault_rate, or poles.")
-        high = min(usable, key=lambda e: step_misses(model, _known(tried[e]), seconds))
+        high = min(e for e, miss in misses.items() if miss <= min(misses.values()) + AS_CLOSE)
         return 10.0**high * unit, _known(tried[high])
     low = high - 1.0
     for _ in range(BISECTIONS):

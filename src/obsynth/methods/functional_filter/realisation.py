@@ -13,14 +13,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
+from typing import Any
 
 import numpy as np
-from scipy.linalg import block_diag
+from scipy.linalg import block_diag, schur
 
 from obsynth.methods.functional_filter.kalman_gain import FilterModel, KalmanGain
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
+from obsynth.numerics.scaling import balanced_matrix
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
+
+#: A matrix larger than its eigenvalues by this is given in coordinates in which it is triangular.
+FAR_FROM_NORMAL = 1e3
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,8 +56,13 @@ class Rows:
         return Rows(self.of_order(order) + other.of_order(order), self.D + other.D, self.T0 + other.T0)
 
     def times(self, matrix: FloatArray) -> Rows:
-        """Return combinations of the rows."""
-        return Rows(matrix @ self.C, matrix @ self.D, matrix @ self.T0)
+        """Return combinations of the rows; where only rounding is left, there is nothing."""
+        return Rows(matrix @ self.C, _combined(matrix, self.D), _combined(matrix, self.T0))
+
+
+def _combined(matrix: FloatArray, rows: FloatArray) -> FloatArray:
+    found = matrix @ rows
+    return np.where(np.abs(found) > CANCELLATION_TOLERANCE * (np.abs(matrix) @ np.abs(rows)), found, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +85,7 @@ def filter_part(model: FilterModel, gain: KalmanGain, shown: FloatArray, *, dela
     innovation = Rows(-model.C, model.L, model.T0)
     count, nx = len(model.estimate), model.T.shape[1]
     row = Rows(model.estimate, np.zeros((count, model.L.shape[1])), np.zeros((count, nx)))
+    dynamics, innovation, row = _in_plain_coordinates(dynamics, innovation, row)
     corrections = [innovation.times(model.estimate @ part) for part in gain.lag]
     if corrections:
         row = row.plus(corrections[0])
@@ -86,6 +98,24 @@ def filter_part(model: FilterModel, gain: KalmanGain, shown: FloatArray, *, dela
         total = total.plus(row)
     estimates = total.times(np.eye(count) / mean) if mean > 1 else total
     return FilterPart(dynamics, estimates, innovation.times(shown), model.faults, delay + (mean - 1) // 2)
+
+
+def _in_plain_coordinates(dynamics: Dynamics, *rows: Rows) -> tuple[Any, ...]:
+    """Return dynamics and rows in coordinates in which A is about as large as its eigenvalues, if it is not already.
+
+    Of gains for noises of very different size the entries cancel each other: a real Schur form, balanced, has none that
+    do.
+    """
+    a = dynamics.A
+    if not len(a) or not np.all(np.isfinite(a)):
+        return dynamics, *rows
+    largest = float(np.max(np.abs(np.linalg.eigvals(a))))
+    if np.linalg.norm(balanced_matrix(a)[0], 2) <= FAR_FROM_NORMAL * largest:
+        return dynamics, *rows
+    triangular, turn = schur(a, output="real")
+    plain, factors = balanced_matrix(triangular)
+    back, there = turn.T / factors[:, None], turn * factors
+    return Dynamics(plain, back @ dynamics.B, back @ dynamics.T), *(Rows(r.C @ there, r.D, r.T0) for r in rows)
 
 
 def _registered(dynamics: Dynamics, row: Rows) -> tuple[Dynamics, Rows]:

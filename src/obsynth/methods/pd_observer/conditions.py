@@ -13,9 +13,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from obsynth.analysis.conditions import Condition, rank_condition
+from obsynth.analysis.conditions import Condition, is_doubted, is_refused, rank_condition
 from obsynth.analysis.existence.distance import least_share
-from obsynth.analysis.existence.numbers import numbers_of
+from obsynth.analysis.existence.numbers import numbers_of, reconsidered
 from obsynth.analysis.existence.rational import PlantNumbers, WrittenNumbers
 from obsynth.analysis.existence.verdicts import (
     described_distance,
@@ -44,12 +44,16 @@ _SOURCE = "Filasova et al., eqs. (1), (2)"
 
 def pd_observer_conditions(plant: DescriptorSystem) -> tuple[Condition, ...]:
     """Return the existence conditions of the PD observer, in order; the list ends at the first failure."""
-    found: list[Condition] = []
-    for condition in _all_conditions(plant):
-        found.append(condition)
-        if not condition.holds:
-            break
-    return tuple(found)
+
+    def decided() -> tuple[Condition, ...]:
+        found: list[Condition] = []
+        for condition in _all_conditions(plant):
+            found.append(condition)
+            if not condition.holds:
+                break
+        return tuple(found)
+
+    return reconsidered(decided, is_refused, is_doubted)
 
 
 def explicit_form(plant: DescriptorSystem) -> Transformation | None:

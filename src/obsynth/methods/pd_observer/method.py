@@ -23,16 +23,13 @@ CLAIMS = {
 
 METHOD = MethodSpec(
     id="pd-observer",
+    folder=__package__,
     plants=("time-invariant",),
     time="continuous",
     summary="states and faults by proportional and derivative action, no derivative taken",
     source="Filasova, Krokavec, Serbak",
-    public="obsynth.methods.pd_observer.public:pd_observer",
-    options="obsynth.methods.pd_observer.options:PdOptions",
-    conditions="obsynth.methods.pd_observer.synthesis:conditions",
-    synthesise="obsynth.methods.pd_observer.synthesis:synthesise",
-    checks="obsynth.methods.pd_observer.checks:checks",
+    options=".options:PdOptions",
     claims=CLAIMS,
     witnesses=frozenset({"P1", "P3", "P_rate", "P_noise", "P1_low", "P1_high", "T0"}),
-    tracked="obsynth.methods.pd_observer.checks:tracked_plant",
+    tracked=".checks:tracked_plant",
 )

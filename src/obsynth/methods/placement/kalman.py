@@ -19,16 +19,10 @@ from obsynth.numerics.spectra import abscissa, decay_rates, eigenvalues, noise_c
 
 #: Times the Riccati equation is solved, each time in the coordinates of the last solution, which improve it.
 ROUNDS = 2
-
-
 #: From so many states on the Riccati equation is solved by doubling first.
 MANY_STATES = 40
-
-
 #: A rate that cannot be had at once is gone to in steps of this factor, from one that is at most so many below.
 RATE_FACTOR = 4.0
-
-
 MOST_STEPS = 12
 
 
@@ -180,20 +174,12 @@ def _by_the_library(
 
 #: The default pays at most this factor in noise, against the quietest Kalman filter, for being fast.
 NOISE_PRICE = 10.0
-
-
 #: The default rate is found to about this factor.
 RATE_STEP = 1.05
-
-
 #: Estimates with less than this share of the outputs' noise have none but rounding.
 SILENT = 1e-8
-
-
 #: Deviations that differ by more than this share from one choice of states to another are rounding.
 SAME_DEVIATION = 0.1
-
-
 #: Halvings of the default rate before the quietest filter is taken as it is.
 MOST_HALVINGS = 40
 

@@ -23,8 +23,6 @@ from obsynth.numerics.scaling import equilibrate_pencil
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 
 _NAME = "identifiable parameters"
-
-
 _TRACES_SOURCE = "our finding: (26) needs it, Moussa Ali, Zhang 2013"
 
 

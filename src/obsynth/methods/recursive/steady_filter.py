@@ -128,7 +128,7 @@ def reached_condition(plant: TimeVaryingDescriptorSystem, Q_root: FloatArray, R_
     noise = stacked_noise(Q_root, R_root)
     wide_e = np.hstack([np.vstack([E, C]), np.zeros_like(noise)])
     wide_a = np.hstack([np.vstack([A, np.zeros_like(C)]), noise])
-    zeros = finite_zeros(wide_e, wide_a)
+    zeros = finite_zeros(wide_e, wide_a, to_the_end=False)
     outside = are_outside(wide_e, wide_a, zeros, plant.dt)
     on_circle = [
         complex(z) for z, out in zip(zeros.values, outside, strict=True) if out and abs(z) <= 1.0 + BOUNDARY_TOLERANCE

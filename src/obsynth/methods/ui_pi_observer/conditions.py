@@ -19,9 +19,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from obsynth.analysis.conditions import Condition
+from obsynth.analysis.conditions import Condition, is_doubted, is_refused
 from obsynth.analysis.existence.distance import drowned_zeros
-from obsynth.analysis.existence.numbers import numbers_of
+from obsynth.analysis.existence.numbers import numbers_of, reconsidered
 from obsynth.analysis.existence.rational import SystemFacts
 from obsynth.analysis.existence.verdicts import (
     believed,
@@ -87,6 +87,13 @@ class Existence:
 def existence(plant: DescriptorSystem, model: Exosystem) -> Existence:
     """Return the existence conditions of the unknown-input PI observer, and the plant to design for."""
     plant = plant.dense()
+    return reconsidered(
+        lambda: _decided(plant, model), lambda found: is_refused(found.conditions),
+        lambda found: is_doubted(found.conditions),
+    )  # fmt: skip
+
+
+def _decided(plant: DescriptorSystem, model: Exosystem) -> Existence:
     nothing = np.zeros(0, dtype=np.complex128)
     enough = _enough_outputs(plant)
     if not enough.holds:

@@ -194,7 +194,7 @@ def _decoupling_condition(plant: DescriptorSystem, decision: RankDecision, detai
     kept = list(range(plant.nd)) if numbers is None else numbers.independent_columns(both, plant.nd)
     free = [j for j in kept if not plant.Dd[:, j].any()]
     seen = [j for j in kept if j not in free]
-    layout = [["E", "Bd"], ["C", None]] if not seen else [["E", "Bd", None], ["C", None, "Dd"]]
+    layout: list[list[str | None]] = [["E", "Bd"], ["C", None]] if not seen else [["E", "Bd", None], ["C", None, "Dd"]]
     doubt = rank_doubt(plant, PlantUnits.of(plant).rounded(), decision, layout, kept={"Bd": free, "Dd": seen})
     return found.in_doubt(doubt, plant)
 

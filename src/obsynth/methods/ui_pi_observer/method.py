@@ -18,16 +18,13 @@ CLAIMS = {
 
 METHOD = MethodSpec(
     id="ui-pi-observer",
+    folder=__package__,
     plants=("time-invariant",),
     time="both",
     summary="state and faults untouched by any unknown input",
     source="Share Pasand, Aliyari, Taghirad",
-    public="obsynth.methods.ui_pi_observer.public:ui_pi_observer",
-    options="obsynth.methods.ui_pi_observer.options:UiPiOptions",
-    conditions="obsynth.methods.ui_pi_observer.synthesis:conditions",
-    synthesise="obsynth.methods.ui_pi_observer.synthesis:synthesise",
-    checks="obsynth.methods.ui_pi_observer.checks:checks",
+    options=".options:UiPiOptions",
     claims=CLAIMS,
     witnesses=frozenset({"tracking", "Phi", "Cw", "poles", "stability", "T0"}),
-    tracked="obsynth.methods.ui_pi_observer.checks:tracked_plant",
+    tracked=".checks:tracked_plant",
 )

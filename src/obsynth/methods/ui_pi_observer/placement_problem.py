@@ -38,12 +38,8 @@ from obsynth.plants.exosystems import Exosystem
 
 #: Modes slower than this share of the fastest do not count for the plant's time scale: integrators and rounding.
 SLOW_SHARE = 1e-6
-
-
 #: Where all modes are slower than this share of the pair's size, they are integrators that rounding has scattered.
 SCATTER = 3e-5
-
-
 #: Poles of sampled plants are not asked to decay by more than this exponent in one sample: nearer to zero they cannot
 #: be told apart, and printed gains miss them.
 MOST_PER_SAMPLE = 2.0
@@ -181,8 +177,6 @@ def _own_rate(plant: DescriptorSystem, f: FloatArray) -> float:
 
 #: How strongly states are driven by default, beside fault models: a plant is better known than the course of a fault.
 PROCESS_SHARE = 0.1
-
-
 #: Noise on innovations that have none of their own, relative to the outputs' noise.
 BACKGROUND_NOISE = 0.1
 

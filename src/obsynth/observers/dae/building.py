@@ -21,8 +21,6 @@ from obsynth.plants.names import index_of
 
 #: Radians that a mode may turn in one step of backward Euler: its amplitude then falls by an eighth of a per cent.
 LARGEST_TURN = 0.05
-
-
 #: Eigenvalues above this, per second times dt, are those at infinity, up to rounding.
 INFINITE = 1e8
 
@@ -49,12 +47,8 @@ def chosen_integration(model: DAEModel, dt: float) -> str:
 
 #: Deviation of an initial state that is not stated, as a share of its nominal size.
 DEFAULT_STATE_SHARE = 0.01
-
-
 #: Deviation of an initial parameter that is not stated, as a share of its nominal value.
 DEFAULT_PARAMETER_SHARE = 0.1
-
-
 OPTIONS = (
     "dt", "Q", "R", "form", "forgetting", "guard", "weight", "integration", "random_walk", "initial_state",
     "initial_covariance", "initial_parameters", "initial_parameter_covariance", "bounds", "largest_move", "window",

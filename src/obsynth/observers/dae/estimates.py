@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.analysis.dae_index import SINGULAR_CONDITION, involved
+from obsynth.analysis.dae_index import involved
 from obsynth.errors import SolverError
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.ranks import SINGULAR_CONDITION
 from obsynth.observers.estimates import Estimates, named_estimates
 
 if TYPE_CHECKING:

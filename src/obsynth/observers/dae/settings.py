@@ -121,6 +121,11 @@ class DAESettings(Undelayed):
         """The parameters that are estimated, in order."""
         return self.model.parameter_names
 
+    @property
+    def innovation_count(self) -> int:
+        """Numbers in an innovation: one for each output."""
+        return self.model.ny
+
     @cached_property
     def timing(self) -> SensorTiming:
         """When each sensor is sampled, and how late its values are."""

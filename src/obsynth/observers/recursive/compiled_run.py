@@ -107,23 +107,17 @@ def stacked_steps(step: StepMatrices, before: FloatArray, y: FloatArray, u: Floa
 #: Samples from which the kernel is used unasked: they take seconds without it, which is what loading numba, or the
 #: first compilation of an installation, takes.
 LONG_RECORD = 100_000
-
-
 #: Numbers in the state up to which the kernel is faster than LAPACK.
 SMALL_ORDER = 25
-
-
 #: Steps that are prepared together: bounds the memory of plants that vary.
 CHUNK = 4096
-
-
 #: Fewer complete samples in a row than this are faster step by step.
 SHORT_STRETCH = 8
 
 
 def kernel_covers(observer: RecursiveSettings) -> bool:
     """Return whether the kernel knows the recursion: that of a filter, with parameters as a random walk or none."""
-    return observer.adaptation is None or observer.adaptation.form == "random-walk"
+    return observer.form in ("", "random-walk")
 
 
 def kernel_is_chosen(observer: RecursiveSettings, samples: int, compiled: bool | None) -> bool:

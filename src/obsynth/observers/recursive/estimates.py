@@ -23,7 +23,7 @@ def recursive_estimates(
     length = 1 if observer.adaptation is None else observer.adaptation.window
     levels = excitation_levels([row.regressor for row in rows] if window is None else list(window), length)
     levels = levels[len(levels) - len(rows) :]
-    if observer.adaptation is not None and observer.adaptation.form == "random-walk":
+    if observer.form == "random-walk":
         levels = np.full(len(rows), np.nan)
     nx, nq = observer.plant.nx, len(observer.fault_names)
     most = max((len(row.innovation) for row in rows), default=0)

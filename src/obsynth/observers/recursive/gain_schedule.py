@@ -62,26 +62,26 @@ def gain_steps(
     prepared: PreparedStep | None = None
     for k, step in enumerate(chain(first, (model.at(k) for k in range(steps))), 1 - len(first)):
         ne, rows, nq = len(step.A), len(step.H), Upsilon.shape[1]
-        S = np.zeros((rows, max(factor.shape[1] + step.noise.shape[1], rows)))
-        S[:ne, : factor.shape[1]] = step.A @ factor
-        S[:, factor.shape[1] : factor.shape[1] + step.noise.shape[1]] = step.noise
-        require_in_range(S, factor, k, observer.state_names)
         right = np.eye(rows)
         if nq:
             right = np.hstack([right, np.vstack([step.A @ Upsilon + step.Phi, -step.Psi])])
-        unknown = np.vstack([step.A @ diffuse, np.zeros((rows - ne, diffuse.shape[1]))])
-        H = step.H
-        if received is not None and k and not received[k].all():
-            kept = np.concatenate([np.ones(ne, dtype=bool), received[k], np.ones(len(step.Dn), dtype=bool)])
-            H, S, right, unknown = H[kept], S[kept], right[kept], unknown[kept]
-        if unknown.shape[1]:
-            found = None
-        elif H is step.H:
+        complete = received is None or not k or bool(received[k].all())
+        found = None
+        if complete and not diffuse.shape[1]:
             prepared = PreparedStep.of(step, prepared)
-            found = prepared.taken(factor, right)
-        else:
-            found = least_squares_step(H, S, right)
-        found = found or rank_revealing_step(H, S, right, unknown, mapped=rows)
+            found = prepared.taken(factor, right if nq else None)
+        # The literal form asks for the noise itself.
+        if found is None or recursion.literal:
+            S = _noise_root(step, factor)
+            require_in_range(S, factor, k, observer.state_names)
+            unknown = np.vstack([step.A @ diffuse, np.zeros((rows - ne, diffuse.shape[1]))])
+            H = step.H
+            if not complete and received is not None:
+                kept = np.concatenate([np.ones(ne, dtype=bool), received[k], np.ones(len(step.Dn), dtype=bool)])
+                H, S, right, unknown = H[kept], S[kept], right[kept], unknown[kept]
+            if found is None and not unknown.shape[1] and not complete:
+                found = least_squares_step(H, S, right)
+            found = found or rank_revealing_step(H, S, right, unknown, mapped=rows)
         diffuse = found.diffuse
         gain, Upsilon, factor = found.estimate[:, :rows], found.estimate[:, rows:], found.factor
         parity, G = found.innovation[:, :rows], -found.innovation[:, rows:]
@@ -96,6 +96,15 @@ def gain_steps(
             )  # fmt: skip
             learn, forget = theta_gain @ seen, np.eye(nq) - theta_gain @ regressor
         yield GainStep(step, gain, parity, G, Upsilon, factor, learn, forget, parameters.spread)
+
+
+def _noise_root(step: StepMatrices, factor: FloatArray) -> FloatArray:
+    """Return the square root ``(rows, any)`` of the covariance of a step's data."""
+    ne, rows, width = len(step.A), len(step.H), factor.shape[1]
+    S = np.zeros((rows, max(width + step.noise.shape[1], rows)))
+    S[:ne, :width] = step.A @ factor
+    S[:, width : width + step.noise.shape[1]] = step.noise
+    return S
 
 
 def run_batch(observer: RecursiveObserver, y: ArrayLike, u: ArrayLike | None = None) -> Estimates:

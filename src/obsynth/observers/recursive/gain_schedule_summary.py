@@ -75,7 +75,7 @@ def gain_schedule_summary(observer: RecursiveObserver) -> GainScheduleSummary:
     """Return what the gains along the horizon say."""
     steps = looked_at(observer)
     learning = observer.adaptation is not None
-    random_walk = observer.adaptation is not None and observer.adaptation.form == "random-walk"
+    random_walk = observer.form == "random-walk"
     # Of a walk, the state filter and the regressors are those of the model without the walk.
     plain = observer
     if observer.adaptation is not None and random_walk:

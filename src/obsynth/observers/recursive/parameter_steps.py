@@ -56,7 +56,11 @@ class WalkingEarlySteps(EarlyConstraintSteps):
 
     def first(self) -> StepMatrices:
         """Return the correction of x(0) and theta(0) by the algebraic equations of step 0."""
-        return self._augmented(super().first(), np.zeros_like(self.walk))
+        return self._augmented(super().correction(0), np.zeros_like(self.walk))
+
+    def correction(self, k: int) -> StepMatrices:
+        """Return the correction of x(k) by the algebraic equations of step k, of parameters that walk until there."""
+        return self._augmented(super().correction(k), self.walk)
 
     def _augmented(self, step: StepMatrices, walk: FloatArray) -> StepMatrices:
         ne, nq = len(step.A), len(walk)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -182,7 +183,27 @@ class Recursion:
         """
         if self.settings.outliers == "none":
             return self.plain(state, y, u)
-        return robust_advance(self.settings.outliers, self.limit, self.plain, self.predicted, state, y, u)
+        foreseen = self.foreseen if state.k and self._constraints is not None else None
+        return robust_advance(
+            self.settings.outliers, self.limit, self.plain, self.predicted, state, y, u, foreseen=foreseen
+        )
+
+    def foreseen(self, state: RecursiveState, u: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return mean and deviation of each output ``(ny,)`` before the sample, with its own algebraic equations.
+
+        They come with the next step, but what they say of this sample is known now.  Infinite where nothing is.
+        """
+        plant, k = self.settings.plant, state.k
+        nothing = np.full(plant.ny, np.nan)
+        if self._constraints is None or (plant.horizon is not None and k >= plant.horizon):
+            return nothing, np.full(plant.ny, np.inf)
+        try:
+            after, _ = self.plain(state, nothing, u)
+            corrected, v, G = self._stepped(after, self._constraints.correction(k), np.zeros(0), u)
+        except PreconditionError:
+            # Equations without noise contradict each other within rounding: they judge nothing.
+            return nothing, np.full(plant.ny, np.inf)
+        return self._outputs(self._estimate(corrected, v, G, v, nothing)._replace(k=k))
 
     def predicted(self, state: RecursiveState, heard: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return mean and deviation of each output ``(ny,)`` from what is heard of the next sample.
@@ -192,9 +213,13 @@ class Recursion:
         plant, k = self.settings.plant, state.k
         if k == 0:
             return np.zeros(plant.ny), np.full(plant.ny, np.inf)
-        _, row = self.plain(state, heard, u)
-        C, mean = plant.C.at(k), plant.C.at(k) @ row.x
-        reach = C @ row.factor
+        return self._outputs(self.plain(state, heard, u)[1])
+
+    def _outputs(self, row: RawEstimate) -> tuple[FloatArray, FloatArray]:
+        """Return mean and deviation of each output ``(ny,)`` at what is known; infinite where nothing is."""
+        plant, k = self.settings.plant, row.k
+        C = plant.C.at(k)
+        mean, reach = C @ row.x, C @ row.factor
         variances = np.einsum("ij,ij->i", reach, reach) + np.diag(self.settings.R.at(k))
         if len(row.parameters.theta):
             Psi = plant.Psi.at(k - 1)
@@ -202,6 +227,21 @@ class Recursion:
             mean, variances = mean + Psi @ row.parameters.theta, variances + np.einsum("ij,ij->i", moved, moved)
         unknown = (np.abs(C @ row.diffuse) > UNDETERMINED_SHARE).any(axis=1)
         return mean, np.where(unknown, np.inf, np.sqrt(variances))
+
+    @cached_property
+    def _constraints(self) -> EarlyConstraintSteps | None:
+        """The algebraic equations of a plant that takes them with its next step; none where noise couples them."""
+        settings = self.settings
+        rows = early_rows(settings.plant, early=not settings.early_constraints)
+        if not rows.size or not settings.Q.is_constant:
+            return None
+        others = np.setdiff1d(np.arange(settings.plant.ne), rows)
+        if np.any(settings.Q.at(0)[np.ix_(others, rows)]):
+            return None
+        parts = (settings.plant, settings.Q, settings.R, rows)
+        if settings.adaptation is None or settings.adaptation.form != "random-walk":
+            return EarlyConstraintSteps(*parts)
+        return WalkingEarlySteps(*parts, covariance_factor(settings.adaptation.walk, "walk"))
 
     def plain(self, state: RecursiveState, y: FloatArray, u: FloatArray) -> tuple[RecursiveState, RawEstimate]:
         """Take a sample as it is."""

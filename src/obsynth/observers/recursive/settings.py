@@ -23,8 +23,6 @@ from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 
 Form: TypeAlias = Literal["innovation", "literal", "random-walk"]
 Guard: TypeAlias = Literal["regularise", "directional", "none"]
-
-
 _KINDS = {"form": Form, "guard": Guard, "forgetting": ForgettingFactor, "window": Count, "reset": Probability}
 
 
@@ -134,6 +132,21 @@ class RecursiveSettings(Undelayed):
     def fault_names(self) -> tuple[str, ...]:
         """The parameters that are estimated, in order."""
         return () if self.adaptation is None else self.plant.parameter_names
+
+    @property
+    def form(self) -> str:
+        """How parameters are estimated; empty for a filter without any."""
+        return "" if self.adaptation is None else self.adaptation.form
+
+    @property
+    def initial_parameters(self) -> FloatArray:
+        """Mean of the parameters at the start ``(nq,)``; empty for a filter without any."""
+        return np.zeros(0) if self.adaptation is None else self.adaptation.initial_parameters
+
+    @property
+    def innovation_count(self) -> int:
+        """Numbers in an innovation: what equations and outputs say beyond the state."""
+        return self.plant.ne + self.plant.ny - self.plant.nx
 
     @cached_property
     def timing(self) -> SensorTiming:

@@ -18,9 +18,19 @@ from obsynth.analysis.zeros import leading_names
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.covariances import covariance_factor
-from obsynth.numerics.least_squares_step import OUTGROWN, LeastSquaresStep, Projection, projected_step, projection_of
+from obsynth.numerics.least_squares_step import (
+    OUTGROWN,
+    LeastSquaresStep,
+    Projection,
+    noise_triangle,
+    projected_step,
+    projection_of,
+)
 from obsynth.plants.sequences import MatrixSequence
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+
+#: From so many rows on the noise that stays the same is brought to a triangle once, and only what moves is added to it.
+MANY_ROWS = 100
 
 
 class StepMatrices(NamedTuple):
@@ -158,13 +168,17 @@ class EarlyConstraintSteps:
         )  # fmt: skip
 
     def first(self) -> StepMatrices:
-        """Return the correction of x(0) by the algebraic equations of step 0: the prior is the 'equation'."""
+        """Return the correction of x(0) by the algebraic equations of step 0."""
+        return self.correction(0)
+
+    def correction(self, k: int) -> StepMatrices:
+        """Return the correction of x(k) by the algebraic equations of step k: what is known is the 'equation'."""
         plant, late = self.plant, self.late
-        H = np.vstack([np.eye(plant.nx), plant.A.at(0)[late]])
-        noise = stacked_noise(np.zeros((plant.nx, 0)), self._factors(0)[1])
+        H = np.vstack([np.eye(plant.nx), plant.A.at(k)[late]])
+        noise = stacked_noise(np.zeros((plant.nx, 0)), self._factors(k)[1])
         return StepMatrices(
             H, np.eye(plant.nx), np.zeros((plant.nx, plant.nu)), np.zeros((plant.nx, plant.nq)),
-            plant.Phi.at(0)[late], -plant.B.at(0)[late], noise,
+            plant.Phi.at(k)[late], -plant.B.at(k)[late], noise,
         )  # fmt: skip
 
 
@@ -174,7 +188,7 @@ class PreparedStep:
 
     Fields: step: Which step it is; projection: Of H; ``None`` where its rank has to be decided; moved: ``(rows, n)``:
     rotated A, empty without a projection; known: ``(any, rows)``: the transpose of the rotated noise, empty without a
-    projection.
+    projection; its triangular factor ``(rows, rows)`` from so many rows on.
     """
 
     step: StepMatrices
@@ -185,25 +199,33 @@ class PreparedStep:
     @classmethod
     def of(cls, step: StepMatrices, last: PreparedStep | None) -> PreparedStep:
         """Prepare a step."""
+        if last is not None and last.step is step:
+            return last
         same = last if last is not None and last.step.H is step.H else None
         projection = projection_of(step.H) if same is None else same.projection
         if projection is None:
             return cls(step, None, step.A[:0], step.noise[:0])
         rotation = projection.rotation
         moved = rotation[:, : len(step.A)] @ step.A
-        still = same is not None and same.step.noise is step.noise
-        return cls(step, projection, moved, same.known if same and still else (rotation @ step.noise).T)
+        if same is not None and same.step.noise is step.noise:
+            return cls(step, projection, moved, same.known)
+        known = (rotation @ step.noise).T
+        return cls(step, projection, moved, known if len(rotation) < MANY_ROWS else noise_triangle(known))
 
-    def taken(self, factor: FloatArray, right: FloatArray) -> LeastSquaresStep | None:
+    def taken(self, factor: FloatArray, right: FloatArray | None) -> LeastSquaresStep | None:
         """Take the step, or return ``None`` where a rank has to be decided.
 
-        Shapes: ``factor (n, any)``, ``right (rows, columns)``.
+        Shapes: ``factor (n, any)``, ``right (rows, columns)``, ``None`` for the identity.
         """
         if self.projection is None:
             return None
-        width, known, rows = factor.shape[1], self.known, len(right)
+        rotation = self.projection.rotation
+        width, known, rows = factor.shape[1], self.known, len(rotation)
+        data = rotation if right is None else rotation @ right
+        if rows >= MANY_ROWS:
+            return projected_step(self.projection, (self.moved @ factor).T, data, known=known)
         # As many rows as the projection has at least: what is missing (rectangular roots) are rows of zeros.
         noise = np.zeros((max(width + len(known), rows), rows), order="F")
         noise[:width] = (self.moved @ factor).T
         noise[width : width + len(known)] = known
-        return projected_step(self.projection, noise, self.projection.rotation @ right)
+        return projected_step(self.projection, noise, data)

@@ -134,12 +134,8 @@ def _all(conditions: Any) -> Any:
 
 #: First fraction of a homotopy; it grows twofold after each success and is halved after each failure.
 FIRST_FRACTION = 0.125
-
-
 #: A homotopy that needs smaller fractions than this, or more sub-solves, is not going anywhere.
 LEAST_FRACTION = 2.0**-20
-
-
 MOST_SUBSOLVES = 10_000
 
 

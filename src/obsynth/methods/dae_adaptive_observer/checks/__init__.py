@@ -9,13 +9,13 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from obsynth.analysis.dae_index import SINGULAR_CONDITION
 from obsynth.errors import ObsynthError
 from obsynth.methods.dae_adaptive_observer.conditions import dae_conditions
 from obsynth.methods.recursive.checks import listed_gains, refinement_rows
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.covariances import covariance_factor
 from obsynth.numerics.newton import LARGEST_RESIDUAL
+from obsynth.numerics.ranks import SINGULAR_CONDITION
 from obsynth.observers.dae.batch import run_dae_batch
 from obsynth.observers.dae.building import OPTIONS, dae_observer_from_options, resolved_options
 from obsynth.observers.dae.nominal_run import NOMINAL_STEPS, DAEFacts, dae_facts

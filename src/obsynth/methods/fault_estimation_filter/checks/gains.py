@@ -28,8 +28,6 @@ from obsynth.verification.identities import Identity, equality, tracking_identit
 
 #: Letters that every gain set has, and that it may have.
 NEEDED, OPTIONAL = ("T", "N", "L", "W", "Psi", "Upsilon"), ("R",)
-
-
 RESTRICTED, WEIGHT = "gains: T and N", "gains: W"
 
 

@@ -60,8 +60,6 @@ def noise_rows(design: ObserverDesign) -> Iterator[Check]:
 
 
 _MATRICES = ("T", "T0", "Phi", "Cw", "walks", "stability", "tracking", "deviations")
-
-
 _SOURCE = "identities of the error z - T E x, ours"
 
 

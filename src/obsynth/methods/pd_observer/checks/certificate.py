@@ -126,11 +126,7 @@ def _inequality(moving: Enclosed, still: Enclosed, p: Enclosed, delta: float) ->
 #: Claims that a certificate always makes, those on l2 gains with the names of their certificates, and those that are
 #: positive.
 NEEDED_CLAIMS = ("theorem", "delta", "decay")
-
-
 GAIN_CLAIMS: dict[str, Literal["rate", "noise"]] = {"fault_rate_gain": "rate", "noise_gain": "noise"}
-
-
 POSITIVE_CLAIMS = ("delta", "gain_bound", "fault_rate_gain", "noise_gain", "disk_radius", "adaptation_low")
 
 

@@ -33,11 +33,7 @@ from obsynth.verification.identities import Residual, equality, residual, worst
 
 #: Recomputed poles may miss the claimed ones by this, relative to their size; claimed rates and norms likewise.
 SPECTRUM_TOLERANCE = 1e-4
-
-
 CLAIM_TOLERANCE = 1e-4
-
-
 #: Significant digits with which gains are commonly printed in full: the observer must stay stable with them.
 PRINTED_DIGITS = 9
 

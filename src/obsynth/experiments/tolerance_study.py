@@ -1,0 +1,226 @@
+"""What tolerances cost: false alarms and the least fault that is found, of a fixed bound and of an adaptive one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from obsynth.errors import SpecError
+from obsynth.experiments.batch_simulation import Runs, make_bench
+from obsynth.experiments.monitors.monitor import Monitor
+from obsynth.experiments.monitors.residual_monitor import monitor
+from obsynth.numerics.arguments import is_whole, require_kind
+from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.plants.constants import tolerance_share
+from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.results.design import ObserverDesign
+from obsynth.simulation.profiles import Step
+from obsynth.simulation.scenario import Scenario
+from obsynth.tolerances.exact_plant import drawn_points, plant_at
+
+#: Tolerances that are tried, by default.
+TOLERANCES = (0.0, 0.01, 0.02, 0.05)
+#: The least fault is found to this share, up to this many times the threshold it is compared with.
+FAULT_SHARE, MOST_TIMES = 0.05, 1e4
+#: The fault of a search steps up after this share of the scenario.
+ONSET = 0.5
+#: The two monitors.
+FIXED, ADAPTIVE = "fixed bound", "adaptive threshold"
+
+
+@dataclass(frozen=True, eq=False)
+class ToleranceStudy:
+    """False alarms and least faults by tolerance; see `obsynth.tolerance_study`.
+
+    Parameters
+    ----------
+    tolerances : FloatArray
+        ``(n,)``: largest tolerance of a constant, as a share; those of others go with it.
+    false_alarms : FloatArray
+        ``(n, 2)``: share of the runs without a fault that have an alarm: fixed bound, adaptive threshold.
+    least_faults : FloatArray
+        ``(n, 2)``: least step of the fault that is told in every run, in its unit; infinite where none is.
+    fault : str
+        Which fault.
+    unit : str
+        Of it; empty where it is not known.
+    runs : int
+        For each number, each with a plant of its own from the box, half of them vertices.
+    """
+
+    tolerances: FloatArray
+    false_alarms: FloatArray
+    least_faults: FloatArray
+    fault: str
+    unit: str
+    runs: int
+
+    def __post_init__(self) -> None:
+        for name in ("tolerances", "false_alarms", "least_faults"):
+            object.__setattr__(self, name, read_only(getattr(self, name)))
+
+    def rows(self) -> list[tuple[str, ...]]:
+        """Return a heading and a row for each tolerance, as text."""
+        unit = f" ({self.unit})" if self.unit else ""
+        heading = ("tolerance", *(f"{what}, {name}" for what in ("false alarms", f"least {self.fault}{unit}")
+                                  for name in (FIXED, ADAPTIVE)))  # fmt: skip
+        body = [
+            (f"{100.0 * tolerance:.3g} %", *(f"{100.0 * value:.0f} %" for value in alarms),
+             *(f"{value:.3g}" if np.isfinite(value) else "none" for value in least))
+            for tolerance, alarms, least in zip(self.tolerances, self.false_alarms, self.least_faults, strict=True)
+        ]  # fmt: skip
+        return [heading, *body]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return everything as plain data; `None` for a fault that is never told."""
+        least = [[float(value) if np.isfinite(value) else None for value in row] for row in self.least_faults]
+        return {
+            "tolerances": self.tolerances.tolist(), "false_alarms": self.false_alarms.tolist(), "least_faults": least,
+            "fault": self.fault, "unit": self.unit, "runs": self.runs, "monitors": [FIXED, ADAPTIVE],
+        }  # fmt: skip
+
+    def __str__(self) -> str:
+        table = self.rows()
+        widths = [max(len(row[i]) for row in table) for i in range(len(table[0]))]
+        return "\n".join("  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in table)
+
+
+def tolerance_study(
+    design: ObserverDesign, scenario: Scenario, *, tolerances: Sequence[float | str] = TOLERANCES,
+    fault: str | None = None, runs: int = 20, disturbance_bounds: Mapping[str, float] | None = None,
+    noise_bound: float | None = None, progress: Callable[[str], None] | None = None,
+) -> ToleranceStudy:  # fmt: skip
+    """Compare the fixed bound of the pointwise monitor with the adaptive one, for larger and larger tolerances.
+
+    Parameters
+    ----------
+    design : ObserverDesign
+        Linear, of a plant with tolerances.
+    scenario : Scenario
+        Inputs, disturbances, noise and start; its faults do not count.
+    tolerances : sequence of float or str, optional
+        Shares, or texts such as ``"2 %"``: of the constant with the largest tolerance; the others stay in proportion.
+    fault : str, optional
+        The fault that steps up in the middle of the scenario; the first that the design estimates by default.
+    runs : int, optional
+        For each tolerance: as many plants of the box, half of them vertices, and seeds.
+    disturbance_bounds, noise_bound : optional
+        As for `obsynth.monitor`.
+    progress : callable, optional
+        Called with a text before each tolerance.
+
+    Returns
+    -------
+    ToleranceStudy
+        Print it for a table; `obsynth.plotting.plot_tolerances` draws it.  A fault counts as told in a run where it
+        brings an alarm at a sample at which the same run has none without it.
+
+    Raises
+    ------
+    SpecError
+        The plant has no tolerances or no fault, a nominal value is zero, or an option is out of range.
+    PreconditionError
+        No bound exists over some of the tolerances.
+    """
+    require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
+    require_kind(scenario, Scenario, "scenario", "an obsynth.Scenario")
+    if not is_whole(runs) or runs < 1:
+        raise SpecError(f"runs is {runs!r}: give a whole number, 1 or more.", path="runs")
+    plant, observer = design.linear
+    known = _tolerance_of(plant)
+    names = observer.fault_names
+    if not names or (fault is not None and fault not in names):
+        raise SpecError(f"fault is {fault!r}: the design estimates {', '.join(names) or 'none'}.", path="fault")
+    if isinstance(tolerances, str) or not len(tolerances):
+        raise SpecError(f"tolerances is {tolerances!r}: give a list, such as [0, '1 %', '2 %'].", path="tolerances")
+    shares = [tolerance_share(value, "tolerances") for value in tolerances]
+    chosen = names[0] if fault is None else fault
+    quiet = scenario.replace(faults={}, sensors={})
+    alarms, least = np.empty((len(shares), 2)), np.empty((len(shares), 2))
+    for i, share in enumerate(shares):
+        if progress is not None:
+            progress(f"tolerance {100.0 * share:.3g} %")
+        scaled = _scaled(design, share / known)
+        without, with_one = _both(scaled, quiet, chosen, runs)
+        for j, constants in enumerate((None, scaled.linear[0])):
+            watched = monitor(scaled, quiet, constants=constants, disturbance_bounds=disturbance_bounds,
+                              noise_bound=noise_bound)  # fmt: skip
+            alarms[i, j], least[i, j] = _counted(watched, without, with_one)
+    return ToleranceStudy(np.array(shares), alarms, least, chosen, plant.units.get(chosen, ""), runs)
+
+
+def _tolerance_of(plant: DescriptorSystem) -> float:
+    """Return the largest tolerance of a plant's constants, as a share."""
+    box = None if plant.uncertainty is None else plant.uncertainty.box
+    if box is None or not box.names:
+        raise SpecError("The plant's constants have no tolerances: state constants.", path="design")
+    zero = [item.name for item in box.uncertain if item.nominal == 0.0]
+    if zero:
+        raise SpecError(f"The nominal value of {zero[0]!r} is zero, which has no per cent.", path="tolerances")
+    return max(item.half / abs(item.nominal) for item in box.uncertain)
+
+
+def _scaled(design: ObserverDesign, factor: float) -> ObserverDesign:
+    plant, _ = design.linear
+    uncertain = plant.uncertainty
+    if uncertain is None:
+        return design
+    return design.replace(plant=plant.replace(uncertainty=uncertain.with_box(uncertain.box.scaled(factor))))
+
+
+def _both(design: ObserverDesign, scenario: Scenario, fault: str, runs: int) -> tuple[Runs, Runs]:
+    """Return the same runs without and with a fault of size 1, each of a plant drawn from the box."""
+    plant, _ = design.linear
+    uncertain = plant.uncertainty
+    count = 0 if uncertain is None else len(uncertain.box.names)
+    points = drawn_points(count, runs, scenario.seed)
+    faulty = scenario.replace(faults={fault: Step(size=1.0, start=ONSET * scenario.horizon)})
+    found: list[list[Runs]] = [[], []]
+    for i, q in enumerate(points):
+        true = plant if uncertain is None else plant_at(plant, uncertain.box.values(q))
+        for kept, what in zip(found, (scenario, faulty), strict=True):
+            kept.append(make_bench(design.replace(plant=true), what).run([scenario.seed + i]))
+    return _together(found[0]), _together(found[1])
+
+
+def _together(found: list[Runs]) -> Runs:
+    def joined(name: str) -> FloatArray:
+        return np.concatenate([getattr(run, name) for run in found], axis=1)
+
+    return Runs(joined("states"), joined("outputs"), joined("inputs"), joined("faults"), joined("disturbances"),
+                joined("rows"), found[0].observer)  # fmt: skip
+
+
+def _counted(watched: Monitor, without: Runs, with_one: Runs) -> tuple[float, float]:
+    """Return the share of false alarms, and the least size of the fault that is told in every run."""
+    observer: Any = without.observer
+    rows = observer.fault_rows if watched.watches_estimates else observer.residual_rows
+    false = watched.passed_in(without, rows)
+
+    def told(size: float) -> bool:
+        def moved(one: FloatArray, other: FloatArray) -> FloatArray:
+            return np.asarray(one + size * (other - one))
+
+        # Plant and observer are linear: what the fault does goes with its size.
+        changed = replace(
+            without, states=moved(without.states, with_one.states), outputs=moved(without.outputs, with_one.outputs),
+            inputs=moved(without.inputs, with_one.inputs), faults=moved(without.faults, with_one.faults),
+            rows=moved(without.rows, with_one.rows),
+        )  # fmt: skip
+        passed = watched.passed_in(changed, rows)
+        return bool((passed & ~false).any(axis=0).all())
+
+    level = np.abs(watched.threshold[np.isfinite(watched.threshold)])
+    high = float(np.max(level, initial=np.finfo(np.float64).tiny))
+    low, most = 0.0, MOST_TIMES * high
+    while not told(high):
+        low, high = high, 2.0 * high
+        if high > most:
+            return float(false.any(axis=0).mean()), float("inf")
+    while high - low > FAULT_SHARE * high:
+        middle = (low + high) / 2.0
+        low, high = (low, middle) if told(middle) else (middle, high)
+    return float(false.any(axis=0).mean()), high
