@@ -343,3 +343,70 @@ def test_ragged_rows_with_an_entry_that_is_none(capsys):
     told = capsys.readouterr().err
     assert "row 1, column 2 must be a number or an expression in k, not nothing (null)" in told
     assert "row 2 has 1 entries, but row 1 has 2" in told
+
+
+class TestFoldersOfResults:
+    """``sweep`` and ``run`` on many designs: what is refused leaves no folder, and nothing that is read is written."""
+
+    @pytest.mark.parametrize(
+        "words",
+        [
+            ["--system", "missing.yaml"], ["--system", "spec.yaml", "--set", "gamma"],
+            ["--system", "spec.yaml", "--set", "gamma=[]"], ["--system", "spec.yaml", "--jobs", "0"],
+            ["--system", "spec.yaml", "--set", "gamma=[2]", "--set", "gamma=[3]"],
+        ],
+        ids=["no spec", "no list", "no values", "no process", "twice"],
+    )  # fmt: skip
+    def test_a_refused_sweep_leaves_no_folder(self, words, capsys):
+        before = contents()
+        assert main(["sweep", *words, "--out", "new/folder", "--quiet"]) == 2
+        assert capsys.readouterr().err.startswith("Malformed input: ")
+        assert not Path("new").exists()
+        assert contents() == before
+
+    def test_a_table_that_is_the_spec(self, capsys):
+        Path("o").mkdir()
+        os.symlink("../spec.yaml", "o/table.csv")
+        before = contents()
+        assert main(["sweep", "--system", "spec.yaml", "--out", "o", "--force", "--quiet"]) == 2
+        assert "is read by this command" in capsys.readouterr().err
+        assert contents() == before
+        assert [path.name for path in Path("o").iterdir()] == ["table.csv"]
+
+    def test_many_designs_on_nothing(self, capsys):
+        Path("gs").mkdir()
+        assert main(["run", "--gains", "gs", "--data", "log.csv", "--out", "o", "--quiet"]) == 2
+        assert "there is no file" in capsys.readouterr().err
+        assert not Path("o").exists()
+
+    def test_a_log_that_would_be_the_table(self, capsys):
+        Path("gs").mkdir()
+        Path("o").mkdir()
+        Path("gs/a.gains.json").write_bytes(Path("g.json").read_bytes())
+        Path("o/table.csv").write_bytes(Path("log.csv").read_bytes())
+        words = ["run", "--gains", "gs", "--data", "o/table.csv", "--out", "o", "--force", "--quiet"]
+        assert main(words) == 2
+        assert "is read by this command" in capsys.readouterr().err
+        assert Path("o/table.csv").read_bytes() == Path("log.csv").read_bytes()
+
+
+def test_a_named_pipe_is_no_log_of_a_calibration():
+    from obsynth import SpecError
+    from obsynth.calibration.logs import read_log
+
+    os.mkfifo("pipe.csv")
+    with pytest.raises(SpecError, match="named pipe"):
+        read_log("pipe.csv", ["u"], ["y"])
+
+
+@pytest.mark.parametrize("runs", [10**30, 10**400])
+def test_numbers_beyond_any_memory_are_refused(runs):
+    from obsynth import SpecError, functional_filter
+    from obsynth.numerics.arguments import Count, checked_value, is_finite_number
+    from obsynth.spec import load_spec
+
+    assert is_finite_number(runs) == (runs < 10**300)
+    with pytest.raises(SpecError, match="whole number"):
+        checked_value(runs, "runs", Count)
+    with pytest.raises(SpecError, match="delay"):
+        functional_filter(load_spec("spec.yaml").plant, delay=runs)

@@ -25,7 +25,7 @@ STEADY_DEFINITE = "steady state: covariance"
 EVERYTHING = {FITS, STATE, COVARIANCE, REGRESSOR, CLAIMS, NEES, NIS, WHITE, CONTRACTION}
 
 
-GOOD = ("innovation", "literal", "early", "walk", "constant", "constant walk", "exact output")
+GOOD = ("innovation", "literal", "early", "early walk", "walk", "constant", "constant walk", "exact output")
 STILL = {
     "E": np.diag([1.0, 1, 0]), "A": [[0.8, 0.1, 0.3], [0, 0.7, 0.2], [1, 0.4, -1]],
     "C": [[1, 0, 0.3], [0, 1, 1]], "Phi": [[0.5, 0.3], [1, 0.2], [0.2, 0]], "Psi": None,
@@ -41,6 +41,14 @@ def good(name: str = "innovation") -> ObserverDesign:
         return obsynth.adaptive_observer(varying(horizon=60, **STILL), Q=0.1, R=0.2, window=10, name=name, **options)
     if name == "exact output":
         return obsynth.descriptor_kalman(varying(horizon=60, **STILL), Q=0.1, R=np.diag([0.0, 0.2]), name=name)
+    if name == "early walk":
+        # The correction of x(0) has as many rows as a step, of other kinds.
+        plant = obsynth.TimeVaryingDescriptorSystem(
+            E=np.diag([1.0, 0]), A=[[0.9, 0.1], [0.5, -1.0]], C=[[1.0, 0]], Phi=[[0.1], [0.0]], dt=1.0, horizon=60
+        )
+        return obsynth.adaptive_observer(
+            plant, Q=0.1, R=0.2, form="random-walk", random_walk=1e-3, early_constraints=True, window=10, name=name
+        )
     options = {"literal": {"form": "literal"}, "early": {"early_constraints": True},
                "walk": {"form": "random-walk", "random_walk": 1e-3}}.get(name, {})  # fmt: skip
     return obsynth.adaptive_observer(varying(horizon=60), Q=0.1, R=0.2, window=10, name=name, **options)

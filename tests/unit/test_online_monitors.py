@@ -178,6 +178,18 @@ def test_peak_gains_are_integrals():
         peak_gain(np.array([[0.0]]), np.eye(1), np.eye(1))
 
 
+@pytest.mark.parametrize("share", [0.5, 0.05, 1e-4])
+def test_a_peak_gain_holds_however_early_its_intervals_end(share, monkeypatch):
+    """What is left after the last interval is part of the bound: the integral of exp(-t) is one."""
+    from obsynth.numerics import continuous
+
+    monkeypatch.setattr(continuous, "LEFT_SHARE", share)
+    for rates in ([1.0], [1.0, 1e-3], [50.0, 0.2, 0.01]):
+        a = -np.diag(rates)
+        found = continuous.peak_gain(a, np.eye(len(rates)), np.ones((1, len(rates))))
+        assert np.all(found >= 1.0 / np.array(rates))
+
+
 def test_no_false_alarm_where_known_inputs_bend_the_outputs():
     """Without disturbances the bound is what the start leaves, and what straight lines between samples add."""
     spec = load_spec(DESIGNS / "filasova" / "spec.yaml")

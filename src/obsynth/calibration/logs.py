@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.errors import PreconditionError, SpecError
+from obsynth.files.inputs import input_file
 from obsynth.numerics.arrays import FloatArray, read_only
 
 if TYPE_CHECKING:
@@ -90,6 +91,9 @@ class Log:
 
     def shifted(self, rows: int) -> Log:
         """Return the log with its inputs later by whole rows: what row k says acts from row k on for ``rows = 1``."""
+        if abs(rows) >= len(self.u):
+            raise SpecError(f"input_delay is {rows} rows, but the log has {len(self.u)} here: give fewer.",
+                            path="input_delay")  # fmt: skip
         u = np.roll(self.u, rows, axis=0)
         if rows > 0:
             u[:rows] = self.u[0]
@@ -177,9 +181,7 @@ def read_log(
 
 def _table(log: Any) -> tuple[dict[str, Any], str]:
     if isinstance(log, str | Path):
-        path = Path(log)
-        if path.is_dir() or not path.exists():
-            raise SpecError(f"{path} {'is a folder' if path.is_dir() else 'does not exist'}.", path=str(path))
+        path = input_file(Path(log))
         import pandas as pd
 
         try:

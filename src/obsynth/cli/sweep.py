@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 from obsynth.cli.arguments import add_force, add_json, add_quiet, output_file
 from obsynth.cli.output import print_json, progress, stdout_console
 from obsynth.errors import SpecError
-from obsynth.files.outputs import FileKind, write_together
+from obsynth.files.inputs import input_file
+from obsynth.files.outputs import FileKind, made_folder, write_together
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -55,12 +56,22 @@ def add_executors(parser: argparse.ArgumentParser) -> None:
 
 def run_sweep(options: argparse.Namespace) -> int:
     """Run ``sweep``; the exit code is 0 when every case was decided, whatever it came to."""
-    from obsynth.sweeps.sweep import sweep
-
     if options.out.exists() and not options.out.is_dir():
         raise SpecError(f"{options.out} is no folder: give --out the name of one.", path="--out")
-    parameters = dict(_value_list(text) for text in options.set)
-    options.out.mkdir(parents=True, exist_ok=True)
+    listed = [_value_list(text) for text in options.set]
+    parameters = dict(listed)
+    if len(parameters) < len(listed):
+        raise SpecError("Two lists of values (--set) are of the same entry: put them into one.", path="--set")
+    for spec in options.system:
+        input_file(Path(spec))  # what is designed for hours is not refused in the end
+    with made_folder(options.out):
+        return _swept(options, parameters)
+
+
+def _swept(options: argparse.Namespace, parameters: dict[str, list[Any]]) -> int:
+    """Run ``sweep`` in its folder."""
+    from obsynth.sweeps.sweep import sweep
+
     table = output_file(options.out / "table.csv", TABLE, options)
     picture = output_file(options.out / "sweep.png", PICTURE, options)
     with progress(quiet=options.quiet) as report_stage, chosen_executor(options.jobs, options.cluster) as executor:
@@ -87,9 +98,6 @@ def run_sweep(options: argparse.Namespace) -> int:
 
 def run_many(options: argparse.Namespace) -> int:
     """Run ``run`` for a folder of gain sets: a table, a picture, and the estimates of each design on each log."""
-    from obsynth.cli.data_run import numbers_of
-    from obsynth.sweeps.fleet import run_fleet
-
     alone = ("system", "state", "prove", "monitor", "smooth", "lag")
     given = [name for name in alone if getattr(options, name)]
     if given:
@@ -98,7 +106,18 @@ def run_many(options: argparse.Namespace) -> int:
     folder = Path(options.out)
     if options.out == "-" or (folder.exists() and not folder.is_dir()):
         raise SpecError("Many designs need a folder for their estimates: give one to --out.", path="--out")
-    folder.mkdir(parents=True, exist_ok=True)
+    with made_folder(folder):
+        return _run_in(folder, options)
+
+
+def _run_in(folder: Path, options: argparse.Namespace) -> int:
+    """Run ``run`` for a folder of gain sets into a folder."""
+    from obsynth.cli.data_run import numbers_of
+    from obsynth.sweeps.fleet import run_fleet
+
+    for path in (Path(options.gains), Path(options.data)):
+        if path.is_file():
+            input_file(path)  # what is read is never written, by force or not
     table = output_file(folder / "table.csv", RUNS_TABLE, options)
     picture = output_file(folder / "fleet.png", PICTURE, options)
     asked = {

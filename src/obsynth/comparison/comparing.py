@@ -201,18 +201,23 @@ def _log(data: Any, plant: DescriptorSystem) -> _Log:
     if isinstance(data, (str, Path)):
         from obsynth.files.inputs import input_file
 
-        frame = pd.read_csv(input_file(Path(data)))
+        try:
+            frame = pd.read_csv(input_file(Path(data)))
+        except (ValueError, OSError) as error:
+            raise SpecError(f"{data} cannot be read: {' '.join(str(error).split())}", path=str(data)) from error
     else:
         require_kind(data, pd.DataFrame, "data", "a file name or a pandas.DataFrame")
         frame = data
     missing = [name for name in (*plant.input_names, *plant.output_names) if name not in frame.columns]
     if missing:
         raise SpecError(f"The log has no column {', '.join(map(repr, missing))}.", path="data")
+    if not len(frame):
+        raise SpecError("The log has no rows.", path="data")
 
     def columns(names: Sequence[str]) -> FloatArray:
         offsets = np.array([plant.operating_point.get(name, 0.0) for name in names])
         scales = np.array([plant.scales.get(name, 1.0) for name in names])
-        values = frame[list(names)].to_numpy(dtype=np.float64)
+        values = _numbers(frame, list(names))
         if not np.all(np.isfinite(values)):
             raise SpecError("The log has gaps: give rows without missing values.", path="data")
         return np.asarray(values * scales - offsets)
@@ -220,9 +225,18 @@ def _log(data: Any, plant: DescriptorSystem) -> _Log:
     there = [name for name in plant.fault_names if name in frame.columns]
     truth = np.zeros((len(frame), plant.nf))
     for name in there:
-        truth[:, plant.fault_names.index(name)] = frame[name].to_numpy(dtype=np.float64)
+        truth[:, plant.fault_names.index(name)] = _numbers(frame, [name])[:, 0]
     times: FloatArray = np.asarray(np.arange(len(frame)) * float(plant.dt), dtype=np.float64)
     return _Log(times, columns(plant.input_names), columns(plant.output_names), truth, bool(there))
+
+
+def _numbers(frame: Any, names: list[str]) -> FloatArray:
+    """Return columns of a log as numbers, ``(rows, names)``."""
+    try:
+        return np.asarray(frame[names].to_numpy(dtype=np.float64))
+    except (ValueError, TypeError, OverflowError) as error:
+        raise SpecError(f"{', '.join(map(repr, names))}: the log holds what is no number: {error}.",
+                        path="data") from error  # fmt: skip
 
 
 def _compared(

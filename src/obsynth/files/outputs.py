@@ -7,7 +7,7 @@ import re
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -111,6 +111,24 @@ def replacement_of(target: Path) -> Iterator[tuple[int, str]]:
     with _temporary_beside(target) as (handle, temporary), _written(target):
         yield handle, temporary
         _settle(temporary, target)
+
+
+@contextmanager
+def made_folder(folder: Path) -> Iterator[Path]:
+    """Give a folder, made where there is none; what was made and is still empty goes again if what follows fails."""
+    missing: list[Path] = []
+    try:
+        missing = [place for place in (folder, *folder.parents) if not place.exists()]
+        folder.mkdir(parents=True, exist_ok=True)
+    except (OSError, ValueError) as error:
+        raise SpecError(f"{folder} cannot be used as a folder: {reason(error)}.", path=str(folder)) from error
+    try:
+        yield folder
+    except BaseException:
+        for place in missing:
+            with suppress(OSError):
+                place.rmdir()
+        raise
 
 
 def write_atomically(path: str | Path, content: str | bytes) -> Path:

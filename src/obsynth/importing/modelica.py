@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
+from obsynth.files.inputs import input_file
 from obsynth.importing.roles import plant_of
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
@@ -62,7 +63,7 @@ def from_modelica(
     The file does not hold the outputs at the operating point: add them by ``operating_point={...}``.  Constant terms
     are not in it either: linearise in a steady state.
     """
-    source = Path(path)
+    source = input_file(Path(path))
     try:
         text = source.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:

@@ -5,6 +5,7 @@ Types of option values with their ranges: stated once, read by constructors, by 
 
 from __future__ import annotations
 
+import math
 import operator
 import types
 from collections.abc import Callable, Mapping
@@ -19,7 +20,7 @@ from obsynth.numerics.arrays import FloatArray, holds_truth, unmasked
 
 def real_number(value: Any, name: str, what: str = "a number") -> float:
     """Return a finite real number; raise `SpecError` naming the argument and ``what`` it should be."""
-    if not is_number(value) or not np.isfinite(value):
+    if not is_finite_number(value):
         raise SpecError(f"{name} is {shown(value)}: give {what}.", path=name)
     return float(value)
 
@@ -95,7 +96,15 @@ def require_mapping(value: Any, name: str) -> None:
 
 def is_finite_number(value: Any) -> bool:
     """Whether ``value`` is a single finite real number."""
-    return is_number(value) and bool(np.isfinite(value))
+    return is_number(value) and math.isfinite(_as_float(value))
+
+
+def _as_float(value: Any) -> float:
+    """Return a number in double precision; infinity for whole numbers beyond it."""
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf
 
 
 def shown(value: Any) -> str:
@@ -123,7 +132,12 @@ Probability = Annotated[float, Ge(0.0), Lt(1.0)]
 OpenUnitInterval = Annotated[float, Gt(0.0), Lt(1.0)]
 
 
-Count = Annotated[int, Ge(1)]
+#: More than the upper ends is a mistake that would fill the memory.
+Count = Annotated[int, Ge(1), Le(1_000_000)]
+
+
+#: Samples that are kept as states.
+FewSamples = Annotated[int, Ge(0), Le(1000)]
 
 
 #: Mark -> its attribute, the comparison it stands for, and how a message says it.

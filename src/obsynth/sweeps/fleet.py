@@ -15,6 +15,7 @@ import numpy as np
 
 from obsynth.data.run import run_on_data
 from obsynth.errors import ObsynthError, SpecError
+from obsynth.files.inputs import input_file
 from obsynth.files.outputs import write_atomically
 from obsynth.results.gain_sets import load
 from obsynth.sweeps.kept_work import STATUSES, ResultTable, all_of, carried_out, file_stem, folder_for, result_in
@@ -181,8 +182,8 @@ def run_fleet(
     wrong = sorted(set(options) - set(known))
     if wrong:
         raise SpecError(f"{', '.join(wrong)}: use some of {', '.join(known)}.", path=wrong[0])
-    place = folder_for(Path(folder))
     pairs = _pairs(_files(gains, (GAINS_ENDING,), "gains"), _files(data, LOG_ENDINGS, "data"), options)
+    place = folder_for(Path(folder))
     return Fleet(carried_out(
         pairs, _run, executor=executor, told=progress, known=lambda pair: _known(pair, place),
         kept=lambda pair, outcome: _kept(pair, *outcome, place),
@@ -205,7 +206,7 @@ def _files(given: Any, endings: tuple[str, ...], what: str) -> list[Path]:
 
 def _pairs(gains: Sequence[Path], logs: Sequence[Path], options: Mapping[str, Any]) -> list[_Pair]:
     names = {path: path.name.removesuffix(GAINS_ENDING).removesuffix(".json") for path in gains}
-    digests = {path: hashlib.sha256(path.read_bytes()).hexdigest() for path in (*gains, *logs)}
+    digests = {path: hashlib.sha256(input_file(path).read_bytes()).hexdigest() for path in (*gains, *logs)}
     own = {log: log.stem for log in logs if log.stem in names.values()}
     said = json.dumps(options, sort_keys=True, default=str)
     return [

@@ -113,6 +113,9 @@ def linearise(
     if at not in ("equilibrium", "point"):
         raise SpecError(f"at is {at!r}: use 'equilibrium' or 'point'.", path="at")
     values, freed = dict(given or {}), _names(free, "free")
+    for name, bounds in free.items() if isinstance(free, Mapping) else ():
+        if np.shape(bounds) != (2,) or not float(bounds[0]) <= float(bounds[1]):
+            raise SpecError(f"free.{name} must be [low, high].", path=f"free.{name}")
     box = None
     if constants is not None:
         box = box_of_model(model, constants, values)
@@ -238,8 +241,6 @@ def _require_bounds(model: DAEModel, point: Point, free: Sequence[str] | Mapping
     )
     outside = []
     for name, bounds in free.items():
-        if np.shape(bounds) != (2,) or not float(bounds[0]) <= float(bounds[1]):
-            raise SpecError(f"free.{name} must be [low, high].", path=f"free.{name}")
         low, high = map(float, bounds)
         if not low <= values[name] <= high:
             outside.append((name, f"{name} = {values[name]:.6g} is outside [{low:g}, {high:g}]"))

@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from annotated_types import Ge
 
 from obsynth.methods.method_spec import MethodOptions
-from obsynth.numerics.arguments import Count, OpenUnitInterval, Positive, WrittenAs
+from obsynth.numerics.arguments import FewSamples, OpenUnitInterval, Positive, WrittenAs
 
 #: The least relative distance to the optimum at which a proof can be expected: less leaves no room for one.
 LEAST_MARGIN = 1e-2
@@ -30,7 +30,7 @@ class FilterOptions(MethodOptions):
     engine: Literal["auto", "riccati", "lmi"] = "auto"
     solver: Literal["auto", "SCHUR", "CLARABEL", "SCS"] = "auto"
     tolerance: OpenUnitInterval = 1e-6
-    mean: Count = 1
+    mean: Annotated[FewSamples, Ge(1)] = 1
     model_error: Literal["none", "columns"] = "none"
 
     def conflicts(self) -> Iterator[str]:

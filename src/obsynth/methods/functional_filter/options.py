@@ -11,7 +11,7 @@ from annotated_types import Ge
 
 from obsynth.errors import SpecError
 from obsynth.methods.method_spec import MethodOptions
-from obsynth.numerics.arguments import Count, NonNegative, WrittenAs, is_finite_number
+from obsynth.numerics.arguments import FewSamples, NonNegative, WrittenAs, is_finite_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
 
@@ -28,8 +28,8 @@ class FunctionalFilterOptions(MethodOptions):
     joint: bool = False
     fault_model: Annotated[Any, WrittenAs("fault model")] = "step"
     fault_rate: Annotated[Any, WrittenAs("named numbers")] = None
-    delay: Annotated[int, Ge(0)] = 0
-    mean: Count = 1
+    delay: FewSamples = 0
+    mean: Annotated[FewSamples, Ge(1)] = 1
     decay: NonNegative | None = None
     poles: Annotated[Any, WrittenAs("pole sets")] = None
     noise: Annotated[Any, WrittenAs("named numbers")] = None

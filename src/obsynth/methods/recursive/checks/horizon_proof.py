@@ -102,7 +102,7 @@ def _followed(stated: RecursiveObserver, shipped: RecursiveObserver, steps: int)
     for step, found in zip(_true_steps(stated, shipped, steps), gain_steps(shipped, steps), strict=False):
         step = found.step if step is None else step
         # Steps of another size (corrections of x(0)) are stacks of their own.
-        if len(waiting) == AT_ONCE or (waiting and waiting[0][0].H.shape != step.H.shape):
+        if len(waiting) == AT_ONCE or (waiting and _sizes(*waiting[0]) != _sizes(step, found)):
             bias = max(bias, _closed(waiting, errors, joint, lengths, units))
             waiting = []
         waiting.append((step, found))
@@ -128,6 +128,11 @@ def _true_steps(stated: RecursiveObserver, shipped: RecursiveObserver, steps: in
     model = stated.recursion.model
     first = [model.first()] if isinstance(model, EarlyConstraintSteps) else []
     return chain(first, (model.at(k) for k in range(steps)))
+
+
+def _sizes(step: StepMatrices, found: GainStep) -> tuple[tuple[int, ...], ...]:
+    """Return the shapes that steps of one stack share."""
+    return step.H.shape, step.A.shape, found.gain.shape, found.learn.shape
 
 
 def _closed(
