@@ -93,11 +93,3 @@ def test_what_cannot_be_decided_is_refused(design):
         decide(walking.observer, walking.observer.run(y, u, progress=False), statistic="cusum")
     with pytest.raises(SpecError, match="cusum"):
         obsynth.online_monitor(walking, "cusum")
-
-
-@pytest.mark.parametrize(("options", "named"), [({"outliers": "gate"}, "outliers"), ({"reset": 1e-6}, "reset")])
-def test_exported_code_refuses_options_that_it_does_not_know(tmp_path, options, named):
-    gated = dae_adaptive_observer(TANK.model, **OPTIONS, **options)
-    with pytest.raises(SpecError, match=named):
-        obsynth.export(gated, tmp_path / "observer.c")
-    assert not list(tmp_path.iterdir())
