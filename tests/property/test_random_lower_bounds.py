@@ -105,7 +105,7 @@ def test_no_stated_proof_of_the_least_gain_proves_more_than_what_is_true(free_we
         for trial in range(40):
             # Two runs, as one leaves a slack of rank one; and mixtures that cannot follow each other.
             runs = [samples(a, b, rng.normal(size=(5, 1))) for _ in range(2)]
-            mixture = np.hstack(runs) if trial % 2 else rng.normal(size=(3, 3))
+            mixture = np.hstack(runs) if trial % 2 else rng.normal(size=(3, 2)) * (rng.random((3, 2)) < 0.6)
             size = 10.0 ** rng.uniform(-3.0, 3.0, size=2)
             parts = {PAIRS: mixture, LAST: size[0] * rng.normal(size=(1, 2)), ALONE: size[1] * rng.normal(size=(1, 1))}
             for left_out in (set(), {PAIRS}, {LAST}, {ALONE}, {LAST, ALONE}):

@@ -30,13 +30,14 @@ def turning(radius: float, angle: float) -> np.ndarray:
     return radius * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
 
 
-RESONANCES = block_diag(*(turning(0.93, angle) for angle in (0.3, 1.1, 2.3)))
+RESONANCES = block_diag(*(turning(0.93, angle) for angle in (0.3, 0.9, 1.5, 2.1, 2.7)))
 SYSTEMS = {
     # name: A, B, C, D
     "slow": ([[0.9]], [[1.0, 0.5]], [[2.0]], [[0.3, 0.1]]),
     "fast": ([[0.1]], [[1.0, 1.0]], [[1.0]], [[0.0, 0.0]]),
     "direct": ([[0.1]], [[0.1, 0.0]], [[1.0]], [[0.0, 3.0]]),
-    "resonances": (RESONANCES, np.tile([[1.0], [0.0]], (3, 1)), np.tile([[1.0, 0.0]], (1, 3)), [[0.0]]),
+    "resonances": (RESONANCES, np.tile([[1.0, 1.0], [0.0, 0.0]], (5, 1)), np.tile([[1.0, 0.0]], (1, 5)), [[0.0, 0.0]]),
+    "start alone": (turning(0.8, 0.7), [[0.0], [0.0]], [[1.0, 0.5]], [[0.0]]),
     "two rows": (turning(0.8, 0.7), [[1.0, 0.2], [0.0, 1.0]], [[1.0, 0.0], [0.5, 1.0]], [[0.2, 0.0], [0.0, 0.4]]),
 }
 
