@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
+from itertools import product
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.integrate import quad
@@ -9,6 +14,7 @@ from scipy.linalg import expm
 
 import obsynth
 from obsynth import SpecError
+from obsynth.experiments.monitors.between_samples import BetweenSamples
 from obsynth.proofs.balls import Ball
 from obsynth.proofs.contraction import prove_contraction
 from obsynth.proofs.exponentials import energy, exponential
@@ -64,6 +70,58 @@ def test_sums_are_bounds_and_tight():
         assert np.all(gains <= 1.06 * terms)
 
 
+def test_of_one_state_the_sum_is_the_series():
+    """1 / (1 - a), wherever the terms that are summed one by one end."""
+    one = np.eye(1)
+    for a in (0.5, 0.9, 0.97):
+        contraction = prove_contraction(a * one, discrete=True)
+        for left in (1e-3, 0.3, 10.0):
+            found = peak_sums(Ball.exact(a * one), one, Ball.exact(one), contraction, left=left)
+            assert 1.0 / (1.0 - a) * (1.0 - 1e-15) <= found.whole[0] <= 1.2 / (1.0 - a)
+
+
+@pytest.mark.parametrize("each", [False, True])
+def test_sums_hold_for_every_member_of_balls(each: bool):
+    """The largest member of a positive system has the largest sums."""
+    rng = np.random.default_rng(4)
+    for wide in ((0.02, 0.0), (0.0, 0.1), (0.02, 0.1)):
+        a, b, c = rng.uniform(0.05, 0.2, (3, 3)), rng.uniform(0.5, 1.0, (3, 2)), rng.uniform(0.5, 1.0, (2, 3))
+        moving, columns = Ball(a, np.full_like(a, wide[0])), Ball(b, np.full_like(b, wide[1]))
+        contraction = prove_contraction(moving, discrete=True)
+        found = peak_sums(moving, c, columns, contraction, least=6, each=each)
+        terms = [c @ np.linalg.matrix_power(a + wide[0], k) @ (b + wide[1]) for k in range(400)]
+        exact = np.cumsum([term if each else np.linalg.norm(term, axis=0) for term in terms], axis=0)
+        assert np.all(found.partial[:6] >= exact[:6])
+        assert np.all(found.whole >= exact[-1] * (1.0 - 1e-12))
+
+
+def test_sums_are_no_less_than_those_of_rational_arithmetic():
+    """Products that cancel, so that double precision is off by much of what is left; half of them are too small."""
+    rng = np.random.default_rng(5)
+    for trial in range(20):
+        b, c = rng.standard_normal((12, 1)), rng.standard_normal((1, 12))
+        c[0, -1] = -float(c[0, :-1] @ b[:-1, 0]) / b[-1, 0]
+        a = np.diag(rng.uniform(0.3, 0.6, 12)) if trial % 2 else np.zeros((12, 12))
+        found = peak_sums(Ball.exact(a), c, Ball.exact(b), prove_contraction(a, discrete=True), least=4)
+        pairs = zip(np.diag(a), c[0], b[:, 0], strict=True)
+        modes = [(Fraction(pole), Fraction(x) * Fraction(y)) for pole, x, y in pairs]
+        total = Fraction(0)
+        for k in range(4):
+            total += abs(sum((weight * pole**k for pole, weight in modes), Fraction(0)))
+            assert Fraction(float(found.partial[k, 0])) >= total
+
+
+@pytest.mark.parametrize("start", [0.0, np.pi / 2.0])
+def test_an_interval_is_no_shorter_than_its_integral(start: float):
+    """sin and cos over [0, 1.3]: trapezoids are below both, and the curvature of one grows along every piece."""
+    turn, length = np.array([[0.0, 1.0], [-1.0, 0.0]]), 1.3
+    b = np.array([[np.sin(start)], [np.cos(start)]])
+    pieces = interval_pieces(turn, b, Ball.exact(np.eye(2)), length)
+    sizes = np.abs(pieces.columns.midpoint[0]) + pieces.columns.radius[0]
+    exact = np.cos(start) - np.cos(start + length)
+    assert exact * (1.0 - 1e-14) <= gathered(pieces, sizes, 1)[0] <= exact * (1.0 + 1e-3)
+
+
 def test_gains_in_continuous_time_are_integrals():
     a, c = np.array([[-1.0, 5.0], [-5.0, -1.0]]), np.array([[1.0, 0.5]])
     found = absolute_gains(a, c, prove_contraction(a, discrete=False))
@@ -91,20 +149,20 @@ def test_the_energy_of_an_interval_is_enclosed():
 
 
 def worst_residual(design: obsynth.ObserverDesign, dt: float, horizon: float, pieces: int = 8) -> float:
-    """The largest residual that a switching load of one reaches in a simulation of plant and sampled observer."""
+    """The largest residual that switching loads of one reaches in a simulation of plant and sampled observer."""
     plant, held = design.linear[0], obsynth.sample_observer(design.observer, dt)
     steps, step = round(horizon / dt), dt / pieces
     whole = expm(np.block([[plant.A, plant.Bd], [np.zeros((plant.nd, plant.nx + plant.nd))]]) * step)
     free, forced = whole[: plant.nx, : plant.nx], whole[: plant.nx, plant.nx :]
     seen = []
-    for piece in range(-1, pieces):  # -1: the value at the sample alone
+    for piece, load in product(range(-1, pieces), range(plant.nd)):  # -1: the value at the sample alone
         x, z, rows = np.zeros(plant.nx), np.zeros(held.order), []
         for k in range(steps):
-            y = plant.C @ x + (plant.Dd[:, 0] if k == 0 and piece == -1 else 0.0)
+            y = plant.C @ x + (plant.Dd[:, load] if k == 0 and piece == -1 else 0.0)
             rows.append((held.Cz @ z + held.Dy @ y)[held.residual_rows])
             z = held.Az @ z + held.By @ y
             for i in range(pieces):
-                x = free @ x + forced[:, 0] * (k == 0 and i == piece)
+                x = free @ x + forced[:, load] * (k == 0 and i == piece)
         seen.append(rows)
     response = np.array(seen).reshape(-1, held.Cz[held.residual_rows].shape[0])
     directions = np.random.default_rng(0).standard_normal((20, response.shape[1]))
@@ -133,6 +191,58 @@ def test_no_switching_load_passes_the_threshold_and_some_come_near(dt: float, di
     assert online._rule._limit >= threshold[-1] * (1.0 - 1e-9)
     assert "between samples" in online.statement
     assert "exact model" in online.statement
+    assert online._rule._other.limit >= found
+
+
+@pytest.mark.parametrize("dt", [0.05, 0.4])
+def test_two_loads_at_once_pass_no_threshold_at_any_sample(dt: float):
+    """Both switch at their worst, from the first interval on; at any stamps as well as at regular ones."""
+    plant = obsynth.DescriptorSystem(
+        None, [[-0.4, 3.0], [-3.0, -0.4]], C=np.eye(2), Bf=[[0.0], [1.0]], Bd=[[0.5, 0.4], [0.2, 0.3]],
+        Dd=[[0.0, 0.1], [0.3, 0.2]], disturbance_names=["load", "wind"],
+    )  # fmt: skip
+    design = obsynth.pd_observer(plant, decay=1.0)
+    both = {name: obsynth.Uniform(low=-1, high=1) for name in ("load", "wind")}
+    threshold = obsynth.monitor(design, obsynth.Scenario(horizon=10, sample_time=dt, disturbances=both)).threshold
+    for k in (1, 2, 3, len(threshold)):
+        assert worst_residual(design, dt, k * dt) <= threshold[k - 1]
+    online = obsynth.online_monitor(design, disturbance_bounds={"load": 1.0, "wind": 1.0}, sample_time=dt)
+    reached = worst_residual(design, dt, 10.0)
+    assert reached <= min(online._rule._limit, online._rule._other.limit)
+
+
+RESONANCE = [[0.0, 1.0], [-1.0, -0.1]]
+STRAIGHT_LINES = {
+    # name: A, C, Bd, Dd, interval
+    "at once": ([[-1.0]], [[1.0]], [[0.0, 0.0]], [[1.0, 0.5]], 0.1),
+    "slope": ([[-1.0]], [[1.0]], [[1.0, 0.5]], [[0.0, 0.0]], 0.01),
+    "bend": (RESONANCE, [[1.0, 0.0]], [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]], [[0.0, 0.0, 0.0]], 0.2),
+}
+
+
+@pytest.mark.parametrize("name", STRAIGHT_LINES)
+def test_straight_lines_miss_no_more_of_an_output_than_is_added(name: str):
+    """An observer of gain one: what is added is the largest distance of an output from its chord."""
+    a, c, bd, dd, h = STRAIGHT_LINES[name]
+    plant = obsynth.DescriptorSystem(None, a, C=c, Bd=bd, Dd=dd)
+    none: Any = None
+    found = BetweenSamples(plant, h, none, none, none, none, none, none, none, slice(0, 1), 0.0)
+    one: Any = SimpleNamespace(Az=-np.eye(1), By=np.eye(1), Cz=np.eye(1))
+    added = found.at_any_stamps(np.ones(plant.nd), one)
+    if name == "at once":
+        reached = 2.0 * 1.5  # both are one at the samples, and minus one between them
+    else:
+        # Impulse responses of what an output has above the middle of its chord; the worst signs of what came before.
+        fine = h / 40
+        whole = expm(np.block([[plant.A, plant.Bd], [np.zeros((plant.nd, plant.nx + plant.nd))]]) * fine)
+        free, forced, response = whole[: plant.nx, : plant.nx], whole[: plant.nx, plant.nx :], [np.zeros(plant.nd)] * 40
+        for _ in range(20_000):
+            response.append((plant.C @ forced)[0])
+            forced = free @ forced
+        rows = np.array(response)
+        reached = float(np.sum(np.abs(rows[20:-20] - 0.5 * (rows[40:] + rows[:-40]))))
+    assert reached <= added * (1.0 + 2e-3)
+    assert added < 4.0 * reached
 
 
 def test_an_unstable_plant_whose_outputs_bend_has_no_bound_for_ever():
