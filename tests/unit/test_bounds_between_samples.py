@@ -15,6 +15,7 @@ from scipy.linalg import expm
 import obsynth
 from obsynth import SpecError
 from obsynth.experiments.monitors.between_samples import BetweenSamples
+from obsynth.experiments.monitors.residual_model import residual_model
 from obsynth.proofs.balls import Ball
 from obsynth.proofs.contraction import prove_contraction
 from obsynth.proofs.exponentials import energy, exponential
@@ -209,6 +210,46 @@ def test_two_loads_at_once_pass_no_threshold_at_any_sample(dt: float):
     online = obsynth.online_monitor(design, disturbance_bounds={"load": 1.0, "wind": 1.0}, sample_time=dt)
     reached = worst_residual(design, dt, 10.0)
     assert reached <= min(online._rule._limit, online._rule._other.limit)
+
+
+def test_two_noises_of_the_plant_add_up_in_tables_and_for_ever():
+    """What is gathered in each sample, of the worst signs, through plant and sampled observer."""
+    plant = obsynth.DescriptorSystem(
+        None, [[-0.4, 3.0], [-3.0, -0.4]], C=np.eye(2), Bf=[[0.0], [1.0]], Bw=[[0.1, 0.05], [0.0, 0.2]],
+        Dw=np.zeros((2, 2)),
+    )  # fmt: skip
+    design, dt, bound = obsynth.pd_observer(plant, decay=1.0), 0.1, 2.0
+    scenario = obsynth.Scenario(horizon=10, sample_time=dt, noise=1)
+    threshold = obsynth.monitor(design, scenario, noise_bound=bound).threshold
+    model = residual_model(design, scenario)
+    columns = bound * model.continuous.gathered_noise(model.continuous.between.plant)
+    held, free = obsynth.sample_observer(design.observer, dt), expm(plant.A * dt)
+    rows, terms = held.residual_rows, np.zeros(len(threshold))
+    for column in columns.T:
+        x, z = column, np.zeros(held.order)
+        for k in range(1, len(threshold)):
+            y = plant.C @ x
+            terms[k] += np.linalg.norm((held.Cz @ z + held.Dy @ y)[rows])
+            x, z = free @ x, held.Az @ z + held.By @ y
+    sums = np.cumsum(terms)
+    assert np.all(threshold >= sums * (1.0 - 1e-12))
+    assert np.all(threshold <= sums * 1.01 + 1e-9)
+    online = obsynth.online_monitor(design, noise_bound=bound, sample_time=dt)
+    assert online._rule._limit >= sums[-1]
+
+
+def test_two_loads_of_a_sampled_design_add_up():
+    written = obsynth.DescriptorSystem(
+        None, [[-0.2, 4.0], [-4.0, -0.2]], C=np.eye(2), Bf=[[0.0], [1.0]], Bd=[[1.0, 0.4], [0.3, 0.7]],
+        disturbance_names=["load", "wind"],
+    )  # fmt: skip
+    design = obsynth.fault_estimation_filter(obsynth.discretise(written, 0.6).plant)
+    bounds = {"load": 1.0, "wind": 1.0}
+    alone = [obsynth.online_monitor(design, disturbance_bounds={**bounds, name: 0.0})._rule._limit for name in bounds]
+    both = obsynth.online_monitor(design, disturbance_bounds=bounds)._rule._limit
+    assert both == pytest.approx(sum(alone), rel=1e-9)
+    scenario = obsynth.Scenario(horizon=60, disturbances={name: obsynth.Uniform(low=-1, high=1) for name in bounds})
+    assert obsynth.monitor(design, scenario).threshold[-1] <= both * (1.0 + 1e-9)
 
 
 RESONANCE = [[0.0, 1.0], [-1.0, -0.1]]

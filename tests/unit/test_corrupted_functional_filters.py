@@ -118,11 +118,14 @@ TABLE = {
     "no proof of stability": ("both", matrix("stability", lambda q: np.diag(-np.diag(q) + 1e3)), [STABILITY]),
     "order": ("both", claim(order=1.0), [ORDER]),
     "order, more than there are": ("both", claim(order=40.0), [ORDER]),
+    "order, off by one": ("both", lambda d: claim(order=d.certificate.claims["order"] - 1.0)(d), [ORDER]),
     "decay": ("both", claim(decay=1e3), [DECAY]),
+    "decay, a little too fast": ("both", lambda d: claim(decay=1.01 * d.certificate.claims["decay"])(d), [DECAY]),
     "a claimed gain": ("both", claim(gamma=1e-9), ["claims covered"]),
     "a claimed error per unit of a state": (
         "both", matrix("state_error", lambda found: 0.5 * found), ["stored numbers: states"],
     ),
+    "no error per unit of a state": ("both", matrix("state_error", np.zeros_like), ["stored numbers: states"]),
     "a claimed error per unit of an input": (
         "both", matrix("input_error", lambda found: 0.5 * found), ["stored numbers: inputs"],
     ),
@@ -132,6 +135,15 @@ TABLE = {
     "motion": ("both", matrix("tracking", at(0, 0)), [MOTION, MODELS, ERROR_A]),
     "deviations": (
         "both", matrix("deviations", lambda found: 0.5 * found), [NOISE_A, NOISE_B, ERROR_A, ERROR_B],
+    ),
+    "deviations, a little too small": (
+        "both", matrix("deviations", lambda found: 0.99 * found), [NOISE_A, NOISE_B, ERROR_A, ERROR_B],
+    ),
+    "claimed errors per unit, a little too small": (
+        "both", lambda d: matrix("state_error", lambda found: 0.95 * found)(
+            matrix("input_error", lambda found: 0.95 * found)(
+                matrix("disturbance_error", lambda found: 0.95 * found)(d))),
+        ["stored numbers: states", "stored numbers: inputs", "stored numbers: disturbances"],
     ),
     "a fault that nothing shows": (
         "both", of_plant(Df=lambda found: 0.0 * found), [SHOWS_A, MODELS, MOTION],
