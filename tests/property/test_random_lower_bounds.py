@@ -4,10 +4,14 @@ import numpy as np
 import pytest
 
 import obsynth
-from obsynth.methods.fault_estimation_filter.gamma_lower_bound import proved_lower_bound
+from obsynth.methods.fault_estimation_filter.gamma_lower_bound import _checked_bound, _DualProblem, proved_lower_bound
 from obsynth.methods.fault_estimation_filter.inequality_search import search_least_gain
+from obsynth.methods.fault_estimation_filter.injection_problem import normalise
+from obsynth.methods.fault_estimation_filter.least_gain_proof import ALONE, LAST, PAIRS, InvisiblePairs
+from obsynth.methods.fault_estimation_filter.output_nulling import output_nulling_part
 from obsynth.methods.fault_estimation_filter.prepared_plant import prepare
 from obsynth.methods.fault_estimation_filter.synthesis import gain_problem
+from obsynth.proofs.written_numbers import stored_matrix
 
 
 def random_plant(seed: int, units: float) -> obsynth.DescriptorSystem:
@@ -49,3 +53,74 @@ def test_a_bound_is_not_improved_once_it_is_enough():
     problem, _ = gain_problem(prepare(random_plant(1, 1.0)), free_weight=False)
     least = search_least_gain(problem, solver="CLARABEL", polish=False)
     assert 0.5 * least.gain < proved_lower_bound(problem, solver="CLARABEL", enough=0.5 * least.gain) <= least.gain
+
+
+@pytest.mark.parametrize("free_weight", [False, True])
+def test_no_dual_point_however_infeasible_proves_more_than_a_filter_reaches(free_weight):
+    """Points of any signs and sizes, as a solver that fails leaves them: a filter in hand refutes a larger bound."""
+    rng = np.random.default_rng(0)
+    proved = 0
+    for seed in range(3):
+        problem, _ = gain_problem(prepare(random_plant(seed, 1.0)), free_weight=free_weight)
+        least = search_least_gain(problem, solver="CLARABEL", polish=False)
+        normalised = normalise(problem, start=None, rotate=True)
+        dual = _DualProblem.of(output_nulling_part(normalised.problem))
+        (n, size), nd = dual.top.shape, len(dual.bottom)
+        for _ in range(200):
+            scale = 10.0 ** rng.uniform(-3.0, 12.0)
+            z1, last = (scale * rng.normal(size=(count, count)) for count in (size, nd))
+            bound = normalised.gain * _checked_bound(dual, z1, scale * rng.normal(size=(nd, n)), last)
+            assert bound <= least.gain * (1.0 + 1e-9)
+            proved += bound > 0.0
+    assert proved > 0
+
+
+def pairs_of_everything(a, b, c, d) -> InvisiblePairs:
+    """Return the pairs of a system whose outputs no gain can change: all errors, all disturbances."""
+    one, none = np.eye(len(a)), np.zeros((len(a), b.shape[1]))
+    top, bottom = np.hstack([one, none]), np.hstack([none.T, np.eye(b.shape[1])])
+    parts = (one, top, bottom, np.hstack([a, b]), np.hstack([c, d]), c, d)
+    return InvisiblePairs(*(stored_matrix(part) for part in parts))
+
+
+def samples(a, b, disturbances) -> np.ndarray:
+    """Return the pairs that a disturbance from rest runs through: they can follow each other."""
+    errors = [np.zeros(len(a))]
+    for value in disturbances[:-1]:
+        errors.append(a @ errors[-1] + b @ value)
+    return np.vstack([np.array(errors).T, disturbances.T])
+
+
+@pytest.mark.parametrize("free_weight", [False, True])
+def test_no_stated_proof_of_the_least_gain_proves_more_than_what_is_true(free_weight):
+    """Where no gain changes anything the least gain is the norm: runs from rest show less, whatever follows them."""
+    rng = np.random.default_rng(1)
+    proved = 0
+    for _ in range(6):
+        a, b, c, d = (rng.normal(size=shape) for shape in ((2, 2), (2, 1), (1, 2), (1, 1)))
+        a *= 0.7 / np.max(np.abs(np.linalg.eigvals(a)))
+        points = np.exp(1j * np.linspace(0.0, np.pi, 4001))
+        norm = max(abs((c @ np.linalg.solve(z * np.eye(2) - a, b) + d).item()) for z in points) * (1.0 + 1e-5)
+        pairs = pairs_of_everything(a, b, c, d)
+        for trial in range(40):
+            # Two runs, as one leaves a slack of rank one; and mixtures that cannot follow each other.
+            runs = [samples(a, b, rng.normal(size=(5, 1))) for _ in range(2)]
+            mixture = np.hstack(runs) if trial % 2 else rng.normal(size=(3, 2)) * (rng.random((3, 2)) < 0.6)
+            size = 10.0 ** rng.uniform(-3.0, 3.0, size=2)
+            parts = {PAIRS: mixture, LAST: size[0] * rng.normal(size=(1, 2)), ALONE: size[1] * rng.normal(size=(1, 1))}
+            for left_out in (set(), {PAIRS}, {LAST}, {ALONE}, {LAST, ALONE}):
+                stated = {name: part for name, part in parts.items() if name not in left_out}
+                bound = pairs.bound(stated, free_weight=free_weight)
+                assert bound <= norm, (trial, left_out)
+                proved += bound > 0.0
+    assert proved > 0
+
+
+def test_a_long_run_proves_nearly_the_norm():
+    """The gain of e+ = e / 2 + d, xi = e is 2, and a constant disturbance comes near it."""
+    one = np.eye(1)
+    mixture = samples(0.5 * one, one, np.ones((400, 1)))
+    pairs = pairs_of_everything(0.5 * one, one, one, 0.0 * one)
+    assert 1.99 < pairs.bound({PAIRS: mixture}, free_weight=False) <= 2.0
+    # Without the first sample, which is the one at rest, nothing says where the run came from.
+    assert pairs.bound({PAIRS: np.array([[1.0], [0.0]])}, free_weight=False) == 0.0

@@ -32,6 +32,8 @@ from obsynth import (
     pd_observer_from_gains,
     verify,
 )
+from obsynth.methods.pd_observer.checks.certificate import prove_gain
+from obsynth.proofs.balls import Ball
 from obsynth.spec import load_spec
 from obsynth.verification.claims import WITNESS_CLAIMS
 
@@ -265,6 +267,8 @@ TABLE: dict[str, tuple[str, Corruption, tuple[str, ...]]] = {
     "Q negative": ("second theorem", certificate_times("P3", -1.0), (Q, LMI)),
     "P3 of Theorem 1 called Q": ("paper", claim("theorem", 2.0), (Q,)),
     "P1_low negative": ("range", certificate_times("P1_low", -1.0), (RANGE,)),
+    "P1_low not symmetric": ("range", certificate_nudge("P1_low", 0, 1), (RANGE,)),
+    "P1_high not symmetric": ("range", certificate_nudge("P1_high", 1, 2), (RANGE,)),
     "P1_high wrong": ("range", certificate_times("P1_high", 100.0), (RANGE,)),
     "P1_high missing": (
         "range",
@@ -426,6 +430,17 @@ def test_not_a_number_anywhere_is_refused_or_fails(name: str) -> None:
             assert failed(certificate_entry(key, row, 0, np.nan)(design)) == {WITNESS_CLAIMS.get(key, FITS)}
     for key in design.certificate.claims:
         assert failed(claim(key, np.nan)(design)) == {FITS}
+
+
+def test_a_gain_is_proved_down_to_the_norm_and_no_further() -> None:
+    """x' = -x + v: norm one, and P = 1 solves the equation at it.  P = 1/8 does for x' = -2 x + v, z = x / 2."""
+    one = np.eye(1)
+    for a, c, p, norm in ((-1.0, 1.0, 1.0, 1.0), (-2.0, 0.5, 0.125, 0.25)):
+        for level, proved in ((1.0 + 1e-6, True), (1.0 - 1e-6, False), (0.95, False)):
+            found = prove_gain(a * one, Ball.exact(one), c * one, p * one, level * norm)
+            assert found.proved is proved, (a, level)
+    # Of an unstable system no P is positive and solves it.
+    assert not prove_gain(one, Ball.exact(one), one, -one, 2.0).proved
 
 
 def test_a_report_is_about_the_design_it_is_made_of_not_about_the_one_saved() -> None:
