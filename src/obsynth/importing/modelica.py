@@ -63,7 +63,9 @@ def from_modelica(
     The file does not hold the outputs at the operating point: add them by ``operating_point={...}``.  Constant terms
     are not in it either: linearise in a steady state.
     """
-    source = input_file(Path(path))
+    source = Path(path)
+    if source.exists():
+        source = input_file(source)
     try:
         text = source.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
