@@ -182,6 +182,12 @@ class Ball(Enclosure):
         """Upper bounds on the absolute values of the entries of every member."""
         return rounded_up(np.abs(self.midpoint) + self.radius, 2)
 
+    @property
+    def frobenius_norm(self) -> float:
+        """Upper bound on the Frobenius norm of every member, and so on its 2-norm."""
+        size = self.magnitude
+        return float(rounded_up(np.asarray(np.sqrt(np.sum(size**2))), size.size + 6))
+
     def widened(self, share: float) -> Ball:
         """Return the ball of every member times a number that is off one by at most ``share``."""
         radius = self.radius + share * (np.abs(self.midpoint) + self.radius)

@@ -151,8 +151,7 @@ def _tried(ball: Ball, rate: float, *, discrete: bool) -> Contraction | None:
     if not prove_positive_definite(formula).proved:
         return None
     product = Ball.exact(factor) @ Ball.exact(inverse) - Ball.exact(np.eye(n))
-    size = np.abs(product.midpoint) + product.radius
-    defect = float(rounded_up(np.asarray(np.sqrt(np.sum(size**2))), n * n + 6))
+    defect = product.frobenius_norm
     return Contraction(factor, inverse, defect, rate, discrete) if defect < 0.5 else None
 
 

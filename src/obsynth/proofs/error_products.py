@@ -67,8 +67,7 @@ def logarithm_of_product(factors: Sequence[Ball], units: FloatArray | None = Non
 def _lack_of_orthogonality(axes: FloatArray) -> float:
     """Return an upper bound on ``|U' U - I|``."""
     gap = Ball.exact(axes.T) @ Ball.exact(axes) - Ball.exact(np.eye(len(axes)))
-    size = np.abs(gap.midpoint) + gap.radius
-    return float(rounded_up(np.asarray(np.sqrt(np.sum(size**2))), size.size + 6))
+    return gap.frobenius_norm
 
 
 def _in_units(ball: Ball, units: FloatArray) -> Ball:

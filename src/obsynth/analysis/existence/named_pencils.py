@@ -31,7 +31,7 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.exosystems import Exosystem
 from obsynth.proofs.written_numbers import written_fraction
 
-#: Digits to which the vector of a witness is rounded, until the plant is within the tolerance.
+#: Digits to which the direction of a witness is rounded, until the plant is within the tolerance.
 DIGITS = (1, 2, 3, 5, 8, 11, 14, 17)
 #: How much rather an entry is changed that is not zero, and one of E, whose ones are structure rather than data.
 KNOWN_ENTRY, STRUCTURE = 8.0, 1e-2

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from obsynth.analysis.existence.distance import DROWNED
+from obsynth.analysis.existence.named_pencils import DIGITS
 from obsynth.analysis.existence.numbers import numbers_of
 from obsynth.analysis.existence.rational import WrittenNumbers
 from obsynth.analysis.existence.verdicts import DECIDER
@@ -28,9 +29,6 @@ from obsynth.plants.descriptor import DescriptorSystem
 if TYPE_CHECKING:
     from flint import fmpq_mat
 
-#: Digits to which the combination of faults is rounded.
-_DIGITS = (1, 2, 3, 5, 8, 11, 14, 17)
-
 
 def index_doubt(plant: DescriptorSystem, detectability: FaultDetectability) -> Unclear | None:
     """Return why the rank of Upsilon is unclear; ``None`` where it is not."""
@@ -38,7 +36,7 @@ def index_doubt(plant: DescriptorSystem, detectability: FaultDetectability) -> U
         return None
     units, best = PlantUnits.of(plant).rounded(), None
     direction = _null_direction(detectability)
-    for digits in _DIGITS:
+    for digits in DIGITS:
         found = _changed(plant, units, detectability.indexes, np.round(direction, digits))
         if found is not None and (best is None or found.size < best.size):
             best = found

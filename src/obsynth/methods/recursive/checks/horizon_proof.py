@@ -117,8 +117,7 @@ def natural_units(observer: RecursiveObserver) -> FloatArray:
     """Return sizes of the states that equations and outputs suggest, ``(n,)``; of parameters that walk, one."""
     plant, count = observer.plant, len(observer.recursion.first.x)
     E, A, C = plant.E.at(1), plant.A.at(0), plant.C.at(1)
-    units = balance_by_least_squares(E, A, outputs=[C]).states if E.shape == A.shape else np.ones(plant.nx)
-    return np.concatenate([units, np.ones(count - plant.nx)])
+    return np.concatenate([balance_by_least_squares(E, A, outputs=[C]).states, np.ones(count - plant.nx)])
 
 
 def _true_steps(stated: RecursiveObserver, shipped: RecursiveObserver, steps: int) -> Iterable[StepMatrices | None]:

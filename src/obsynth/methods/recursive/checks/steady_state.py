@@ -93,12 +93,11 @@ def _steady_covariance(
     X = Ball.exact((found + found.T) / 2.0)
     norm = Ball.exact(contraction.Q)
     gap = norm @ (transition @ X @ transition.T + noise - X) @ norm.T
-    size = float(rounded_up(np.asarray(np.linalg.norm(np.abs(gap.midpoint) + gap.radius)), gap.midpoint.size + 6))
     # One minus the rate squared, in a form that does not cancel: three roundings, which the radius below covers.
     share = (1.0 - contraction.rate) * (1.0 + contraction.rate)
     # Every row of the inverse is seen on its own.
     seen = rounded_up(column_norms(Ball.exact(contraction.inverse).T) / (1.0 - contraction.defect), 4)
-    radius = rounded_up(np.outer(seen, seen) * size / share, 8)
+    radius = rounded_up(np.outer(seen, seen) * gap.frobenius_norm / share, 8)
     enclosed = Ball(X.midpoint, radius)
     middle, spread = np.diag(X.midpoint), np.diag(radius)
     low, high = np.sqrt(np.maximum(middle - spread, 0.0)), np.sqrt(rounded_up(np.abs(middle) + spread, 4))
