@@ -126,10 +126,8 @@ def innovations_fit(
     *,
     exact: Problem | None = None,
 ) -> tuple[InnovationsFit | None, float]:
-    """Return the fit of the innovations, from fits of the simulation.
-
-    With an ``exact`` problem also by how much its constants would move; there is no fit where that matters.
-    """
+    """Return the fit of the innovations, from fits of the simulation. With an ``exact`` problem also by how much its
+    constants would move; there is no fit where that matters."""
     objective = Objective(problem, fits[0])
     maximum, found = guarded_maximum(objective, fits, note)
     moved = 0.0 if exact is None else moved_by(exact, fits[0], maximum, objective.avoided, found)

@@ -26,11 +26,8 @@ IMPOSSIBLE = 1e12
 
 
 class Likelihood:
-    """Negative log likelihood of a record as a function of ``v = [t, log q, log r]``.
-
-    ``u (n, nu)``, ``y (n, ny)`` with NaN for what is missing, ``noisy`` numbers of equations, ``x0 (nx,)``,
-    ``P0 (nx, nx)``.
-    """
+    """Negative log likelihood of a record as a function of ``v = [t, log q, log r]``. ``u (n, nu)``, ``y (n, ny)`` with
+    NaN for what is missing, ``noisy`` numbers of equations, ``x0 (nx,)``, ``P0 (nx, nx)``."""
 
     def __init__(
         self, graphs: SampleGraphs, u: FloatArray, y: FloatArray, *, noisy: Sequence[int], x0: FloatArray,

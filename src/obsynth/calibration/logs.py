@@ -61,11 +61,9 @@ EVEN = 12.0
 
 @dataclass(frozen=True, eq=False)
 class Log:
-    """Inputs and outputs on a regular grid.
-
-    time : ``(n,)`` seconds; u : ``(n, nu)``; y : ``(n, ny)`` with NaN for what is missing; dt : seconds.
-    rows : first row and one past the last, of the data that were given; notes : what was noticed and repaired.
-    """
+    """Inputs and outputs on a regular grid. time : ``(n,)`` seconds; u : ``(n, nu)``; y : ``(n, ny)`` with NaN for what
+    is missing; dt : seconds. rows : first row and one past the last, of the data that were given; notes : what was
+    noticed and repaired."""
 
     time: FloatArray
     u: FloatArray
@@ -141,11 +139,9 @@ def read_log(
     rows: str | slice | Sequence[int] | None = None, columns: Mapping[str, str] | None = None,
     scales: Mapping[str, float] | None = None, dt: float | None = None,
 ) -> Log:  # fmt: skip
-    """Return the rows of a log as inputs and outputs on a grid.
-
-    A log is a CSV or Parquet file, a data frame, or a mapping from names to columns; ``columns`` says which column a
-    signal (or ``time``) is in where the names differ, ``scales`` what its values are multiplied by.
-    """
+    """Return the rows of a log as inputs and outputs on a grid. A log is a CSV or Parquet file, a data frame, or a
+    mapping from names to columns; ``columns`` says which column a signal (or ``time``) is in where the names differ,
+    ``scales`` what its values are multiplied by."""
     if isinstance(log, Log):
         if (log.input_names, log.output_names) != (tuple(input_names), tuple(output_names)):
             raise SpecError("The log is of another plant: its signals differ.", path="log")

@@ -49,10 +49,8 @@ AT_BOUND = 1e-6
 
 
 class Objective:
-    """Negative log of likelihood and prior, and its gradient, of free variables ``z``.
-
-    ``z`` holds the constants in widths of their bounds, then the logarithms of the variances that are not known.
-    """
+    """Negative log of likelihood and prior, and its gradient, of free variables ``z``. ``z`` holds the constants in
+    widths of their bounds, then the logarithms of the variances that are not known."""
 
     def __init__(self, problem: Problem, fit: Fit) -> None:
         p, g = problem, problem.graphs
@@ -123,9 +121,7 @@ class Objective:
 @dataclass(frozen=True, eq=False)
 class Maximum:
     """Where the likelihood is greatest: free variables, value, Hessian, and the value that each start reached.
-
-    ``likeliest`` are the free variables before any variance was kept from zero.
-    """
+    ``likeliest`` are the free variables before any variance was kept from zero."""
 
     z: FloatArray
     value: float
@@ -192,10 +188,8 @@ def polished(
     objective: Objective, z: FloatArray, *, fixed: int | None = None, most: int = MOST_NEWTON_STEPS,
     tolerance: float = NEWTON_TOLERANCE, near: FloatArray | None = None,
 ) -> tuple[float, FloatArray, FloatArray]:  # fmt: skip
-    """Return value, place and Hessian after Newton steps: a quiet log makes valleys that other searches end beside.
-
-    One variable may be fixed; the Hessian is then that of a place nearby.  ``near`` is a Hessian to begin with.
-    """
+    """Return value, place and Hessian after Newton steps: a quiet log makes valleys that other searches end beside. One
+    variable may be fixed; the Hessian is then that of a place nearby. ``near`` is a Hessian to begin with."""
     value, gradient = objective(z)
     curvature = hessian(objective, z) if near is None else near
     for _ in range(most):
@@ -264,11 +258,9 @@ def collapsed(objective: Objective, maximum: Maximum) -> BoolArray:
 
 
 def without_collapse(objective: Objective, maximum: Maximum, note: Callable[[str], object]) -> Maximum:
-    """Return the maximum with variances kept away from zero where the log cannot tell them from it.
-
-    The weight sqrt(q) of a boundary-avoiding prior (Chung et al. 2013) is given to those variances alone: a variance
-    that a short log makes zero by chance would make every box too small.
-    """
+    """Return the maximum with variances kept away from zero where the log cannot tell them from it. The weight sqrt(q)
+    of a boundary-avoiding prior (Chung et al. 2013) is given to those variances alone: a variance that a short log
+    makes zero by chance would make every box too small."""
     for _ in range(len(objective.problem.noisy) + 1):
         new = collapsed(objective, maximum) & (objective.avoided == 0.0)
         if not new.any():

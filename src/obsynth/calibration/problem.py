@@ -26,10 +26,8 @@ LEAST_NOISE = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """A plant with its log; arrays by unknown ``(nt,)``, by sensor ``(ny,)``, by noisy equation.
-
-    ``u (n, ns)``: the signals that the plant takes of each row.
-    """
+    """A plant with its log; arrays by unknown ``(nt,)``, by sensor ``(ny,)``, by noisy equation. ``u (n, ns)``: the
+    signals that the plant takes of each row."""
 
     plant: CalibrationPlant
     log: Log

@@ -38,10 +38,8 @@ COMPARED = 100
 
 @dataclass(frozen=True)
 class IntegrationError:
-    """Largest difference of one step of backward Euler from Radau, in deviations of a sensor, and where it is.
-
-    moved : by how much it moves a constant, in deviations of that, where it was asked.
-    """
+    """Largest difference of one step of backward Euler from Radau, in deviations of a sensor, and where it is. moved :
+    by how much it moves a constant, in deviations of that, where it was asked."""
 
     largest: float
     sensor: str

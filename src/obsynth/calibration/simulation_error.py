@@ -152,11 +152,9 @@ def simulation_fits(
 
 
 def with_seen_start(problem: Problem, fit: Fit, *, first: FloatArray | None = None) -> Problem:
-    """Return the problem with a wider covariance of the initial state, where the log begins elsewhere.
-
-    A start that nobody stated would else look like a fault in the first rows.  It is seen in the fit, or in the
-    ``first`` whitened innovations ``(rows, ny)``: then a fit that hardly knows it says where it is.
-    """
+    """Return the problem with a wider covariance of the initial state, where the log begins elsewhere. A start that
+    nobody stated would else look like a fault in the first rows. It is seen in the fit, or in the ``first`` whitened
+    innovations ``(rows, ny)``: then a fit that hardly knows it says where it is."""
     deviations, limit = np.sqrt(np.diag(problem.P0)), START_LIMIT
     if first is not None:
         if not np.abs(np.nan_to_num(first)).max() > FIRST_LIMIT:

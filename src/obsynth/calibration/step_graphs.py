@@ -57,14 +57,11 @@ COMPILED_OPERATIONS = 200_000
 
 @dataclass(frozen=True, eq=False)
 class SampleGraphs:
-    """The functions of one sample; ``u (nu,)`` are the signals, ``t (nt,)`` the unknown constants.
-
-    solve : from x, u, t to the stages of all substeps and the scaled residual that is left.
-    sensitivities : from x, u, t, stages to what `local` takes as numbers: stages and their derivatives.
-    local : from x, u, t and those numbers (with x itself) to the state after, F, G by t, and the noise's way.
-    outputs : from x, u, t to y, H and L by t.
-    fast : `local`, to be evaluated and not to be differentiated; in_c : whether functions are machine code.
-    """
+    """The functions of one sample; ``u (nu,)`` are the signals, ``t (nt,)`` the unknown constants. solve : from x, u, t
+    to the stages of all substeps and the scaled residual that is left. sensitivities : from x, u, t, stages to what
+    `local` takes as numbers: stages and their derivatives. local : from x, u, t and those numbers (with x itself) to
+    the state after, F, G by t, and the noise's way. outputs : from x, u, t to y, H and L by t. fast : `local`, to be
+    evaluated and not to be differentiated; in_c : whether functions are machine code."""
 
     solve: Any
     sensitivities: Any

@@ -41,10 +41,8 @@ from obsynth.results.design import ObserverDesign
 
 @dataclass(frozen=True, eq=False)
 class RecordedInnovations:
-    """Innovations ``(n, ny)`` and their deviations; sum of NIS and of its degrees; each parameter ``(n, 2)``.
-
-    error : What a step of backward Euler errs along the log, of a nonlinear observer that takes such steps.
-    """
+    """Innovations ``(n, ny)`` and their deviations; sum of NIS and of its degrees; each parameter ``(n, 2)``. error :
+    What a step of backward Euler errs along the log, of a nonlinear observer that takes such steps."""
 
     innovations: FloatArray
     deviations: FloatArray

@@ -19,15 +19,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SensorValidation:
-    """What the innovations of one sensor say.
+    """What the innovations of one sensor say."""
 
-    Fields: nis: Mean square in units of the expected variance, with its 95 % interval; mean: Of the innovations, in
-    standard deviations of such a mean for white ones; beyond 3 it is an offset; whiteness: Test of Ljung and Box.
-    """
-
-    nis: Consistency
-    mean: float
-    whiteness: Whiteness
+    nis: Consistency  # mean square in units of the expected variance, with its 95 % interval
+    mean: float  # of the innovations, in standard deviations of such a mean for white ones; beyond 3 it is an offset
+    whiteness: Whiteness  # test of Ljung and Box
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,13 +20,10 @@ from obsynth.plants.descriptor import DescriptorSystem
 
 @dataclass(frozen=True, eq=False)
 class GapModel:
-    """A plant with its algebraic states eliminated, ready to be propagated.
+    """A plant with its algebraic states eliminated, ready to be propagated."""
 
-    Fields: plant: ``E = I``; into: ``(nx, nx_source)``: the dynamic states in an estimate of all states.
-    """
-
-    plant: DescriptorSystem
-    into: FloatArray
+    plant: DescriptorSystem  # ``E = I``
+    into: FloatArray  # ``(nx, nx_source)``: the dynamic states in an estimate of all states
 
     @classmethod
     def of(cls, plant: DescriptorSystem) -> GapModel | None:
@@ -43,10 +40,8 @@ class GapModel:
         return cls(done.plant, np.asarray(np.linalg.pinv(moving) @ plant.E))
 
     def start(self, estimate: FloatArray, inputs: Sequence[FloatArray], fault: FloatArray) -> FloatArray:
-        """Return the dynamic states now from an estimate of the past.
-
-        Shapes: ``estimate (nx_source,)``, ``inputs (nu,)``, ``fault (nf,)``.
-        """
+        """Return the dynamic states now from an estimate of the past: ``estimate (nx_source,)``, ``inputs (nu,)``,
+        ``fault (nf,)``."""
         state = self.into @ estimate
         for u in inputs:
             state = self.sampled(state, u, fault)
@@ -65,10 +60,8 @@ class GapModel:
         return np.asarray(self.plant.C @ state + self.plant.D @ u + self.plant.Df @ fault)
 
     def miss(self, v: FloatArray, state: FloatArray | None = None, fault: FloatArray | None = None) -> float:
-        """Return the distance between measured outputs and those of a state; of rest and no fault by default.
-
-        Shapes: ``state (nx,)``, ``fault (nf,)``.
-        """
+        """Return the distance between measured outputs and those of a state; of rest and no fault by default: ``state
+        (nx,)``, ``fault (nf,)``."""
         plant = self.plant
         at = np.zeros(plant.nx) if state is None else state
         f = np.zeros(plant.nf) if fault is None else fault
@@ -81,10 +74,8 @@ Hold: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
 
 
 class KeptHolds:
-    """First-order holds of one system by the length of the interval; those used last are kept.
-
-    Fields: compute: Takes seconds, returns ``Phi, Gamma_0, Gamma_1``.
-    """
+    """First-order holds of one system by the length of the interval; those used last are kept. Fields: compute: Takes
+    seconds, returns ``Phi, Gamma_0, Gamma_1``."""
 
     def __init__(self, compute: Callable[[float], Hold]) -> None:
         self._compute = compute

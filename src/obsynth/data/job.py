@@ -29,10 +29,7 @@ FAR = 0.2
 
 
 class OperatingPointCheck:
-    """Gathers the first second of data.
-
-    Fields: signals: With the operating point.
-    """
+    """Gathers the first second of data. Fields: signals: With the operating point."""
 
     def __init__(self, signals: Signals) -> None:
         self._signals = signals
@@ -69,12 +66,9 @@ def damaged_state(path: Path) -> SpecError:
 
 
 class Job:
-    """Rows of data to rows of output.
-
-    Fields: engine: What is run; signals: Which columns it reads; recovery: The way back to the states of the plant as
-    written; thresholds: Level by column; monitor: What watches residuals or parameters; later: Where rows wait
-    for those after them.
-    """
+    """Rows of data to rows of output. Fields: engine: What is run; signals: Which columns it reads; recovery: The way
+    back to the states of the plant as written; thresholds: Level by column; monitor: What watches residuals or
+    parameters; later: Where rows wait for those after them."""
 
     def __init__(
         self, engine: Engine, signals: Signals, recovery: StateRecovery | None, thresholds: Mapping[str, float],
@@ -120,10 +114,7 @@ class Job:
         self.alarm_rows = dict[str, int]()
 
     def take(self, chunk: FloatArray) -> list[list[Any]]:
-        """Take rows ``[time, u, y]`` as read; return rows of output.
-
-        Shapes: ``chunk (rows, 1 + nu + ny)``.
-        """
+        """Take rows ``[time, u, y]`` as read; return rows of output: ``chunk (rows, 1 + nu + ny)``."""
         if self.resumed_from is None:
             return self._taken(chunk)
         try:

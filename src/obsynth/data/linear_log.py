@@ -33,11 +33,9 @@ def _running(part: _Part | None) -> _Part:
 
 
 class DataObserver(LinearSignalNames):
-    """A running linear observer on measured data.
-
-    Fields: design: A linear design; gap: Continuous time: intervals longer than this are gaps, in seconds; warm_up:
-    Seconds that are marked after a start and after a gap; by default until the slowest mode has shrunk to 2 %.
-    """
+    """A running linear observer on measured data. Fields: design: A linear design; gap: Continuous time: intervals
+    longer than this are gaps, in seconds; warm_up: Seconds that are marked after a start and after a gap; by default
+    until the slowest mode has shrunk to 2 %."""
 
     def __init__(self, design: ObserverDesign, *, gap: float | None = None, warm_up: float | None = None) -> None:
         super().__init__(design)

@@ -17,29 +17,23 @@ LONGEST_BRIDGE = 10_000
 
 
 class Row(NamedTuple):
-    """Estimates at one row of data.
+    """Estimates at one row of data."""
 
-    Fields: status: ``ok``, ``warm-up``, ``partial``, ``gap`` or ``recovering``; values: One for each column of the
-    engine, state estimates first, then fault estimates; deviations; NaN where nothing is known; skipped: How many rows
-    were missing before this one; evidence: What a recursive observer learnt from this row, for decisions; `None` for
-    others.
-    """
-
-    status: str
+    status: str  # ``ok``, ``warm-up``, ``partial``, ``gap`` or ``recovering``
+    # one for each column of the engine, state estimates first, then fault estimates; deviations; NaN where nothing is
+    # known
     values: FloatArray
-    skipped: int = 0
+    skipped: int = 0  # how many rows were missing before this one
+    # what a recursive observer learnt from this row, for decisions; `None` for others
     evidence: Evidence | LinearSample | None = None
 
 
 class Entry(NamedTuple):
-    """A row of a log.
+    """A row of a log."""
 
-    Fields: time: In seconds; deviations: ``(nu + ny,)`` as read; row: Of the filter, and in time smoothed.
-    """
-
-    time: float
-    deviations: FloatArray
-    row: Row
+    time: float  # in seconds
+    deviations: FloatArray  # ``(nu + ny,)`` as read
+    row: Row  # of the filter, and in time smoothed
 
 
 class Later(Protocol):
@@ -55,14 +49,11 @@ class Later(Protocol):
 
 
 class Engine(Protocol):
-    """A running design on measured data.
-
-    Fields: input_names, output_names: What is read from each row, in order; state_names, fault_names: What is
-    estimated: the first columns; columns: Names of the columns of estimates; state_delays, fault_delays: Samples by
-    which each estimate lags; dt: Seconds between samples; 0 for continuous time; point: Operating point by name of the
-    signal; scales: Factor of inputs and outputs by name, where the plant states one; notes: What a user should know
-    before anything is run.
-    """
+    """A running design on measured data. Fields: input_names, output_names: What is read from each row, in order;
+    state_names, fault_names: What is estimated: the first columns; columns: Names of the columns of estimates;
+    state_delays, fault_delays: Samples by which each estimate lags; dt: Seconds between samples; 0 for continuous time;
+    point: Operating point by name of the signal; scales: Factor of inputs and outputs by name, where the plant states
+    one; notes: What a user should know before anything is run."""
 
     @property
     def input_names(self) -> tuple[str, ...]:

@@ -22,19 +22,14 @@ TIME = "time"
 
 @dataclass(frozen=True, eq=False)
 class Signals:
-    """Which column holds which measured signal, and how its values become deviations.
+    """Which column holds which measured signal, and how its values become deviations."""
 
-    Fields: names: Signals: known inputs, then outputs; columns: The columns that are read: time, then one for each
-    signal; scale, offset: ``(nu + ny,)``: deviation = scale times the value in the column, minus offset; point: The
-    operating point; one: Number of the signal that is one in every row and has no column, if there is such a one.
-    """
-
-    names: tuple[str, ...]
-    columns: tuple[str, ...]
-    scale: FloatArray
+    names: tuple[str, ...]  # signals: known inputs, then outputs
+    columns: tuple[str, ...]  # the columns that are read: time, then one for each signal
+    scale: FloatArray  # scale, offset: ``(nu + ny,)``: deviation = scale times the value in the column, minus offset
     offset: FloatArray
-    point: Mapping[str, float]
-    one: int | None = None
+    point: Mapping[str, float]  # the operating point
+    one: int | None = None  # number of the signal that is one in every row and has no column, if there is such a one
 
     @classmethod
     def of(
@@ -111,10 +106,7 @@ def _advice(header: tuple[str, ...], missing: list[str]) -> str:
 
 
 class LinearSignalNames:
-    """Names, delays, operating point and scales of a linear design.
-
-    Fields: design: Linear.
-    """
+    """Names, delays, operating point and scales of a linear design. Fields: design: Linear."""
 
     def __init__(self, design: ObserverDesign) -> None:
         self.plant, self.observer = design.linear

@@ -47,10 +47,8 @@ class Sink(Protocol):
 
 
 class TextSink:
-    """CSV to a text stream, flushed after each call.
-
-    Fields: stream: Where to; header: Names of the columns; stamps: Dates are written back as such.
-    """
+    """CSV to a text stream, flushed after each call. Fields: stream: Where to; header: Names of the columns; stamps:
+    Dates are written back as such."""
 
     def __init__(self, stream: TextIO, header: Sequence[str], stamps: Stamps) -> None:
         self._stream, self._writer, self._stamps = stream, TableWriter(stream, header), stamps
@@ -63,10 +61,7 @@ class TextSink:
 
 
 class FrameSink:
-    """Rows to a data frame.
-
-    Fields: header: Names of the columns; stamps: Dates stay dates.
-    """
+    """Rows to a data frame. Fields: header: Names of the columns; stamps: Dates stay dates."""
 
     def __init__(self, header: Sequence[str], stamps: Stamps) -> None:
         self._header, self._rows, self._stamps = list(header), list[Sequence[Any]](), stamps
@@ -84,10 +79,8 @@ class FrameSink:
 
 
 class ParquetSink:
-    """Rows to a Parquet file, one row group for each call.
-
-    Fields: path: The file; header: Names of the columns; texts: The columns that hold text.
-    """
+    """Rows to a Parquet file, one row group for each call. Fields: path: The file; header: Names of the columns; texts:
+    The columns that hold text."""
 
     def __init__(self, path: str, header: Sequence[str], texts: set[str]) -> None:
         import pyarrow as pa
@@ -113,10 +106,8 @@ class ParquetSink:
 
 @contextmanager
 def file_sink(path: Path, header: Sequence[str], texts: set[str], stamps: Stamps) -> Iterator[Sink]:
-    """Give a sink for a file that replaces ``path`` when all went well, and leaves nothing behind otherwise.
-
-    In a Parquet file times are seconds, since 1970 where the log has dates.
-    """
+    """Give a sink for a file that replaces ``path`` when all went well, and leaves nothing behind otherwise. In a
+    Parquet file times are seconds, since 1970 where the log has dates."""
     check_suffix(path)
     with replacement_of(path) as (handle, temporary):
         if path.suffix.lower() == ".parquet":

@@ -43,10 +43,8 @@ class _Waiting(NamedTuple):
 
 
 class LaterRows:
-    """Rows of a log that wait for those after them.
-
-    Fields: engine: Of a recursive or nonlinear design; lag: How many samples they wait; ``None`` for the end.
-    """
+    """Rows of a log that wait for those after them. Fields: engine: Of a recursive or nonlinear design; lag: How many
+    samples they wait; ``None`` for the end."""
 
     def __init__(self, engine: Engine, lag: int | None) -> None:
         if not isinstance(engine, SteppingEngine):

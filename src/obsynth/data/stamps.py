@@ -25,9 +25,7 @@ _NANO, _MICRO, _DAY, _MICROSECONDS = 1e-9, 1e-6, 86400.0, 1e6
 
 class Stamps:
     """Which kind of stamps a log has, decided by its first one, and the zone in which they are written back.
-
-    Attributes: is_dated: Dates and times; zone: Of the first stamp, `None` where it names none (taken as UTC).
-    """
+    Attributes: is_dated: Dates and times; zone: Of the first stamp, `None` where it names none (taken as UTC)."""
 
     def __init__(self) -> None:
         self.is_dated: bool | None = None
@@ -118,11 +116,8 @@ MOST_SAMPLES = 2.0**53
 
 
 class Clock:
-    """Checks one time stamp after the other.
-
-    Fields: dt: Seconds between samples of the design; 0 for continuous time; gap: Continuous time: intervals longer
-    than this are gaps, in seconds.
-    """
+    """Checks one time stamp after the other. Fields: dt: Seconds between samples of the design; 0 for continuous time;
+    gap: Continuous time: intervals longer than this are gaps, in seconds."""
 
     def __init__(self, dt: float, gap: float | None) -> None:
         self.dt, self.gap = dt, gap

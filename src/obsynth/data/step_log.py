@@ -22,14 +22,10 @@ from obsynth.results.design import ObserverDesign
 
 
 class SteppingEngine:
-    """A running observer with deviations on measured data; the first row is k = 0.
-
-    Signals of a nonlinear plant are absolute values, as its model's.
-
-    Fields: design: Recursive or nonlinear; warm_up: Seconds that are marked after a start, and after rows with unknown
-    inputs, none by default: the covariances of the start say how uncertain the estimates are; outliers: What is done
-    with them, by default what the observer says, or a gate.
-    """
+    """A running observer with deviations on measured data; the first row is k = 0. Signals of a nonlinear plant are
+    absolute values, as its model's. Fields: design: Recursive or nonlinear; warm_up: Seconds that are marked after a
+    start, and after rows with unknown inputs, none by default: the covariances of the start say how uncertain the
+    estimates are; outliers: What is done with them, by default what the observer says, or a gate."""
 
     def __init__(self, design: ObserverDesign, *, warm_up: float | None = None, outliers: str | None = None) -> None:
         self.observer, plant = _with_gate(design.observer, outliers), design.plant

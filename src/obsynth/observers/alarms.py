@@ -72,8 +72,5 @@ def quantile(degrees: FloatArray, probability: float) -> FloatArray:
 
 
 def alone(scores: FloatArray, information: FloatArray) -> int:
-    """Return the parameter whose change alone explains most.
-
-    Shapes: ``scores (nq,)``, ``information (nq,)``.
-    """
+    """Return the parameter whose change alone explains most: ``scores (nq,)``, ``information (nq,)``."""
     return int(np.argmax(scores**2 / np.maximum(information, np.finfo(np.float64).tiny)))

@@ -57,11 +57,9 @@ def robust_advance(
     u: FloatArray, *, foreseen: Callable[[State, FloatArray], tuple[FloatArray, FloatArray]] | None = None,
 ) -> tuple[State, Row]:  # fmt: skip
     """Take a step; where its innovation is too long, ask each sensor and take the step again without the outliers.
-
     ``predicted(state, heard, u)`` returns mean and deviation of each output ``(ny,)`` from the samples that are heard.
     An output that a step needs to determine its state has no innovation there; ``foreseen(state, u)`` says what the
-    equations of the model expect of it, and what is `BLIND` times further off than the limit is left out as well.
-    """
+    equations of the model expect of it, and what is `BLIND` times further off than the limit is left out as well."""
     failed, mean, deviation, far = False, y, y, np.zeros(len(y), dtype=bool)
     try:
         with np.errstate(all="ignore"):
@@ -97,10 +95,8 @@ def _judged(
     limit: float, predicted: Callable[[State, FloatArray, FloatArray], tuple[FloatArray, FloatArray]], state: State,
     y: FloatArray, u: FloatArray,
 ) -> tuple[FloatArray, FloatArray, BoolArray]:  # fmt: skip
-    """Return mean and deviation of each output, and which are too far from them.
-
-    Where the model alone predicts nothing of an output, the others of the same sample do.
-    """
+    """Return mean and deviation of each output, and which are too far from them. Where the model alone predicts nothing
+    of an output, the others of the same sample do."""
     with np.errstate(all="ignore"):
         mean, deviation = predicted(state, np.full(len(y), np.nan), u)
         far = (np.abs(y - mean) > limit * deviation) | (np.abs(y) > OVERFLOW)

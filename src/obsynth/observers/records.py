@@ -96,10 +96,8 @@ def checked_sample(value: Any, count: int, name: str) -> FloatArray:
 def whole_record(
     y: ArrayLike, u: ArrayLike | None, ny: int, nu: int, *, complete: bool = False
 ) -> tuple[FloatArray, FloatArray]:
-    """Return outputs ``(samples, ny)``, all there where ``complete``, and known inputs ``(samples, nu)``.
-
-    Inputs may be left out where there are none.
-    """
+    """Return outputs ``(samples, ny)``, all there where ``complete``, and known inputs ``(samples, nu)``. Inputs may be
+    left out where there are none."""
     outputs = checked_record(y, ny, "y") if complete else measured_record(y, ny)
     inputs = checked_record(np.zeros((len(outputs), 0)) if u is None and not nu else u, nu, "u")
     if len(inputs) != len(outputs):

@@ -21,10 +21,8 @@ BY_COLUMNS = "by columns"
 
 
 class Observer(Protocol[State, Row]):
-    """An observer: values alone, so that one serves any number of runs; a state is a tuple of plain arrays.
-
-    `advance` is `step` without checks of the sample, and returns the row of numbers that the estimates are made of.
-    """
+    """An observer: values alone, so that one serves any number of runs; a state is a tuple of plain arrays. `advance`
+    is `step` without checks of the sample, and returns the row of numbers that the estimates are made of."""
 
     def init(self) -> State:
         """Return the state before the first sample."""
@@ -142,36 +140,24 @@ class StepObserver(Undelayed, Generic[State, Known]):
         return found
 
     def advance(self, state: State, y: FloatArray, u: FloatArray) -> tuple[State, Known]:
-        """Return the next state and what is known at a sample, without checking it.
-
-        Shapes: ``y (ny,)``, ``u (nu,)``.
-        """
+        """Return the next state and what is known at a sample, without checking it: ``y (ny,)``, ``u (nu,)``."""
         after, row = self.timing.advance(self._steps.advance, state, y, u)
         return after, self.shown(row)
 
     def accept(self, state: State, y: FloatArray, u: FloatArray) -> tuple[State, Known]:
-        """Return the same as `advance`, where the step is one that can be trusted.
-
-        Shapes: ``y (ny,)``, ``u (nu,)``.
-        """
+        """Return the same as `advance`, where the step is one that can be trusted: ``y (ny,)``, ``u (nu,)``."""
         after, row = self.timing.advance(self.in_order, state, y, u)
         return after, self.shown(row)
 
     def in_order(self, state: State, y: FloatArray, u: FloatArray) -> tuple[State, Known]:
-        """Take a sample whose values are all of its own time, as `accept` takes it.
-
-        Shapes: ``y (ny,)``, ``u (nu,)``.
-        """
+        """Take a sample whose values are all of its own time, as `accept` takes it: ``y (ny,)``, ``u (nu,)``."""
         self._allow(state)
         after, row = self._steps.advance(state, y, u)
         self._trust(row)
         return after, row
 
     def step(self, state: State, y: ArrayLike, u: ArrayLike = ()) -> tuple[State, Estimates]:
-        """Return the state after a sample, and the estimates at it.
-
-        Shapes: ``y (ny,)``, ``u (nu,)``.
-        """
+        """Return the state after a sample, and the estimates at it: ``y (ny,)``, ``u (nu,)``."""
         after, row = self.accept(state, *self._sample(state, y, u))
         return after, self._estimates(getattr(after, "latest", after), row)
 

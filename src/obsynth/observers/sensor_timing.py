@@ -52,15 +52,11 @@ def checked_sensors(value: Any, names: Sequence[str]) -> dict[str, dict[str, int
 
 
 class WaitingState(NamedTuple):
-    """The state of an observer with late sensors.
+    """The state of an observer with late sensors."""
 
-    Fields: before: Its states before each of the latest samples; latest: After the last one; outputs, inputs: Of these
-    samples, as far as they have arrived.
-    """
-
-    before: tuple[Any, ...]
-    latest: Any
-    outputs: FloatArray
+    before: tuple[Any, ...]  # its states before each of the latest samples
+    latest: Any  # after the last one
+    outputs: FloatArray  # outputs, inputs: Of these samples, as far as they have arrived
     inputs: FloatArray
 
     @property
@@ -83,15 +79,11 @@ class WaitingState(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SensorTiming:
-    """When each sensor is sampled, and how late its values are.
+    """When each sensor is sampled, and how late its values are."""
 
-    Fields: every, delays: ``(ny,)``, in rows; inputs: How many there are.  A sensor is sampled at k = 0, every, 2
-    every, ...
-    """
-
-    every: NDArray[np.int_]
+    every: NDArray[np.int_]  # every, delays: ``(ny,)``, in rows
     delays: NDArray[np.int_]
-    inputs: int
+    inputs: int  # how many there are. A sensor is sampled at k = 0, every, 2 every,
 
     @classmethod
     def of(cls, sensors: Mapping[str, Mapping[str, int]] | None, names: Sequence[str], inputs: int) -> SensorTiming:
@@ -138,10 +130,7 @@ class SensorTiming:
         return WaitingState((), first, np.zeros((0, len(self.every))), np.zeros((0, self.inputs)))
 
     def advance(self, inner: Inner, state: Any, y: FloatArray, u: FloatArray) -> tuple[Any, Any]:
-        """Take a row as it arrives by the steps of an observer without delays.
-
-        Shapes: ``y (ny,)``, ``u (nu,)``.
-        """
+        """Take a row as it arrives by the steps of an observer without delays: ``y (ny,)``, ``u (nu,)``."""
         if self.is_plain:
             return inner(state, y, u)
         heard = np.where(self.expected(state.k), y, np.nan)

@@ -46,11 +46,9 @@ def _pair(pair: Any, path: str) -> tuple[float, float]:
 
 
 def projected(x: FloatArray, factor: FloatArray, bounds: FloatArray) -> FloatArray:
-    """Return the point within bounds nearest to ``x`` in the metric of the covariance ``factor factor'``.
-
-    The shortest e with ``low <= x + factor e <= high`` by nonnegative least squares (Lawson, Hanson, LDP), so that the
-    covariance may be singular.  Shapes: ``x (n,)``, ``factor (n, any)``, ``bounds (n, 2)``.
-    """
+    """Return the point within bounds nearest to ``x`` in the metric of the covariance ``factor factor'``. The shortest
+    e with ``low <= x + factor e <= high`` by nonnegative least squares (Lawson, Hanson, LDP), so that the covariance
+    may be singular. Shapes: ``x (n,)``, ``factor (n, any)``, ``bounds (n, 2)``."""
     if ((bounds[:, 0] <= x) & (x <= bounds[:, 1])).all():
         return x
     from scipy.optimize import nnls

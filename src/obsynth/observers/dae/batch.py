@@ -27,10 +27,7 @@ def run_dae_batch(
     observer: DAEObserver, y: ArrayLike, u: ArrayLike | None = None, *, compiled: bool | None = None,
     progress: bool | Callable[[int], None] | None = None,
 ) -> Estimates:  # fmt: skip
-    """Run many trials; see `obsynth.run_batch`.
-
-    Shapes: ``y (trials, samples, ny)``.
-    """
+    """Run many trials; see `obsynth.run_batch`: ``y (trials, samples, ny)``."""
     outputs, inputs = _checked(observer, y, u)
     trials, samples = outputs.shape[:2]
     alone = observer.outside_graph

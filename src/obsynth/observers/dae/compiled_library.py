@@ -34,10 +34,7 @@ def compiler() -> list[str] | None:
 
 
 class DAELibrary:
-    """An observer in C.
-
-    Fields: steps: Of the observer.
-    """
+    """An observer in C. Fields: steps: Of the observer."""
 
     def __init__(self, steps: Steps) -> None:
         self.steps = steps
@@ -70,10 +67,8 @@ class DAELibrary:
         return state
 
     def record(self, state: ctypes.Array[ctypes.c_char], y: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Go on over some samples; return memory and row of each that could be taken.
-
-        Shapes: ``y (samples, ny)``, ``u (samples, nu)``.
-        """
+        """Go on over some samples; return memory and row of each that could be taken: ``y (samples, ny)``, ``u
+        (samples, nu)``."""
         graph = self.steps.graph
         after, said = np.zeros((len(y), graph.memory.size)), np.zeros((len(y), graph.row.size))
         taken = self._library.record(state, len(y), *map(_pointer, (_plain(u), _plain(y), after, said)))

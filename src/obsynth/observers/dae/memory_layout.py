@@ -18,12 +18,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Layout:
-    """Named arrays in one vector, each by columns, as CasADi has them.
+    """Named arrays in one vector, each by columns, as CasADi has them."""
 
-    Fields: shapes: In order.
-    """
-
-    shapes: Mapping[str, tuple[int, int]]
+    shapes: Mapping[str, tuple[int, int]]  # in order
 
     @cached_property
     def slices(self) -> dict[str, slice]:
@@ -40,17 +37,11 @@ class Layout:
         return sum(rows * columns for rows, columns in self.shapes.values())
 
     def part(self, vectors: FloatArray, name: str) -> FloatArray:
-        """Return one array of each of many vectors.
-
-        Shapes: ``vectors (..., size)``.
-        """
+        """Return one array of each of many vectors: ``vectors (..., size)``."""
         return self.shaped(vectors[..., self.slices[name]], name)
 
     def shaped(self, flat: FloatArray, name: str) -> FloatArray:
-        """Return one array of each of many parts of vectors.
-
-        Shapes: ``flat (..., entries)``.
-        """
+        """Return one array of each of many parts of vectors: ``flat (..., entries)``."""
         rows, columns = self.shapes[name]
         if columns == 1 and name not in MATRICES:
             return flat
@@ -87,11 +78,9 @@ MATRICES = frozenset({
 
 
 def memory_layout(observer: DAESettings) -> Layout:
-    """Return the state.
-
-    ``posterior`` is the state after the measurement, ``x`` the one before it with the parameters as they are estimated
-    now; P belongs to ``x``, and ``spread`` is the covariance of the parameters, which S with forgetting is not.
-    """
+    """Return the state. ``posterior`` is the state after the measurement, ``x`` the one before it with the parameters
+    as they are estimated now; P belongs to ``x``, and ``spread`` is the covariance of the parameters, which S with
+    forgetting is not."""
     nx, ny, nq = observer.model.nx, observer.model.ny, observer.model.nq
     learning = {"cross": (nx, nq)} if observer.form == "augmented-kalman" else {"S": (nq, nq)}
     return Layout({
@@ -101,14 +90,12 @@ def memory_layout(observer: DAESettings) -> Layout:
 
 
 def row_layout(observer: DAESettings) -> Layout:
-    """Return what is said of one sample besides what is remembered.
-
-    ``score`` and ``information``: to first order the score less the information times the true parameters has mean zero
-    and covariance ``information``, of parameters that stay as they are.
-    ``expected`` is the covariance of the innovation, that of the identity for what is not seen; ``noise`` is the
-    derivative by what is added to the equations, ``kept`` F (I - K H) with K and H of the sample before, ``scaled`` the
-    equilibrated matrix of (7), and ``trusted`` one where the step of the compiled graph was solved.
-    """
+    """Return what is said of one sample besides what is remembered. ``score`` and ``information``: to first order the
+    score less the information times the true parameters has mean zero and covariance ``information``, of parameters
+    that stay as they are. ``expected`` is the covariance of the innovation, that of the identity for what is not seen;
+    ``noise`` is the derivative by what is added to the equations, ``kept`` F (I - K H) with K and H of the sample
+    before, ``scaled`` the equilibrated matrix of (7), and ``trusted`` one where the step of the compiled graph was
+    solved."""
     nx, ny, nq = observer.model.nx, observer.model.ny, observer.model.nq
     n = nx * len(BUTCHER[observer.integration])
     return Layout({
@@ -119,10 +106,7 @@ def row_layout(observer: DAESettings) -> Layout:
 
 
 def initial_memory(observer: DAESettings, x: FloatArray) -> FloatArray:
-    """Return what is remembered before the first sample.
-
-    Shapes: ``x (nx,)``.
-    """
+    """Return what is remembered before the first sample: ``x (nx,)``."""
     layout = memory_layout(observer)
     start = {name: np.zeros(shape) for name, shape in layout.shapes.items()}
     start |= {"posterior": x, "x": x, "theta": observer.initial_parameters, "P": observer.initial_covariance,

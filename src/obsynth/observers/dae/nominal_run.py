@@ -19,30 +19,22 @@ NOMINAL_STEPS = 100
 
 @dataclass(frozen=True, eq=False)
 class DAEFacts:
-    """Facts of a nominal run.
+    """Facts of a nominal run."""
 
-    Fields: index: At the nominal point; condition: Largest condition number of (7) along the run; condition_k: The
-    sample at which it is largest; residual: Largest scaled Newton residual; contraction: Spectral radius of F (I - K H)
-    at the end; deviations: ``(nq,)``: standard deviations of the parameters at the end; correlations: ``(nq, nq)``: of
-    the parameters' errors at the end: how much a change of one is taken for another; projection: ``(nx,)``: how far the
-    initial state is moved onto its constraint; identifiable: Of states and parameters along the nominal trajectory; K:
-    ``(nx, ny)`` at the end; Upsilon: ``(nx, nq)`` at the end; kept: ``(steps, nx, nx)``: F (I - K H) of every step;
-    parameter_covariance: ``(nq, nq)`` at the end.
-    """
-
-    index: IndexReport
-    condition: float
-    condition_k: int
-    residual: float
-    contraction: float
-    deviations: FloatArray
+    index: IndexReport  # at the nominal point
+    condition: float  # largest condition number of (7) along the run
+    condition_k: int  # the sample at which it is largest
+    residual: float  # largest scaled Newton residual
+    contraction: float  # spectral radius of F (I - K H) at the end
+    deviations: FloatArray  # ``(nq,)``: standard deviations of the parameters at the end
+    # ``(nq, nq)``: of the parameters' errors at the end: how much a change of one is taken for another
     correlations: FloatArray
-    projection: FloatArray
-    identifiable: Identifiability
-    K: FloatArray
-    Upsilon: FloatArray
-    kept: FloatArray
-    parameter_covariance: FloatArray
+    projection: FloatArray  # ``(nx,)``: how far the initial state is moved onto its constraint
+    identifiable: Identifiability  # of states and parameters along the nominal trajectory
+    K: FloatArray  # ``(nx, ny)`` at the end
+    Upsilon: FloatArray  # ``(nx, nq)`` at the end
+    kept: FloatArray  # ``(steps, nx, nx)``: F (I - K H) of every step
+    parameter_covariance: FloatArray  # ``(nq, nq)`` at the end
 
     @property
     def decay_time(self) -> float:

@@ -23,10 +23,7 @@ def run_record(
     steps: Steps, y: FloatArray, u: FloatArray, *, compiled: bool | None, library: DAELibrary | None,
     progress: bool | Callable[[int], None] | None,
 ) -> Estimates:  # fmt: skip
-    """Run over a whole record.
-
-    Shapes: ``y (samples, ny)``, ``u (samples, nu)``.
-    """
+    """Run over a whole record: ``y (samples, ny)``, ``u (samples, nu)``."""
     alone = steps.settings.outside_graph
     if library is not None and alone:
         raise SpecError(f"The C knows no {alone}: leave compiled=True out, or leave {alone} out.", path="compiled")
@@ -76,10 +73,8 @@ def advanced(
     steps: Steps, y: FloatArray, u: FloatArray, keep: Callable[[DAERow], object],
     note: Callable[[int], object] = bool,
 ) -> DAEState:  # fmt: skip
-    """Lead an observer from its start through a record; return its state at the end.
-
-    Shapes: ``y (samples, ny)``, ``u (samples, nu)``.
-    """
+    """Lead an observer from its start through a record; return its state at the end: ``y (samples, ny)``, ``u (samples,
+    nu)``."""
     calls: dict[int, Compiled] = {}
     state = steps.first
 

@@ -38,21 +38,16 @@ def chi_square_limit(degrees: int, probability: float) -> float:
 
 
 class DAEState(NamedTuple):
-    """The state of an observer of a DAE.
+    """The state of an observer of a DAE."""
 
-    Fields: memory: Laid out as `memory_layout` says; k: The next sample; u: ``(nu,)``: the inputs of
-    the sample before; informations: ``(nq, nq)`` each: on the parameters, of the latest samples; refused: ``(2, ny)``:
-    outliers in a row, and at all; surprises: ``(any, 2)``: normalised squares of the latest innovations, and their
-    degrees of freedom, for resets; resets: How many there were.
-    """
-
-    memory: FloatArray
-    k: int
-    u: FloatArray
-    informations: tuple[FloatArray, ...]
-    refused: FloatArray
+    memory: FloatArray  # laid out as `memory_layout` says
+    k: int  # the next sample
+    u: FloatArray  # ``(nu,)``: the inputs of the sample before
+    informations: tuple[FloatArray, ...]  # ``(nq, nq)`` each: on the parameters, of the latest samples
+    refused: FloatArray  # ``(2, ny)``: outliers in a row, and at all
+    # ``(any, 2)``: normalised squares of the latest innovations, and their degrees of freedom, for resets
     surprises: FloatArray
-    resets: int
+    resets: int  # how many there were
 
 
 class Steps:
@@ -70,10 +65,8 @@ class Steps:
         return self.graph.memory.part(state.memory, name)
 
     def advance(self, state: DAEState, y: FloatArray, u: FloatArray) -> tuple[DAEState, DAERow]:
-        """Return the state after a sample and what is said at it.
-
-        Shapes: ``y (ny,)`` with NaN for what is missing, ``u (nu,)``.
-        """
+        """Return the state after a sample and what is said at it: ``y (ny,)`` with NaN for what is missing, ``u
+        (nu,)``."""
         take = self.watched if self.settings.reset else self.plain
         if self.settings.outliers == "none":
             after, row = take(state, y, u)
@@ -95,9 +88,7 @@ class Steps:
 
     def watched(self, state: DAEState, y: FloatArray, u: FloatArray) -> tuple[DAEState, DAERow]:
         """Take a sample; where innovations have become too large, again with parameters known no better than at first.
-
-        A jump of a parameter is followed from there at once.
-        """
+        A jump of a parameter is followed from there at once."""
         after, row = self.plain(state, y, u)
         latest = [float(row.nis), float(row.degrees)]
         surprises = np.vstack([state.surprises, latest])[-RESET_WINDOW:] if state.k else state.surprises
@@ -148,10 +139,8 @@ class Steps:
     def stretch(
         self, state: DAEState, y: FloatArray, u: FloatArray, run: Callable[..., tuple[FloatArray, ...]]
     ) -> tuple[DAEState, DAERow]:
-        """Advance over samples until a step is not solved, by `ObserverGraph.whole` over that many samples.
-
-        Return what was reached, which may be nothing.  Shapes: ``y (samples, ny)``, ``u (samples, nu)``.
-        """
+        """Advance over samples until a step is not solved, by `ObserverGraph.whole` over that many samples. Return what
+        was reached, which may be nothing. Shapes: ``y (samples, ny)``, ``u (samples, nu)``."""
         seen = ~np.isnan(y)
         arriving = np.hstack([u, np.where(seen, y, 0.0), seen])
         after, said = (found.T for found in run(state.memory, arriving.ravel()))
@@ -167,10 +156,8 @@ class Steps:
         return state, rows
 
     def projected(self, state: DAEState, u: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Put the initial state onto the algebraic equations; return the memory and how far it moved.
-
-        Shapes: ``u (nu,)`` at k = 0.
-        """
+        """Put the initial state onto the algebraic equations; return the memory and how far it moved: ``u (nu,)`` at k
+        = 0."""
         model, start = self.settings.model, self.part(state, "x")
         short = ImplicitStep(DAEFunctions(model), PROJECTION_SHARE * self.settings.dt)
         found = short.solve_carefully(start, u, self.part(state, "theta")).x

@@ -31,16 +31,12 @@ from obsynth.plants.sequences import MatrixSequence
 
 
 class StepStack(NamedTuple):
-    """Steps as `obsynth.numerics.compiled_steps.square_root_steps` takes them.
+    """Steps as `obsynth.numerics.compiled_steps.square_root_steps` takes them."""
 
-    Fields: moved: ``(1 or steps, n, rows)``; known: ``(1 or steps, any, rows)``; head: ``(1 or steps, n, n)``; data:
-    ``(steps, rows)``: as many steps as have an H of full rank, from the first one.
-    """
-
-    moved: FloatArray
-    known: FloatArray
-    head: FloatArray
-    data: FloatArray
+    moved: FloatArray  # ``(1 or steps, n, rows)``
+    known: FloatArray  # ``(1 or steps, any, rows)``
+    head: FloatArray  # ``(1 or steps, n, n)``
+    data: FloatArray  # ``(steps, rows)``: as many steps as have an H of full rank, from the first one
 
 
 def stacked_matrices(model: StepModel, first: int, count: int) -> StepMatrices:
@@ -82,10 +78,8 @@ def _products(matrices: FloatArray, rows: FloatArray) -> FloatArray:
 
 
 def stacked_steps(step: StepMatrices, before: FloatArray, y: FloatArray, u: FloatArray) -> StepStack | None:
-    """Return steps with H factorised and everything rotated, up to the first H whose rank has to be decided.
-
-    Shapes: ``before (steps, nu)``, ``y (steps, measured)``, ``u (steps, nu)``.
-    """
+    """Return steps with H factorised and everything rotated, up to the first H whose rank has to be decided: ``before
+    (steps, nu)``, ``y (steps, measured)``, ``u (steps, nu)``."""
     ne, rows, n = step.A.shape[1], step.H.shape[1], step.H.shape[2]
     if rows < n:
         return None
@@ -146,10 +140,7 @@ def kernel_is_chosen(observer: RecursiveSettings, samples: int, compiled: bool |
 
 
 def run_record(recursion: Recursion, y: FloatArray, u: FloatArray, compiled: bool | None) -> Estimates:
-    """Run over a whole record.
-
-    Shapes: ``y (samples, ny)``, ``u (samples, nu)``.
-    """
+    """Run over a whole record: ``y (samples, ny)``, ``u (samples, nu)``."""
     if kernel_is_chosen(recursion.settings, len(y), compiled):
         return run_compiled(recursion, y, u)
     state, rows = recursion.first, []
@@ -200,10 +191,8 @@ class _Record:
 
 
 def run_compiled(recursion: Recursion, y: FloatArray, u: FloatArray) -> Estimates:
-    """Run over a whole record with the kernel; single steps where samples are missing or a rank has to be decided.
-
-    Shapes: ``y (samples, ny)``, ``u (samples, nu)``.
-    """
+    """Run over a whole record with the kernel; single steps where samples are missing or a rank has to be decided: ``y
+    (samples, ny)``, ``u (samples, nu)``."""
     state, observer = recursion.first, recursion.settings
     plant = observer.plant
     nq = 0 if observer.adaptation is None else plant.nq

@@ -16,10 +16,8 @@ from obsynth.observers.recursive.settings import RecursiveSettings
 def recursive_estimates(
     observer: RecursiveSettings, rows: Sequence[RawEstimate], *, window: Sequence[FloatArray] | None = None
 ) -> Estimates:
-    """Return the estimates in rows of a recursive observer.
-
-    Shapes: ``window (any, nq)``: regressors of the latest samples, when only the last row is given.
-    """
+    """Return the estimates in rows of a recursive observer: ``window (any, nq)``: regressors of the latest samples,
+    when only the last row is given."""
     length = 1 if observer.adaptation is None else observer.adaptation.window
     levels = excitation_levels([row.regressor for row in rows] if window is None else list(window), length)
     levels = levels[len(levels) - len(rows) :]
@@ -73,10 +71,8 @@ def received_in(y: FloatArray) -> NDArray[np.bool_]:
 
 
 def excitation_levels(regressors: Sequence[FloatArray], window: int) -> FloatArray:
-    """Return the least eigenvalue of ``sum G' G`` over the last ``window`` samples, zero while the window fills.
-
-    Shapes: ``regressors (any, nq)``.
-    """
+    """Return the least eigenvalue of ``sum G' G`` over the last ``window`` samples, zero while the window fills:
+    ``regressors (any, nq)``."""
     nq = regressors[0].shape[1] if regressors else 0
     levels = np.zeros(len(regressors))
     if not nq or len(regressors) < window:

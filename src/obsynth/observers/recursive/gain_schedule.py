@@ -27,33 +27,23 @@ from obsynth.observers.recursive.step_model import (
 
 
 class GainStep(NamedTuple):
-    """The gains of one step; data are the rows ``[A x + B u; outputs]``.
+    """The gains of one step; data are the rows ``[A x + B u; outputs]``."""
 
-    Fields: step: Of the model as it is run; gain: ``[L K] (nx, rows)`` of (11); parity: ``(m, rows)``: from data to the
-    whitened innovation; G: ``(m, nq)``: its regressor; Upsilon: ``(nx, nq)``, after the step; factor: ``(nx, nx)``:
-    square root of the covariance of the state, the parameters being known; learn: ``(nq, rows)``: from data to the
-    correction of the parameters; forget: ``(nq, nq)``: ``theta^+ = forget theta + learn data``; spread: ``(nq, nq)``:
-    square root of the covariance of the parameters.
-    """
-
-    step: StepMatrices
-    gain: FloatArray
-    parity: FloatArray
-    G: FloatArray
-    Upsilon: FloatArray
-    factor: FloatArray
-    learn: FloatArray
-    forget: FloatArray
-    spread: FloatArray
+    step: StepMatrices  # of the model as it is run
+    gain: FloatArray  # ``[L K] (nx, rows)`` of (11)
+    parity: FloatArray  # ``(m, rows)``: from data to the whitened innovation
+    G: FloatArray  # ``(m, nq)``: its regressor
+    Upsilon: FloatArray  # ``(nx, nq)``, after the step
+    factor: FloatArray  # ``(nx, nx)``: square root of the covariance of the state, the parameters being known
+    learn: FloatArray  # ``(nq, rows)``: from data to the correction of the parameters
+    forget: FloatArray  # ``(nq, nq)``: ``theta^+ = forget theta + learn data``
+    spread: FloatArray  # ``(nq, nq)``: square root of the covariance of the parameters
 
 
 def gain_steps(
     observer: RecursiveObserver, steps: int, *, received: NDArray[np.bool_] | None = None
 ) -> Iterator[GainStep]:
-    """Yield the gains of the first steps.
-
-    Shapes: ``received (samples, ny)``.
-    """
+    """Yield the gains of the first steps: ``received (samples, ny)``."""
     recursion = observer.recursion
     start = recursion.first
     factor, Upsilon, parameters, diffuse = start.factor, start.Upsilon, start.parameters, start.diffuse

@@ -20,10 +20,8 @@ SMALLEST_INFORMATION = float(np.finfo(np.float64).tiny / np.finfo(np.float64).ep
 
 
 def pull_of_the_start(observer: RecursiveObserver, estimates: Estimates, error: FloatArray) -> FloatArray:
-    """Return what is left, in the estimates at each sample, of an error of the initial parameters, ``(samples, nq)``.
-
-    Shapes: ``error (nq,)``.
-    """
+    """Return what is left, in the estimates at each sample, of an error of the initial parameters, ``(samples, nq)``:
+    ``error (nq,)``."""
     adaptation, nx = observer.adaptation, observer.plant.nx
     if adaptation is not None and adaptation.reset:
         raise SpecError("chi-square with reset needs nominal parameters that are the observer's initial ones: what a "
@@ -42,13 +40,9 @@ def pull_of_the_start(observer: RecursiveObserver, estimates: Estimates, error: 
 def likelihood_ratio(
     observer: RecursiveObserver, estimates: Estimates, gaps: FloatArray, false_alarms: float
 ) -> Decision:
-    """Return the generalised likelihood ratio of a jump at any of the last onsets.
-
-    The signature of a jump starts at zero at its onset (the regressor that runs along has another past); where samples
-    are missing it is that of the record.
-
-    Shapes: ``gaps (samples, m)``.
-    """
+    """Return the generalised likelihood ratio of a jump at any of the last onsets. The signature of a jump starts at
+    zero at its onset (the regressor that runs along has another past); where samples are missing it is that of the
+    record: ``gaps (samples, m)``."""
     samples, nq = gaps.shape[0], estimates.parameters.shape[1]
     begin = 0 if observer.early_constraints else 1
     looks = max(samples * GLR_WINDOW * GLR_LOOKS, 1.0)
@@ -80,10 +74,8 @@ def likelihood_ratio(
 
 
 def _doubled_log_ratios(information: FloatArray, scores: FloatArray) -> FloatArray:
-    """Return ``s' M^+ s`` of each onset; zero where a change leaves less than double precision resolves.
-
-    Each information is scaled first: where excitation dies out it underflows, and its inverse would overflow.
-    """
+    """Return ``s' M^+ s`` of each onset; zero where a change leaves less than double precision resolves. Each
+    information is scaled first: where excitation dies out it underflows, and its inverse would overflow."""
     sizes = np.einsum("oqq->oq", information).max(axis=1, initial=0.0)
     felt = sizes > SMALLEST_INFORMATION
     squares = np.where(felt, sizes, np.inf)

@@ -22,16 +22,12 @@ from obsynth.observers.recursive.step_model import EarlyConstraintSteps, StepMat
 
 @dataclass
 class RandomWalkParameterSteps:
-    """The steps of a model with its parameters among the states, as a random walk.
+    """The steps of a model with its parameters among the states, as a random walk. The state at k + 1 is ``[x(k+1);
+    theta(k)]``: the parameters that acted in the step that led there. Their increment then is noise of an equation of
+    its own, and no noise is correlated in time."""
 
-    The state at k + 1 is ``[x(k+1); theta(k)]``: the parameters that acted in the step that led there.  Their
-    increment then is noise of an equation of its own, and no noise is correlated in time.
-
-    Fields: model: With parameters; walk: ``(nq, nq)``: square root of the covariance of one step of the walk.
-    """
-
-    model: StepModel
-    walk: FloatArray
+    model: StepModel  # with parameters
+    walk: FloatArray  # ``(nq, nq)``: square root of the covariance of one step of the walk
 
     def at(self, k: int) -> StepMatrices:
         """Return the matrices of the step from k to k + 1."""
@@ -40,15 +36,11 @@ class RandomWalkParameterSteps:
 
 @dataclass
 class WalkingEarlySteps(EarlyConstraintSteps):
-    """Both at once: early constraints, and parameters that walk.
+    """Both at once: early constraints, and parameters that walk. An early equation of k + 1 holds for the parameters of
+    k + 1, so the state at k + 1 is ``[x(k+1); theta(k+1)]``. The outputs still hold theta(k), which is theta(k + 1)
+    without its last increment: that noise they share."""
 
-    An early equation of k + 1 holds for the parameters of k + 1, so the state at k + 1 is ``[x(k+1); theta(k+1)]``.
-    The outputs still hold theta(k), which is theta(k + 1) without its last increment: that noise they share.
-
-    Fields: walk: ``(nq, nq)``: square root of the covariance of one step of the walk.
-    """
-
-    walk: FloatArray
+    walk: FloatArray  # ``(nq, nq)``: square root of the covariance of one step of the walk
 
     def at(self, k: int) -> StepMatrices:
         """Return the matrices of the step from k to k + 1."""
@@ -81,10 +73,7 @@ class WalkingEarlySteps(EarlyConstraintSteps):
 
 
 def with_walking_parameters(step: StepMatrices, walk: FloatArray) -> StepMatrices:
-    """Return one step with its parameters among the states.
-
-    Shapes: ``walk (nq, nq)``.
-    """
+    """Return one step with its parameters among the states: ``walk (nq, nq)``."""
     ne, nx, nq = *step.A.shape, step.Phi.shape[1]
     E, C = step.H[:ne], step.H[ne:]
     H = np.block([[E, -step.Phi], [np.zeros((nq, nx)), np.eye(nq)], [C, step.Psi]])
@@ -137,21 +126,17 @@ RESET_WINDOW = 20
 
 
 class ParameterReset:
-    """Sums up normalised innovations, and starts S and the covariance again when they are too large.
-
-    Fields: probability: That the threshold is passed at a sample although nothing has changed; start: Whose triangle
-    and spread are taken back.
-    """
+    """Sums up normalised innovations, and starts S and the covariance again when they are too large. Fields:
+    probability: That the threshold is passed at a sample although nothing has changed; start: Whose triangle and spread
+    are taken back."""
 
     def __init__(self, probability: float, start: ParameterState) -> None:
         self.probability, self.start = probability, start
         self.thresholds: dict[int, float] = {}
 
     def surprises(self, before: FloatArray, state: ParameterState, v: FloatArray, G: FloatArray) -> FloatArray:
-        """Return the latest normalised squares with their degrees of freedom, that of this sample last.
-
-        Shapes: ``before (any, 2)``, ``v (m,)``, ``G (m, nq)``.
-        """
+        """Return the latest normalised squares with their degrees of freedom, that of this sample last: ``before (any,
+        2)``, ``v (m,)``, ``G (m, nq)``."""
         gap, seen = v - G @ state.theta, G @ state.spread
         covariance = np.eye(len(v)) + seen @ seen.T
         latest = [float(gap @ np.linalg.solve(covariance, gap)), float(len(v))]

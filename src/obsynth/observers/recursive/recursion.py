@@ -40,24 +40,17 @@ from obsynth.observers.recursive.step_model import (
 
 
 class RawEstimate(NamedTuple):
-    """What is known at one sample.
+    """What is known at one sample."""
 
-    Fields: k: The sample; x: ``(nx,)``: the state estimate, with the parameters as they are estimated now; factor:
-    ``(nx, any)``: square root of its covariance; diffuse: ``(nx, r)``: directions about which nothing is known;
-    parameters: Estimate and spreads; empty without parameters; innovation: ``(m,)``: whitened parity innovation of the
-    model without parameters; regressor: ``(m, nq)``; gap: ``(m,)``: the innovation at the parameters estimated one
-    sample before; y: ``(ny,)``: the outputs that were given, NaN where one was missing.
-    """
-
-    k: int
-    x: FloatArray
-    factor: FloatArray
-    diffuse: FloatArray
-    parameters: ParameterState
-    innovation: FloatArray
-    regressor: FloatArray
-    gap: FloatArray
-    y: FloatArray
+    k: int  # the sample
+    x: FloatArray  # ``(nx,)``: the state estimate, with the parameters as they are estimated now
+    factor: FloatArray  # ``(nx, any)``: square root of its covariance
+    diffuse: FloatArray  # ``(nx, r)``: directions about which nothing is known
+    parameters: ParameterState  # estimate and spreads; empty without parameters
+    innovation: FloatArray  # ``(m,)``: whitened parity innovation of the model without parameters
+    regressor: FloatArray  # ``(m, nq)``
+    gap: FloatArray  # ``(m,)``: the innovation at the parameters estimated one sample before
+    y: FloatArray  # ``(ny,)``: the outputs that were given, NaN where one was missing
 
     @property
     def theta(self) -> FloatArray:
@@ -116,27 +109,20 @@ def step_model_of(settings: RecursiveSettings) -> StepModel:
 
 
 class RecursiveState(NamedTuple):
-    """The state of a recursive observer.
+    """The state of a recursive observer."""
 
-    Fields: k: The next sample; x: ``(n,)``: estimate of the model without parameters, or of states and parameters of a
-    random walk; factor: ``(n, any)``: square root of its covariance; Upsilon: ``(nx, nq)``; diffuse: ``(n, r)``:
-    directions about which nothing is known; parameters: Estimate and spreads; u: ``(nu,)``: the inputs of the sample
-    before; regressors: Of the latest samples; surprises: ``(any, 2)``: normalised squares of the latest innovations,
-    and their degrees of freedom, for resets; resets: How many there were; refused: ``(2, ny)``: outliers in a row, and
-    at all.
-    """
-
-    k: int
-    x: FloatArray
-    factor: FloatArray
-    Upsilon: FloatArray
-    diffuse: FloatArray
-    parameters: ParameterState
-    u: FloatArray
-    regressors: tuple[FloatArray, ...]
+    k: int  # the next sample
+    x: FloatArray  # ``(n,)``: estimate of the model without parameters, or of states and parameters of a random walk
+    factor: FloatArray  # ``(n, any)``: square root of its covariance
+    Upsilon: FloatArray  # ``(nx, nq)``
+    diffuse: FloatArray  # ``(n, r)``: directions about which nothing is known
+    parameters: ParameterState  # estimate and spreads
+    u: FloatArray  # ``(nu,)``: the inputs of the sample before
+    regressors: tuple[FloatArray, ...]  # of the latest samples
+    # ``(any, 2)``: normalised squares of the latest innovations, and their degrees of freedom, for resets
     surprises: FloatArray
-    resets: int
-    refused: FloatArray
+    resets: int  # how many there were
+    refused: FloatArray  # ``(2, ny)``: outliers in a row, and at all
 
 
 class Recursion:
@@ -177,10 +163,8 @@ class Recursion:
         self.regular = parameters.triangle if adaptation.guard == "regularise" else None
 
     def advance(self, state: RecursiveState, y: FloatArray, u: FloatArray) -> tuple[RecursiveState, RawEstimate]:
-        """Return the state after a sample and what is known at it.
-
-        Shapes: ``y (ny,)`` with NaN for what is missing, ``u (nu,)``.
-        """
+        """Return the state after a sample and what is known at it: ``y (ny,)`` with NaN for what is missing, ``u
+        (nu,)``."""
         if self.settings.outliers == "none":
             return self.plain(state, y, u)
         foreseen = self.foreseen if state.k and self._constraints is not None else None
@@ -189,10 +173,8 @@ class Recursion:
         )
 
     def foreseen(self, state: RecursiveState, u: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return mean and deviation of each output ``(ny,)`` before the sample, with its own algebraic equations.
-
-        They come with the next step, but what they say of this sample is known now.  Infinite where nothing is.
-        """
+        """Return mean and deviation of each output ``(ny,)`` before the sample, with its own algebraic equations. They
+        come with the next step, but what they say of this sample is known now. Infinite where nothing is."""
         plant, k = self.settings.plant, state.k
         nothing = np.full(plant.ny, np.nan)
         if self._constraints is None or (plant.horizon is not None and k >= plant.horizon):
@@ -206,10 +188,8 @@ class Recursion:
         return self._outputs(self._estimate(corrected, v, G, v, nothing)._replace(k=k))
 
     def predicted(self, state: RecursiveState, heard: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return mean and deviation of each output ``(ny,)`` from what is heard of the next sample.
-
-        The deviation is infinite where nothing is known.
-        """
+        """Return mean and deviation of each output ``(ny,)`` from what is heard of the next sample. The deviation is
+        infinite where nothing is known."""
         plant, k = self.settings.plant, state.k
         if k == 0:
             return np.zeros(plant.ny), np.full(plant.ny, np.inf)
@@ -304,9 +284,7 @@ class Recursion:
         self, state: RecursiveState, step: StepMatrices, right: FloatArray
     ) -> tuple[LeastSquaresStep, tuple[FloatArray, FloatArray, FloatArray] | None]:
         """Take a step with missing samples, with undetermined directions, with perfect rows, or of the literal form.
-
-        Return also what the literal form learns from.
-        """
+        Return also what the literal form learns from."""
         ne, width, H = len(step.A), state.factor.shape[1], step.H
         S = np.zeros((len(H), max(width + step.noise.shape[1], len(H))))
         S[:ne, :width] = step.A @ state.factor

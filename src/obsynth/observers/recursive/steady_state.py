@@ -34,16 +34,12 @@ STILL_STEPS = 5
 
 @dataclass(frozen=True, eq=False)
 class SteadyObserver:
-    """A recursive observer whose gains have settled.
+    """A recursive observer whose gains have settled."""
 
-    Fields: observer: From ``[u; y]`` to states, parameters, and the whitened innovation at the parameters of one sample
-    before; start: ``z(0)``, from the state and the parameters that the recursion starts with; read-only; steps: After
-    how many steps the gains had settled.
-    """
-
+    # from ``[u; y]`` to states, parameters, and the whitened innovation at the parameters of one sample before
     observer: LinearObserver
-    start: FloatArray
-    steps: int
+    start: FloatArray  # ``z(0)``, from the state and the parameters that the recursion starts with; read-only
+    steps: int  # after how many steps the gains had settled
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "start", read_only(self.start))

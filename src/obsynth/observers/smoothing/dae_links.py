@@ -32,18 +32,14 @@ def dae_links(steps: Steps) -> Links:
 
 
 class _Sample(NamedTuple):
-    """One sample of an observer at the point where its step was linearised.
+    """One sample of an observer at the point where its step was linearised."""
 
-    Fields: x, theta: Before the measurement; F, G, noise: Of the step; e, H, L, R: Innovation, derivatives and
-    covariance of the outputs that are there.
-    """
-
-    x: FloatArray
+    x: FloatArray  # x, theta: Before the measurement
     theta: FloatArray
-    F: FloatArray
+    F: FloatArray  # F, G, noise: Of the step
     G: FloatArray
     noise: FloatArray
-    e: FloatArray
+    e: FloatArray  # e, H, L, R: Innovation, derivatives and covariance of the outputs that are there
     H: FloatArray
     L: FloatArray
     R: FloatArray

@@ -26,10 +26,8 @@ SmoothedObserver = RecursiveObserver | DAEObserver
 
 
 class Chain:
-    """The samples of one run from its start, or from where it went on.
-
-    Fields: nodes, rows: One for each sample that is kept; begin: The k of the first of them.
-    """
+    """The samples of one run from its start, or from where it went on. Fields: nodes, rows: One for each sample that is
+    kept; begin: The k of the first of them."""
 
     def __init__(self) -> None:
         self.nodes: list[Node] = []
@@ -70,10 +68,8 @@ class Chain:
 
 
 class KeepingObserver:
-    """An observer that adds each sample it takes to a chain; a new start begins a new one.
-
-    Fields: observer: What runs; chain: Of the last start.
-    """
+    """An observer that adds each sample it takes to a chain; a new start begins a new one. Fields: observer: What runs;
+    chain: Of the last start."""
 
     def __init__(self, observer: SmoothedObserver) -> None:
         self.observer = observer
@@ -140,10 +136,7 @@ def checked_lag(lag: Any) -> int | None:
 
 
 def smoothed_record(observer: SmoothedObserver, y: ArrayLike, u: ArrayLike | None, lag: int | None) -> Estimates:
-    """Return smoothed estimates of a whole record of arrays.
-
-    Shapes: ``y (samples, ny)``, ``u (samples, nu)``.
-    """
+    """Return smoothed estimates of a whole record of arrays: ``y (samples, ny)``, ``u (samples, nu)``."""
     if isinstance(observer, RecursiveObserver):
         outputs, inputs = whole_record(y, u, observer.plant.ny, observer.plant.nu)
     else:
