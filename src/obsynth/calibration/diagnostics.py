@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from obsynth.numerics.arrays import SMALLEST, FloatArray
 
 BoolArray = NDArray[np.bool_]
-
 #: Lags of the whiteness test, and their least number of rows each.
 LAGS, ROWS_PER_LAG = 10, 5
 #: A test fails below this probability.

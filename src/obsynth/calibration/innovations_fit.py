@@ -24,7 +24,6 @@ from obsynth.calibration.simulation_error import Fit, simulation_fits
 from obsynth.numerics.arrays import FloatArray
 
 BoolArray = NDArray[np.bool_]
-
 #: Nats by which another timing of the inputs must be better to be taken: a likelihood ratio of about 150.
 TIMING_NATS = 5.0
 #: A likeliest variance below this share of its upper limit counts as zero.

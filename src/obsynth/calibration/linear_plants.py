@@ -29,7 +29,6 @@ EXACT = "exact"
 SIZED_SAMPLES = 50
 #: The least effect of a state on the outputs, as a share of the largest, by which it is sized.
 LEAST_EFFECT = 1e-6
-
 Known = Mapping[str, Any]
 
 

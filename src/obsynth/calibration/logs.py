@@ -34,23 +34,13 @@ def refused(code: str, message: str, *, signals: Sequence[str] = ()) -> Precondi
 
 
 LogData: TypeAlias = "str | Path | pd.DataFrame | Mapping[str, Any] | Log"
-
-
 #: Stamps further off the grid than this share of a step are refused, and further than the second are told.
 LARGEST_JITTER = 0.2
-
-
 NOTED_JITTER = 0.02
-
-
 #: What counts as one quantum between values of a column: all differences are whole multiples within this.
 QUANTUM_SLACK = 0.02
-
-
 #: Share of distinct values above which a column shows no quantum that limits its noise: a ramp has none twice.
 REPEATED = 0.7
-
-
 #: Rows of wrong values that are named.
 TOLD_ROWS = 5
 #: Decimals to which values of a column are compared, and the share of the largest below which a step is rounding.

@@ -15,7 +15,6 @@ from obsynth.calibration.simulation_error import Fit
 from obsynth.numerics.arrays import FloatArray
 
 BoolArray = NDArray[np.bool_]
-
 #: Where the search for the variances begins: process noise and sensor noise as logarithms of factors of a first guess.
 #: With one start alone the result was 3.6 nats above the best on the measured tanks.
 NOISE_STARTS = ((0.0, 0.0), (3.0, -2.0), (-5.0, 0.0), (0.0, -4.0))

@@ -17,7 +17,6 @@ from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.plants.dae.functions import Compiled
 
 BoolArray = NDArray[np.bool_]
-
 #: Rounds in which the sensors' weights are estimated again; the first is robust against single wrong values.
 ROUNDS = 3
 MOST_EVALUATIONS = 60

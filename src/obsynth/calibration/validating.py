@@ -120,8 +120,6 @@ def _estimates(names: tuple[str, ...], values: FloatArray, covariances: FloatArr
 
 #: Nats that a variance of the design must cost, the others being free, before its ratio is told.
 CLEAR_NATS = 3.0
-
-
 #: Ratios nearer to one than this factor are not told: nobody knows a variance better.
 TOLD_FACTOR = 1.5
 
@@ -162,8 +160,6 @@ def noise_ratios(observer: DAEObserver, log: Log) -> Mapping[str, float]:
 
 #: A mean of innovations, or a parameter's deviation from its start, beyond so many standard deviations is told.
 OFFSET = 3.0
-
-
 #: Rows that a log must have at least.
 LEAST_ROWS = 20
 #: A sensor's variance that a log may say, at least, as a share of what the design says.

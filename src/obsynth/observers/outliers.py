@@ -29,7 +29,6 @@ LONGEST = 2
 #: How many times further off than the limit a sample must be that nothing contradicts but the equations of the model;
 #: and what rounding makes of a prediction without noise.
 BLIND, ROUNDING = 10.0, 1e-6
-
 State = TypeVar("State", bound=Any)
 Row = TypeVar("Row", bound=Any)
 

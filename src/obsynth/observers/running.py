@@ -15,7 +15,6 @@ State = TypeVar("State")
 Row = TypeVar("Row", covariant=True)
 Known = TypeVar("Known")
 Kept = TypeVar("Kept", bound=tuple[Any, ...])
-
 #: Marks an array whose columns are contiguous: sums are rounded in another order there.
 BY_COLUMNS = "by columns"
 

@@ -20,7 +20,6 @@ from obsynth.plants.names import index_of
 
 #: Rows that may be waited for: a delay in another unit is larger.
 LONGEST_DELAY = 10_000
-
 Inner = Callable[[Any, FloatArray, FloatArray], tuple[Any, Any]]
 
 
