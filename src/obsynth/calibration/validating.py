@@ -35,7 +35,7 @@ from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.observers.robustness import with_all_sensors
+from obsynth.observers.running import changed
 from obsynth.results.design import ObserverDesign
 
 
@@ -64,9 +64,9 @@ def recorded_innovations(design: ObserverDesign, log: Log) -> RecordedInnovation
         # Afterwards every value is known at its own time.
         log = replace(log, y=observer.timing.in_order(log.y))
     if isinstance(observer, DAEObserver):
-        return _nonlinear(with_all_sensors(observer), log)
+        return _nonlinear(changed(observer, sensors=None), log)
     if isinstance(observer, RecursiveObserver):
-        return _recursive(with_all_sensors(observer), log, dict(getattr(design.plant, "operating_point", {})))
+        return _recursive(changed(observer, sensors=None), log, dict(getattr(design.plant, "operating_point", {})))
     raise TypeError(f"{type(observer).__name__} has no innovations with a covariance")
 
 

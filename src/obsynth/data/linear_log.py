@@ -16,8 +16,8 @@ from obsynth.experiments.monitors.online import LinearSample
 from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.holds import first_order_hold
+from obsynth.observers.linear.derived import transient
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.observers.linear.warm_up import transient
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
 

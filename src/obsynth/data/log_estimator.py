@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, Protocol
 from obsynth.errors import SpecError
 from obsynth.experiments.monitors.online import Evidence, LinearSample
 from obsynth.numerics.arrays import FloatArray
-from obsynth.observers.linear.warm_up import checked_warm_up
+from obsynth.observers.linear.derived import checked_warm_up
 from obsynth.plants.descriptor import DescriptorSystem
 
 #: What a row of estimates is.

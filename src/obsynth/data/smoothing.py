@@ -19,7 +19,7 @@ from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import read_only
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.observers.robustness import with_outliers
+from obsynth.observers.running import changed
 from obsynth.observers.smoothing.chain import Smoothed, deviations_in
 from obsynth.observers.smoothing.keeping import (
     Chain,
@@ -183,7 +183,7 @@ def smooth(
                         path="columns")  # fmt: skip
     observer: Any = design.observer
     if outliers is not None:
-        observer = with_outliers(observer, outliers)
+        observer = changed(observer, outliers=outliers)
     if isinstance(data, tuple) and len(data) == 2 and u is None and np.ndim(data[0]) == 2:
         data, u = data
     return smoothed_record(observer, data, u, waited)

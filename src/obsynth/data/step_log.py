@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -20,17 +20,21 @@ from obsynth.data.log_estimator import (
 from obsynth.errors import ObsynthError, PreconditionError, SolverError, SpecError
 from obsynth.experiments.monitors.online import Evidence
 from obsynth.numerics.arrays import FloatArray
+from obsynth.observers.dae.estimates import DAERow
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.observers.robustness import with_outliers
-from obsynth.observers.running import ParameterRow, state_as_data, state_from_data
+from obsynth.observers.recursive.recursion import RawEstimate
+from obsynth.observers.running import changed, state_as_data, state_from_data
 from obsynth.results.design import ObserverDesign
+
+#: What an observer with deviations knows at one sample.
+StepRow: TypeAlias = RawEstimate | DAERow
 
 
 class SteppingEngine(Engine):
     """A running observer with deviations on measured data; the first row is k = 0.
 
-    Signals of a nonlinear plant are absolute values, as its model's.  By default there is no warm-up, as the covariances
+    Signals of a nonlinear plant are absolute values, as its model's.  By default there is no warm-up, as covariances
     of the start say how uncertain the estimates are, and a gate for outliers where the observer says nothing of them.
     """
 
@@ -73,7 +77,7 @@ class SteppingEngine(Engine):
             )  # fmt: skip
         return values
 
-    def _taken(self, y: FloatArray, u: FloatArray, row: int) -> ParameterRow | SolverError | None:
+    def _taken(self, y: FloatArray, u: FloatArray, row: int) -> StepRow | SolverError | None:
         """Take one sample, or return why the sample cannot be taken; `None` if numbers are not finite."""
         try:
             self.state, found = self.observer.accept(self.state, y, u)
@@ -87,7 +91,7 @@ class SteppingEngine(Engine):
             return None
         return found if found.is_finite else None
 
-    def _values(self, found: ParameterRow) -> FloatArray:
+    def _values(self, found: StepRow) -> FloatArray:
         """Return a row: estimates, standard deviations, innovation at the parameters of one sample before."""
         residual = np.full(self.directions, np.nan)
         # The correction of the start by early constraints has no more directions, but may have fewer.
@@ -149,7 +153,7 @@ class SteppingEngine(Engine):
                 return True
         return False
 
-    def _found(self, y: FloatArray, u: FloatArray, row: int, *, may_restart: bool) -> tuple[ParameterRow, bool, bool]:
+    def _found(self, y: FloatArray, u: FloatArray, row: int, *, may_restart: bool) -> tuple[StepRow, bool, bool]:
         """Take one sample; return also whether its outputs were left out, and whether the observer started again."""
         found = self._safe(y, u, row)
         if found is not None:
@@ -172,7 +176,7 @@ class SteppingEngine(Engine):
         self.phase = OK
         return OK if outputs.all() else PARTIAL
 
-    def _safe(self, y: FloatArray, u: FloatArray, row: int) -> ParameterRow | None:
+    def _safe(self, y: FloatArray, u: FloatArray, row: int) -> StepRow | None:
         """Take one sample, or none of it: what overflows leaves the state as it was."""
         before = self.state
         with np.errstate(all="ignore"):
@@ -182,7 +186,7 @@ class SteppingEngine(Engine):
             return None
         return found
 
-    def _required(self, u: FloatArray, row: int) -> ParameterRow:
+    def _required(self, u: FloatArray, row: int) -> StepRow:
         """Take one sample without outputs."""
         with np.errstate(all="ignore"):
             found = self._taken(np.full(len(self.output_names), np.nan), u, row)
@@ -206,5 +210,5 @@ def _with_gate(observer: Any, outliers: str | None) -> RecursiveObserver | DAEOb
     """Return an observer for logs: with a gate, unless it or ``outliers`` says otherwise."""
     wanted = outliers or ("gate" if observer.outliers == "none" else observer.outliers)
     found: RecursiveObserver | DAEObserver
-    found = observer if wanted == observer.outliers else with_outliers(observer, wanted)
+    found = observer if wanted == observer.outliers else changed(observer, outliers=wanted)
     return found

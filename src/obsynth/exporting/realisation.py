@@ -11,8 +11,8 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.observer import DAEObserver
+from obsynth.observers.linear.derived import sample_observer
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.observers.linear.sampling import sample_observer
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.recursive.steady_state import steady_observer
 from obsynth.plants.dae.model import DAEModel

@@ -14,10 +14,9 @@ from numpy.typing import ArrayLike
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import chosen, real_array, real_number, real_vector
 from obsynth.numerics.arrays import FloatArray, read_only
-from obsynth.observers.alarms import Alarm, Decision, alone, quantile, tail
+from obsynth.observers.alarms import Alarm, Decision, alone, likelihood_ratio, pull_of_the_start, quantile, tail
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.estimates import Estimates
-from obsynth.observers.recursive.likelihood_ratio import likelihood_ratio, pull_of_the_start
 from obsynth.observers.recursive.observer import RecursiveObserver
 
 STATISTICS = ("chi-square", "cusum", "glr", "nis")

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.numerics.arrays import FloatArray, read_only
+
+if TYPE_CHECKING:
+    from obsynth.observers.running import StepSettings
 
 NOTHING = read_only(np.zeros(0))
 #: Standard deviations within which 95 % of a normal number lie: the width of bands, drawn or counted.
@@ -156,31 +158,7 @@ class Estimates:
         return self.fault_deviations
 
 
-class Undelayed(ABC):
-    """An observer whose estimates are of the sample that it has just been given."""
-
-    @property
-    @abstractmethod
-    def state_names(self) -> tuple[str, ...]:
-        """The states that are estimated, in order."""
-
-    @property
-    @abstractmethod
-    def fault_names(self) -> tuple[str, ...]:
-        """The faults or parameters that are estimated, in order."""
-
-    @property
-    def state_delays(self) -> tuple[int, ...]:
-        """Samples by which each state estimate lags: none."""
-        return (0,) * len(self.state_names)
-
-    @property
-    def fault_delays(self) -> tuple[int, ...]:
-        """Samples by which each fault estimate lags: none."""
-        return (0,) * len(self.fault_names)
-
-
-def named_estimates(observer: Undelayed, *, states: FloatArray, faults: FloatArray, **known: Any) -> Estimates:
+def named_estimates(observer: StepSettings, *, states: FloatArray, faults: FloatArray, **known: Any) -> Estimates:
     """Return the estimates of an observer without delays; arrays are made read-only."""
     residuals = known.pop("residuals", np.zeros((*states.shape[:-1], 0)))
     arrays: dict[str, Any] = {name: value if value.dtype == bool else read_only(value) for name, value in known.items()}

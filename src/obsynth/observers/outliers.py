@@ -1,13 +1,16 @@
-"""Single wrong samples: measurements that a prediction excludes are left out, or pulled to where they may be.
+"""What an observer does about samples that its prediction excludes, and about estimates beyond bounds of the states.
 
 A sensor whose sample is further from its prediction than `limit` standard deviations is left out (``gate``), but at
 most `LONGEST` times in a row: what stays away has changed, and is no outlier.  With ``huber`` the sample is taken at
 the limit instead, which is Huber's weight: its influence grows no further (Huber 1964; Masreliez 1975).
+
+With a truth inside the bounds, the projection brings the error nowhere further in that metric, so that the covariance
+stays an upper bound in the sense of the squared error it normalises (Simon, Chia 2002).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -15,21 +18,38 @@ from numpy.typing import NDArray
 
 from obsynth.errors import SolverError, SpecError
 from obsynth.numerics.arguments import is_finite_number
-from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.plants.names import index_of
 
 BoolArray = NDArray[np.bool_]
+
+
 Outliers = Literal["none", "gate", "huber"]
+
+
 KINDS = ("none", "gate", "huber")
+
+
 #: Standard deviations: of a gate, so that no sample of a true model is left out in a million; and of Huber's weight.
 LIMITS = {"gate": 6.0, "huber": 3.0}
+
+
 #: What is larger has no square: it is no measurement, whatever the model says.
 OVERFLOW = 1e150
+
+
 #: Samples of one sensor in a row that are left out; the next is believed.
 LONGEST = 2
+
+
 #: How many times further off than the limit a sample must be that nothing contradicts but the equations of the model;
 #: and what rounding makes of a prediction without noise.
 BLIND, ROUNDING = 10.0, 1e-6
+
+
 State = TypeVar("State", bound=Any)
+
+
 Row = TypeVar("Row", bound=Any)
 
 
@@ -112,3 +132,61 @@ def _judged(
         worst = int(np.argmax(ratios))
         far[worst] |= bool(ratios[worst] > limit)
     return mean, deviation, far
+
+
+def checked_state_bounds(value: Any, names: Sequence[str]) -> FloatArray | None:
+    """Return lower and upper bounds ``(nx, 2)`` from rows or from pairs by name; ``None`` where there are none."""
+    if value is None:
+        return None
+    found = np.tile([-np.inf, np.inf], (len(names), 1))
+    if isinstance(value, Mapping):
+        for name, pair in value.items():
+            place = index_of(name, names, what="state_bounds")
+            found[place] = _pair(pair, f"state_bounds.{name}")
+    else:
+        rows = np.asarray(value, dtype=object)
+        if rows.shape != found.shape:
+            raise SpecError(f"state_bounds must be {len(names)} pairs [low, high], or pairs by name.",
+                            path="state_bounds")  # fmt: skip
+        for i, name in enumerate(names):
+            found[i] = _pair(list(rows[i]), f"state_bounds.{name}")
+    return read_only(found) if np.isfinite(found).any() else None
+
+
+def _pair(pair: Any, path: str) -> tuple[float, float]:
+    try:
+        low, high = (float(end) for end in pair)
+    except (TypeError, ValueError):
+        raise SpecError(f"{path} is {pair!r}: give [low, high].", path=path) from None
+    if not low < high:
+        raise SpecError(f"{path}: the lower bound ({low:g}) must be below the upper one ({high:g}).", path=path)
+    return low, high
+
+
+def projected(x: FloatArray, factor: FloatArray, bounds: FloatArray) -> FloatArray:
+    """Return the point within bounds nearest to ``x`` in the metric of the covariance ``factor factor'``. The shortest
+    e with ``low <= x + factor e <= high`` by nonnegative least squares (Lawson, Hanson, LDP), so that the covariance
+    may be singular. Shapes: ``x (n,)``, ``factor (n, any)``, ``bounds (n, 2)``."""
+    if ((bounds[:, 0] <= x) & (x <= bounds[:, 1])).all():
+        return x
+    from scipy.optimize import nnls
+
+    deviations = np.sqrt(np.einsum("ij,ij->i", factor, factor))
+    moving = deviations > 0.0
+    rows, gaps = [], []
+    for sign, ends in ((1.0, bounds[:, 0]), (-1.0, -bounds[:, 1])):
+        used = moving & np.isfinite(ends)
+        rows.append(sign * factor[used] / deviations[used, None])
+        gaps.append((ends[used] - sign * x[used]) / deviations[used])
+    sides, least = np.vstack(rows), np.concatenate(gaps)
+    target = np.zeros(factor.shape[1] + 1)
+    target[-1] = 1.0
+    weights, rest = nnls(np.vstack((sides.T, least)), target)
+    residual = np.vstack((sides.T, least)) @ weights - target
+    moved = x
+    # Without a rest no e keeps all of them: a state that is known exactly stands in the way.
+    if rest > 0.0 and residual[-1] < 0.0:
+        # The shortest e that reaches the ends that hold it, without the cancellation of the ratio of residuals.
+        held = weights > 0.0
+        moved = x + factor @ np.linalg.lstsq(sides[held], least[held], rcond=None)[0]
+    return np.asarray(np.clip(moved, bounds[:, 0], bounds[:, 1]))

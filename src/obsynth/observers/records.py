@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -103,3 +104,25 @@ def whole_record(
     if len(inputs) != len(outputs):
         raise SpecError(f"u has {len(inputs)} samples and y has {len(outputs)}: give the same number.", path="u")
     return outputs, inputs
+
+
+def batch_record(
+    y: ArrayLike, u: ArrayLike | None, ny: int, input_names: Sequence[str]
+) -> tuple[FloatArray, FloatArray]:
+    """Return outputs ``(trials, samples, ny)`` and inputs, ``(samples, nu)`` where they are those of all trials."""
+    outputs, nu = real_array(y, "y"), len(input_names)
+    if outputs.ndim != 3 or outputs.shape[2] != ny or not outputs.size:
+        raise SpecError(f"y has shape {outputs.shape}, but (trials, samples, {ny}) is needed.", path="y")
+    if np.isinf(outputs).any():
+        raise SpecError("y holds an infinity: mark a missing sample by NaN.", path="y")
+    trials, samples = outputs.shape[:2]
+    known = np.zeros((samples, 0)) if u is None and not nu else real_array(u, "u")
+    if known.shape not in ((samples, nu), (trials, samples, nu)):
+        raise SpecError(f"u has shape {known.shape}, but (samples, {nu}) or (trials, samples, {nu}) is needed, with "
+                        f"{trials} trials and {samples} samples.", path="u")  # fmt: skip
+    if not np.isfinite(known).all():
+        *trial, k, i = np.argwhere(~np.isfinite(known))[0]
+        where = f" of trial {trial[0]}" if trial else ""
+        raise SpecError(f"The input {input_names[i]!r}{where} is {known[*trial, k, i]} at k = {k}: inputs must be "
+                        "known.", path="u")  # fmt: skip
+    return outputs, known

@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import fields, replace
+from functools import cached_property
 from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.numerics.arrays import FloatArray
-from obsynth.observers.estimates import Estimates, Undelayed
+from obsynth.observers.estimates import Estimates
+from obsynth.observers.outliers import Outliers, checked_limit, checked_state_bounds
+from obsynth.observers.sensor_timing import SensorTiming, checked_sensors
 
 State = TypeVar("State")
 Row = TypeVar("Row", covariant=True)
 Known = TypeVar("Known")
 Kept = TypeVar("Kept", bound=tuple[Any, ...])
+Robust = TypeVar("Robust", bound=Any)
 #: Marks an array whose columns are contiguous: sums are rounded in another order there.
 BY_COLUMNS = "by columns"
 
@@ -36,58 +42,59 @@ class Observer(Protocol[State, Row]):
         ...
 
 
-class ParameterRow(Protocol):
-    """What an observer with deviations knows at one sample."""
+class StepSettings(ABC):
+    """What observers that take missing samples themselves have in common, besides a state."""
+
+    plant: Any  # what it runs on
+    outliers: Outliers
+    outlier_limit: float | None
+    sensors: Mapping[str, Mapping[str, int]] | None
+    state_bounds: FloatArray | None
+
+    def _check_options(self) -> None:
+        checked_limit(self.outliers, self.outlier_limit)
+        object.__setattr__(self, "sensors", checked_sensors(self.sensors, self.plant.output_names))
+        object.__setattr__(self, "state_bounds", checked_state_bounds(self.state_bounds, self.state_names))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what makes it again in another process: what follows from it is made there anew."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
 
     @property
-    def x(self) -> FloatArray:
-        """The states ``(nx,)``."""
-        ...
+    def state_names(self) -> tuple[str, ...]:
+        """The states that are estimated, in order."""
+        names: tuple[str, ...] = self.plant.state_names
+        return names
 
     @property
-    def theta(self) -> FloatArray:
-        """The parameters ``(nq,)``."""
-        ...
+    @abstractmethod
+    def fault_names(self) -> tuple[str, ...]:
+        """The parameters that are estimated, in order."""
 
     @property
-    def state_deviations(self) -> FloatArray:
-        """Standard deviations of `x` ``(nx,)``."""
-        ...
+    def state_delays(self) -> tuple[int, ...]:
+        """Samples by which each state estimate lags: none."""
+        return (0,) * len(self.state_names)
 
     @property
-    def parameter_covariance(self) -> FloatArray:
-        """Covariance of `theta` ``(nq, nq)``."""
-        ...
+    def fault_delays(self) -> tuple[int, ...]:
+        """Samples by which each estimate of a parameter lags: none."""
+        return (0,) * len(self.fault_names)
 
     @property
-    def gap(self) -> FloatArray:
-        """The innovation at the parameters estimated one sample before ``(m,)``."""
-        ...
+    def order(self) -> int:
+        """Number of states and parameters in its state."""
+        return len(self.state_names) + len(self.fault_names)
+
+    @cached_property
+    def timing(self) -> SensorTiming:
+        """When each sensor is sampled, and how late its values are."""
+        return SensorTiming.of(self.sensors, self.plant.output_names, self.plant.nu)
 
     @property
-    def whitened(self) -> FloatArray:
-        """The innovation of the model without parameters, whitened ``(m,)``."""
-        ...
-
-    @property
-    def regressor(self) -> FloatArray:
-        """Its regressor ``(m, nq)``."""
-        ...
-
-    @property
-    def score(self) -> FloatArray:
-        """What the sample says of the parameters ``(nq,)``; less ``information`` times the true ones it is noise."""
-        ...
-
-    @property
-    def information(self) -> FloatArray:
-        """How much the sample says of the parameters ``(nq, nq)``: the covariance of that noise."""
-        ...
-
-    @property
-    def is_finite(self) -> bool:
-        """Whether no number has overflown."""
-        ...
+    def is_plain(self) -> bool:
+        """Whether every sensor is sampled at each row, at once, and no state has bounds."""
+        return self.timing.is_plain and self.state_bounds is None
 
 
 class Steps(Protocol[State, Row]):
@@ -100,7 +107,7 @@ class Steps(Protocol[State, Row]):
         ...
 
 
-class StepObserver(Undelayed, Generic[State, Known]):
+class StepObserver(StepSettings, Generic[State, Known]):
     """An observer of states and parameters, which takes missing samples itself and states deviations."""
 
     @property
@@ -123,11 +130,6 @@ class StepObserver(Undelayed, Generic[State, Known]):
     @abstractmethod
     def _estimates(self, state: State, row: Known) -> Estimates:
         """Return the estimates of one sample."""
-
-    @property
-    @abstractmethod
-    def timing(self) -> Any:
-        """When each sensor is sampled, and how late its values are: `obsynth.observers.sensor_timing.SensorTiming`."""
 
     def shown(self, row: Known) -> Known:
         """Return a row as it is shown, within the bounds of the states."""
@@ -216,6 +218,20 @@ class RunningObserver(Generic[State, Row]):
         return row
 
 
+def changed(observer: Robust, **options: Any) -> Robust:
+    """Return the observer with other options; the steps of a nonlinear one are built once."""
+    found = replace(observer, **options)  # type: ignore[type-var]
+    if "steps" in vars(observer):
+        # What these options do stands outside of the compiled steps.
+        vars(found)["steps"] = type(observer.steps)(found, observer.steps.graph)
+    return found
+
+
+def plain_recursion(observer: Robust) -> Robust:
+    """Return the recursion itself: every sensor at each row, at once, taken as it is, and no bounds on states."""
+    return changed(observer, outliers="none", sensors=None, state_bounds=None)
+
+
 def state_as_data(state: tuple[Any, ...]) -> dict[str, Any]:
     """Return a state as numbers, arrays, lists and mappings, to be written to a file."""
     return {name: _as_data(value) for name, value in state._asdict().items()}  # type: ignore[attr-defined]
@@ -224,7 +240,7 @@ def state_as_data(state: tuple[Any, ...]) -> dict[str, Any]:
 def state_from_data(like: Kept, data: dict[str, Any]) -> Kept:
     """Return the state of the same kind as ``like`` that `state_as_data` described."""
     if hasattr(like, "from_data"):
-        restored: Kept = like.from_data(data)
+        restored: Kept = like.from_data(data, state_from_data)
         return restored
     values = {name: _from_data(own, data[name]) for name, own in like._asdict().items()}  # type: ignore[attr-defined]
     return type(like)(**values)

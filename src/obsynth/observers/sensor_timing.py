@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.errors import SpecError
+from obsynth.numerics.arguments import is_whole
 from obsynth.numerics.arrays import FloatArray
-from obsynth.observers.running import state_from_data
 from obsynth.plants.names import index_of
 
 #: Rows that may be waited for: a delay in another unit is larger.
@@ -38,8 +38,7 @@ def checked_sensors(value: Any, names: Sequence[str]) -> dict[str, dict[str, int
         timing = {"every": entry.get("every", 1), "delay": entry.get("delay", 0)}
         for key, least in (("every", 1), ("delay", 0)):
             count = timing[key]
-            whole = isinstance(count, (int, np.integer)) and not isinstance(count, bool)
-            if not whole or not least <= count <= LONGEST_DELAY:
+            if not is_whole(count) or not least <= count <= LONGEST_DELAY:
                 raise SpecError(
                     f"sensors.{name}.{key} is {count!r}: give a whole number of rows from {least} to {LONGEST_DELAY}.",
                     path=f"sensors.{name}.{key}",
@@ -68,12 +67,11 @@ class WaitingState(NamedTuple):
         """Outliers in a row, and at all, ``(2, ny)``."""
         return np.asarray(self.latest.refused)
 
-    def from_data(self, data: Mapping[str, Any]) -> WaitingState:
-        """Return the state that `state_as_data` described."""
-        return WaitingState(
-            tuple(state_from_data(self.latest, part) for part in data["before"]),
-            state_from_data(self.latest, data["latest"]), np.array(data["outputs"]), np.array(data["inputs"]),
-        )  # fmt: skip
+    def from_data(self, data: Mapping[str, Any], restored: Callable[[Any, Any], Any]) -> WaitingState:
+        """Return the state that data describe, by what restores that of an observer without late sensors."""
+        return WaitingState(tuple(restored(self.latest, part) for part in data["before"]),
+                            restored(self.latest, data["latest"]), np.array(data["outputs"]),
+                            np.array(data["inputs"]))  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)

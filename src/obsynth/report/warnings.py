@@ -11,8 +11,8 @@ from obsynth.errors import ObsynthError
 from obsynth.methods.choosing.automatic import SAMPLES
 from obsynth.methods.choosing.figures import FaultFigures, fault_figures, on_the_clock
 from obsynth.methods.functional_filter.rates import settling_time
+from obsynth.observers.linear.derived import sample_observer
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.observers.linear.sampling import sample_observer
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
 

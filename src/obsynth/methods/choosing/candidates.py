@@ -13,8 +13,8 @@ from obsynth.errors import ObsynthError
 from obsynth.methods.choosing.figures import DECOUPLED, FaultFigures, fault_figures
 from obsynth.methods.method_spec import MethodSpec
 from obsynth.methods.registry import REGISTRY, method_spec
+from obsynth.observers.linear.derived import sample_observer
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.observers.linear.sampling import sample_observer
 from obsynth.observers.recursive.steady_state import steady_observer
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign

@@ -30,7 +30,7 @@ from obsynth.observers.dae.building import LARGEST_TURN, dae_observer_from_optio
 from obsynth.observers.dae.nominal_run import NOMINAL_STEPS, DAEFacts, dae_facts
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.dae.steps import PROJECTION_NOTICE
-from obsynth.observers.robustness import plain_recursion
+from obsynth.observers.running import plain_recursion
 from obsynth.plants.dae.model import DAEModel
 from obsynth.results.design import Certificate
 

@@ -10,8 +10,7 @@ from obsynth.analysis.dae_index import IndexReport, index_report
 from obsynth.analysis.identifiability import Identifiability, identifiability
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.dae.estimates import DAERow, GatheredRows
-from obsynth.observers.dae.observer import DAEObserver
-from obsynth.observers.dae.records import advanced
+from obsynth.observers.dae.observer import DAEObserver, advanced
 
 #: Steps of the nominal run.
 NOMINAL_STEPS = 100

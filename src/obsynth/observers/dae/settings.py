@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from functools import cached_property
 from typing import Any, Literal, Self, TypeAlias
 
 import numpy as np
@@ -13,10 +12,8 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arguments import Count, ForgettingFactor, Positive, Probability, checked_value
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.numerics.covariances import covariance_factor, is_definite
-from obsynth.observers.estimates import Undelayed
-from obsynth.observers.outliers import Outliers, checked_limit
-from obsynth.observers.sensor_timing import SensorTiming, checked_sensors
-from obsynth.observers.state_bounds import checked_state_bounds
+from obsynth.observers.outliers import Outliers
+from obsynth.observers.running import StepSettings
 from obsynth.plants.dae.checks import finite_vector, step_length
 from obsynth.plants.dae.model import DAEModel
 
@@ -33,7 +30,7 @@ _DEFINITE = ("R", "initial_parameter_covariance")
 
 
 @dataclass(frozen=True, eq=False)
-class DAESettings(Undelayed):
+class DAESettings(StepSettings):
     """The fields of `obsynth.DAEObserver`, which is these with its steps."""
 
     model: DAEModel
@@ -64,14 +61,8 @@ class DAESettings(Undelayed):
         object.__setattr__(self, "dt", step_length(self.dt))
         for name, kind in _KINDS.items():
             checked_value(getattr(self, name), name, kind)
-        checked_limit(self.outliers, self.outlier_limit)
-        object.__setattr__(self, "sensors", checked_sensors(self.sensors, self.model.output_names))
-        object.__setattr__(self, "state_bounds", checked_state_bounds(self.state_bounds, self.state_names))
+        self._check_options()
         self._check_arrays()
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return what makes it again in another process: its functions and its library are made there anew."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def _check_arrays(self) -> None:
         nx, ny, nq = self.model.nx, self.model.ny, self.model.nq
@@ -112,9 +103,9 @@ class DAESettings(Undelayed):
             raise SpecError(f"{name} must be positive definite, but it is singular.", path=name)
 
     @property
-    def state_names(self) -> tuple[str, ...]:
-        """The states that are estimated, in order."""
-        return self.model.state_names
+    def plant(self) -> DAEModel:
+        """The model, by the name that every observer has for what it runs on."""
+        return self.model
 
     @property
     def fault_names(self) -> tuple[str, ...]:
@@ -126,27 +117,12 @@ class DAESettings(Undelayed):
         """Numbers in an innovation: one for each output."""
         return self.model.ny
 
-    @cached_property
-    def timing(self) -> SensorTiming:
-        """When each sensor is sampled, and how late its values are."""
-        return SensorTiming.of(self.sensors, self.model.output_names, self.model.nu)
-
-    @property
-    def is_plain(self) -> bool:
-        """Whether every sensor is sampled at each row, at once, and no state has bounds."""
-        return self.timing.is_plain and self.state_bounds is None
-
     @property
     def outside_graph(self) -> str:
         """An option in use that stands outside of the compiled steps, by name; empty without one."""
         if self.outliers != "none":
             return "outliers"
         return "reset" if self.reset else "" if self.state_bounds is None else "state_bounds"
-
-    @property
-    def order(self) -> int:
-        """Number of states and parameters in its state."""
-        return self.model.nx + self.model.nq
 
     def as_dict(self) -> dict[str, Any]:
         """Return every field as data."""

@@ -16,8 +16,7 @@ from obsynth.observers.dae.estimates import DAERow
 from obsynth.observers.dae.memory_layout import initial_memory
 from obsynth.observers.dae.settings import DAESettings
 from obsynth.observers.dae.step_graph import ObserverGraph, observer_graph
-from obsynth.observers.outliers import checked_limit, no_refusals, robust_advance
-from obsynth.observers.state_bounds import projected
+from obsynth.observers.outliers import checked_limit, no_refusals, projected, robust_advance
 from obsynth.plants.dae.functions import Compiled, DAEFunctions
 from obsynth.plants.dae.step import ImplicitStep
 

@@ -10,12 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import real_array
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.least_squares_step import least_squares_step, rank_revealing_step
 from obsynth.numerics.recursive_least_squares import update
 from obsynth.observers.estimates import Estimates, named_estimates
-from obsynth.observers.records import require_horizon
+from obsynth.observers.records import batch_record, require_horizon
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.recursive.parameter_steps import posterior_residual
 from obsynth.observers.recursive.step_model import (
@@ -104,14 +103,9 @@ def run_batch(observer: RecursiveObserver, y: ArrayLike, u: ArrayLike | None = N
     """
     if observer.adaptation is not None and observer.adaptation.reset:
         raise SpecError("Resets depend on the data of each trial: run them one by one, or without reset.", path="reset")
-    outputs = real_array(y, "y")
-    if outputs.ndim != 3 or outputs.shape[2] != observer.plant.ny:
-        raise SpecError(f"y has shape {outputs.shape}, but (trials, samples, {observer.plant.ny}) is needed.", path="y")
+    outputs, known = batch_record(y, u, observer.plant.ny, observer.plant.input_names)
     trials, samples = outputs.shape[:2]
-    known = np.zeros((samples, 0)) if u is None and not observer.plant.nu else real_array(u, "u")
-    if known.ndim not in (2, 3) or known.shape[-2:] != (samples, observer.plant.nu):
-        raise SpecError(f"u has shape {known.shape}, but (trials, samples, {observer.plant.nu}) is needed.", path="u")
-    if not (np.isfinite(outputs[:, 1:]).all() and np.isfinite(known).all()):
+    if not np.isfinite(outputs[:, 1:]).all():
         raise SpecError("A batch must be complete: run trials with missing samples one by one.", path="y")
     require_horizon(observer.plant.horizon, samples, early=observer.early_constraints)
     inputs = np.broadcast_to(known, (trials, *known.shape[-2:]))

@@ -18,8 +18,7 @@ from obsynth.observers.records import measured_record, whole_record
 from obsynth.observers.recursive.estimates import recursive_estimates
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.smoothing.chain import Links, Node, Smoothed, all_smoothed, deviations_in, smoothed_from
-from obsynth.observers.smoothing.dae_links import dae_links
-from obsynth.observers.smoothing.recursive_links import recursive_links
+from obsynth.observers.smoothing.links import dae_links, recursive_links
 from obsynth.plants.dae.checks import checked_inputs
 
 SmoothedObserver = RecursiveObserver | DAEObserver
