@@ -22,8 +22,8 @@ from obsynth.experiments.monitors.online import Evidence
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.estimates import DAERow
 from obsynth.observers.dae.observer import DAEObserver
+from obsynth.observers.recursive.estimates import RawEstimate
 from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.observers.recursive.recursion import RawEstimate
 from obsynth.observers.running import changed, state_as_data, state_from_data
 from obsynth.results.design import ObserverDesign
 

@@ -11,6 +11,7 @@ stays an upper bound in the sense of the squared error it normalises (Simon, Chi
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -46,6 +47,9 @@ LONGEST = 2
 #: and what rounding makes of a prediction without noise.
 BLIND, ROUNDING = 10.0, 1e-6
 
+
+#: Samples whose squared innovations are summed up before a reset.
+RESET_WINDOW = 20
 
 State = TypeVar("State", bound=Any)
 
@@ -190,3 +194,22 @@ def projected(x: FloatArray, factor: FloatArray, bounds: FloatArray) -> FloatArr
         held = weights > 0.0
         moved = x + factor @ np.linalg.lstsq(sides[held], least[held], rcond=None)[0]
     return np.asarray(np.clip(moved, bounds[:, 0], bounds[:, 1]))
+
+
+@lru_cache(maxsize=256)
+def chi_square_limit(degrees: int, probability: float) -> float:
+    """Return what a chi-square variable passes with a probability."""
+    from scipy.special import chdtri
+
+    return float(chdtri(degrees, probability))
+
+
+def with_surprise(surprises: FloatArray, nis: float, degrees: int) -> FloatArray:
+    """Return the latest normalised squares of innovations with their degrees of freedom ``(any, 2)``, this one last."""
+    return np.vstack([surprises, [nis, float(degrees)]])[-RESET_WINDOW:]
+
+
+def has_jumped(surprises: FloatArray, probability: float) -> bool:
+    """Return whether the latest innovations are too large for what is known of the parameters."""
+    total, degrees = surprises.sum(axis=0)
+    return bool(degrees > 0) and bool(total > chi_square_limit(int(degrees), probability))

@@ -29,11 +29,9 @@ from obsynth.observers.dae.step_graph import ObserverGraph
 from obsynth.observers.dae.steps import (
     PROJECTION_NOTICE,
     PROJECTION_SHARE,
-    RESET_WINDOW,
     Steps,
-    chi_square_limit,
 )
-from obsynth.observers.outliers import LONGEST, OVERFLOW
+from obsynth.observers.outliers import LONGEST, OVERFLOW, RESET_WINDOW, chi_square_limit
 from obsynth.plants.dae import step as implicit_step
 from obsynth.plants.dae.functions import DAEFunctions
 from obsynth.plants.dae.step import step_graph

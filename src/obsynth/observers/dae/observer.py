@@ -29,30 +29,6 @@ from obsynth.plants.dae.functions import Compiled, take_samples
 SAMPLES_PER_CALL = 10_000
 
 
-def run_record(
-    steps: Steps, y: FloatArray, u: FloatArray, *, compiled: bool | None, library: DAELibrary | None,
-    progress: bool | Callable[[int], None] | None,
-) -> Estimates:  # fmt: skip
-    """Run over a whole record: ``y (samples, ny)``, ``u (samples, nu)``."""
-    alone = steps.settings.outside_graph
-    if library is not None and alone:
-        raise SpecError(f"The C knows no {alone}: leave compiled=True out, or leave {alone} out.", path="compiled")
-    found = GatheredRows(steps.settings)
-    found.add(_nothing(steps))
-    with shown_progress(progress, len(y), "samples") as note:
-        if library is not None:
-            _in_c(steps, library, y, u, found.add_regular, note)
-        elif compiled is None and not alone:
-            advanced(steps, y, u, found.add_regular, note)
-        else:
-            state = steps.first
-            for k in range(len(y)):
-                state, row = steps.advance(state, y[k], u[k])
-                found.add_regular(row)
-                note(k + 1)
-    return found.estimates()
-
-
 def _nothing(steps: Steps) -> DAERow:
     """Return rows of no samples, so that an empty record has estimates of the right shape."""
     graph, model = steps.graph, steps.settings.model
@@ -238,26 +214,24 @@ class DAEObserver(DAESettings, StepObserver[DAEState, DAERow]):
             raise SpecError(f"compiled is {compiled!r}: give True, False or None.", path="compiled")
         outputs = measured_record(y, self.model.ny)
         inputs = checked_inputs(self.model, u, len(outputs))
-        if not self.is_plain:
-            return self._run_in_rows(outputs, inputs, compiled=compiled, progress=progress)
-        library = self.library if compiled else None
-        return run_record(self.steps, outputs, inputs, compiled=compiled, library=library, progress=progress)
-
-    def _run_in_rows(
-        self, y: FloatArray, u: FloatArray, *, compiled: bool | None, progress: bool | Callable[[int], None] | None
-    ) -> Estimates:
-        """Run sample by sample, with sensors of their own times or bounds on states.
-
-        Shapes: ``y (samples, ny)``, ``u (samples, nu)``.
-        """
-        if compiled:
+        alone = self.outside_graph
+        if compiled and not self.is_plain:
             raise SpecError("The C knows neither sensors of their own times nor state_bounds: leave compiled=True out.",
                             path="compiled")  # fmt: skip
-        found, state = GatheredRows(self), self.init()
-        with shown_progress(progress, len(y), "samples") as note:
-            for k in range(len(y)):
-                state, row = self.accept(state, y[k], u[k])
-                found.add(row)
-                note(k + 1)
-        return found.estimates() if len(y) else run_record(self.steps, y, u, compiled=False, library=None,
-                                                           progress=False)  # fmt: skip
+        if compiled and alone:
+            raise SpecError(f"The C knows no {alone}: leave compiled=True out, or leave {alone} out.", path="compiled")
+        library = self.library if compiled else None
+        found = GatheredRows(self)
+        found.add(_nothing(self.steps))
+        with shown_progress(progress, len(outputs), "samples") as note:
+            if library is not None:
+                _in_c(self.steps, library, outputs, inputs, found.add_regular, note)
+            elif compiled is None and self.is_plain and not alone:
+                advanced(self.steps, outputs, inputs, found.add_regular, note)
+            else:
+                state = self.init()
+                for k in range(len(outputs)):
+                    state, row = self.accept(state, outputs[k], inputs[k])
+                    found.add(row)
+                    note(k + 1)
+        return found.estimates()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -16,24 +16,14 @@ from obsynth.observers.dae.estimates import DAERow
 from obsynth.observers.dae.memory_layout import initial_memory
 from obsynth.observers.dae.settings import DAESettings
 from obsynth.observers.dae.step_graph import ObserverGraph, observer_graph
-from obsynth.observers.outliers import checked_limit, no_refusals, projected, robust_advance
+from obsynth.observers.outliers import checked_limit, has_jumped, no_refusals, projected, robust_advance, with_surprise
 from obsynth.plants.dae.functions import Compiled, DAEFunctions
 from obsynth.plants.dae.step import ImplicitStep
 
-#: Samples whose squared innovations are summed up before a reset.
-RESET_WINDOW = 20
 #: A step of backward Euler this much shorter than dt puts a state onto its constraint and moves it no further.
 PROJECTION_SHARE = 1e-6
 #: Smaller moves, in sizes of the states, are the motion during that step and no projection.
 PROJECTION_NOTICE = 1e-5
-
-
-@lru_cache(maxsize=256)
-def chi_square_limit(degrees: int, probability: float) -> float:
-    """Return what a chi-square variable passes with a probability."""
-    from scipy.special import chdtri
-
-    return float(chdtri(degrees, probability))
 
 
 class DAEState(NamedTuple):
@@ -89,10 +79,8 @@ class Steps:
         """Take a sample; where innovations have become too large, again with parameters known no better than at first.
         A jump of a parameter is followed from there at once."""
         after, row = self.plain(state, y, u)
-        latest = [float(row.nis), float(row.degrees)]
-        surprises = np.vstack([state.surprises, latest])[-RESET_WINDOW:] if state.k else state.surprises
-        total, degrees = surprises.sum(axis=0)
-        if not degrees or total <= chi_square_limit(int(degrees), self.settings.reset):
+        surprises = with_surprise(state.surprises, float(row.nis), row.degrees) if state.k else state.surprises
+        if not has_jumped(surprises, self.settings.reset):
             return after._replace(surprises=surprises), row
         after, row = self.plain(state._replace(memory=self._forgetful(state)), y, u)
         return after._replace(surprises=state.surprises[:0], resets=state.resets + 1), row

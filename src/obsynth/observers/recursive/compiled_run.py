@@ -23,8 +23,8 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.covariances import covariance_factor
 from obsynth.numerics.least_squares_step import DEPENDENT_COLUMN, SUSPECT_PARITY
 from obsynth.observers.estimates import Estimates, named_estimates
-from obsynth.observers.recursive.estimates import received_in, recursive_estimates
-from obsynth.observers.recursive.recursion import RawEstimate, Recursion, RecursiveState
+from obsynth.observers.recursive.estimates import RawEstimate, RecursiveState, received_in
+from obsynth.observers.recursive.recursion import Recursion
 from obsynth.observers.recursive.settings import RecursiveSettings
 from obsynth.observers.recursive.step_model import PlantSteps, StepMatrices, StepModel, stacked_noise
 from obsynth.plants.sequences import MatrixSequence
@@ -109,11 +109,6 @@ CHUNK = 4096
 SHORT_STRETCH = 8
 
 
-def kernel_covers(observer: RecursiveSettings) -> bool:
-    """Return whether the kernel knows the recursion: that of a filter, with parameters as a random walk or none."""
-    return observer.form in ("", "random-walk")
-
-
 def kernel_is_chosen(observer: RecursiveSettings, samples: int, compiled: bool | None) -> bool:
     """Return whether a record goes through the kernel."""
     if compiled is False:
@@ -123,7 +118,8 @@ def kernel_is_chosen(observer: RecursiveSettings, samples: int, compiled: bool |
             raise SpecError("compiled=True: the kernel knows no outliers: leave it out, or take outliers='none'.",
                             path="compiled")  # fmt: skip
         return False
-    covered, installed = kernel_covers(observer), importlib.util.find_spec("numba") is not None
+    # The recursion of a filter, with parameters as a random walk or none.
+    covered, installed = observer.form in ("", "random-walk"), importlib.util.find_spec("numba") is not None
     if compiled is None:
         return covered and installed and samples >= LONG_RECORD and observer.order <= SMALL_ORDER
     if not installed:
@@ -137,17 +133,6 @@ def kernel_is_chosen(observer: RecursiveSettings, samples: int, compiled: bool |
             "'innovation' and 'literal' run without it: leave the option out.", path="compiled",
         )  # fmt: skip
     return True
-
-
-def run_record(recursion: Recursion, y: FloatArray, u: FloatArray, compiled: bool | None) -> Estimates:
-    """Run over a whole record: ``y (samples, ny)``, ``u (samples, nu)``."""
-    if kernel_is_chosen(recursion.settings, len(y), compiled):
-        return run_compiled(recursion, y, u)
-    state, rows = recursion.first, []
-    for k in range(len(y)):
-        state, row = recursion.advance(state, y[k], u[k])
-        rows.append(row)
-    return recursive_estimates(recursion.settings, rows)
 
 
 @dataclass

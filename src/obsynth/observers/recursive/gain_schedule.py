@@ -21,7 +21,7 @@ from obsynth.observers.recursive.step_model import (
     EarlyConstraintSteps,
     PreparedStep,
     StepMatrices,
-    require_in_range,
+    spreads,
 )
 
 
@@ -61,9 +61,7 @@ def gain_steps(
             found = prepared.taken(factor, right if nq else None)
         # The literal form asks for the noise itself.
         if found is None or recursion.literal:
-            S = _noise_root(step, factor)
-            require_in_range(S, factor, k, observer.state_names)
-            unknown = np.vstack([step.A @ diffuse, np.zeros((rows - ne, diffuse.shape[1]))])
+            S, unknown = spreads(step, factor, diffuse, k, observer.state_names)
             H = step.H
             if not complete and received is not None:
                 kept = np.concatenate([np.ones(ne, dtype=bool), received[k], np.ones(len(step.Dn), dtype=bool)])
@@ -85,15 +83,6 @@ def gain_steps(
             )  # fmt: skip
             learn, forget = theta_gain @ seen, np.eye(nq) - theta_gain @ regressor
         yield GainStep(step, gain, parity, G, Upsilon, factor, learn, forget, parameters.spread)
-
-
-def _noise_root(step: StepMatrices, factor: FloatArray) -> FloatArray:
-    """Return the square root ``(rows, any)`` of the covariance of a step's data."""
-    ne, rows, width = len(step.A), len(step.H), factor.shape[1]
-    S = np.zeros((rows, max(width + step.noise.shape[1], rows)))
-    S[:ne, :width] = step.A @ factor
-    S[:, width : width + step.noise.shape[1]] = step.noise
-    return S
 
 
 def run_batch(observer: RecursiveObserver, y: ArrayLike, u: ArrayLike | None = None) -> Estimates:

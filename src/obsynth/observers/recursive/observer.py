@@ -18,9 +18,9 @@ from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.outliers import projected
 from obsynth.observers.records import measured_record, require_horizon, whole_record
-from obsynth.observers.recursive.compiled_run import run_record
-from obsynth.observers.recursive.estimates import recursive_estimates
-from obsynth.observers.recursive.recursion import RawEstimate, Recursion, RecursiveState
+from obsynth.observers.recursive.compiled_run import kernel_is_chosen, run_compiled
+from obsynth.observers.recursive.estimates import RawEstimate, RecursiveState, recursive_estimates
+from obsynth.observers.recursive.recursion import Recursion
 from obsynth.observers.recursive.settings import Adaptation, RecursiveSettings
 from obsynth.observers.running import StepObserver
 from obsynth.plants.sequences import MatrixSequence
@@ -112,11 +112,11 @@ class RecursiveObserver(RecursiveSettings, StepObserver[RecursiveState, RawEstim
         """
         outputs, inputs = whole_record(y, u, self.plant.ny, self.plant.nu)
         require_horizon(self.plant.horizon, len(outputs), early=self.early_constraints)
-        if self.is_plain:
-            return run_record(self.recursion, outputs, inputs, compiled)
-        if compiled:
+        if compiled and not self.is_plain:
             raise SpecError("compiled=True: the kernel knows neither sensors of their own times nor state_bounds: "
                             "leave it out.", path="compiled")  # fmt: skip
+        if self.is_plain and kernel_is_chosen(self, len(outputs), compiled):
+            return run_compiled(self.recursion, outputs, inputs)
         rows, state = [], self.init()
         for y_k, u_k in zip(outputs, inputs, strict=True):
             state, row = self.advance(state, y_k, u_k)

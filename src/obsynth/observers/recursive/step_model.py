@@ -74,6 +74,18 @@ def require_in_range(S: FloatArray, factor: FloatArray, k: int, state_names: Seq
     )  # fmt: skip
 
 
+def spreads(
+    step: StepMatrices, factor: FloatArray, diffuse: FloatArray, k: int, state_names: Sequence[str]
+) -> tuple[FloatArray, FloatArray]:
+    """Return a root ``(rows, any)`` of the covariance of a step's data, and what is unknown in them ``(rows, r)``."""
+    ne, rows, width = len(step.A), len(step.H), factor.shape[1]
+    S = np.zeros((rows, max(width + step.noise.shape[1], rows)))
+    S[:ne, :width] = step.A @ factor
+    S[:, width : width + step.noise.shape[1]] = step.noise
+    require_in_range(S, factor, k, state_names)
+    return S, np.vstack([step.A @ diffuse, np.zeros((rows - ne, diffuse.shape[1]))])
+
+
 @dataclass
 class PlantSteps:
     """The steps of a plant as it is."""

@@ -17,7 +17,8 @@ from obsynth.numerics.covariances import covariance_factor
 from obsynth.numerics.square_root_smoothing import joint_step
 from obsynth.observers.dae.estimates import DAERow
 from obsynth.observers.dae.steps import DAEState, Steps
-from obsynth.observers.recursive.recursion import RawEstimate, Recursion, RecursiveState
+from obsynth.observers.recursive.estimates import RawEstimate, RecursiveState
+from obsynth.observers.recursive.recursion import Recursion
 from obsynth.observers.recursive.step_model import EarlyConstraintSteps, StepMatrices, stacked_noise
 from obsynth.observers.smoothing.chain import Lesson, Links, Node
 
