@@ -87,7 +87,7 @@ _NAMES = {
         "RecursiveEstimates=Estimates"
     ),
     "observers.linear.observer": "LinearObserver",
-    "observers.linear.sampling": "sample_observer",
+    "observers.linear.derived": "sample_observer",
     "observers.recursive.observer": "RecursiveObserver",
     "observers.recursive.settings": "Adaptation",
     "observers.running": "RunningObserver RunningDAEObserver=RunningObserver RunningRecursiveObserver=RunningObserver",

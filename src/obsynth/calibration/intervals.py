@@ -90,12 +90,9 @@ def quantile(level: float, constants: int, samples: int, variances: int) -> floa
     each = 1.0 - (1.0 - level) / (2.0 * max(constants, 1))
     if not variances:
         return float(norm.ppf(each))
-    return float(t.ppf(each, max(samples - constants - 2, 3))) * widening(samples)
-
-
-def widening(samples: int) -> float:
-    """Return by how much boxes of few rows are wider than Student's distribution says."""
-    return 1.0 + (SHORT_WIDENING - 1.0) * min(1.0, SHORT / samples)
+    return float(t.ppf(each, max(samples - constants - 2, 3))) * (
+        1.0 + (SHORT_WIDENING - 1.0) * min(1.0, SHORT / samples)
+    )
 
 
 @dataclass(frozen=True, eq=False)

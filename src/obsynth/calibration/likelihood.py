@@ -34,12 +34,10 @@ class Likelihood:
         P0: FloatArray,
     ) -> None:  # fmt: skip
         self.graphs, self.samples, self.size = graphs, len(y), graphs.nt + len(noisy) + graphs.ny
-        self.evaluations = 0
         self._both = Compiled(_whole(graphs, u, y, noisy, x0, P0))
 
     def __call__(self, v: FloatArray) -> tuple[float, FloatArray]:
         """Return the value and its gradient ``(nt + len(noisy) + ny,)``."""
-        self.evaluations += 1
         total, gradient, rows = self._both(v)
         left = rows[-1]
         good = np.isfinite(total).all() and np.isfinite(gradient).all() and np.abs(left).max() <= LARGEST_RESIDUAL

@@ -77,6 +77,12 @@ class Log:
         names = "\n".join((*self.input_names, "", *self.output_names)).encode()
         return hashlib.sha256(names + b"\0" + np.where(np.isnan(seen), np.nan, seen).tobytes()).hexdigest()
 
+    @property
+    def described(self) -> dict[str, Any]:
+        """What a report says of the log."""
+        return {"source": self.source, "rows": list(self.rows), "digest": self.digest, "samples": self.samples,
+                "dt": self.dt}  # fmt: skip
+
     def shifted(self, rows: int) -> Log:
         """Return the log with its inputs later by whole rows: what row k says acts from row k on for ``rows = 1``."""
         if abs(rows) >= len(self.u):
@@ -87,8 +93,7 @@ class Log:
             u[:rows] = self.u[0]
         elif rows < 0:
             u[rows:] = self.u[-1]
-        return Log(self.time, read_only(u), self.y, self.dt, self.input_names, self.output_names, self.rows,
-                   self.source, self.notes)  # fmt: skip
+        return replace(self, u=read_only(u))
 
     def without(self, wrong: NDArray[np.bool_]) -> Log:
         """Return the log without single outputs ``(n, ny)`` that are no measurements, with a note for each sensor."""
@@ -136,8 +141,8 @@ def read_log(
         if (log.input_names, log.output_names) != (tuple(input_names), tuple(output_names)):
             raise SpecError("The log is of another plant: its signals differ.", path="log")
         first, last = parsed_rows(rows, log.samples)
-        return Log(log.time[first:last], log.u[first:last], log.y[first:last], log.dt, log.input_names,
-                   log.output_names, (log.rows[0] + first, log.rows[0] + last), log.source, log.notes)  # fmt: skip
+        return replace(log, time=log.time[first:last], u=log.u[first:last], y=log.y[first:last],
+                       rows=(log.rows[0] + first, log.rows[0] + last))  # fmt: skip
     table, source = _table(log)
     signals = ("time", *input_names, *output_names)
     for what, given in (("columns", columns or {}), ("scales", scales or {})):
@@ -197,11 +202,8 @@ def _on_grid(
 ) -> Log:  # fmt: skip
     """Return the log on its grid; missing rows become rows without outputs whose inputs are those that follow."""
     if not np.isfinite(time).all() or (np.diff(time) <= 0).any():
-        bad = (
-            int(np.argmax(~np.isfinite(time)))
-            if not np.isfinite(time).all()
-            else int(np.argmax(np.diff(time) <= 0)) + 1
-        )
+        wrong = ~np.isfinite(time) if not np.isfinite(time).all() else np.diff(time, prepend=-np.inf) <= 0
+        bad = int(np.argmax(wrong))
         raise bad_log("time", f"Stamps must rise and be finite, but that of row {rows[0] + bad} is {time[bad]:g} s.",
                       path="log.time")  # fmt: skip
     gaps = np.diff(time)

@@ -103,6 +103,10 @@ class Objective:
         value += 0.5 * float(p.prior_weights @ away**2) - 0.5 * float(self.avoided @ z)
         return value, gradient[self.free] - 0.5 * self.avoided
 
+    def descent(self, start: FloatArray) -> tuple[float, FloatArray]:
+        """Return a minimum within the bounds near a start, and where it is."""
+        return descent(self, np.clip(start, self.low, self.high), self.low, self.high, self.scale)
+
     def plain(self, z: FloatArray) -> float:
         """Return the negative log likelihood alone."""
         return self.likelihood(self.full(z))[0]
@@ -125,7 +129,6 @@ class Maximum:
     z: FloatArray
     value: float
     hessian: FloatArray
-    starts: tuple[float, ...]
     likeliest: FloatArray
 
 
@@ -163,24 +166,22 @@ def descent(
 
 def greatest_likelihood(objective: Objective, fits: Sequence[Fit], note: Callable[[str], object]) -> Maximum:
     """Return the best of several searches, polished."""
-    starts: list[float] = []
-    best, value = None, np.inf
+    count, best, value = 0, None, np.inf
     for i, fit in enumerate(fits):
         if i and fit.cost - fits[0].cost < SAME_MINIMUM * abs(fits[0].cost):
             continue
         for process, sensor in NOISE_STARTS if i == 0 else NOISE_STARTS[:1]:
-            note(f"likelihood, start {len(starts) + 1}")
+            count += 1
+            note(f"likelihood, start {count}")
             start = objective.start(fit.t) + process * objective.is_q + sensor * objective.is_r
-            start = np.clip(start, objective.low, objective.high)
-            reached, z = descent(objective, start, objective.low, objective.high, objective.scale)
-            starts.append(reached)
+            reached, z = objective.descent(start)
             if reached < value:
                 best, value = z, reached
     if best is None or value >= IMPOSSIBLE:
         raise refused("cannot-simulate", "The filter has no finite likelihood from any start: check units, bounds and "
                       "the initial covariance.", signals=list(objective.problem.unknown))  # fmt: skip
     value, best, curvature = polished(objective, best)
-    return Maximum(best, value, curvature, tuple(starts), best)
+    return Maximum(best, value, curvature, best)
 
 
 def polished(
@@ -270,11 +271,11 @@ def without_collapse(objective: Objective, maximum: Maximum, note: Callable[[str
         for raised in RAISED:
             start = maximum.z.copy()
             start[new] = np.clip(objective.first[new] + raised, objective.low[new], objective.high[new])
-            reached, z = descent(objective, start, objective.low, objective.high, objective.scale)
+            reached, z = objective.descent(start)
             if reached < value:
                 best, value = z, reached
         value, best, curvature = polished(objective, best)
-        maximum = Maximum(best, value, curvature, maximum.starts, maximum.likeliest)
+        maximum = Maximum(best, value, curvature, maximum.likeliest)
     return maximum
 
 

@@ -1,9 +1,4 @@
-"""Comparing a recorded, fault-free log with a design: the public function.
-
-Which variances of a design a log contradicts: likeliest ones beside those that were designed with.
-
-The innovations of a design along a log, with what the design expects of them.
-"""
+"""Comparing a recorded, fault-free log with a design: its innovations, the variances that the log contradicts."""
 
 from __future__ import annotations
 
@@ -28,7 +23,7 @@ from obsynth.calibration.reporting import IntegrationError, integration_error
 from obsynth.calibration.simulation_error import Fit
 from obsynth.calibration.step_graphs import sample_graphs
 from obsynth.calibration.validation import SensorValidation, Validation
-from obsynth.errors import PreconditionError, SolverError, SpecError
+from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.dae.observer import DAEObserver
@@ -71,27 +66,12 @@ def recorded_innovations(design: ObserverDesign, log: Log) -> RecordedInnovation
 
 
 def _nonlinear(observer: DAEObserver, log: Log) -> RecordedInnovations:
-    found = observer.run(log.y, log.u, progress=False)
+    found, error = observer.run(log.y, log.u, progress=False), None
+    if observer.integration == "backward-euler":
+        error = integration_error(observer.model, np.array(found.states), log.u, np.array(found.parameters[-1]),
+                                  np.sqrt(np.diag(observer.R)), observer.dt)  # fmt: skip
     deviations = np.sqrt(np.einsum("kii->ki", found.innovation_covariances))
-    return RecordedInnovations(
-        found.innovations, deviations, float(found.nis.sum()), int(found.nis_degrees.sum()),
-        _estimates(found.parameter_names, found.parameters, found.parameter_covariances),
-        _step_error(observer, log, found),
-    )  # fmt: skip
-
-
-def _step_error(observer: DAEObserver, log: Log, found: Estimates) -> IntegrationError | None:
-    """Return what a step of backward Euler errs from the estimates on, in deviations of the sensors."""
-    if observer.integration != "backward-euler":
-        return None
-    try:
-        return integration_error(
-            observer.model, np.array(found.states), log.u, np.array(found.parameters[-1]),
-            np.sqrt(np.diag(observer.R)), observer.dt,
-        )  # fmt: skip
-    except SolverError:
-        # Where Radau has no solution there is nothing to compare.
-        return None
+    return _recorded(found, found.innovations, deviations, error)
 
 
 def _recursive(observer: RecursiveObserver, log: Log, point: Mapping[str, float]) -> RecordedInnovations:
@@ -107,15 +87,16 @@ def _recursive(observer: RecursiveObserver, log: Log, point: Mapping[str, float]
             e[k], deviations[k] = np.where(np.isfinite(spread), y[k] - mean, np.nan), spread
         state, _ = observer.advance(state, y[k], u[k])
     found = observer.run(y, u)
-    return RecordedInnovations(
-        e, deviations, float(found.nis.sum()), int(found.nis_degrees.sum()),
-        _estimates(found.parameter_names, found.parameters, found.parameter_covariances),
-    )  # fmt: skip
+    return _recorded(found, e, deviations)
 
 
-def _estimates(names: tuple[str, ...], values: FloatArray, covariances: FloatArray) -> dict[str, FloatArray]:
-    deviations = np.sqrt(np.einsum("kii->ki", covariances))
-    return {name: read_only(np.column_stack([values[:, i], deviations[:, i]])) for i, name in enumerate(names)}
+def _recorded(
+    found: Estimates, innovations: FloatArray, deviations: FloatArray, error: IntegrationError | None = None
+) -> RecordedInnovations:
+    columns = np.stack([found.parameters, found.parameter_deviations], axis=2)
+    estimates = {name: read_only(columns[:, i]) for i, name in enumerate(found.parameter_names)}
+    return RecordedInnovations(innovations, deviations, float(found.nis.sum()), int(found.nis_degrees.sum()), estimates,
+                               error)  # fmt: skip
 
 
 #: Nats that a variance of the design must cost, the others being free, before its ratio is told.
@@ -237,17 +218,13 @@ def validate(
     return Validation(
         passed, design.name, whole, sensors, ratios, change, tuple(verdict), read_only(record.innovations),
         read_only(record.deviations), read_only(np.array(found.y)), read_only(found.y - record.innovations),
-        record.estimates, _described(found),
+        record.estimates, found.described,
     )  # fmt: skip
 
 
 def states_innovations(design: ObserverDesign) -> bool:
     """Whether a design predicts its outputs with a covariance, which a log could contradict."""
     return not isinstance(design.observer, LinearObserver)
-
-
-def _described(log: Log) -> dict[str, object]:
-    return {"source": log.source, "rows": list(log.rows), "digest": log.digest, "samples": log.samples, "dt": log.dt}
 
 
 def _sensors(record: RecordedInnovations, names: Sequence[str]) -> dict[str, SensorValidation]:
