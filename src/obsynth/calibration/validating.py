@@ -9,6 +9,8 @@ import numpy as np
 
 from obsynth.calibration.diagnostics import (
     SIGNIFICANT,
+    SensorValidation,
+    Validation,
     change_of_mean,
     consistency,
     consistency_of,
@@ -22,7 +24,6 @@ from obsynth.calibration.problem import Problem
 from obsynth.calibration.reporting import IntegrationError, integration_error
 from obsynth.calibration.simulation_error import Fit
 from obsynth.calibration.step_graphs import sample_graphs
-from obsynth.calibration.validation import SensorValidation, Validation
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray, read_only

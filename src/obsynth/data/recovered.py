@@ -22,10 +22,6 @@ LATE = "recovered states"
 class RecoveredStates:
     """Estimates of the states that a transformation took away, all of one moment.
 
-    Fields: recovery: Of the design; engine: Whose estimates are used.
-
-    Notes
-    -----
     ``x_source = from_state x + from_input u + from_fault f``: what disturbances and noise add is not known.  Where the
     fault estimate lags more than that of the state, both are taken of the older moment.  Faults that the observer does
     not estimate count as zero.

@@ -82,12 +82,8 @@ def alone(scores: FloatArray, information: FloatArray) -> int:
 
 #: Onsets that the GLR considers: the choice that its threshold was tried with.
 GLR_WINDOW = 40
-
-
 #: Correlated looks count as this share of independent ones: measured false-alarm rates stay below what is asked.
 GLR_LOOKS = 1.0 / 4.0
-
-
 #: Information below this (parameter units to the power -2) has lost digits to underflow: as good as none.
 SMALLEST_INFORMATION = float(np.finfo(np.float64).tiny / np.finfo(np.float64).eps)
 

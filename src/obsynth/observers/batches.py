@@ -25,8 +25,6 @@ from obsynth.observers.recursive.observer import RecursiveObserver
 
 #: Samples in one call of the library: a second or less, so that progress shows and an interrupt is heard.
 SAMPLES_PER_CALL = 100_000
-
-
 #: Steps from which it pays to compile unasked: compiling takes about a second, and the rest thirty microseconds a step.
 WORTH_COMPILING = 50_000
 

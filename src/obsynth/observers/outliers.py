@@ -23,37 +23,20 @@ from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.plants.names import index_of
 
 BoolArray = NDArray[np.bool_]
-
-
 Outliers = Literal["none", "gate", "huber"]
-
-
 KINDS = ("none", "gate", "huber")
-
-
 #: Standard deviations: of a gate, so that no sample of a true model is left out in a million; and of Huber's weight.
 LIMITS = {"gate": 6.0, "huber": 3.0}
-
-
 #: What is larger has no square: it is no measurement, whatever the model says.
 OVERFLOW = 1e150
-
-
 #: Samples of one sensor in a row that are left out; the next is believed.
 LONGEST = 2
-
-
 #: How many times further off than the limit a sample must be that nothing contradicts but the equations of the model;
 #: and what rounding makes of a prediction without noise.
 BLIND, ROUNDING = 10.0, 1e-6
-
-
 #: Samples whose squared innovations are summed up before a reset.
 RESET_WINDOW = 20
-
 State = TypeVar("State", bound=Any)
-
-
 Row = TypeVar("Row", bound=Any)
 
 

@@ -54,7 +54,7 @@ class WaitingState(NamedTuple):
 
     before: tuple[Any, ...]  # its states before each of the latest samples
     latest: Any  # after the last one
-    outputs: FloatArray  # outputs, inputs: Of these samples, as far as they have arrived
+    outputs: FloatArray  # outputs, inputs: of these samples, as far as they have arrived
     inputs: FloatArray
 
     @property

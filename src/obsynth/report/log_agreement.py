@@ -8,8 +8,8 @@ from html import escape
 from rich.table import Table
 from rich.text import Text
 
+from obsynth.calibration.diagnostics import Validation, draw_validation
 from obsynth.calibration.validating import states_innovations, validate
-from obsynth.calibration.validation import Validation, draw_validation
 from obsynth.data.run import DataRun
 from obsynth.errors import ObsynthError
 from obsynth.report.page_tables import copied_table, fact_rows

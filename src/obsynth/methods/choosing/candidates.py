@@ -15,7 +15,7 @@ from obsynth.methods.method_spec import MethodSpec
 from obsynth.methods.registry import REGISTRY, method_spec
 from obsynth.observers.linear.derived import sample_observer
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.observers.recursive.steady_state import steady_observer
+from obsynth.observers.recursive.gain_schedule import steady_observer
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
 

@@ -38,15 +38,9 @@ from obsynth.plants.dae.step import step_graph
 
 #: What ``record.c`` hands out of a batch, in this order.
 BATCH_PARTS = ("posterior", "theta", "spread", "innovation", "nis", "residual")
-
-
 _NUMBERS_PER_LINE = 4
-
-
 #: Bounds of states whose moves differ by less than this share are dependent.
 DEPENDENT = 1e-13
-
-
 #: A bound that is missed by less, in deviations of its state, is kept.
 SLACK = 1e-7
 
@@ -197,8 +191,6 @@ def _renamed(function: Any, name: str) -> Any:
 
 #: Tried in turn when the environment does not name one in ``CC``.
 COMPILERS = ("cc", "gcc", "clang")
-
-
 FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-shared", "-fPIC")
 
 
@@ -214,7 +206,7 @@ def compiler() -> list[str] | None:
 
 
 class DAELibrary:
-    """An observer in C. Fields: steps: Of the observer."""
+    """An observer in C."""
 
     def __init__(self, steps: Steps) -> None:
         self.steps = steps

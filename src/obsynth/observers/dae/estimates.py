@@ -25,7 +25,7 @@ class DAERow:
 
     graph: ObserverGraph  # which laid it out
     k: int  # number of the (first) sample
-    memory: FloatArray  # memory, said: What is carried on, and what is said besides
+    memory: FloatArray  # memory, said: what is carried on, and what is said besides
     said: FloatArray
     seen: NDArray[np.bool_]  # ``(ny,)``, of bool: which outputs were there
     moved: FloatArray  # ``(nx,)``: how far the state was put onto its constraint; zeros but at k = 0
@@ -143,7 +143,7 @@ class DAERow:
 
 
 class GatheredRows:
-    """What the estimates keep of the rows of a record, while it is being run. Fields: observer: Whose rows they are."""
+    """What the estimates keep of the rows of a record, while it is being run."""
 
     def __init__(self, observer: DAESettings) -> None:
         self.observer = observer

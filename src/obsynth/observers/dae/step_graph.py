@@ -26,7 +26,7 @@ Arrays = dict[str, Any]
 class ObserverGraph:
     """The functions of an observer."""
 
-    memory: Layout  # memory, row: Of what is carried on, and of what is said besides
+    memory: Layout  # memory, row: of what is carried on, and of what is said besides
     row: Layout
     functions: DAEFunctions  # the model with its method of integration
     step: StepGraph  # its implicit step

@@ -44,7 +44,7 @@ class GainScheduleSummary:
     # the least eigenvalue of the information on the parameters in any window, (26); NaN without parameters
     excitation: float
     excitation_k: int  # the sample that ends that window
-    L: FloatArray  # L, K: The gains (11) of the last step
+    L: FloatArray  # L, K: the gains (11) of the last step
     K: FloatArray
     deviations: FloatArray  # ``(nq,)``: standard deviations of the parameters after the last step
     # ``(nx,)``: standard deviations of the states after the last step, the parameters being known

@@ -127,7 +127,7 @@ class EarlyConstraintSteps:
     """The steps of a plant with its algebraic equations used as outputs one step earlier."""
 
     plant: TimeVaryingDescriptorSystem  # the plant
-    Q: MatrixSequence  # Q, R: Covariances; Q must not couple algebraic equations with the others
+    Q: MatrixSequence  # Q, R: covariances; Q must not couple algebraic equations with the others
     R: MatrixSequence
     rows: IntArray  # the algebraic equations, see `obsynth.analysis.time_varying.algebraic_rows`
 

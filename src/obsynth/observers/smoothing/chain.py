@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -48,13 +48,14 @@ class Smoothed(NamedTuple):
 
 
 class LaterLessons:
-    """Constant parameters from the samples after one, with weights that fall by the forgetting factor. They are
-    independent of what the sample itself has learnt, and of the errors of the states at given parameters. Fields:
-    forgetting: lambda; triangle: ``(any, nq + 1)``: weight and weighted data; noise: ``(nq, any)``: square root of the
-    covariance of the weighted sum."""
+    """Constant parameters from the samples after one, with weights that fall by the forgetting factor.
+
+    They are independent of what the sample itself has learnt, and of the errors of the states at given parameters.
+    """
 
     def __init__(self, forgetting: float, nq: int) -> None:
         self.forgetting = forgetting
+        # Weight and weighted data ``(any, nq + 1)``; square root of the covariance of the weighted sum ``(nq, any)``.
         self.triangle, self.noise = np.zeros((0, nq + 1)), np.zeros((nq, 0))
 
     def add(self, lesson: Lesson) -> None:
@@ -82,18 +83,25 @@ class LaterLessons:
         return theta, np.asarray(np.linalg.solve(triangle, np.linalg.solve(triangle.T, sums)))
 
 
-@dataclass(frozen=True)
-class Links:
+class Links(ABC):
     """How an observer makes a chain."""
 
-    first: Callable[[Any, Any, FloatArray], Node]  # from the state after the first sample and its row to its node
-    # from the node before, the states before and after a sample, its row and its input to its node
-    next: Callable[[Node, Any, Any, Any, FloatArray], Node]
-    begun: Callable[[Any], Node]  # from the state at which a run went on to the node it stands for
-    forgetting: float = 1.0  # lambda of constant parameters
+    forgetting = 1.0  # lambda of constant parameters
     bounds: FloatArray | None = None  # ``(nx, 2)``, of the states
-    lower: FloatArray | None = None  # lower, upper: ``(nq,)``, of the parameters
+    lower: FloatArray | None = None  # ``(nq,)``, of the parameters, as `upper`
     upper: FloatArray | None = None
+
+    @abstractmethod
+    def begun(self, state: Any) -> Node:
+        """Return the node of a state from which a chain begins."""
+
+    def first(self, after: Any, row: Any, u: FloatArray) -> Node:
+        """Return the node of k = 0 from the state after it and its row."""
+        return self.begun(after)
+
+    @abstractmethod
+    def next(self, node: Node, before: Any, after: Any, row: Any, u: FloatArray) -> Node:
+        """Return the node of the next sample, from the states before and after it, its row and its input."""
 
 
 def smoothed_from(links: Links, nodes: Sequence[Node], begin: int, end: int) -> list[Smoothed]:

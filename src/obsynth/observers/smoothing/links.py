@@ -6,7 +6,6 @@ that walk are states of the chain.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from typing import NamedTuple
 
 import numpy as np
@@ -16,42 +15,43 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.covariances import covariance_factor
 from obsynth.numerics.square_root_smoothing import joint_step
 from obsynth.observers.dae.estimates import DAERow
+from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.dae.steps import DAEState, Steps
 from obsynth.observers.recursive.estimates import RawEstimate, RecursiveState
+from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.recursive.recursion import Recursion
 from obsynth.observers.recursive.step_model import EarlyConstraintSteps, StepMatrices, stacked_noise
 from obsynth.observers.smoothing.chain import Lesson, Links, Node
 
 
-def dae_links(steps: Steps) -> Links:
-    """Return how a chain is made of the steps of an observer of a nonlinear plant."""
-    settings = steps.settings
-    own: _DAELinks
-    if settings.form == "forgetting":
-        own, forgetting = _ConstantLinks(steps), settings.forgetting
-    else:
-        own, forgetting = _WalkingLinks(steps), 1.0
-    return Links(own.first, own.next, own.begun, forgetting, settings.state_bounds, settings.lower, settings.upper)
+def links_of(observer: RecursiveObserver | DAEObserver) -> Links:
+    """Return how a chain is made of the steps of an observer."""
+    if isinstance(observer, RecursiveObserver):
+        return _RecursiveLinks(observer.recursion)
+    return (_ConstantLinks if observer.form == "forgetting" else _WalkingLinks)(observer.steps)
 
 
 class _Sample(NamedTuple):
     """One sample of an observer at the point where its step was linearised."""
 
-    x: FloatArray  # x, theta: Before the measurement
+    x: FloatArray  # x, theta: before the measurement
     theta: FloatArray
-    F: FloatArray  # F, G, noise: Of the step
+    F: FloatArray  # F, G, noise: of the step
     G: FloatArray
     noise: FloatArray
-    e: FloatArray  # e, H, L, R: Innovation, derivatives and covariance of the outputs that are there
+    e: FloatArray  # e, H, L, R: innovation, derivatives and covariance of the outputs that are there
     H: FloatArray
     L: FloatArray
     R: FloatArray
 
 
-class _DAELinks(ABC):
+class _DAELinks(Links):
+    """Those of an observer of a nonlinear plant: linearised along what it found, as the observer is itself."""
+
     def __init__(self, steps: Steps) -> None:
         self.steps, settings = steps, steps.settings
         self.nx, self.nq = settings.model.nx, settings.model.nq
+        self.bounds, self.lower, self.upper = settings.state_bounds, settings.lower, settings.upper
         self.Q = covariance_factor(settings.Q, "Q")
         self.walk = covariance_factor(settings.random_walk, "random_walk") if self.nq else np.zeros((0, 0))
 
@@ -69,18 +69,6 @@ class _DAELinks(ABC):
         return _Sample(x, theta, row.part("F"), row.part("G"), row.part("noise") @ self.Q, row.innovation[seen],
                        H[seen], L[seen], R)  # fmt: skip
 
-    def first(self, after: DAEState, row: DAERow, u: FloatArray) -> Node:
-        """Return the node of k = 0."""
-        return self.begun(after)
-
-    @abstractmethod
-    def begun(self, state: DAEState) -> Node:
-        """Return the node of a state from which a chain begins."""
-
-    @abstractmethod
-    def next(self, node: Node, before: DAEState, after: DAEState, row: DAERow, u: FloatArray) -> Node:
-        """Return the node of the next sample."""
-
     def through(self, state: DAEState) -> FloatArray:
         """Return the derivative of the state after the measurement by the parameters."""
         K, H, L, Upsilon = (self.steps.part(state, name) for name in ("K", "H", "L", "Upsilon"))
@@ -97,6 +85,10 @@ class _DAELinks(ABC):
 
 class _ConstantLinks(_DAELinks):
     """States at given parameters, and what each sample says of the parameters."""
+
+    def __init__(self, steps: Steps) -> None:
+        super().__init__(steps)
+        self.forgetting = steps.settings.forgetting
 
     def begun(self, state: DAEState) -> Node:
         """Return the node of a state from which a chain begins; y(0) corrects the states alone."""
@@ -199,27 +191,18 @@ class _WalkingLinks(_DAELinks):
         return Node(self._posterior(after)[:, None], found.factor, found.diffuse, found.back)
 
 
-def recursive_links(recursion: Recursion) -> Links:
-    """Return how a chain is made of the steps of a recursive observer."""
-    if recursion.literal:
-        raise PreconditionError(
-            "Form 'literal' learns from residuals that are correlated in time, of which no smoother exists: use form "
-            "'innovation' or 'random-walk'.", condition="white residuals",
-        )  # fmt: skip
-    adaptation = recursion.settings.adaptation
-    own = _RecursiveLinks(recursion)
-    return Links(
-        own.first,
-        own.next,
-        own.begun,
-        1.0 if adaptation is None else adaptation.forgetting,
-        recursion.settings.state_bounds,
-    )
+class _RecursiveLinks(Links):
+    """Those of a recursive observer."""
 
-
-class _RecursiveLinks:
     def __init__(self, recursion: Recursion) -> None:
-        self.recursion, self.start = recursion, recursion.first
+        if recursion.literal:
+            raise PreconditionError(
+                "Form 'literal' learns from residuals that are correlated in time, of which no smoother exists: use "
+                "form 'innovation' or 'random-walk'.", condition="white residuals",
+            )  # fmt: skip
+        self.recursion, self.start, settings = recursion, recursion.first, recursion.settings
+        self.forgetting = 1.0 if settings.adaptation is None else settings.adaptation.forgetting
+        self.bounds = settings.state_bounds
 
     def first(self, after: RecursiveState, row: RawEstimate, u: FloatArray) -> Node:
         """Return the node of k = 0."""
