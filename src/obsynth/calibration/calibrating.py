@@ -25,7 +25,7 @@ from obsynth.calibration.simulation_error import (
     with_seen_start,
 )
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import is_whole
+from obsynth.numerics.arguments import chosen, is_whole, whole_number
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
@@ -146,7 +146,13 @@ def calibrate(
        Psychometrika 78, 2013: the weight that keeps variances from zero, which we give only to those that the log
        cannot tell from it.
     """
-    _check_options(method, integration, level, starts, input_delay)
+    chosen(method, "method", METHODS)
+    chosen(integration, "integration", INTEGRATIONS)
+    if not isinstance(level, (int, float)) or not 0.0 < level < 1.0:
+        raise SpecError(f"level is {level!r}: give a probability, such as 0.95.", path="level")
+    starts = whole_number(starts, "starts")
+    if input_delay != "auto" and not is_whole(input_delay):
+        raise SpecError(f"input_delay is {input_delay!r}: give whole rows, or 'auto'.", path="input_delay")
     note = progress or (lambda text: None)
     model = require_plant(model)
     factors = dict(getattr(model, "scales", {})) | dict(scales or {})
@@ -224,16 +230,3 @@ def _sample_time(model: Any, dt: float | None, substeps: int) -> float | None:
         raise SpecError("substeps divides the steps of continuous plants, and this one is discrete: leave it out.",
                         path="substeps")  # fmt: skip
     return own
-
-
-def _check_options(method: Any, integration: Any, level: Any, starts: Any, input_delay: Any) -> None:
-    if method not in METHODS:
-        raise SpecError(f"method is {method!r}: use one of {', '.join(METHODS)}.", path="method")
-    if integration not in INTEGRATIONS:
-        raise SpecError(f"integration is {integration!r}: use one of {', '.join(INTEGRATIONS)}.", path="integration")
-    if not isinstance(level, (int, float)) or not 0.0 < level < 1.0:
-        raise SpecError(f"level is {level!r}: give a probability, such as 0.95.", path="level")
-    if not is_whole(starts) or starts < 1:
-        raise SpecError(f"starts is {starts!r}: give a whole number, at least 1.", path="starts")
-    if input_delay != "auto" and (not is_whole(input_delay)):
-        raise SpecError(f"input_delay is {input_delay!r}: give whole rows, or 'auto'.", path="input_delay")

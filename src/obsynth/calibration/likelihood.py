@@ -93,24 +93,11 @@ def _update(graphs: SampleGraphs, x: Any, P: Any, u: Any, t: Any, log_r: Any, y:
     e = seen * (y - predicted)
     S = H @ P @ H.T + ca.diag(seen * ca.exp(log_r) + (1.0 - seen))
     root = ca.chol(ca.densify(S)).T
-    whitened = _forward_substituted(root, ca.horzcat(e, H @ P))
+    whitened = ca.solve(root, ca.horzcat(e, H @ P))
     w, V = whitened[:, 0], whitened[:, 1:]
     after = P - V.T @ V
     value = 0.5 * ca.sumsqr(w) + ca.sum1(ca.log(ca.diag(root))) + 0.5 * math.log(2.0 * math.pi) * ca.sum1(seen)
     return ca.vertcat(x + V.T @ w, ca.vec(0.5 * (after + after.T))), ca.vertcat(value, w, e, ca.diag(S))
-
-
-def _forward_substituted(root: Any, right: Any) -> Any:
-    """Return ``root^-1 right`` for a lower triangle."""
-    import casadi as ca
-
-    found: list[Any] = []
-    for i in range(root.shape[0]):
-        rest = right[i, :]
-        for j in range(i):
-            rest = rest - root[i, j] * found[j]
-        found.append(rest / root[i, i])
-    return ca.vertcat(*found)
 
 
 def _symbols(graphs: SampleGraphs, noisy: Sequence[int]) -> tuple[Any, ...]:

@@ -139,8 +139,7 @@ class ParameterMonitor:
     change: float | tuple[float, ...] = 0.1
 
     def __post_init__(self) -> None:
-        if self.statistic not in STATISTICS:
-            raise SpecError(f"statistic is {self.statistic!r}: use one of {', '.join(STATISTICS)}.", path="statistic")
+        chosen(self.statistic, "statistic", STATISTICS)
 
     def watch(self, observer: RecursiveObserver | DAEObserver, estimates: Estimates) -> Decision:
         """Return the decision on one run.

@@ -10,7 +10,7 @@ stays an upper bound in the sense of the squared error it normalises (Simon, Chi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any, Literal, TypeVar
 
@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.errors import SolverError, SpecError
-from obsynth.numerics.arguments import is_finite_number
+from obsynth.numerics.arguments import chosen, is_finite_number
 from obsynth.numerics.arrays import FloatArray, read_only
-from obsynth.plants.names import index_of
+from obsynth.observers.records import named_bounds
 
 BoolArray = NDArray[np.bool_]
 Outliers = Literal["none", "gate", "huber"]
@@ -42,8 +42,7 @@ Row = TypeVar("Row", bound=Any)
 
 def checked_limit(kind: str, limit: float | None) -> float:
     """Return the limit in standard deviations, infinite for ``none``."""
-    if kind not in KINDS:
-        raise SpecError(f"outliers is {kind!r}: use one of {', '.join(KINDS)}.", path="outliers")
+    chosen(kind, "outliers", KINDS)
     if limit is None:
         return LIMITS.get(kind, float("inf"))
     if not is_finite_number(limit) or not limit > 0.0:
@@ -123,31 +122,8 @@ def _judged(
 
 def checked_state_bounds(value: Any, names: Sequence[str]) -> FloatArray | None:
     """Return lower and upper bounds ``(nx, 2)`` from rows or from pairs by name; ``None`` where there are none."""
-    if value is None:
-        return None
-    found = np.tile([-np.inf, np.inf], (len(names), 1))
-    if isinstance(value, Mapping):
-        for name, pair in value.items():
-            place = index_of(name, names, what="state_bounds")
-            found[place] = _pair(pair, f"state_bounds.{name}")
-    else:
-        rows = np.asarray(value, dtype=object)
-        if rows.shape != found.shape:
-            raise SpecError(f"state_bounds must be {len(names)} pairs [low, high], or pairs by name.",
-                            path="state_bounds")  # fmt: skip
-        for i, name in enumerate(names):
-            found[i] = _pair(list(rows[i]), f"state_bounds.{name}")
+    found = named_bounds(value, names, "state_bounds")
     return read_only(found) if np.isfinite(found).any() else None
-
-
-def _pair(pair: Any, path: str) -> tuple[float, float]:
-    try:
-        low, high = (float(end) for end in pair)
-    except (TypeError, ValueError):
-        raise SpecError(f"{path} is {pair!r}: give [low, high].", path=path) from None
-    if not low < high:
-        raise SpecError(f"{path}: the lower bound ({low:g}) must be below the upper one ({high:g}).", path=path)
-    return low, high
 
 
 def projected(x: FloatArray, factor: FloatArray, bounds: FloatArray) -> FloatArray:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import is_whole, real_array
+from obsynth.numerics.arguments import is_number, is_whole, real_array, real_number
 from obsynth.numerics.arrays import FloatArray, as_matrix, unmasked
+from obsynth.plants.dae.checks import finite_vector
+from obsynth.plants.names import index_of
 
 #: The fields of an observer that hold names.
 NAME_FIELDS = ("input_names", "output_names", "state_names", "fault_names", "residual_names")
@@ -104,6 +106,56 @@ def whole_record(
     if len(inputs) != len(outputs):
         raise SpecError(f"u has {len(inputs)} samples and y has {len(outputs)}: give the same number.", path="u")
     return outputs, inputs
+
+
+def named_vector(value: Any, names: Sequence[str], default: FloatArray, what: str) -> FloatArray:
+    """Return numbers ``(len(names),)`` from an array or from values by name; the default where nothing is said."""
+    if not isinstance(value, Mapping):
+        return finite_vector(value, names, default, what)
+    vector = np.array(default)
+    for name, entry in value.items():
+        vector[index_of(name, names, what=what)] = real_number(entry, f"{what}.{name}")
+    return vector
+
+
+def named_covariance(
+    value: Any, names: Sequence[str], what: str, default: FloatArray | None, *, others: FloatArray | None = None
+) -> FloatArray:
+    """Return a covariance from a matrix, one variance, or variances by name, beside which ``others`` have theirs."""
+    if value is None:
+        if default is None:
+            raise SpecError(f"{what} is missing: give variances, for example by the names {', '.join(names)}.",
+                            path=what)  # fmt: skip
+        return np.diag(default)
+    if isinstance(value, Mapping):
+        variances = np.zeros(len(names)) if others is None else others
+        return np.diag(named_vector(value, names, variances, what))
+    empty = isinstance(value, (list, tuple, np.ndarray)) and not np.asarray(value, dtype=object).size
+    matrix = np.zeros((0, 0)) if empty else as_matrix(value, what)
+    return float(matrix[0, 0]) * np.eye(len(names)) if np.ndim(value) == 0 else matrix
+
+
+def named_bounds(value: Any, names: Sequence[str], what: str) -> FloatArray:
+    """Return lower and upper bounds ``(n, 2)`` from rows or from pairs by name; infinite where nothing is said."""
+    found = np.tile([-np.inf, np.inf], (len(names), 1))
+    if value is None:
+        return found
+    if isinstance(value, Mapping):
+        pairs = {index_of(name, names, what=what): pair for name, pair in value.items()}
+    else:
+        rows = np.asarray(value, dtype=object)
+        if rows.shape != found.shape:
+            raise SpecError(f"{what} must be {len(names)} pairs [low, high], or pairs by name.", path=what)
+        pairs = {i: list(row) for i, row in enumerate(rows)}
+    for i, pair in pairs.items():
+        path = f"{what}.{names[i]}"
+        if np.shape(pair) != (2,) or not all(map(is_number, pair)):
+            raise SpecError(f"{path} is {pair!r}: give [low, high].", path=path)
+        if not pair[0] < pair[1]:
+            raise SpecError(f"{path}: the lower bound ({pair[0]:g}) must be below the upper one ({pair[1]:g}).",
+                            path=path)  # fmt: skip
+        found[i] = pair
+    return found
 
 
 def batch_record(

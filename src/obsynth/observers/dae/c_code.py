@@ -24,7 +24,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.numerics import newton
 from obsynth.numerics.arrays import FloatArray
-from obsynth.observers.dae.memory_layout import initial_memory
+from obsynth.observers.dae.settings import initial_memory
 from obsynth.observers.dae.step_graph import ObserverGraph
 from obsynth.observers.dae.steps import (
     PROJECTION_NOTICE,

@@ -31,7 +31,7 @@ class DAERow:
     moved: FloatArray  # ``(nx,)``: how far the state was put onto its constraint; zeros but at k = 0
 
     def part(self, name: str) -> FloatArray:
-        """Return one array by its name in the layouts `obsynth.observers.dae.memory_layout`."""
+        """Return one array by its name in the layouts `obsynth.observers.dae.settings`."""
         layout, values = (self.graph.memory, self.memory) if name in self.graph.memory.shapes else (
             self.graph.row, self.said)  # fmt: skip
         return layout.part(values, name)

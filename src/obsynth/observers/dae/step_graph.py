@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from obsynth.numerics.symbolic_solve import definite_solved
-from obsynth.observers.dae.memory_layout import Layout, memory_layout, row_layout
+from obsynth.observers.dae.settings import Layout, memory_layout, row_layout
 from obsynth.plants.dae.functions import DAEFunctions
 from obsynth.plants.dae.step import StepGraph, step_graph
 

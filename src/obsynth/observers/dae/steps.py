@@ -13,8 +13,7 @@ from obsynth.errors import SolverError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.covariances import covariance_factor
 from obsynth.observers.dae.estimates import DAERow
-from obsynth.observers.dae.memory_layout import initial_memory
-from obsynth.observers.dae.settings import DAESettings
+from obsynth.observers.dae.settings import DAESettings, initial_memory
 from obsynth.observers.dae.step_graph import ObserverGraph, observer_graph
 from obsynth.observers.outliers import checked_limit, has_jumped, no_refusals, projected, robust_advance, with_surprise
 from obsynth.plants.dae.functions import Compiled, DAEFunctions
