@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.numerics.arrays import FloatArray, read_only
-
-if TYPE_CHECKING:
-    from obsynth.observers.running import StepSettings
 
 NOTHING = read_only(np.zeros(0))
 #: Standard deviations within which 95 % of a normal number lie: the width of bands, drawn or counted.
@@ -156,13 +152,3 @@ class Estimates:
     def parameter_deviations(self) -> FloatArray:
         """The same as `fault_deviations`, ``(samples, nq)``."""
         return self.fault_deviations
-
-
-def named_estimates(observer: StepSettings, *, states: FloatArray, faults: FloatArray, **known: Any) -> Estimates:
-    """Return the estimates of an observer without delays; arrays are made read-only."""
-    residuals = known.pop("residuals", np.zeros((*states.shape[:-1], 0)))
-    arrays: dict[str, Any] = {name: value if value.dtype == bool else read_only(value) for name, value in known.items()}
-    return Estimates(
-        read_only(states), read_only(faults), read_only(residuals), observer.state_names, observer.fault_names,
-        STEP_RESIDUAL[: residuals.shape[-1]], observer.state_delays, observer.fault_delays, **arrays,
-    )  # fmt: skip

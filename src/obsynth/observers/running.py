@@ -11,8 +11,8 @@ from typing import Any, Generic, Protocol, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.numerics.arrays import FloatArray
-from obsynth.observers.estimates import Estimates
+from obsynth.numerics.arrays import FloatArray, read_only
+from obsynth.observers.estimates import STEP_RESIDUAL, Estimates
 from obsynth.observers.outliers import Outliers, checked_limit, checked_state_bounds
 from obsynth.observers.sensor_timing import SensorTiming, checked_sensors
 
@@ -216,6 +216,16 @@ class RunningObserver(Generic[State, Row]):
         """
         self.state, row = self.observer.advance(self.state, y, u)
         return row
+
+
+def named_estimates(observer: StepSettings, *, states: FloatArray, faults: FloatArray, **known: Any) -> Estimates:
+    """Return the estimates of an observer without delays; arrays are made read-only."""
+    residuals = known.pop("residuals", np.zeros((*states.shape[:-1], 0)))
+    arrays: dict[str, Any] = {name: value if value.dtype == bool else read_only(value) for name, value in known.items()}
+    return Estimates(
+        read_only(states), read_only(faults), read_only(residuals), observer.state_names, observer.fault_names,
+        STEP_RESIDUAL[: residuals.shape[-1]], observer.state_delays, observer.fault_delays, **arrays,
+    )  # fmt: skip
 
 
 def changed(observer: Robust, **options: Any) -> Robust:

@@ -12,7 +12,8 @@ from obsynth.analysis.dae_index import involved
 from obsynth.errors import SolverError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import SINGULAR_CONDITION
-from obsynth.observers.estimates import Estimates, named_estimates
+from obsynth.observers.estimates import Estimates
+from obsynth.observers.running import named_estimates
 
 if TYPE_CHECKING:
     from obsynth.observers.dae.settings import DAESettings

@@ -22,11 +22,12 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.covariances import covariance_factor
 from obsynth.numerics.least_squares_step import DEPENDENT_COLUMN, SUSPECT_PARITY
-from obsynth.observers.estimates import Estimates, named_estimates
+from obsynth.observers.estimates import Estimates
 from obsynth.observers.recursive.estimates import RawEstimate, RecursiveState, received_in
 from obsynth.observers.recursive.recursion import Recursion
 from obsynth.observers.recursive.settings import RecursiveSettings
 from obsynth.observers.recursive.step_model import PlantSteps, StepMatrices, StepModel, stacked_noise
+from obsynth.observers.running import named_estimates
 from obsynth.plants.sequences import MatrixSequence
 
 

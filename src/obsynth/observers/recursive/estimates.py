@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import UNDETERMINED_SHARE
 from obsynth.numerics.recursive_least_squares import ParameterState
-from obsynth.observers.estimates import Estimates, named_estimates
+from obsynth.observers.estimates import Estimates
 from obsynth.observers.recursive.settings import RecursiveSettings
+from obsynth.observers.running import named_estimates
 
 
 class RawEstimate(NamedTuple):

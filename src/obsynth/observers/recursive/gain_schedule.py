@@ -15,7 +15,7 @@ from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.least_squares_step import least_squares_step, rank_revealing_step
 from obsynth.numerics.recursive_least_squares import update
 from obsynth.numerics.spectra import abscissa
-from obsynth.observers.estimates import Estimates, named_estimates
+from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.records import batch_record, require_horizon
 from obsynth.observers.recursive.observer import RecursiveObserver
@@ -26,6 +26,7 @@ from obsynth.observers.recursive.step_model import (
     StepMatrices,
     spreads,
 )
+from obsynth.observers.running import named_estimates
 from obsynth.observers.sensor_timing import require_plain
 
 
