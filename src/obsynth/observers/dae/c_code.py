@@ -24,6 +24,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.numerics import newton
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.ranks import DEPENDENT_BOUND
 from obsynth.observers.dae.settings import initial_memory
 from obsynth.observers.dae.step_graph import ObserverGraph
 from obsynth.observers.dae.steps import (
@@ -39,8 +40,6 @@ from obsynth.plants.dae.step import step_graph
 #: What ``record.c`` hands out of a batch, in this order.
 BATCH_PARTS = ("posterior", "theta", "spread", "innovation", "nis", "residual")
 _NUMBERS_PER_LINE = 4
-#: Bounds of states whose moves differ by less than this share are dependent.
-DEPENDENT = 1e-13
 #: A bound that is missed by less, in deviations of its state, is kept.
 SLACK = 1e-7
 
@@ -135,7 +134,7 @@ def _option_constants(steps: Steps) -> list[str]:
         "OUTLIERS": int(settings.outliers != "none"), "GATE": int(settings.outliers == "gate"),
         "OUTLIER_LIMIT": steps.limit if np.isfinite(steps.limit) else 0.0, "OVERFLOW_LIMIT": OVERFLOW,
         "LONGEST_REFUSAL": LONGEST, "RESETS": int(bool(settings.reset)), "RESET_WINDOW": RESET_WINDOW,
-        "BOUNDS": len(ends), "DEPENDENT": DEPENDENT, "SLACK": SLACK, "WAITS": int(not timing.is_plain),
+        "BOUNDS": len(ends), "DEPENDENT": DEPENDENT_BOUND, "SLACK": SLACK, "WAITS": int(not timing.is_plain),
         "LATEST": timing.longest,
     }  # fmt: skip
     lines = [f"#define {name} {value!r}" for name, value in numbers.items()]
