@@ -50,7 +50,7 @@ def run_design(options: argparse.Namespace) -> int:
 
 def _print_design(design: ObserverDesign, file: Path, *, verbose: bool) -> None:
     """Print the answer first; every claim and check if asked for, and what fails in any case."""
-    from obsynth.report import design_report
+    from obsynth.report.designs import design_report
     from obsynth.report.summary import print_summary, summary
     from obsynth.results.checks_table import checks_table
 
@@ -59,7 +59,7 @@ def _print_design(design: ObserverDesign, file: Path, *, verbose: bool) -> None:
         design_report(design, console=console)
         console.print()
     print_summary(summary(design, file=file, everything=verbose), console=console)
-    if not verbose and "delta_scan" in design.solver:
+    if "delta_scan" in design.solver:
         from obsynth.report.designs import delta_scan_table
         from obsynth.results.delta_scan import DeltaScan
         from obsynth.results.layout import print_section
