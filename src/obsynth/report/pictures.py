@@ -17,11 +17,11 @@ from obsynth.observers.alarms import Decision
 from obsynth.observers.decisions import decide
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.plotting.estimates import plot_states
 from obsynth.plotting.frequency import plot_gains
 from obsynth.plotting.panels import names_as_they_are
 from obsynth.plotting.simulation import plot_simulation
 from obsynth.plotting.spectra import plot_poles
-from obsynth.plotting.states import plot_states
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario
 
