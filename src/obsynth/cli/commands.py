@@ -52,7 +52,7 @@ def _print_design(design: ObserverDesign, file: Path, *, verbose: bool) -> None:
     """Print the answer first; every claim and check if asked for, and what fails in any case."""
     from obsynth.report.designs import design_report
     from obsynth.report.summary import print_summary, summary
-    from obsynth.results.checks_table import checks_table
+    from obsynth.results.layout import checks_table
 
     console = stdout_console()
     if verbose:
@@ -206,7 +206,7 @@ def run_verify(options: argparse.Namespace) -> int:
     """Run ``verify``: recheck a saved gain set, or the certificate of an alarm, without a solver."""
     if _is_alarm(options.gains):
         from obsynth.experiments.alarm_proofs.certificate import verify_alarm
-        from obsynth.results.checks_table import print_checks
+        from obsynth.results.layout import print_checks
 
         report = verify_alarm(options.gains)
         answer(options, {"file": str(options.gains), "passed": report.passed, "report": report.as_dict()},

@@ -67,7 +67,7 @@ def print_error(error: ObsynthError) -> None:
     if isinstance(error, VerificationError):
         from rich.console import Console
 
-        from obsynth.results.checks_table import checks_table
+        from obsynth.results.layout import checks_table
 
         console = Console(stderr=True, markup=False, highlight=False, emoji=False)
         console.print(checks_table(error.report.failures, width=console.width))

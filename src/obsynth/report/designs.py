@@ -23,10 +23,9 @@ from obsynth.observers.linear.sampling import sample_observer
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
-from obsynth.results.checks_table import print_checks
 from obsynth.results.delta_scan import DeltaScan
 from obsynth.results.design import ObserverDesign
-from obsynth.results.layout import facts_table, headed_table, name_list, number, print_section
+from obsynth.results.layout import facts_table, headed_table, name_list, number, print_checks, print_section
 
 
 def tolerance_facts(design: ObserverDesign) -> list[tuple[str, str]]:

@@ -12,8 +12,7 @@ from rich.table import Table
 
 from obsynth.numerics.arrays import FloatArray
 from obsynth.results.checks import Check, CheckKind, Status
-from obsynth.results.checks_table import verdict
-from obsynth.results.layout import number
+from obsynth.results.layout import number, verdict
 
 #: Prefix of a check's name -> heading of its group; the others are about the shipped observer.
 _GROUPS = {"plant": "The plant", "exists": "Does such an observer exist?"}

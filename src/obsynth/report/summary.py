@@ -22,9 +22,8 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.plotting.frequency import FaultGains, fault_gains
 from obsynth.report.designs import Followed, design_warnings, followed_steps
-from obsynth.results.checks_table import verdict_line
 from obsynth.results.design import ObserverDesign
-from obsynth.results.layout import number
+from obsynth.results.layout import number, verdict_line
 
 #: Faults, warnings and notes that are listed; the others are counted.
 _MOST_FAULTS, _MOST_NOTES = 5, 1
