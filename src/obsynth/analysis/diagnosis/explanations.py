@@ -9,7 +9,6 @@ from itertools import combinations
 import numpy as np
 
 from obsynth.analysis.diagnosis.decoupled import unknowns_pencil
-from obsynth.analysis.diagnosis.fault_columns import Question
 from obsynth.analysis.diagnosis.reduction import PencilUnits
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.ranks import RANK_TOLERANCE
@@ -84,22 +83,6 @@ def least_additions(
         if found:
             return tuple(found)
     return ()
-
-
-def estimable(fault: int, *, step: bool) -> Callable[[DescriptorSystem], bool]:
-    """Return the goal that a fault can be estimated free of all others, as a step or whatever its course."""
-
-    def reached(plant: DescriptorSystem) -> bool:
-        asked = Question(plant, tuple(j for j in range(plant.nf) if j != fault), fault, False)
-        rest = 1.0 if plant.dt > 0.0 else 0.0
-        return asked.visible and (asked.shows_at(rest) if step else not asked.blocking.size)
-
-    return reached
-
-
-def detectable(fault: int) -> Callable[[DescriptorSystem], bool]:
-    """Return the goal that a fault shows free of the unknown inputs."""
-    return lambda plant: Question(plant, (), fault, False).visible
 
 
 def listed(sets: Sequence[Sequence[str]], most: int = 6) -> str:

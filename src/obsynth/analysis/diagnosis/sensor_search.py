@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.analysis.diagnosis.explanations import Sensor, with_sensors
-from obsynth.analysis.diagnosis.fault_columns import Question
+from obsynth.analysis.diagnosis.fault_columns import Question, others
 from obsynth.analysis.diagnosis.reduction import PencilUnits
 from obsynth.numerics.arrays import SMALLEST, ComplexArray
 from obsynth.numerics.ranks import RANK_TOLERANCE
@@ -134,9 +134,9 @@ class SensorSearch:
         if self.goal == "detect":
             return [Task(i, (), self.goal) for i in faults]
         if self.goal == "isolate":
-            pairs = [Task(i, (j,), self.goal) for i in faults for j in range(plant.nf) if j != i]
+            pairs = [Task(i, (j,), self.goal) for i in faults for j in others(plant, i)]
             return [*(Task(i, (), self.goal) for i in faults), *pairs]
-        return [Task(i, tuple(j for j in range(plant.nf) if j != i), self.goal) for i in faults]
+        return [Task(i, others(plant, i), self.goal) for i in faults]
 
     def reachable(self) -> list[Task]:
         """Return the tasks that all candidates together reach: no set can do more."""
@@ -240,13 +240,10 @@ class SensorSearch:
 
 def reached(plant: DescriptorSystem, task: Task) -> bool:
     """Whether a plant reaches a task, decided by taking out what must not show."""
-    asked = Question(plant, task.beside, task.fault, False)
-    if not asked.visible:
-        return False
+    asked = Question(plant, task.beside, task.fault)
     if task.goal == "estimate":
-        return not asked.blocking.size
-    rest = 1.0 if plant.dt > 0.0 else 0.0
-    return asked.shows_at(rest) if task.goal == "estimate-step" else True
+        return asked.estimable
+    return asked.shows_at_rest if task.goal == "estimate-step" else asked.visible
 
 
 def _is_new(task: Task, count: int) -> bool:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.analysis.diagnosis.fault_columns import Question
+from obsynth.analysis.diagnosis.exact import question
 from obsynth.files.tables import html_table
 from obsynth.numerics.arrays import ComplexArray
 from obsynth.plants.descriptor import DescriptorSystem
@@ -45,19 +45,18 @@ class StructuredResidual:
 def residual_bank(plant: DescriptorSystem, exactly: bool) -> tuple[StructuredResidual, ...]:
     """Return every structured residual that exists, those that see least first."""
     found = []
-    rest = 1.0 if plant.dt > 0.0 else 0.0
     for removed in _sets(plant.nf):
         kept = [i for i in range(plant.nf) if i not in removed]
-        asked = [Question(plant, tuple(removed), i, exactly) for i in kept]
-        if not all(question.visible for question in asked):
+        asked = [question(plant, removed, i, exactly) for i in kept]
+        if not all(one.visible for one in asked):
             continue
-        orders = [question.residual_order for question in asked]
+        orders = [one.residual_order for one in asked]
         known = [order for order in orders if order is not None]
         found.append(
             StructuredResidual(
                 tuple(plant.fault_names[i] for i in kept),
                 tuple(plant.fault_names[i] for i in removed),
-                tuple(plant.fault_names[q.number] for q in asked if q.shows_at(rest)),
+                tuple(plant.fault_names[q.number] for q in asked if q.shows_at_rest),
                 max(known) if len(known) == len(orders) else None,
             )
         )
