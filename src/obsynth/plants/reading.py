@@ -166,6 +166,10 @@ def _appended(
 SENSOR_PICKS = {"Df": "Bf", "Dd": "Bd"}
 
 
+def _size(given: Mapping[str, Any]) -> int:
+    return int(given["A"].shape[0])
+
+
 def _with_sensor_picks(
     asked: Mapping[str, Any], given: dict[str, FloatArray | None], outputs: Sequence[str]
 ) -> dict[str, tuple[str, ...]]:
@@ -180,7 +184,7 @@ def _with_sensor_picks(
             continue
         columns = rows_picking(picked, outputs, what=name).T
         own = given.get(beside)
-        dynamics = np.zeros((given["A"].shape[0], 0)) if own is None else dense(own)
+        dynamics = np.zeros((_size(given), 0)) if own is None else dense(own)
         given[beside] = np.hstack([dynamics, np.zeros((len(dynamics), len(picked)))])
         given[name] = np.hstack([np.zeros((len(outputs), dynamics.shape[1])), columns])
         found[name] = tuple(picked)
@@ -208,7 +212,7 @@ def _noise_of_sensors(
                             path="sensor_noise")  # fmt: skip
         columns[list(outputs).index(name), column] = deviation
     others = [matrix for name in ("Bw", "Dw") if (matrix := given.get(name)) is not None and 0 not in matrix.shape]
-    nw, nx = others[0].shape[1] if others else 0, given["A"].shape[0]
+    nw, nx = others[0].shape[1] if others else 0, _size(given)
     for name, rows, more in (("Bw", nx, np.zeros((nx, len(sensor_noise)))), ("Dw", len(outputs), columns)):
         matrix = given.get(name)
         matrix = np.zeros((rows, nw)) if matrix is None or 0 in matrix.shape else dense(matrix)

@@ -129,9 +129,10 @@ def proved_rate(matrix: FloatArray | Ball, known: Contraction | None = None) -> 
 
 
 def _tried(ball: Ball, rate: float, *, discrete: bool) -> Contraction | None:
-    factor = _lyapunov_factor(ball.midpoint, rate, discrete=discrete)
-    if factor is None:
+    found = _lyapunov_factor(ball.midpoint, rate, discrete=discrete)
+    if found is None:
         return None
+    factor = found
     inverse = np.triu(np.linalg.inv(factor))
     if not np.all(np.isfinite(inverse)) or np.any(np.diag(inverse) == 0.0) or np.any(np.diag(factor) == 0.0):
         return None

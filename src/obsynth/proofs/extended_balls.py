@@ -138,6 +138,12 @@ def _lower_bound(matrix: ExtendedBall) -> float:
     return max(float(np.nextafter(bound, 0.0)), float(np.nextafter(0.0, 1.0)))
 
 
+def arb_matrix(matrix: FloatArray) -> Any:
+    """Return a matrix as python-flint's, exactly."""
+    rows, columns = np.shape(matrix)
+    return flint.arb_mat(rows, columns, np.ravel(matrix).tolist())
+
+
 @dataclass(frozen=True, eq=False)
 class ExtendedBall:
     """All real matrices within radii of midpoints that have the digits of python-flint's current precision.
@@ -150,14 +156,15 @@ class ExtendedBall:
     @classmethod
     def exact(cls, matrix: FloatArray) -> Self:
         """Return the ball that holds ``matrix`` alone, whatever the precision."""
-        return cls(flint.arb_mat(*np.shape(matrix), np.ravel(matrix).tolist()))
+        return cls(arb_matrix(matrix))
 
     @classmethod
     def of(cls, ball: Ball) -> Self:
         """Return the ball with the midpoint and radius of ``ball``."""
+        rows, columns = ball.shape
         pairs = zip(np.ravel(ball.midpoint).tolist(), np.ravel(ball.radius).tolist(), strict=True)
         content = [flint.arb(middle, radius) if radius else flint.arb(middle) for middle, radius in pairs]
-        return cls(flint.arb_mat(*ball.shape, content))
+        return cls(flint.arb_mat(rows, columns, content))
 
     @classmethod
     def blocks(cls, rows: Sequence[Sequence[Self]]) -> Self:

@@ -25,6 +25,7 @@ import numpy as np
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.scaling import balancing_factors
 from obsynth.proofs.balls import UNDERFLOW, UNIT_ROUNDOFF, Ball, gamma, rounded_up
+from obsynth.proofs.extended_balls import arb_matrix
 
 #: Digits in which exponentials are formed, in bits.
 BITS = 160
@@ -42,7 +43,7 @@ def exponential(matrix: FloatArray, time: float) -> Ball:
     if n > MANY_STATES and (found := _Doubling(matrix, time).exponential()) is not None:
         return found
     with flint.ctx.workprec(BITS):
-        return as_ball((_arb_matrix(matrix) * flint.arb(float(time))).exp())
+        return as_ball((arb_matrix(matrix) * flint.arb(float(time))).exp())
 
 
 def energy(a: FloatArray, b: FloatArray, time: float) -> Ball:
@@ -51,8 +52,8 @@ def energy(a: FloatArray, b: FloatArray, time: float) -> Ball:
     if n > MANY_STATES and (found := _Doubling(a, time).energy(b)) is not None:
         return found
     with flint.ctx.workprec(2 * BITS):
-        whole = _arb_matrix(np.block([[-a, np.zeros((n, n))], [np.zeros((n, n)), a.T]]))
-        square = _arb_matrix(b) * _arb_matrix(b).transpose()
+        whole = arb_matrix(np.block([[-a, np.zeros((n, n))], [np.zeros((n, n)), a.T]]))
+        square = arb_matrix(b) * arb_matrix(b).transpose()
         for i in range(n):
             for j in range(n):
                 whole[i, n + j] = square[i, j]
@@ -60,10 +61,6 @@ def energy(a: FloatArray, b: FloatArray, time: float) -> Ball:
         late = flint.arb_mat([[whole[n + j, n + i] for j in range(n)] for i in range(n)])
         upper = flint.arb_mat([[whole[i, n + j] for j in range(n)] for i in range(n)])
         return as_ball(late * upper)
-
-
-def _arb_matrix(matrix: FloatArray) -> flint.arb_mat:
-    return flint.arb_mat(*matrix.shape, np.ravel(matrix).tolist())
 
 
 def _is_sharp(ball: Ball) -> bool:
