@@ -15,8 +15,8 @@ import numpy as np
 from benchmarks.campaigns.frame import Outcome
 
 from obsynth import DescriptorSystem
-from obsynth.analysis.diagnosis.columns import Question
 from obsynth.analysis.diagnosis.exact import PencilColumn, exact_decoupled
+from obsynth.analysis.diagnosis.fault_columns import Question
 
 CASES = 500
 LIMIT = 60.0

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import obsynth
-from obsynth.analysis.diagnosis.columns import Question
+from obsynth.analysis.diagnosis.fault_columns import Question
 
 CASES = Path(__file__).parents[1] / "data" / "cases"
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import obsynth
-from obsynth.analysis.diagnosis.additions import state_sensors, with_sensors
-from obsynth.analysis.diagnosis.columns import Question
+from obsynth.analysis.diagnosis.explanations import state_sensors, with_sensors
+from obsynth.analysis.diagnosis.fault_columns import Question
 from obsynth.analysis.diagnosis.sensor_search import SensorResponses
 from obsynth.spec.loader import load_spec
 

@@ -14,17 +14,20 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.sparse import as_sparse_matrix, dense, is_sparse
-from obsynth.plants.names import checked_names, is_name_list, require_picked, rows_picking
 from obsynth.plants.validation import (
     Problems,
     any_matrix,
     checked_dt,
+    checked_names,
     checked_point,
     checked_scales,
     checked_units,
     expected_shapes,
+    is_name_list,
     matrix_or_picks,
     picked_names,
+    require_picked,
+    rows_picking,
     signal_counts,
     square,
     uncounted_signals,

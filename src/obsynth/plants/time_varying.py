@@ -11,10 +11,10 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.names import checked_names
-from obsynth.plants.sequences import MatrixLike, MatrixSequence
-from obsynth.plants.time_varying_checks import (
+from obsynth.plants.sequences import (
     LAYOUT,
+    MatrixLike,
+    MatrixSequence,
     check_every_k,
     checked_constants,
     checked_horizon,
@@ -22,7 +22,7 @@ from obsynth.plants.time_varying_checks import (
     missing,
     positive_dt,
 )
-from obsynth.plants.validation import Problems, checked_point, checked_scales, checked_units
+from obsynth.plants.validation import Problems, checked_names, checked_point, checked_scales, checked_units
 
 
 @dataclass(frozen=True, eq=False, init=False)

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from obsynth.analysis.transformations import StateRecovery
+from obsynth.analysis.transformations.recovery import StateRecovery
 from obsynth.errors import PreconditionError
 from obsynth.methods.functional_filter.delay_curve import DelayCurve, delay_curve
 from obsynth.methods.registry import REGISTRY, method_spec

@@ -7,11 +7,16 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.analysis.diagnosis.additions import detectable, estimable, least_additions, listed, state_sensors
-from obsynth.analysis.diagnosis.banks import residual_bank
-from obsynth.analysis.diagnosis.columns import Question, decided_exactly
-from obsynth.analysis.diagnosis.hidden_motions import hidden_motion
-from obsynth.analysis.diagnosis.verdicts import Diagnosis, FaultDiagnosis
+from obsynth.analysis.diagnosis.explanations import (
+    detectable,
+    estimable,
+    hidden_motion,
+    least_additions,
+    listed,
+    state_sensors,
+)
+from obsynth.analysis.diagnosis.fault_columns import Question, decided_exactly
+from obsynth.analysis.diagnosis.verdicts import Diagnosis, FaultDiagnosis, residual_bank
 from obsynth.analysis.transformations.recovery import Transformation, linear_plant
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_finite_number

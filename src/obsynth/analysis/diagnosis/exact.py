@@ -17,10 +17,18 @@ from flint import fmpq, fmpq_mat, fmpq_poly, fmpz_poly
 from obsynth.analysis.diagnosis.decoupled import unknowns_pencil
 from obsynth.numerics.arrays import ComplexArray
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.proofs.exact_matrices import blocks, identity, null_basis, pivot_columns, zeros_matrix
+from obsynth.proofs.exact_matrices import (
+    blocks,
+    computed_entries,
+    identity,
+    null_basis,
+    pivot_columns,
+    written_fraction,
+    written_matrix,
+    zeros_matrix,
+)
 from obsynth.proofs.exact_pencils import ExactPencil
 from obsynth.proofs.root_location import Root, RootLocation, locate_roots, primitive
-from obsynth.proofs.written_numbers import computed_entries, written_fraction, written_matrix
 
 #: Plants with more unknowns are decided in floating point.
 MOST_UNKNOWNS = 70

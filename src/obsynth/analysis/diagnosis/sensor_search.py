@@ -20,8 +20,8 @@ from math import comb
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.analysis.diagnosis.additions import Sensor, with_sensors
-from obsynth.analysis.diagnosis.columns import Question
+from obsynth.analysis.diagnosis.explanations import Sensor, with_sensors
+from obsynth.analysis.diagnosis.fault_columns import Question
 from obsynth.analysis.diagnosis.reduction import PencilUnits
 from obsynth.numerics.arrays import SMALLEST, ComplexArray
 from obsynth.numerics.ranks import RANK_TOLERANCE

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.conditions import Condition
-from obsynth.analysis.diagnosis.columns import Question, question
 from obsynth.analysis.diagnosis.diagnosing import model_points, rest_point
-from obsynth.analysis.diagnosis.hidden_motions import hidden_motion
+from obsynth.analysis.diagnosis.explanations import hidden_motion
+from obsynth.analysis.diagnosis.fault_columns import Question, question
 from obsynth.analysis.existence.distance import DROWNED
 from obsynth.analysis.existence.named_pencils import NamedPencil, named_pencil, unclear
 from obsynth.analysis.existence.numbers import COMPUTED_STATES

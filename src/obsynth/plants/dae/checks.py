@@ -13,8 +13,7 @@ from obsynth.numerics.arguments import is_finite_number, real_array
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.expressions import CONSTANTS, DECIDING_WORDS, FUNCTIONS, FUNCTIONS_OF_TWO
 from obsynth.plants.dae.symbols import DAEFields, DAESymbols, symbols_of
-from obsynth.plants.names import checked_names
-from obsynth.plants.validation import Problems
+from obsynth.plants.validation import Problems, checked_names
 
 #: Names that mean something else in the language.
 RESERVED = frozenset({*CONSTANTS, *FUNCTIONS, *FUNCTIONS_OF_TWO, *DECIDING_WORDS, "der", "where"})
