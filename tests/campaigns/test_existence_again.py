@@ -14,8 +14,9 @@ from benchmarks.campaigns.existence import case
 LOST = {
     # Ahat is unstable in the nine digits that are commonly printed.
     "ui-pi-observer": (386, 162, 3054),
-    # All digits of the deviation under noise are rounding; a pole that stays for good.
-    "functional-filter": (2755, 4083, 923, 2203),
+    # All digits of the deviation under noise are rounding; a pole that stays for good; gains whose entries cancel; a
+    # pole beside the fault model.
+    "functional-filter": (2755, 4083, 923, 2203, 1187, 2171, 495, 2819),
 }
 
 
