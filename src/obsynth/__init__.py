@@ -28,14 +28,14 @@ from obsynth.version import __version__ as __version__
 #: What is public, by the module that holds it; ``name=other`` is another name.  Imported when it is first used, so that
 #: ``import obsynth`` stays fast; ``__init__.pyi`` tells the types.
 _NAMES = {
-    "analysis.diagnosis.banks": "StructuredResidual",
     "analysis.diagnosis.decoupled": "decouple DecoupledPlant",
     "analysis.diagnosis.diagnosing": "diagnose",
-    "analysis.diagnosis.verdicts": "Diagnosis FaultDiagnosis",
-    "analysis.identifiability": "Identifiability identifiability",
+    "analysis.diagnosis.verdicts": "Diagnosis FaultDiagnosis StructuredResidual",
+    "analysis.dae_structure": "Identifiability identifiability",
     "analysis.structure": "analyse_structure",
-    "analysis.transformations": "discretise eliminate_algebraic_states",
+    "analysis.transformations.elimination": "eliminate_algebraic_states",
     "analysis.transformations.linearisation": "linearise",
+    "analysis.transformations.sampling": "discretise",
     "calibration.calibrating": "calibrate",
     "calibration.result": "CalibratedBox Calibration",
     "calibration.validating": "validate",

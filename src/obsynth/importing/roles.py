@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.names import checked_names, index_of
+from obsynth.plants.validation import checked_names, index_of
 
 
 def plant_of(

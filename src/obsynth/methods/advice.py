@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.conditions import Condition
-from obsynth.analysis.diagnosis.additions import least_additions, listed, state_sensors
+from obsynth.analysis.diagnosis.explanations import least_additions, listed, state_sensors
 from obsynth.errors import ObsynthError, PreconditionError
 from obsynth.methods.method_spec import MethodSpec
 from obsynth.plants.descriptor import DescriptorSystem

@@ -11,9 +11,8 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from obsynth.analysis.conditions import Condition
-from obsynth.analysis.transformations import StateRecovery, eliminate_algebraic_states
-from obsynth.analysis.transformations.elimination import MANY_VARIABLES
-from obsynth.analysis.transformations.recovery import Transformation, plant_and_recovery
+from obsynth.analysis.transformations.elimination import MANY_VARIABLES, eliminate_algebraic_states
+from obsynth.analysis.transformations.recovery import StateRecovery, Transformation, plant_and_recovery
 from obsynth.errors import PreconditionError, SpecError, VerificationError
 from obsynth.extensions import extension
 from obsynth.methods.advice import with_advice

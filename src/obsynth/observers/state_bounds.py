@@ -13,7 +13,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, read_only
-from obsynth.plants.names import index_of
+from obsynth.plants.validation import index_of
 
 
 def checked_state_bounds(value: Any, names: Sequence[str]) -> FloatArray | None:

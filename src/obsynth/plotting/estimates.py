@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.observers.estimates import BAND_WIDTH, Estimates
-from obsynth.plants.names import index_of
+from obsynth.plants.validation import index_of
 from obsynth.plotting.panels import (
     BAND_STYLE,
     ESTIMATE_STYLE,

@@ -9,9 +9,9 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from obsynth.analysis.diagnosis.columns import question
-from obsynth.analysis.diagnosis.diagnosing import rest_point
-from obsynth.analysis.transformations import StateRecovery
+from obsynth.analysis.diagnosis.exact import question
+from obsynth.analysis.diagnosis.fault_columns import rest_point
+from obsynth.analysis.transformations.recovery import StateRecovery
 from obsynth.errors import ObsynthError, PreconditionError
 from obsynth.methods.choosing.automatic import SAMPLES
 from obsynth.methods.choosing.figures import FaultFigures, fault_figures, on_the_clock

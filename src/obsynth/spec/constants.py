@@ -9,9 +9,9 @@ from typing import Any
 from obsynth.errors import SpecError
 from obsynth.files.inputs import read_json
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.names import index_of
 from obsynth.plants.uncertain_system import with_expressions
 from obsynth.plants.uncertainty import UNCERTAIN_MATRICES, Entry
+from obsynth.plants.validation import index_of
 from obsynth.spec.schema import DAESection, EntrySection, PlantSection
 
 #: Signals that name the columns of a matrix; rows are equations (states) or outputs.

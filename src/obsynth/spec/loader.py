@@ -24,7 +24,7 @@ from obsynth.spec.documents import read_yaml
 from obsynth.spec.plants import built_plant, linearised, matlab_plant, read_value, transformed
 
 if TYPE_CHECKING:
-    from obsynth.analysis.transformations import Transformation
+    from obsynth.analysis.transformations.recovery import Transformation
     from obsynth.simulation.scenario import Scenario
     from obsynth.spec.schema import ProfileSection, ScenarioSection, TransformSection
 

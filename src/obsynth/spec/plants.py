@@ -20,7 +20,7 @@ from obsynth.spec.matrices import read_matrices, read_matrix
 from obsynth.spec.schema import PlantSection
 
 if TYPE_CHECKING:
-    from obsynth.analysis.transformations import Transformation
+    from obsynth.analysis.transformations.recovery import Transformation
     from obsynth.spec.schema import DAESection, PlantReference, PlantSection, TimeVaryingSection, TransformSection
 
 
@@ -202,7 +202,8 @@ def transformed(
             f"(dt = {plant.dt:g} s): remove it, or set dt to 0.",
             path=f"{where}.sample_time",
         )
-    from obsynth.analysis.transformations import discretise, eliminate_algebraic_states
+    from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
+    from obsynth.analysis.transformations.sampling import discretise
 
     try:
         if wanted.sample_time is None:

@@ -10,6 +10,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.spectra import speeds
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.verification.certificates import slowest_decay
 
 #: Modes slower than this share of the fastest one never settle.
 STANDING = 1e-6
@@ -19,6 +20,8 @@ TIME_CONSTANTS, LEAST_SAMPLES = 7.0, 4.0
 REACHED, ASKED_AT = 0.1, (1.0, 1.5, 2.5)
 #: Where no walk shows a step in time: walks that miss it by so much more than the best are as good.
 AS_CLOSE = 0.05
+#: Errors that need longer than so many settling times to die out would stay in any run: the gain moves such poles.
+FOR_GOOD = 1e5
 #: Decades of the search around a rate of the size of the noise, and its steps per decade at the end.
 DECADES, BISECTIONS = 8, 9
 
@@ -63,12 +66,23 @@ def default_rates(model: FilterModel, seconds: float, *, lag: int) -> tuple[Floa
         if not misses:
             raise SolverError("No walk of the fault gives a stable filter: give fault_rate, or poles.")
         high = min(e for e, miss in misses.items() if miss <= min(misses.values()) + AS_CLOSE)
-        return 10.0**high * unit, _known(tried[high])
+        return 10.0**high * unit, _forgetting(model, 10.0**high * unit, _known(tried[high]), seconds, lag)
     low = high - 1.0
     for _ in range(BISECTIONS):
         middle = 0.5 * (low + high)
         low, high = (low, middle) if in_time(middle) else (middle, high)
-    return 10.0**high * unit, _known(gain(high))
+    return 10.0**high * unit, _forgetting(model, 10.0**high * unit, _known(gain(high)), seconds, lag)
+
+
+def _forgetting(model: FilterModel, walks: FloatArray, found: KalmanGain, seconds: float, lag: int) -> KalmanGain:
+    """Return the gain, or one for the same walks whose errors do not stay for good, where there is one."""
+    slowest = 1.0 / (FOR_GOOD * seconds)
+    if not slowest_decay(model.A - found.K @ model.C, model.dt) < slowest:
+        return found
+    try:
+        return kalman_gain(model, walks, lag=lag, decay=slowest)
+    except SolverError:
+        return found
 
 
 def step_misses(model: FilterModel, gain: KalmanGain, seconds: float) -> float:

@@ -13,6 +13,11 @@ CLAIMS = {
     "noise_price": ClaimMeaning(
         "", "noise of the fault estimates against the quietest Kalman filter of the same plant", STATED
     ),
+    "digits": ClaimMeaning(
+        "",
+        "significant digits in which Ahat has to be kept, where more than 9 are needed",
+        "stable with the claimed digits",
+    ),
     "condition": ClaimMeaning("", "condition number of the (generalised) eigenvectors", STATED),
 }
 

@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.analysis.transformations.equations_at_a_point import local_equations
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_number, real_number
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.plants.dae.checks import finite_vector, step_length
+from obsynth.plants.dae.functions import local_equations
 from obsynth.plants.dae.model import DAEModel
-from obsynth.plants.names import index_of
+from obsynth.plants.validation import index_of
 
 #: Radians that a mode may turn in one step of backward Euler: its amplitude then falls by an eighth of a per cent.
 LARGEST_TURN = 0.05

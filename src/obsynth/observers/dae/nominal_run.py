@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from obsynth.analysis.dae_index import IndexReport, index_report
-from obsynth.analysis.identifiability import Identifiability, identifiability
+from obsynth.analysis.dae_structure import Identifiability, IndexReport, identifiability, index_report
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.dae.estimates import DAERow, GatheredRows
 from obsynth.observers.dae.observer import DAEObserver
