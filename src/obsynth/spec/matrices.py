@@ -111,16 +111,9 @@ def _numpy_archive(path: Path) -> dict[str, Any]:
 
 
 def _matlab_archive(path: Path) -> dict[str, Any]:
-    from scipy.io import loadmat
-    from scipy.io.matlab import MatReadError
+    from obsynth.importing.model_files import mat_arrays
 
-    try:
-        content = loadmat(path)
-    except NotImplementedError as error:
-        raise ValueError("MATLAB 7.3 files are not supported, save it with '-v7'") from error
-    except MatReadError as error:
-        raise ValueError(str(error)) from error
-    return {name: value for name, value in content.items() if not name.startswith("__")}
+    return mat_arrays(path)
 
 
 def _selected(content: Mapping[str, Any], variable: str | None, path: Path, where: str) -> Any:

@@ -142,7 +142,7 @@ def matlab_plant(reference: PlantReference, spec: Path) -> DescriptorSystem | No
     """Return the plant in a ``.mat`` file that a spec refers to; `None` where it refers to another kind of file."""
     arguments = reference.model_dump(exclude={"file", "transform"}, exclude_none=True)
     if Path(reference.file).suffix.lower() == ".mat":
-        from obsynth.importing.matlab import from_matlab
+        from obsynth.importing.model_files import from_matlab
 
         return _placed(lambda: from_matlab(spec.parent / reference.file, **arguments), spec, "plant")
     if arguments:
