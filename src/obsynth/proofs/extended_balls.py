@@ -18,6 +18,7 @@ import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
 from obsynth.proofs.balls import Ball, Enclosure, Formula
+from obsynth.proofs.products import stored_balls
 
 #: Digits to try, in bits.
 PRECISIONS = (128, 512, 2048)
@@ -148,10 +149,7 @@ class ExtendedBall(Enclosure):
     @classmethod
     def exact(cls, matrix: FloatArray) -> Self:
         """Return the ball that holds ``matrix`` alone, whatever the precision."""
-        import flint
-
-        rows, columns = np.shape(matrix)
-        return cls(flint.arb_mat(rows, columns, [flint.arb(value) for value in np.ravel(matrix).tolist()]))
+        return cls(stored_balls(matrix))
 
     @classmethod
     def of(cls, ball: Ball) -> Self:

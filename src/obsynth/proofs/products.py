@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -49,8 +50,7 @@ def exponential(matrix: FloatArray, time: float) -> Ball:
         if found is not None:
             return found
     with flint.ctx.workprec(BITS):
-        scaled = flint.arb_mat(n, n, [flint.arb(value) for value in np.ravel(matrix).tolist()]) * flint.arb(float(time))
-        return as_ball(scaled.exp())
+        return as_ball((stored_balls(matrix) * flint.arb(float(time))).exp())
 
 
 def energy(a: FloatArray, b: FloatArray, time: float) -> Ball:
@@ -64,7 +64,7 @@ def energy(a: FloatArray, b: FloatArray, time: float) -> Ball:
             return found
     with flint.ctx.workprec(2 * BITS):
         rows = [[flint.arb(0)] * (2 * n) for _ in range(2 * n)]
-        inputs = flint.arb_mat(b.shape[0], b.shape[1], [flint.arb(value) for value in np.ravel(b).tolist()])
+        inputs = stored_balls(b)
         square = inputs * inputs.transpose()
         for i in range(n):
             for j in range(n):
@@ -137,6 +137,13 @@ class _Doubling:
 def _remainder(norm: float, power: int, factorial: int) -> float:
     """Return an upper bound on the sum of ``norm^(power + i) / (factorial + i)!`` over i from 0."""
     return 2.0 * norm**power / math.factorial(factorial) if norm < 1.0 else math.inf
+
+
+def stored_balls(matrix: FloatArray) -> Any:
+    """Return a matrix of stored numbers as one of python-flint's balls (``flint.arb_mat``), without a radius."""
+    import flint
+
+    return flint.arb_mat(*np.shape(matrix), [flint.arb(value) for value in np.ravel(matrix).tolist()])
 
 
 def as_ball(content: object) -> Ball:

@@ -23,7 +23,7 @@ from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
 from obsynth.numerics.scaling import balanced_matrix
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.proofs.products import BITS, as_ball
+from obsynth.proofs.products import BITS, as_ball, stored_balls
 
 #: A matrix larger than its eigenvalues by this is given in coordinates in which it is triangular.
 FAR_FROM_NORMAL = 1e3
@@ -125,15 +125,12 @@ def _rounded_once(model: FilterModel, gain: KalmanGain, coordinates: FloatArray)
     """
     import flint
 
-    def exact(matrix: FloatArray) -> flint.arb_mat:
-        return flint.arb_mat(*matrix.shape, matrix.ravel().tolist())
-
     with flint.ctx.workprec(BITS):
-        k, there = exact(gain.K), exact(coordinates)
+        k, there = stored_balls(gain.K), stored_balls(coordinates)
         back = there.inv()
         found = (
-            back * (exact(model.A) - k * exact(model.C)) * there, back * (exact(model.B) + k * exact(model.L)),
-            back * (exact(model.T) + k * exact(model.T0)),
+            back * (stored_balls(model.A) - k * stored_balls(model.C)) * there, back * (stored_balls(model.B) + k * stored_balls(model.L)),
+            back * (stored_balls(model.T) + k * stored_balls(model.T0)),
         )  # fmt: skip
     return Dynamics(*(as_ball(part).midpoint for part in found))
 
