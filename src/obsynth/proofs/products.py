@@ -18,59 +18,46 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
+import flint
 import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.scaling import balancing_factors
 from obsynth.proofs.balls import UNDERFLOW, UNIT_ROUNDOFF, Ball, gamma, rounded_up
+from obsynth.proofs.extended_balls import arb_matrix
 
 #: Digits in which exponentials are formed, in bits.
 BITS = 160
-
-
 #: With more states double precision comes first, where its radius is below this share of the largest entry.
 MANY_STATES, LARGEST_SHARE = 60, 1e-7
-
-
 #: Norm of the shortest interval's exponent, and orders of the Taylor polynomials: what is left is below 1e-18.
 SHORT, ORDER, ENERGY_ORDER = 2.0**-4, 10, 12
 
 
 def exponential(matrix: FloatArray, time: float) -> Ball:
     """Return a ball that holds ``e^{A t}`` of ``A (n, n)``; its radius is infinite where nothing is known."""
-    import flint
-
     n = len(matrix)
     if not n:
         return Ball.exact(np.zeros((0, 0)))
-    if n > MANY_STATES:
-        found = _Doubling(matrix, time).exponential()
-        if found is not None:
-            return found
+    if n > MANY_STATES and (found := _Doubling(matrix, time).exponential()) is not None:
+        return found
     with flint.ctx.workprec(BITS):
-        return as_ball((stored_balls(matrix) * flint.arb(float(time))).exp())
+        return as_ball((arb_matrix(matrix) * flint.arb(float(time))).exp())
 
 
 def energy(a: FloatArray, b: FloatArray, time: float) -> Ball:
     r"""Return a ball that holds ``\int_0^t e^{A s} B B' e^{A' s} ds`` (Van Loan), for ``A (n, n)``, ``B (n, m)``."""
-    import flint
-
     n = len(a)
-    if n > MANY_STATES:
-        found = _Doubling(a, time).energy(b)
-        if found is not None:
-            return found
+    if n > MANY_STATES and (found := _Doubling(a, time).energy(b)) is not None:
+        return found
     with flint.ctx.workprec(2 * BITS):
-        rows = [[flint.arb(0)] * (2 * n) for _ in range(2 * n)]
-        inputs = stored_balls(b)
-        square = inputs * inputs.transpose()
+        whole = arb_matrix(np.block([[-a, np.zeros((n, n))], [np.zeros((n, n)), a.T]]))
+        square = arb_matrix(b) * arb_matrix(b).transpose()
         for i in range(n):
             for j in range(n):
-                rows[i][j], rows[n + i][n + j] = flint.arb(-float(a[i, j])), flint.arb(float(a[j, i]))
-                rows[i][n + j] = square[i, j]
-        whole = (flint.arb_mat(rows) * flint.arb(float(time))).exp()
+                whole[i, n + j] = square[i, j]
+        whole = (whole * flint.arb(float(time))).exp()
         late = flint.arb_mat([[whole[n + j, n + i] for j in range(n)] for i in range(n)])
         upper = flint.arb_mat([[whole[i, n + j] for j in range(n)] for i in range(n)])
         return as_ball(late * upper)
@@ -139,23 +126,14 @@ def _remainder(norm: float, power: int, factorial: int) -> float:
     return 2.0 * norm**power / math.factorial(factorial) if norm < 1.0 else math.inf
 
 
-def stored_balls(matrix: FloatArray) -> Any:
-    """Return a matrix of stored numbers as one of python-flint's balls (``flint.arb_mat``), without a radius."""
-    import flint
-
-    return flint.arb_mat(*np.shape(matrix), [flint.arb(value) for value in np.ravel(matrix).tolist()])
-
-
-def as_ball(content: object) -> Ball:
+def as_ball(content: flint.arb_mat) -> Ball:
     """Return a matrix of python-flint's balls as a `Ball`: midpoints rounded, radii rounded up."""
-    rows, columns = int(content.nrows()), int(content.ncols())  # type: ignore[attr-defined]
-    midpoint, radius = np.empty((rows, columns)), np.empty((rows, columns))
-    for i in range(rows):
-        for j in range(columns):
-            entry = content[i, j]  # type: ignore[index]
-            middle = float(entry.mid()) if entry.is_finite() else np.nan
-            midpoint[i, j] = middle
-            radius[i, j] = float(entry.rad()) if entry.is_finite() else np.inf
+    pairs = [
+        (float(entry.mid()), float(entry.rad())) if entry.is_finite() else (np.nan, np.inf)
+        for entry in content.entries()
+    ]
+    shape = int(content.nrows()), int(content.ncols())
+    midpoint, radius = np.array(pairs, dtype=np.float64).reshape(*shape, 2).transpose(2, 0, 1)
     # Both conversions round to nearest.
     return Ball(midpoint, radius * (1.0 + 4.0 * UNIT_ROUNDOFF) + UNIT_ROUNDOFF * np.abs(midpoint) + 2.0 * UNDERFLOW)
 
@@ -181,10 +159,11 @@ def logarithm_of_product(factors: Sequence[Ball], units: FloatArray | None = Non
     axes, left, logarithm, slack = np.eye(size), np.eye(size), 0.0, 0.0
     for factor in factors:
         moved = factor if units is None else _in_units(factor, units)
-        if not (np.all(np.isfinite(moved.midpoint)) and np.all(np.isfinite(moved.radius))):
+        if not moved.is_finite:
             return np.inf
         following = np.linalg.qr(moved.midpoint @ axes)[0]
-        slack = _lack_of_orthogonality(following)
+        # An upper bound on |U' U - I|.
+        slack = (Ball.exact(following.T) @ Ball.exact(following) - Ball.exact(np.eye(size))).frobenius_norm
         if not slack < 0.5:
             return np.inf
         near = Ball.exact(following.T) @ moved @ Ball.exact(axes)
@@ -204,12 +183,6 @@ def logarithm_of_product(factors: Sequence[Ball], units: FloatArray | None = Non
     bound = float(rounded_up(np.asarray(np.sqrt(rows * columns * (1.0 + slack))), 2 * size + 8))
     found = float(np.log(bound))
     return found + logarithm * float(np.log(2.0)) + LOGARITHMS * (abs(found) + abs(logarithm))
-
-
-def _lack_of_orthogonality(axes: FloatArray) -> float:
-    """Return an upper bound on ``|U' U - I|``."""
-    gap = Ball.exact(axes.T) @ Ball.exact(axes) - Ball.exact(np.eye(len(axes)))
-    return gap.frobenius_norm
 
 
 def _in_units(ball: Ball, units: FloatArray) -> Ball:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 
-from obsynth.analysis.diagnosis.diagnosing import rest_point
-from obsynth.analysis.diagnosis.fault_columns import question
+from obsynth.analysis.diagnosis.exact import question
+from obsynth.analysis.diagnosis.fault_columns import rest_point
 from obsynth.errors import ObsynthError
 from obsynth.methods.choosing.automatic import SAMPLES
 from obsynth.methods.choosing.figures import FaultFigures, fault_figures, on_the_clock

@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 
 from obsynth.analysis.diagnosis.decoupled import unknowns_pencil
-from obsynth.analysis.diagnosis.fault_columns import Question
+from obsynth.analysis.diagnosis.fault_columns import rest_point
 from obsynth.analysis.diagnosis.reduction import PencilUnits
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.ranks import RANK_TOLERANCE
@@ -76,30 +76,10 @@ def least_additions(
     if plant.nx > most[0]:
         return ()
     for size in (1, 2) if plant.nx <= most[1] else (1,):
-        found = [
-            tuple(sensor.name for sensor in chosen)
-            for chosen in combinations(sensors, size)
-            if reached(with_sensors(plant, chosen))
-        ]
-        if found:
-            return tuple(found)
+        helping = [chosen for chosen in combinations(sensors, size) if reached(with_sensors(plant, chosen))]
+        if helping:
+            return tuple(tuple(sensor.name for sensor in chosen) for chosen in helping)
     return ()
-
-
-def estimable(fault: int, *, step: bool) -> Callable[[DescriptorSystem], bool]:
-    """Return the goal that a fault can be estimated free of all others, as a step or whatever its course."""
-
-    def reached(plant: DescriptorSystem) -> bool:
-        asked = Question(plant, tuple(j for j in range(plant.nf) if j != fault), fault, False)
-        rest = 1.0 if plant.dt > 0.0 else 0.0
-        return asked.visible and (asked.shows_at(rest) if step else not asked.blocking.size)
-
-    return reached
-
-
-def detectable(fault: int) -> Callable[[DescriptorSystem], bool]:
-    """Return the goal that a fault shows free of the unknown inputs."""
-    return lambda plant: Question(plant, (), fault, False).visible
 
 
 def listed(sets: Sequence[Sequence[str]], most: int = 6) -> str:
@@ -142,9 +122,8 @@ class HiddenMotion:
 
     @property
     def _course(self) -> str:
-        rest = 1.0 if self.dt > 0.0 else 0.0
         point = self.point
-        if point == rest:
+        if point == rest_point(self.dt):
             return "a step"
         if self.dt > 0.0:
             return f"a course {_amplitude(point)}^k"
@@ -161,19 +140,15 @@ def hidden_motion(plant: DescriptorSystem, fault: int, point: complex, removed: 
     found = _solved(matrix, right)
     if found is None:
         return None
-    x, causes = found[: plant.nx], found[plant.nx :]
     names = (*plant.disturbance_names, *(plant.fault_names[j] for j in removed))
-    inputs = _named(names, causes)
-    return HiddenMotion(
-        plant.fault_names[fault], complex(point), {**inputs, **_named(plant.state_names, x)}, len(inputs), plant.dt
-    )
+    inputs, states = _named(names, found[plant.nx :]), _named(plant.state_names, found[: plant.nx])
+    return HiddenMotion(plant.fault_names[fault], complex(point), {**inputs, **states}, len(inputs), plant.dt)
 
 
 def _solved(matrix: ComplexArray, right: ComplexArray) -> ComplexArray | None:
     """Return the solution with few entries: least squares, then those that are not needed left out one by one."""
     units = PencilUnits.of(np.zeros(matrix.shape), np.abs(matrix))
-    rows, columns = units.rows, units.columns
-    work, goal = rows[:, None] * matrix * columns, rows * right
+    work, goal = units.rows[:, None] * matrix * units.columns, units.rows * right
     reach = float(np.linalg.norm(goal))
     if reach == 0.0:
         return None
@@ -195,7 +170,7 @@ def _solved(matrix: ComplexArray, right: ComplexArray) -> ComplexArray | None:
     whole[kept] = part
     # What is only rounding in balanced units is nothing in those of the data.
     whole[np.abs(whole) <= RANK_TOLERANCE * float(np.max(np.abs(whole), initial=0.0))] = 0.0
-    return np.asarray(columns * whole)
+    return np.asarray(units.columns * whole)
 
 
 def _named(names: Sequence[str], values: ComplexArray) -> dict[str, complex]:

@@ -30,8 +30,9 @@ from obsynth.numerics.continuous import peak_gain
 from obsynth.numerics.holds import first_order_hold
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.proofs.balls import Ball, block, rounded_up
+from obsynth.proofs.balls import Ball, rounded_up
 from obsynth.proofs.contraction import Contraction, column_norms, prove_contraction
+from obsynth.proofs.extended_balls import block
 from obsynth.proofs.peak_sums import PeakSums, gathered, interval_pieces, peak_sums
 from obsynth.proofs.products import exponential
 

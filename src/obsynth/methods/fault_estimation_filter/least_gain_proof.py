@@ -91,7 +91,7 @@ class InvisiblePairs:
         import flint
 
         from obsynth.proofs.exact_matrices import stored_matrix
-        from obsynth.proofs.products import stored_balls
+        from obsynth.proofs.extended_balls import arb_matrix
 
         k, s, nd = int(self.top.ncols()), int(self.S.ncols()), int(self.Zd.ncols())
         empty = {PAIRS: np.zeros((k, 1)), LAST: np.zeros((nd, s)), ALONE: np.zeros((nd, 1))}
@@ -101,7 +101,7 @@ class InvisiblePairs:
         if len(f) != k or last.shape != (nd, s) or len(alone) != nd:
             return 0.0
         with flint.ctx.workprec(BITS):
-            mixed, later, direct = (stored_balls(part) for part in (f, last, alone))
+            mixed, later, direct = (arb_matrix(part) for part in (f, last, alone))
             image, top = (_balls(part) * mixed for part in (self.image, self.top))
             slack = image * image.transpose() - top * top.transpose()
             shown, energy = _square(_balls(self.shown) * mixed), _square(_balls(self.bottom) * mixed)

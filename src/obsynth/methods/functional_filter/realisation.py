@@ -23,7 +23,8 @@ from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
 from obsynth.numerics.scaling import balanced_matrix
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.proofs.products import BITS, as_ball, stored_balls
+from obsynth.proofs.extended_balls import arb_matrix
+from obsynth.proofs.products import BITS, as_ball
 
 #: A matrix larger than its eigenvalues by this is given in coordinates in which it is triangular.
 FAR_FROM_NORMAL = 1e3
@@ -126,12 +127,13 @@ def _rounded_once(model: FilterModel, gain: KalmanGain, coordinates: FloatArray)
     import flint
 
     with flint.ctx.workprec(BITS):
-        k, there = stored_balls(gain.K), stored_balls(coordinates)
+        k, there = arb_matrix(gain.K), arb_matrix(coordinates)
         back = there.inv()
-        found = (
-            back * (stored_balls(model.A) - k * stored_balls(model.C)) * there, back * (stored_balls(model.B) + k * stored_balls(model.L)),
-            back * (stored_balls(model.T) + k * stored_balls(model.T0)),
-        )  # fmt: skip
+        parts = ((model.A, -model.C, there), (model.B, model.L, None), (model.T, model.T0, None))
+        found = []
+        for own, fed_back, right in parts:
+            part = back * (arb_matrix(own) + k * arb_matrix(fed_back))
+            found.append(part if right is None else part * right)
     return Dynamics(*(as_ball(part).midpoint for part in found))
 
 
