@@ -10,7 +10,7 @@ import pytest
 
 import obsynth
 from obsynth.methods.functional_filter.delay_curve import delay_curve
-from obsynth.report.warnings import design_warnings
+from obsynth.report.designs import design_warnings
 from obsynth.spec.loader import load_spec
 
 DESIGNS = Path(__file__).parents[2] / "designs"
