@@ -66,7 +66,7 @@ _NAMES = {
     "importing.modelica": "from_modelica",
     "importing.state_space": "from_control from_scipy",
     "methods.adaptive_observer.public": "adaptive_observer",
-    "methods.choosing.figures": "FaultFigures",
+    "methods.fault_figures": "FaultFigures",
     "methods.dae_adaptive_observer.public": "dae_adaptive_observer",
     "methods.descriptor_kalman.public": "descriptor_kalman",
     "methods.designing": "check design",
