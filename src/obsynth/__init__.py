@@ -64,7 +64,7 @@ _NAMES = {
     "importing.model_files": "from_matlab from_modelica",
     "importing.python_objects": "from_control from_pandas from_scipy from_sympy",
     "methods.adaptive_observer.public": "adaptive_observer",
-    "methods.choosing.figures": "FaultFigures",
+    "methods.fault_figures": "FaultFigures",
     "methods.dae_adaptive_observer.public": "dae_adaptive_observer",
     "methods.descriptor_kalman.public": "descriptor_kalman",
     "methods.designing": "check design",
