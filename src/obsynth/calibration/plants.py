@@ -14,7 +14,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.dae.functions import DAEFunctions
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.dae.symbols import symbols_of
-from obsynth.plants.names import index_of
+from obsynth.plants.validation import index_of
 
 #: Deviation of an initial state that is not stated, as a share of its nominal size.
 DEFAULT_STATE_SHARE = 0.1

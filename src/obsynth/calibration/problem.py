@@ -16,7 +16,7 @@ from obsynth.numerics.arguments import is_number, whole_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.covariances import covariance_factor
 from obsynth.observers.records import named_covariance, named_vector
-from obsynth.plants.names import index_of
+from obsynth.plants.validation import index_of
 
 #: Measured values for each unknown constant and variance that are needed at least.
 VALUES_PER_UNKNOWN = 5

@@ -11,7 +11,7 @@ import numpy as np
 from obsynth.analysis.transformations.recovery import StateRecovery
 from obsynth.data.log_estimator import Engine, Row
 from obsynth.numerics.arrays import FloatArray
-from obsynth.plants.names import index_of
+from obsynth.plants.validation import index_of
 
 #: Of plants with more states as written none is recovered unless asked for: each row would take too long.
 MOST_RECOVERED = 300

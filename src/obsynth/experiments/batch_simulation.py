@@ -16,7 +16,7 @@ from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.derived import sample_observer
 from obsynth.observers.linear.observer import LinearObserver, split_rows
 from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.plants.names import index_of
+from obsynth.plants.validation import index_of
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.linear import Stepper, make_stepper
 from obsynth.simulation.scenario import Scenario

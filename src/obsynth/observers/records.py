@@ -12,7 +12,7 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_number, is_whole, real_array, real_number
 from obsynth.numerics.arrays import FloatArray, as_matrix, unmasked
 from obsynth.plants.dae.checks import finite_vector
-from obsynth.plants.names import index_of
+from obsynth.plants.validation import index_of
 
 #: The fields of an observer that hold names.
 NAME_FIELDS = ("input_names", "output_names", "state_names", "fault_names", "residual_names")

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_whole
 from obsynth.numerics.arrays import FloatArray
-from obsynth.plants.names import index_of
+from obsynth.plants.validation import index_of
 
 #: Rows that may be waited for: a delay in another unit is larger.
 LONGEST_DELAY = 10_000

@@ -14,7 +14,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import ComplexArray, FloatArray, read_only
 from obsynth.plants.fault_models import MODEL_KEYS, FaultModel, fault_model
-from obsynth.plants.names import index_of
+from obsynth.plants.validation import index_of
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,6 @@ from obsynth.plants.constants import ConstantsBox, constants_box
 
 if TYPE_CHECKING:
     from obsynth.proofs.affine import AffineMatrix
-    from obsynth.proofs.affine_numbers import AffineNumber
 
 #: Matrices that may hold constants.
 UNCERTAIN_MATRICES = ("E", "A", "B", "C", "D", "Bf", "Df", "Bd", "Dd")
@@ -187,24 +186,20 @@ class Uncertainty:
             slack = 0.0 if item.certain else HALVING * max(abs(item.low), abs(item.high))
             numbers[name] = AffineNumber(item.nominal if item.certain else item.middle, parts, slack)
         translation, known = affine_translation(count), dict[str, AffineNumber]()
+        zero = AffineNumber(0.0, np.zeros(count), 0.0)
         found = {name: AffineMatrix.exact(np.array(matrices[name]), count) for name in UNCERTAIN_MATRICES}
         for name, entries in self.entries.items():
             at = found[name]
             parts, radius = at.parts.copy(), at.radius.copy()
             for row, column, text in entries:
                 if text not in known:
-                    known[text] = numbers[text] if text in numbers else self._number(text, numbers, translation, count)
+                    value = numbers[text] if text in numbers else self._parsed[text].translated(numbers, translation)
+                    known[text] = zero.lifted(value)
                 value = known[text]
                 at.center[row, column], parts[:, row, column] = value.center, value.parts
                 radius[row, column] = value.radius
             found[name] = AffineMatrix(at.center, parts, radius)
         return found
-
-    def _number(self, text: str, numbers: Mapping[str, AffineNumber], translation: Any, count: int) -> AffineNumber:
-        from obsynth.proofs.affine_numbers import AffineNumber
-
-        value = self._parsed[text].translated(numbers, translation)
-        return value if isinstance(value, AffineNumber) else AffineNumber(float(value), np.zeros(count), 0.0)
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain data, as `uncertainty_of` reads it."""
@@ -238,3 +233,8 @@ def expressions_in(rows: Any) -> tuple[Any, list[Entry]]:
 def matrices_of(plant: Any) -> dict[str, FloatArray]:
     """Return the matrices of a plant that may hold constants, by name."""
     return {name: getattr(plant, name) for name in UNCERTAIN_MATRICES}
+
+
+def as_written(plant: Any, uncertain: Uncertainty) -> Mapping[str, FloatArray]:
+    """Return the matrices that may hold constants as they were written, before any transformation."""
+    return matrices_of(plant) if uncertain.written is None else uncertain.written

@@ -25,10 +25,10 @@ from obsynth.proofs.exact_matrices import (
     null_basis,
     pivot_columns,
     with_integer_entries,
+    written_matrix,
     zeros_matrix,
 )
 from obsynth.proofs.root_location import RootLocation, locate_roots, primitive
-from obsynth.proofs.written_numbers import written_matrix
 
 #: Primes for ranks that are only bounded from below.
 _PRIMES = ((1 << 61) - 1, 2305843009213693921, 2305843009213693907)

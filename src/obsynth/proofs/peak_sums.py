@@ -20,7 +20,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.scaling import balanced_matrix
 from obsynth.proofs.balls import UNDERFLOW, Ball, gamma, rounded_up
 from obsynth.proofs.contraction import Contraction
-from obsynth.proofs.exponentials import exponential
+from obsynth.proofs.products import exponential
 
 #: Most steps that are summed up one by one, and the share of the sum that the rest may then have.
 MOST_STEPS, LEFT = 65_536, 1e-3

@@ -14,7 +14,7 @@ from obsynth.errors import SpecError
 from obsynth.files.inputs import input_file
 from obsynth.methods.designing import Plant
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.names import index_of
+from obsynth.plants.validation import index_of
 from obsynth.results.gain_sets import plain
 from obsynth.spec.documents import read_yaml
 from obsynth.spec.loader import changed_document

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.analysis.transformations import discretise
 from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
+from obsynth.analysis.transformations.sampling import discretise
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.constants import ConstantsBox
 from obsynth.plants.descriptor import DescriptorSystem

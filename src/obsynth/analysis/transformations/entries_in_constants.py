@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.analysis.transformations.equations_at_a_point import symbolic_equations
 from obsynth.analysis.transformations.equilibrium import Point
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.expressions import parse_expression
 from obsynth.plants.constants import Constant, ConstantsBox, constants_box
+from obsynth.plants.dae.functions import symbolic_equations
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.uncertain_system import stated_box
 from obsynth.plants.uncertainty import Entry

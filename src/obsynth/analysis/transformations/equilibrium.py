@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.analysis.transformations.equations_at_a_point import local_equations
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import JACOBIAN_RANK_TOLERANCE
+from obsynth.plants.dae.functions import local_equations
 from obsynth.plants.dae.model import DAEModel
-from obsynth.plants.names import index_of
+from obsynth.plants.validation import index_of
 
 #: Largest scaled residual of what counts as a root.
 ROOT = 1e-9

@@ -9,17 +9,17 @@ from typing import Any
 import numpy as np
 
 from obsynth.analysis.transformations.entries_in_constants import at_nominal, box_of_model, entries_in_constants
-from obsynth.analysis.transformations.equations_at_a_point import LocalEquations, local_equations
 from obsynth.analysis.transformations.equilibrium import Point, consistent_point, equilibrium, nominal_point
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.constants import ConstantsBox
+from obsynth.plants.dae.functions import LocalEquations, local_equations
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.names import index_of
 from obsynth.plants.uncertain_system import filled_plant
 from obsynth.plants.uncertainty import Uncertainty
+from obsynth.plants.validation import index_of
 
 #: What E x' may be, in sizes of its row, where a point counts as resting.
 MOVING = 1e-9

@@ -18,8 +18,8 @@ from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.numerics.ranks import NEGLIGIBLE_INPUT, decide_rank
 from obsynth.numerics.scaling import equilibrate_pencil
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.names import index_of
 from obsynth.plants.uncertainty import matrices_of
+from obsynth.plants.validation import index_of
 
 if TYPE_CHECKING:
     from obsynth.analysis.transformations.recovery_operator import RecoveryOperator

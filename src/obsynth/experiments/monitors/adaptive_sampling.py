@@ -16,8 +16,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from obsynth.analysis.transformations import discretise
 from obsynth.analysis.transformations.elimination import algebraic_coordinates, eliminate_algebraic_states
+from obsynth.analysis.transformations.sampling import discretise
 from obsynth.analysis.transformations.uncertain_plant import AffinePlant, reduced_family
 from obsynth.errors import PreconditionError
 from obsynth.experiments.monitors.adaptive_bound import Start

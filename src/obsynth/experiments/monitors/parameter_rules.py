@@ -18,7 +18,7 @@ from obsynth.observers.alarms import alone
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.decisions import WALKING_FORMS
 from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.plants.names import index_of
+from obsynth.plants.validation import index_of
 
 PARAMETER_KINDS = ("chi-square", "cusum", "nis")
 #: Samples that the NIS sums up.

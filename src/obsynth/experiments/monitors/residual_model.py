@@ -21,7 +21,7 @@ from typing import cast
 
 import numpy as np
 
-from obsynth.analysis.transformations import discretise
+from obsynth.analysis.transformations.sampling import discretise
 from obsynth.errors import SpecError
 from obsynth.experiments.monitors.between_samples import BetweenSamples
 from obsynth.methods.pd_observer.realisation import with_faults_as_states

@@ -33,7 +33,7 @@ from obsynth.analysis.existence.verdicts import (
     zero_verdict,
 )
 from obsynth.analysis.plant_units import PlantUnits, sized_plant
-from obsynth.analysis.transformations import Transformation
+from obsynth.analysis.transformations.recovery import Transformation
 from obsynth.analysis.zeros import Zero, leading_names, zero_at, zeros_of_system
 from obsynth.methods.ui_pi_observer.augmented_plant import AugmentedPlant
 from obsynth.methods.ui_pi_observer.decoupling_condition import (

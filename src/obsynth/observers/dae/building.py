@@ -13,15 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.analysis.dae_index import IndexReport, index_report
-from obsynth.analysis.identifiability import Identifiability, identifiability
-from obsynth.analysis.transformations.equations_at_a_point import local_equations
+from obsynth.analysis.dae_structure import Identifiability, IndexReport, identifiability, index_report
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.dae.estimates import DAERow, GatheredRows
 from obsynth.observers.dae.observer import DAEObserver, advanced
 from obsynth.observers.records import named_bounds, named_covariance, named_vector
 from obsynth.plants.dae.checks import step_length
+from obsynth.plants.dae.functions import local_equations
 from obsynth.plants.dae.model import DAEModel
 
 #: Radians that a mode may turn in one step of backward Euler: its amplitude then falls by an eighth of a per cent.

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from obsynth.analysis.dae_index import involved
+from obsynth.analysis.dae_structure import involved
 from obsynth.errors import SolverError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import SINGULAR_CONDITION

@@ -30,7 +30,7 @@ from obsynth.observers.running import plain_recursion
 from obsynth.proofs.balls import Ball
 from obsynth.proofs.contraction import proved_rate
 from obsynth.proofs.definiteness import prove_positive_definite
-from obsynth.proofs.error_products import logarithm_of_product
+from obsynth.proofs.products import logarithm_of_product
 from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.dae import simulate_dae

@@ -21,7 +21,7 @@ from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.observers.recursive.step_model import EarlyConstraintSteps, StepMatrices
 from obsynth.proofs.balls import Ball, rounded_up
 from obsynth.proofs.definiteness import prove_positive_definite
-from obsynth.proofs.error_products import AT_ONCE, logarithm_of_product, product_of_stack, stacked_product
+from obsynth.proofs.products import AT_ONCE, logarithm_of_product, product_of_stack, stacked_product
 from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.verification.identities import EQUALITY_TOLERANCE
 

@@ -1,20 +1,97 @@
-"""What hides a fault: a motion of the plant and its unknown inputs that cancels it in every output, in one sentence."""
+"""What hides a fault, as a motion in one sentence, and which sensors would let it be detected or estimated."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 
 from obsynth.analysis.diagnosis.decoupled import unknowns_pencil
+from obsynth.analysis.diagnosis.fault_columns import rest_point
 from obsynth.analysis.diagnosis.reduction import PencilUnits
-from obsynth.numerics.arrays import ComplexArray
+from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.plants.descriptor import DescriptorSystem
 
+#: Plants with more states are not searched for pairs.
+MOST_FOR_PAIRS = 24
+
+
+#: Plants with more states are not searched for suggestions at all.
+MOST_FOR_ONE = 120
+
+
+@dataclass(frozen=True, eq=False)
+class Sensor:
+    """A signal that could be measured: rows of C, D, Dd and Df."""
+
+    name: str
+    C: FloatArray
+    D: FloatArray
+    Dd: FloatArray
+    Df: FloatArray
+    deviation: float | None = None
+
+
+def state_sensors(plant: DescriptorSystem, names: Sequence[str] | None = None) -> tuple[Sensor, ...]:
+    """Return a sensor for each state that is not an output already."""
+    measured = set(plant.output_names)
+    chosen = [name for name in plant.state_names if name not in measured] if names is None else list(names)
+    zero = (np.zeros(plant.nu), np.zeros(plant.nd), np.zeros(plant.nf))
+    eye = np.eye(plant.nx)
+    return tuple(Sensor(name, eye[plant.state_names.index(name)], *zero) for name in chosen)
+
+
+def with_sensors(plant: DescriptorSystem, sensors: Sequence[Sensor]) -> DescriptorSystem:
+    """Return the plant with more outputs; a stated deviation adds a noise of its own."""
+    if not sensors:
+        return plant
+
+    def stacked(matrix: FloatArray, part: str) -> FloatArray:
+        return np.vstack([matrix, *(getattr(sensor, part)[None, :] for sensor in sensors)])
+
+    stated = [i for i, sensor in enumerate(sensors) if sensor.deviation is not None]
+    noise = np.zeros((plant.ny + len(sensors), plant.nw + len(stated)))
+    noise[: plant.ny, : plant.nw] = plant.Dw
+    for column, i in enumerate(stated):
+        noise[plant.ny + i, plant.nw + column] = float(sensors[i].deviation or 0.0)
+    names = [*plant.noise_names, *(f"noise of {sensors[i].name}" for i in stated)]
+    return plant.replace(
+        C=stacked(plant.C, "C"), D=stacked(plant.D, "D"), Dd=stacked(plant.Dd, "Dd"), Df=stacked(plant.Df, "Df"),
+        Bw=np.hstack([plant.Bw, np.zeros((plant.nx, len(stated)))]), Dw=noise, noise_names=names,
+        output_names=[*plant.output_names, *(sensor.name for sensor in sensors)],
+    )  # fmt: skip
+
+
+def least_additions(
+    plant: DescriptorSystem, sensors: Sequence[Sensor], reached: Callable[[DescriptorSystem], bool],
+    *, most: tuple[int, int] = (MOST_FOR_ONE, MOST_FOR_PAIRS),
+) -> tuple[tuple[str, ...], ...]:  # fmt: skip
+    """Return all single sensors that do it, or else all pairs; nothing where none of them does.
+
+    Plants of more than ``most`` states are not searched for one, and not for pairs.
+    """
+    if plant.nx > most[0]:
+        return ()
+    for size in (1, 2) if plant.nx <= most[1] else (1,):
+        helping = [chosen for chosen in combinations(sensors, size) if reached(with_sensors(plant, chosen))]
+        if helping:
+            return tuple(tuple(sensor.name for sensor in chosen) for chosen in helping)
+    return ()
+
+
+def listed(sets: Sequence[Sequence[str]], most: int = 6) -> str:
+    """Return sensor sets as a text: ``theta l, or omega l with i``."""
+    texts = [" with ".join(names) for names in sets[:most]]
+    return ", ".join(texts) + (f", or {len(sets) - most} others" if len(sets) > most else "")
+
+
 #: A motion is stated where it cancels the fault to this, relative to the fault's own column.
 EXACTNESS = 1e-8
+
+
 #: Signals of a motion that are named; the others are counted.
 MOST_NAMED = 6
 
@@ -45,9 +122,8 @@ class HiddenMotion:
 
     @property
     def _course(self) -> str:
-        rest = 1.0 if self.dt > 0.0 else 0.0
         point = self.point
-        if point == rest:
+        if point == rest_point(self.dt):
             return "a step"
         if self.dt > 0.0:
             return f"a course {_amplitude(point)}^k"
@@ -64,19 +140,15 @@ def hidden_motion(plant: DescriptorSystem, fault: int, point: complex, removed: 
     found = _solved(matrix, right)
     if found is None:
         return None
-    x, causes = found[: plant.nx], found[plant.nx :]
     names = (*plant.disturbance_names, *(plant.fault_names[j] for j in removed))
-    inputs = _named(names, causes)
-    return HiddenMotion(
-        plant.fault_names[fault], complex(point), {**inputs, **_named(plant.state_names, x)}, len(inputs), plant.dt
-    )
+    inputs, states = _named(names, found[plant.nx :]), _named(plant.state_names, found[: plant.nx])
+    return HiddenMotion(plant.fault_names[fault], complex(point), {**inputs, **states}, len(inputs), plant.dt)
 
 
 def _solved(matrix: ComplexArray, right: ComplexArray) -> ComplexArray | None:
     """Return the solution with few entries: least squares, then those that are not needed left out one by one."""
     units = PencilUnits.of(np.zeros(matrix.shape), np.abs(matrix))
-    rows, columns = units.rows, units.columns
-    work, goal = rows[:, None] * matrix * columns, rows * right
+    work, goal = units.rows[:, None] * matrix * units.columns, units.rows * right
     reach = float(np.linalg.norm(goal))
     if reach == 0.0:
         return None
@@ -98,7 +170,7 @@ def _solved(matrix: ComplexArray, right: ComplexArray) -> ComplexArray | None:
     whole[kept] = part
     # What is only rounding in balanced units is nothing in those of the data.
     whole[np.abs(whole) <= RANK_TOLERANCE * float(np.max(np.abs(whole), initial=0.0))] = 0.0
-    return np.asarray(columns * whole)
+    return np.asarray(units.columns * whole)
 
 
 def _named(names: Sequence[str], values: ComplexArray) -> dict[str, complex]:
