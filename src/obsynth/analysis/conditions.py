@@ -41,12 +41,12 @@ class Condition:
                 if self.unclear
                 else f"No observer of this kind exists: the condition {self.name!r} fails ({self.source}). "
             )
+            missing = [repr(name) for name in self.signals if repr(name) not in self.detail]
+            involved = f" Signals involved: {', '.join(missing)}." if missing else ""
             raise PreconditionError(
-                f"{opening}Needed: {self.claim}. Found: {self.detail}{_involved(self.signals, self.detail)}",
-                condition=self.name,
-                mode=self.mode,
-                signals=self.signals,
-            )
+                f"{opening}Needed: {self.claim}. Found: {self.detail}{involved}",
+                condition=self.name, mode=self.mode, signals=self.signals,
+            )  # fmt: skip
 
     def in_doubt(self, found: Unclear, plant: DescriptorSystem) -> Condition:
         """Return the condition as one that rounding of the data could change, with what tells so in its detail."""
@@ -64,12 +64,6 @@ def is_doubted(conditions: Iterable[Condition]) -> bool:
     return bool(failed) and all(condition.unclear is not None for condition in failed)
 
 
-def _involved(signals: tuple[str, ...], detail: str) -> str:
-    """Name the signals that the detail does not name already."""
-    missing = [repr(name) for name in signals if repr(name) not in detail]
-    return f" Signals involved: {', '.join(missing)}." if missing else ""
-
-
 def require_all(conditions: Iterable[Condition]) -> None:
     """Raise `PreconditionError` for the first condition that fails."""
     for condition in conditions:
@@ -81,12 +75,6 @@ def rank_condition(
 ) -> Condition:
     """Return the condition that a rank is full."""
     return Condition(
-        name,
-        f"{name} = {decision.expected}",
-        decision.full,
-        float(decision.rank),
-        float(decision.expected),
-        source,
-        decision.describe() + ("" if decision.full else f": {remedy}"),
-        signals=() if decision.full else signals,
-    )
+        name, f"{name} = {decision.expected}", decision.full, float(decision.rank), float(decision.expected), source,
+        decision.describe() + ("" if decision.full else f": {remedy}"), signals=() if decision.full else signals,
+    )  # fmt: skip

@@ -85,25 +85,18 @@ def horizon_ranks(plant: TimeVaryingDescriptorSystem, *, early: bool = False) ->
         steps = 1
     elif late.size:
         steps = max(steps - 1, 1)
-    worst, worst_k, condition, condition_k, directions, directions_k = None, 1, 0.0, 1, None, 1
+    looked_at = []
     for k in range(1, steps + 1):
         E, C = plant.E.at(k), plant.C.at(k)
         if late.size:
             E, _, _, C, _ = step_blocks(plant, k - 1, late)
         H = np.vstack([E, C])
-        decision = decide_rank(H, expected=plant.nx)
-        if worst is None or (decision.rank, decision.smallest_kept) < (worst.rank, worst.smallest_kept):
-            worst, worst_k = decision, k
         values = np.linalg.svd(H, compute_uv=False)
-        found = float(values[0] / values[-1]) if len(H) >= plant.nx and values[-1] > 0.0 else float("inf")
-        if found > condition:
-            condition, condition_k = found, k
-        here = decide_rank(E).rank + len(C) - plant.nx
-        if directions is None or here < directions:
-            directions, directions_k = here, k
-    if worst is None or directions is None:
-        raise SpecError("The plant has no steps.", path="horizon")
-    return HorizonRanks(steps, worst, worst_k, condition, condition_k, directions, directions_k)
+        condition = float(values[0] / values[-1]) if len(H) >= plant.nx and values[-1] > 0.0 else float("inf")
+        looked_at.append((k, decide_rank(H, expected=plant.nx), condition, decide_rank(E).rank + len(C) - plant.nx))
+    worst = min(looked_at, key=lambda step: (step[1].rank, step[1].smallest_kept))
+    hardest, fewest = max(looked_at, key=lambda step: step[2]), min(looked_at, key=lambda step: step[3])
+    return HorizonRanks(steps, worst[1], worst[0], hardest[2], hardest[0], fewest[3], fewest[0])
 
 
 def as_time_varying(

@@ -62,13 +62,9 @@ def active_variables(plant: DescriptorSystem) -> ActiveVariables:
         rows, columns = np.delete(rows, gone), np.delete(columns, unused)
     idle_rows, idle_columns = _idle(e[rows][:, columns], a[rows][:, columns], c[:, columns], plant, rows, columns)
     kept_rows, kept_columns = np.delete(rows, idle_rows), np.delete(columns, idle_columns)
-    left_out = np.setdiff1d(np.arange(plant.nx), kept_columns)
-    return ActiveVariables(
-        kept_rows,
-        kept_columns,
-        tuple(plant.state_names[i] for i in left_out),
-        tuple(int(i) + 1 for i in np.setdiff1d(np.arange(plant.nx), kept_rows)),
-    )
+    dropped, unneeded = (np.setdiff1d(np.arange(plant.nx), kept) for kept in (kept_columns, kept_rows))
+    names, numbers = tuple(plant.state_names[i] for i in dropped), tuple(int(i) + 1 for i in unneeded)
+    return ActiveVariables(kept_rows, kept_columns, names, numbers)
 
 
 def active_part(plant: DescriptorSystem, found: ActiveVariables) -> DescriptorSystem:
