@@ -13,13 +13,10 @@ from obsynth.plants.descriptor import DescriptorSystem
 
 @dataclass(frozen=True)
 class Condition:
-    """One existence condition and whether the plant meets it.
+    """One existence condition, as in its ``source``: whether ``value`` meets ``bound``, and the evidence (``detail``).
 
-    Fields: name: Short name, as in the paper where it has one; claim: What must hold, in words; holds: The verdict;
-    value, bound: The deciding number and what it is compared with; source: Paper and equation, or the finding it rests
-    on; detail: The evidence (singular-value gap, the eigenvalue) and, when it fails, what to do; mode: The eigenvalue
-    or zero at which it fails; signals: Names of the signals
-    involved; unclear: Why it does not hold only as far as the data can tell, where that is so: told in the detail.
+    ``mode``: the eigenvalue or zero at which it fails; ``unclear``: why it holds or fails only as far as the data can
+    tell, where that is so.
     """
 
     name: str

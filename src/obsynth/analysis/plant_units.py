@@ -34,10 +34,8 @@ _KINDS = ("equations", "states", "outputs", "faults", "disturbances", "model")
 class PlantUnits:
     """Factors between a plant as given and the scaled one.
 
-    Fields: time: The unit of time: tau, or the sample time; equations, states, outputs, faults, disturbances, model:
-    ``(nx,)``, ``(nx,)``, ``(ny,)``, ``(nf,)``, ``(nd,)``, ``(nw,)``: equations and outputs are multiplied by theirs; a
-    state, fault, disturbance or state of the fault model is its factor times the scaled one; discrete: Whether the
-    plant is sampled: its matrices have no unit of time then.
+    Equations ``(nx,)`` and outputs ``(ny,)`` are multiplied by theirs; a state ``(nx,)``, fault ``(nf,)``, disturbance
+    ``(nd,)`` or state of the fault model ``(nw,)`` is its factor times the scaled one; ``time``: tau or ``dt``.
     """
 
     time: float

@@ -22,18 +22,11 @@ from obsynth.plants.descriptor import DescriptorSystem
 
 @dataclass(frozen=True, eq=False)
 class Structure:
-    """What kind of plant this is.
+    """What kind of plant this is, with the evidence: every rank decided on the way is among the ``decisions``.
 
-    Fields: regular: ``det (A - z E)`` is not identically zero: inputs and initial state determine the trajectory;
-    index: Size of the largest block at infinity, 0 for nonsingular ``E``; None when not regular; finite_eigenvalues:
-    ``(k,)``, finite zeros of ``A - z E``; infinite_block_sizes: Sizes of the blocks at infinity, largest first;
-    impulse_free: Regular with index at most 1 (causal, for a sampled plant); stable: Regular, and every finite
-    eigenvalue is strictly inside the stability region; admissible: Regular, impulse-free and stable;
-    observability_normal_rank: Rank of ``[A - z E; C]`` at almost every ``z``; below ``nx`` the plant hides a whole
-    trajectory; unobservable_modes: Points where ``[A - z E; C]`` loses rank; undetectable_modes: Those of them on or
-    outside the boundary of stability; finitely_observable, detectable: No unobservable, or no undetectable, mode (and
-    full normal rank); impulse_observable: ``rank [E A; 0 E; 0 C] = nx + rank E``; causally_observable: ``rank [E; C] =
-    nx``; rank_of_E: The number of dynamic states; decisions: Every rank decided on the way, by name, read-only.
+    ``index``: size of the largest block at infinity, None unless regular; ``admissible``: regular, impulse-free (at
+    most 1) and stable; ``observability_normal_rank``: of ``[A - z E; C]`` at almost every z; ``impulse_observable``:
+    ``rank [E A; 0 E; 0 C] = nx + rank E``; ``causally_observable``: ``rank [E; C] = nx``.
     """
 
     regular: bool

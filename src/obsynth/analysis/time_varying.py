@@ -26,8 +26,7 @@ IntArray: TypeAlias = NDArray[np.intp]
 class StepBlocks(NamedTuple):
     """The matrices of one step as a filter uses them, without noise and inputs.
 
-    Fields: E, A, Phi: ``(rows, nx)``, ``(rows, nx)`` and ``(rows, nq)``: the equations that lead to x(k + 1); C, Psi:
-    ``(outputs, nx)`` and ``(outputs, nq)``: with early constraints the algebraic equations of step k + 1 too.
+    ``E, A (rows, nx)``, ``Phi (rows, nq)``: the equations of x(k + 1); ``C (outputs, nx)``, ``Psi (outputs, nq)``.
     """
 
     E: FloatArray
@@ -52,14 +51,10 @@ def step_blocks(plant: TimeVaryingDescriptorSystem, k: int, late: IntArray) -> S
 
 @dataclass(frozen=True, eq=False)
 class HorizonRanks:
-    """Rank and condition of ``H_k = [E_k; C_k]``, and the residual directions of (18), where they are worst.
+    """Where rank and condition of ``H_k = [E_k; C_k]``, and the residual directions of (18), are worst on a horizon.
 
-    With early constraints H_k holds them among the outputs.
-
-    Fields: steps: How many steps were looked at; worst: Of the H_k with the lowest rank, or the smallest singular
-    values; worst_k: Where that is; condition: The largest condition number of H_k, as given (the units of equations and
-    outputs matter); condition_k: Where that is; directions: The least ``rank E_k + ny - nx``, early constraints being
-    outputs; directions_k: Where that is.
+    With early constraints H_k holds them among the outputs.  ``condition``: as given, in the units of the data;
+    ``directions``: the least ``rank E_k + ny - nx``.
     """
 
     steps: int

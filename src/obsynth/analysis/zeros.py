@@ -34,11 +34,9 @@ _PATH_TO_BOUNDARY = (1.0, 0.75, 0.5, 0.25)
 
 @dataclass(frozen=True, eq=False)
 class Zero:
-    """An invariant zero and the direction that stays invisible there.
+    """An invariant zero and the direction ``(nx,)``, ``(nu,)``, of unit norm, that stays invisible there.
 
-    Fields: value: The point where the pencil loses rank; state_direction, input_direction: ``(nx,)`` and ``(nu,)``:
-    together of unit norm and in the null space of the pencil at ``value``; input_share: Size of the input part when the
-    pencil is equilibrated, so that units do not matter.
+    ``input_share``: size of the input part when the pencil is equilibrated, so that units do not matter.
     """
 
     value: complex
@@ -56,11 +54,8 @@ class Zero:
 class FaultZeros:
     """What faults a plant can hide from its outputs.
 
-    Fields: zeros: Invariant zeros of ``[A - z E, Bf; C, Df]``; outside: Those on or outside the boundary of stability:
-    such a fault grows or persists unseen; normal_rank_full: Whether the pencil has rank ``nx + nf`` at almost every
-    ``z``; if not, some combination of faults never shows at all; hidden_direction: ``(nf,)``, the fault part of the
-    never-visible direction at a generic point, where there is one; hidden_faults: Names of the faults that take part in
-    such directions; decisions: Every rank decided on the way.
+    ``zeros`` of ``[A - z E, Bf; C, Df]``; ``outside``: those not strictly stable; ``normal_rank_full``: rank nx + nf at
+    almost every z; if not, ``hidden_direction (nf,)`` of ``hidden_faults`` never shows.
     """
 
     zeros: tuple[Zero, ...]

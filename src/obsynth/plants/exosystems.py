@@ -19,11 +19,7 @@ from obsynth.plants.validation import index_of
 
 @dataclass(frozen=True, eq=False)
 class Exosystem:
-    """The exosystems of all faults of a plant, stacked.
-
-    Fields: Phi: ``(nw, nw)``, block-diagonal, in the plant's time; Cw: ``(nf, nw)``; names: Names of its states;
-    eigenvalues: Distinct eigenvalues of ``Phi``; descriptions: One per fault.
-    """
+    """The exosystems of all faults, stacked: ``Phi (nw, nw)``, block-diagonal, in the plant's time, ``Cw (nf, nw)``."""
 
     Phi: FloatArray
     Cw: FloatArray

@@ -29,13 +29,10 @@ INDEX_NAME = "k"
 
 @dataclass(frozen=True, eq=False)
 class MatrixSequence:
-    """A matrix for each k.
+    """A matrix for each k = 0 ... length - 1, or for every k where ``length`` is None.
 
-    Fields: name: For messages, such as ``A``; shape: Rows and columns, the same for every k; length: Number of entries,
-    k = 0 ... length - 1; ``None`` when there is one for every k; values: ``(rows, columns)`` for a constant, ``(length,
-    rows, columns)`` for a stack; function: From k to a matrix; entries: Rows of expressions; constants: Values of the
-    names in the expressions; still: Of expressions, the entries that do not depend on k; moving: Row and column of
-    those that do.
+    ``values``: one matrix, or a stack ``(length, rows, columns)``; or ``function`` of k; or rows of ``entries`` with
+    ``constants``, of which ``still`` holds those that do not depend on k, and ``moving`` the places of the others.
     """
 
     name: str

@@ -42,10 +42,7 @@ __all__ = ["ExactPencil", "blocks", "identity", "null_basis", "pivot_columns", "
 
 @dataclass(frozen=True, eq=False)
 class ExactPencil:
-    """The pencil ``A - s E`` with rational matrices ``(m, n)``; its parts are computed once and kept.
-
-    Fields: E, A: ``(m, n)``.
-    """
+    """The pencil ``A - s E`` with rational matrices ``(m, n)``; its parts are computed once and kept."""
 
     E: fmpq_mat
     A: fmpq_mat

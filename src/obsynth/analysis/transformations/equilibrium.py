@@ -63,8 +63,8 @@ def equilibrium(
 ) -> Point:
     """Return the point where nothing moves, what is given holds, and what is free is as it must be.
 
-    Raises `PreconditionError` with condition ``no-equilibrium`` (the combination of equations that nothing can
-    satisfy is named) or ``equilibrium-not-unique`` (the direction).
+    `PreconditionError` ``no-equilibrium`` (with the combination of equations that nothing can satisfy) or
+    ``equilibrium-not-unique`` (with the direction).
     """
     problem = _Problem(model, given, free, start or {})
     z = problem.solved()

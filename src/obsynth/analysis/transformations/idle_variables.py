@@ -27,11 +27,7 @@ SUBSPACE_STEPS = 3
 
 @dataclass(frozen=True, eq=False)
 class ActiveVariables:
-    """What is left of a plant without its idle variables.
-
-    Fields: rows, columns: Equations and variables that stay; dropped: Names of the variables that do not; equations:
-    Numbers, from 1, of the equations that do not.
-    """
+    """What is left of a plant without its idle variables; names of these, and numbers of their equations from 1."""
 
     rows: Indices
     columns: Indices

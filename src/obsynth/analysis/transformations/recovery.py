@@ -32,14 +32,10 @@ _MAPS = {
 
 @dataclass(frozen=True, eq=False)
 class StateRecovery:
-    """The states of a source plant from the signals of a transformed one.
+    """``x_source = from_state x + from_input u + from_fault f + from_disturbance d + from_noise w``.
 
-    ``x_source = from_state x + from_input u + from_fault f + from_disturbance d + from_noise w``
-
-    Fields: names: Names of the source states; from_state, from_input, from_fault, from_disturbance, from_noise:
-    ``(nx_source, nx)``, ``(nx_source, nu)`` and so on, read-only; noise_kept: ``(nw_source, nw)``: the noise of the
-    source as far as the transformed plant still has it; operating_point: Of the source states: the transformed plant
-    forgets that of states which are gone.
+    Maps ``(nx_source, nx)``, ``(nx_source, nu)`` and so on, read-only; ``noise_kept (nw_source, nw)``: the noise of the
+    source as far as the transformed plant still has it; ``operating_point``: of the source states.
     """
 
     names: tuple[str, ...]
@@ -103,12 +99,10 @@ class StateRecovery:
 
 @dataclass(frozen=True, eq=False)
 class Transformation:
-    """A plant made from another one.
+    """A plant made from another one, in words, and the states of ``source`` from the signals of ``plant``.
 
-    Fields: source, plant: The plant before and after; description: What was done, in words; recovery: The states of
-    ``source`` from the signals of ``plant``; dropped: names of the states of ``source`` that act on nothing and were
-    left out: they are not recovered; notes: what a user should know; bounds: how well the algebraic equations were
-    solved, where that was done by sparsity.
+    ``dropped``: states of ``source`` that act on nothing and are not recovered; ``bounds``: how well the algebraic
+    equations were solved, where that was done by sparsity.
     """
 
     source: DescriptorSystem

@@ -22,10 +22,8 @@ SIGNALS = ("state", "input", "fault", "disturbance", "noise")
 class RecoveryOperator:
     """``x = dynamic xi + algebraic z`` with ``coupling z + right [xi; u; f; d; w] = 0``, all sparse.
 
-    Fields: dynamic, algebraic: ``(nx, count)`` and ``(nx, nx - count)``; coupling: ``(nx - count, nx - count)``,
-    nonsingular; right: ``(nx - count, count + nu + nf + nd + nw)``; counts: Numbers of states, inputs, faults,
-    disturbances and noise inputs; states: Signal of the plant now -> ``(count, n)``: ``xi`` from its signals, where
-    later transformations changed them; noise_kept: ``(nw, nw now)``.
+    ``dynamic (nx, count)``, ``coupling (nx - count, nx - count)`` nonsingular; ``counts`` of states, inputs, faults,
+    disturbances, noise; ``states``: ``xi`` from each signal of the plant now, where later transformations changed it.
     """
 
     dynamic: Any
