@@ -56,7 +56,7 @@ def distinct_eigenvalues(matrix: FloatArray, tolerance: float) -> ComplexArray:
 
 
 def balanced_transition(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return a transition ``(n, n)`` with its states (f, f', f'', ...) in powers of two as units, and these ``(n,)``."""
+    """Return a transition ``(n, n)`` with its states (f, f', ...) in powers of two as units, and these ``(n,)``."""
     n = len(matrix)
     problem = LogBalance(n + 1)
     # The unit of time is free: only the states are scaled.

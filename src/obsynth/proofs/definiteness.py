@@ -59,8 +59,8 @@ class DefinitenessProof:
     """The outcome of an attempt to prove that every symmetric member of a ball is positive definite.
 
     ``lower_bound``: proved, on the smallest eigenvalue after a congruence (scaling, or preconditioning to near the
-    identity); without a proof, the computed one less the error bounds, or zero; ``error_bound``: on rounding and forming
-    in double precision; ``reason``: with ball arithmetic its precision, else why there is none.
+    identity); without a proof, the computed one less the error bounds, or zero; ``error_bound``: of rounding in double
+    precision and forming; ``reason``: with ball arithmetic its precision, else why there is none.
     """
 
     proved: bool

@@ -36,7 +36,7 @@ LEFT_OF_GAINS, MOST_STEPS_OF_GAINS = 0.05, 1_024
 
 
 class PeakSums(NamedTuple):
-    """Upper bounds, a column per input: ``partial (steps, ..., m)`` on the terms ``0 .. k``, ``whole (..., m)`` on all."""
+    """Upper bounds, a column per input: ``partial (steps, ..., m)`` on terms ``0 .. k``, ``whole (..., m)`` on all."""
 
     partial: FloatArray
     whole: FloatArray

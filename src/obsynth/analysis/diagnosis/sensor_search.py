@@ -112,7 +112,7 @@ class Task:
 class SensorSearch:
     """A search over sets of candidate sensors, for the columns ``faults``.
 
-    ``may_fail``: every added sensor brings a fault of its own, to be told as well; ``copies``: how often it may be taken.
+    ``may_fail``: an added sensor brings a fault of its own, to be told as well; ``copies``: how often it may be taken.
     """
 
     plant: DescriptorSystem

@@ -189,7 +189,7 @@ class ImplicitStep:
     def solve(
         self, x: FloatArray, u: FloatArray, theta: FloatArray, *, before: FloatArray | None = None, k: int = 0
     ) -> Solution:
-        """Return the state after one step from ``x (nx,)`` with ``u (nu,)``, ``theta (nq,)``; ``before`` is the last u."""
+        """Return the state after one step from ``x (nx,)`` with ``u (nu,)``, ``theta (nq,)``; ``before``: last u."""
         stages, residual, trusted = self._fast(x, u, theta)
         if trusted[0, 0] == 1.0:
             return Solution(stages[-self.functions.model.nx :, 0], stages[:, 0], float(residual[0, 0]), 1)
