@@ -13,10 +13,9 @@ from obsynth.analysis.diagnosis.exact import question
 from obsynth.analysis.diagnosis.fault_columns import rest_point
 from obsynth.analysis.transformations.recovery import StateRecovery
 from obsynth.errors import ObsynthError, PreconditionError
-from obsynth.methods.choosing.automatic import SAMPLES
-from obsynth.methods.choosing.figures import FaultFigures, fault_figures, on_the_clock
-from obsynth.methods.functional_filter.delay_curve import DelayCurve, delay_curve
-from obsynth.methods.functional_filter.rates import settling_time
+from obsynth.methods.automatic import SAMPLES
+from obsynth.methods.fault_figures import FaultFigures, fault_figures, on_the_clock
+from obsynth.methods.functional_filter.rates import DelayCurve, delay_curve, settling_time
 from obsynth.methods.registry import REGISTRY, method_spec
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.linear.sampling import sample_observer
