@@ -52,14 +52,13 @@ from obsynth.experiments.tolerance_study import tolerance_study as tolerance_stu
 from obsynth.exporting.files import export as export
 from obsynth.importing.andes import from_andes as from_andes
 from obsynth.importing.fmu import from_fmu as from_fmu
-from obsynth.importing.matlab import from_matlab as from_matlab
-from obsynth.importing.matrices import from_pandas as from_pandas
-from obsynth.importing.matrices import from_sympy as from_sympy
-from obsynth.importing.modelica import from_modelica as from_modelica
-from obsynth.importing.state_space import from_control as from_control
-from obsynth.importing.state_space import from_scipy as from_scipy
+from obsynth.importing.model_files import from_matlab as from_matlab
+from obsynth.importing.model_files import from_modelica as from_modelica
+from obsynth.importing.python_objects import from_control as from_control
+from obsynth.importing.python_objects import from_pandas as from_pandas
+from obsynth.importing.python_objects import from_scipy as from_scipy
+from obsynth.importing.python_objects import from_sympy as from_sympy
 from obsynth.methods.adaptive_observer.public import adaptive_observer as adaptive_observer
-from obsynth.methods.choosing.figures import FaultFigures as FaultFigures
 from obsynth.methods.dae_adaptive_observer.public import dae_adaptive_observer as dae_adaptive_observer
 from obsynth.methods.descriptor_kalman.public import descriptor_kalman as descriptor_kalman
 from obsynth.methods.designing import check as check
@@ -68,6 +67,7 @@ from obsynth.methods.fault_estimation_filter.public import fault_estimation_filt
 from obsynth.methods.fault_estimation_filter.public import (
     fault_estimation_filter_from_gains as fault_estimation_filter_from_gains,
 )
+from obsynth.methods.fault_figures import FaultFigures as FaultFigures
 from obsynth.methods.functional_filter.detection import DetectionFilter as DetectionFilter
 from obsynth.methods.functional_filter.detection import detection_filter as detection_filter
 from obsynth.methods.functional_filter.public import functional_filter as functional_filter

@@ -61,7 +61,7 @@ CORRUPTED = {LinearObserver: "Az", RecursiveObserver: "initial_covariance", DAEO
 
 @pytest.fixture(autouse=True)
 def registered(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(REGISTRY, ADDED, "luenberger_method.method")
+    monkeypatch.setitem(REGISTRY, ADDED, "luenberger_method")
 
 
 @cache

@@ -48,7 +48,7 @@ def drawn_runs(
 
     Plants that state tolerances of their constants are drawn within these; an unstable one is held by ``feedback``.
     """
-    from obsynth.methods.choosing.figures import on_the_clock
+    from obsynth.methods.fault_figures import on_the_clock
 
     drive = resolve(sampled, scenario)
     nu, nf = sampled.nu, sampled.nf

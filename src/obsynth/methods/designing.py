@@ -15,10 +15,9 @@ from obsynth.analysis.transformations.elimination import MANY_VARIABLES, elimina
 from obsynth.analysis.transformations.recovery import StateRecovery, Transformation, plant_and_recovery
 from obsynth.errors import PreconditionError, SpecError, VerificationError
 from obsynth.extensions import extension
-from obsynth.methods.advice import with_advice
-from obsynth.methods.choosing.automatic import automatic_design
-from obsynth.methods.drowned_designs import require_above_rounding, rounding_notes
+from obsynth.methods.automatic import automatic_design
 from obsynth.methods.method_spec import MethodSpec, PlantKind, Synthesis
+from obsynth.methods.refusals import require_above_rounding, rounding_notes, with_advice
 from obsynth.methods.registry import AUTO, REGISTRY, method_spec, methods_for
 from obsynth.methods.verifying import verify
 from obsynth.numerics.failures import failed_computations

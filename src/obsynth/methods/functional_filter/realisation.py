@@ -23,6 +23,7 @@ from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
 from obsynth.numerics.scaling import balanced_matrix
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.proofs.extended_balls import arb_matrix
 from obsynth.proofs.products import BITS, as_ball
 
 #: A matrix larger than its eigenvalues by this is given in coordinates in which it is triangular.
@@ -125,16 +126,14 @@ def _rounded_once(model: FilterModel, gain: KalmanGain, coordinates: FloatArray)
     """
     import flint
 
-    def exact(matrix: FloatArray) -> flint.arb_mat:
-        return flint.arb_mat(*matrix.shape, matrix.ravel().tolist())
-
     with flint.ctx.workprec(BITS):
-        k, there = exact(gain.K), exact(coordinates)
+        k, there = arb_matrix(gain.K), arb_matrix(coordinates)
         back = there.inv()
-        found = (
-            back * (exact(model.A) - k * exact(model.C)) * there, back * (exact(model.B) + k * exact(model.L)),
-            back * (exact(model.T) + k * exact(model.T0)),
-        )  # fmt: skip
+        parts = ((model.A, -model.C, there), (model.B, model.L, None), (model.T, model.T0, None))
+        found = []
+        for own, fed_back, right in parts:
+            part = back * (arb_matrix(own) + k * arb_matrix(fed_back))
+            found.append(part if right is None else part * right)
     return Dynamics(*(as_ball(part).midpoint for part in found))
 
 

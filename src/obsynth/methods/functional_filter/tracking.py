@@ -14,6 +14,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.spectra import certain_noise_covariance
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.proofs.extended_balls import arb_matrix
 from obsynth.proofs.products import BITS, as_ball
 
 #: Regulator equations of more unknowns are solved in double precision.
@@ -60,11 +61,9 @@ def _with_digits_to_spare(a: FloatArray, phi: FloatArray, entering: FloatArray) 
     order, count = entering.shape
     whole, right = np.kron(a, np.eye(count)), np.kron(np.eye(order), phi.T)
     with flint.ctx.workprec(BITS):
-        unknowns = [
-            flint.arb_mat(*part.shape, part.ravel().tolist()) for part in (whole, right, entering.reshape(-1, 1))
-        ]
+        own, model, known = (arb_matrix(np.asarray(part)) for part in (whole, right, entering.reshape(-1, 1)))
         try:
-            found = (unknowns[1] - unknowns[0]).solve(unknowns[2])
+            found = (model - own).solve(known)
         except ZeroDivisionError:
             return None
     return as_ball(found).midpoint.reshape(order, count)

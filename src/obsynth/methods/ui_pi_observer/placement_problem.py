@@ -24,11 +24,11 @@ from obsynth.methods.placement.observable import ObservableSplit, observable_spl
 from obsynth.methods.ui_pi_observer.augmented_plant import (
     AugmentedPlant,
     Decoupled,
+    ObserverGains,
     decouple,
     direct_part,
     paper_decoupling,
 )
-from obsynth.methods.ui_pi_observer.realisation import ObserverGains
 from obsynth.numerics.arrays import ComplexArray, FloatArray, as_matrix
 from obsynth.numerics.pencils import finite_zeros, pencil_structure
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE

@@ -31,6 +31,7 @@ from obsynth.methods.placement.eigenstructure import place
 from obsynth.methods.placement.kalman import KalmanProblem, compromise
 from obsynth.methods.placement.region import Region, region_gain
 from obsynth.methods.riccati import lyapunov_factor
+from obsynth.methods.ui_pi_observer.augmented_plant import ObserverGains, combinations_seen, realise
 from obsynth.methods.ui_pi_observer.conditions import existence
 from obsynth.methods.ui_pi_observer.notes import digits_note, elimination_note, fixed_mode_notes, slow_note
 from obsynth.methods.ui_pi_observer.options import UiPiOptions, checked_poles, plain
@@ -42,7 +43,6 @@ from obsynth.methods.ui_pi_observer.placement_problem import (
     placement_problem,
     with_faults,
 )
-from obsynth.methods.ui_pi_observer.realisation import ObserverGains, combinations_seen, realise
 from obsynth.numerics.arrays import ComplexArray, FloatArray, as_matrix
 from obsynth.numerics.spectra import (
     PRINTED_DIGITS,

@@ -1,55 +1,29 @@
-"""The observer of a nonlinear DAE as C99: one header, one source, no allocation, no library but that of C.
+"""Observers of nonlinear DAEs, and thresholds over tolerances, as C99: templates filled with sizes and tables.
 
-CasADi writes the equations; the loop of Newton around them, its damping and its homotopy are those of
+CasADi writes the equations of a DAE; the loop of Newton around them, its damping and its homotopy are those of
 `obsynth.observers.dae.c_code`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from importlib.resources import files
 from pathlib import Path
 
+import numpy as np
+
 from obsynth.errors import SpecError
-from obsynth.exporting.c_source import c_identifier, comment, included, quoted
+from obsynth.experiments.monitors.adaptive_bound import THRESHOLD_ROUNDING, AdaptiveBound
+from obsynth.exporting.c_source import c_identifier, comment, included, quoted, table_lines
 from obsynth.files.outputs import write_together
 from obsynth.observers.dae.c_code import observer_code, observer_struct
 from obsynth.plants.dae.model import DAEModel
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import gain_set_digest
 
-_STEP = r"""
-void PREFIX_reset(PREFIX_state *state)
-{
-    begin(state);
-}
 
-int PREFIX_step(PREFIX_state *state, ARGUMENTSconst double y[NY], PREFIX_estimates *estimates)
-{
-    double heard[NY];
-    double said[ROW];
-    const double *after;
-    int i, failed;
-NOTHING    failed = advance(state, INPUT, y, heard, said);
-    if (failed) {
-        return failed;
-    }
-    after = latest_of(state)->memory;
-    copy(estimates->states, after + AT_POSTERIOR, NX);
-    copy(estimates->parameters, after + AT_THETA, NQ);
-    for (i = 0; i < NX; i++) {
-        estimates->state_deviations[i] = sqrt(fmax(said[AT_COVARIANCE + i * (NX + 1)], 0.0));
-    }
-    for (i = 0; i < NQ; i++) {
-        estimates->parameter_deviations[i] = sqrt(fmax(after[AT_SPREAD + i * (NQ + 1)], 0.0));
-    }
-    for (i = 0; i < NY; i++) {
-        estimates->innovations[i] = isnan(heard[i]) ? NAN : said[AT_INNOVATION + i];
-    }
-    estimates->nis = said[AT_NIS];
-    estimates->residual = said[AT_RESIDUAL];
-    return 0;
-}
-"""
+def _template(name: str) -> str:
+    return files("obsynth.exporting").joinpath("templates", name).read_text(encoding="utf-8")
 
 
 def write_dae_c(design: ObserverDesign, target: Path, sample_time: float | None) -> tuple[Path, ...]:
@@ -89,7 +63,7 @@ def _step_text(prefix: str, model: DAEModel) -> str:
     """Return the two functions of the header; without inputs, C has no array for them."""
     arguments, given, nothing = ("const double u[NU], ", "u", "") if model.nu else (
         "", "nothing", "    static const double nothing[1] = {0.0};\n")  # fmt: skip
-    text = _STEP.replace("PREFIX", prefix).replace("ARGUMENTS", arguments)
+    text = _template("dae_step.c").replace("PREFIX", prefix).replace("ARGUMENTS", arguments)
     return text.replace("NOTHING", nothing).replace("INPUT", given)
 
 
@@ -121,3 +95,62 @@ def _header(design: ObserverDesign, prefix: str, digest: str) -> Iterator[str]:
     taken[1:1] = [f"const double u[{model.nu}]"] if model.nu else []
     yield f"int {prefix}_step({', '.join(taken)});"
     yield from ("", "#endif")
+
+
+def threshold_header(bound: AdaptiveBound, prefix: str) -> str:
+    """Return the declarations, for the end of the header."""
+    p, nz, *_ = bound.counts
+    no = bound.counts[4]
+    sizes = (max(p * nz, 1), bound.length * bound.width, bound.length * nz, bound.rounding.shape[1])
+    lines = [
+        comment("Thresholds over the tolerances of the plant: of the faults, then of the residuals."),
+        "typedef struct {",
+        *(f"    double {name}[{size}];" for name, size in zip(("psi", "ring", "eps", "largest"), sizes, strict=True)),
+        "    int at;", "    long k;", f"}} {prefix}_thresholds;", "",
+        f"void {prefix}_thresholds_reset({prefix}_thresholds *state);", "",
+        comment("After each step of the observer: u, y, and its states, faults and residuals one after the other;"),
+        comment(f"total gets {no} numbers."),
+        f"void {prefix}_thresholds_step({prefix}_thresholds *state, const double *u, const double *y,",
+        "                               const double *rows, double *total);", "",
+    ]  # fmt: skip
+    return "\n".join(lines) + "\n"
+
+
+def threshold_source(bound: AdaptiveBound, prefix: str) -> str:
+    """Return tables and functions, for the end of the source; `SpecError` for constants that vary."""
+    if bound.varying:
+        raise SpecError("Thresholds are written as C for constants that stay the same (variation: constant).",
+                        path="monitor")  # fmt: skip
+    p, nz, rows, m, no = bound.counts
+    structure = bound.structure
+    n, out = structure.reading.shape
+    nv = bound.drive.shape[2]
+    ny = bound.rounding.shape[1] - 1 - nv
+    theta, later = bound.start_later
+    sizes = {
+        "P": p, "NZ": nz, "ROWS": rows, "M": m, "NO": no, "N": n, "NU": nv - n, "NY": ny, "NV": nv, "OUT": out,
+        "W": bound.width, "L": bound.length, "NR": bound.rounding.shape[1], "SINGLE": structure.single,
+        "OWN": len(structure.owner), "DRIVEN": len(bound.remainder_inputs), "START": len(bound.start),
+    }  # fmt: skip
+    tables = {
+        "Az": structure.Az, "reading": structure.reading, "drive": bound.drive.reshape(-1, nv), "shown": bound.shown,
+        "offsets": structure.offsets[None], "channels": structure.channel_rows, "kernels": bound.kernels,
+        "same": bound.same, "solved": bound.solved, "tail": bound.tail, "nominal": bound.nominal[None],
+        "rounding": bound.rounding, "start": bound.start, "later": later[None],
+        "driven": np.array([bound.remainder_inputs], dtype=np.float64),
+    }  # fmt: skip
+    text = _template("adaptive_threshold.c")
+    enumerated = ", ".join(f"{name} = {value}" for name, value in sizes.items())
+    lines = [
+        "", f"enum {{ {enumerated} }};",
+        f"static const double THETA = {theta!r};", f"static const double ROUNDED = {THRESHOLD_ROUNDING!r};", "",
+        *(line for name, table in tables.items() for line in table_lines(f"thresholds_{name}", _filled(table))),
+    ]  # fmt: skip
+    return "\n".join(lines) + "\n" + text.replace("PREFIX", prefix)
+
+
+def _filled(table: np.ndarray) -> np.ndarray:
+    """Return a table without an empty side, which C has not."""
+    found = np.zeros(tuple(max(size, 1) for size in table.shape))
+    found[: table.shape[0], : table.shape[1]] = table
+    return found
