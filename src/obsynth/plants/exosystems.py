@@ -19,11 +19,7 @@ from obsynth.plants.validation import index_of
 
 @dataclass(frozen=True, eq=False)
 class Exosystem:
-    """The exosystems of all faults of a plant, stacked.
-
-    Fields: Phi: ``(nw, nw)``, block-diagonal, in the plant's time; Cw: ``(nf, nw)``; names: Names of its states;
-    eigenvalues: Distinct eigenvalues of ``Phi``; descriptions: One per fault.
-    """
+    """The exosystems of all faults, stacked: ``Phi (nw, nw)``, block-diagonal, in the plant's time, ``Cw (nf, nw)``."""
 
     Phi: FloatArray
     Cw: FloatArray
@@ -43,17 +39,15 @@ def exosystem(data: Any, fault_names: Sequence[str], dt: float) -> Exosystem:
     _require_below_nyquist(fault_names, models, dt)
     count = sum(model.order for model in models)
     phi, cw = np.zeros((count, count)), np.zeros((len(models), count))
-    names: list[str] = []
-    values: list[complex] = []
-    start = 0
-    for row, (name, model) in enumerate(zip(fault_names, models, strict=True)):
-        place = slice(start, start + model.order)
+    starts = np.cumsum([0, *(model.order for model in models)])
+    for row, model in enumerate(models):
+        place = slice(starts[row], starts[row + 1])
         phi[place, place], cw[row, place] = model.transition(dt), model.Cw[0]
-        names += [f"{name} model {i + 1}" for i in range(model.order)]
-        values += [value for value in model.eigenvalues(dt) if value not in values]
-        start += model.order
+    each = zip(fault_names, models, strict=True)
+    names = tuple(f"{name} model {i + 1}" for name, model in each for i in range(model.order))
+    values = list(dict.fromkeys(value for model in models for value in model.eigenvalues(dt).tolist()))
     descriptions = tuple(model.description for model in models)
-    return Exosystem(read_only(phi), read_only(cw), tuple(names), np.array(values, dtype=np.complex128), descriptions)
+    return Exosystem(read_only(phi), read_only(cw), names, np.array(values, dtype=np.complex128), descriptions)
 
 
 def _require_below_nyquist(names: Sequence[str], models: Sequence[FaultModel], dt: float) -> None:

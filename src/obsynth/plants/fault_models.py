@@ -3,8 +3,6 @@ r"""What is known about the course of a fault: an exosystem ``w+ = Phi w, f = Cw
 Source: Share Pasand, Aliyari, Taghirad, eqs. (2), (5), (6).  Differences: each fault has its own exosystem and the
 faults are stacked block-diagonally (the row of (6) would add them up); ``f = Cw w``, not ``f' = Phi f``; the states of
 a polynomial are f, f', f'', ... (so their initial values are ``i! f_i``, not ``f_i``).
-
-Eigenvalues of fault models, each once, although rounding scatters multiple ones.
 """
 
 from __future__ import annotations
@@ -16,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import is_number, is_whole
+from obsynth.numerics.arguments import is_finite_number, is_whole
 from obsynth.numerics.arrays import ComplexArray, FloatArray, as_matrix, read_only
 from obsynth.numerics.ranks import decide_rank
 from obsynth.numerics.scaling import LogBalance
@@ -30,12 +28,12 @@ SAME_EIGENVALUE = 1e-9
 
 def stated_eigenvalues(phi: FloatArray) -> ComplexArray:
     """Return the distinct eigenvalues of a stacked transition ``(nw, nw)``, block by block where it falls apart."""
-    linked = (phi != 0.0) | (phi.T != 0.0) | np.eye(len(phi), dtype=bool)
-    for _ in range(len(phi)):
-        linked = (linked.astype(float) @ linked.astype(float)) > 0.0
+    from scipy.sparse.csgraph import connected_components
+
+    count, parts = connected_components(phi != 0.0, directed=False) if len(phi) else (0, np.zeros(0))
     values: list[complex] = []
-    for members in sorted({tuple(np.flatnonzero(row).tolist()) for row in linked}):
-        block = phi[np.ix_(members, members)]
+    for part in range(count):
+        block = phi[np.ix_(parts == part, parts == part)]
         triangular = not np.any(np.tril(block, -1))
         found = np.unique(np.diag(block)) if triangular else distinct_eigenvalues(block, MULTIPLE_EIGENVALUE)
         values += [complex(value) for value in found if complex(value) not in values]
@@ -58,10 +56,7 @@ def distinct_eigenvalues(matrix: FloatArray, tolerance: float) -> ComplexArray:
 
 
 def balanced_transition(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return a transition ``(n, n)`` with its states scaled by powers of two, and their factors ``(n,)``.
-
-    The states of a fault model, such as f, f', f'', have sizes of their own.
-    """
+    """Return a transition ``(n, n)`` with its states (f, f', ...) in powers of two as units, and these ``(n,)``."""
     n = len(matrix)
     problem = LogBalance(n + 1)
     # The unit of time is free: only the states are scaled.
@@ -141,9 +136,8 @@ def polynomial(order: int) -> FaultModel:
             f"A polynomial fault model has order {order!r}: give a whole number from 0 (step) to {HIGHEST_ORDER}.",
             path="fault_model",
         )
-    words = {number: word for word, number in POLYNOMIAL_WORDS.items()}
-    description = words.get(order, f"polynomial of order {order}")
-    return FaultModel(np.eye(order + 1, k=1), np.eye(1, order + 1), description)
+    words = [*POLYNOMIAL_WORDS, f"polynomial of order {order}"]
+    return FaultModel(np.eye(order + 1, k=1), np.eye(1, order + 1), words[min(order, len(POLYNOMIAL_WORDS))])
 
 
 def sinusoid(frequency: float) -> FaultModel:
@@ -161,10 +155,7 @@ def exponential(rate: float) -> FaultModel:
 
 
 def from_matrices(Phi: Any, Cw: Any) -> FaultModel:
-    """Return the model of any exosystem, in the time of the plant: ``w' = Phi w``, or ``w(k+1) = Phi w(k)``.
-
-    Shapes: ``Phi (n, n)``, ``Cw (1, n)``.
-    """
+    """Return the model of ``Phi (n, n)``, ``Cw (1, n)`` in the time of the plant: ``w' = Phi w``, or ``w(k+1)``."""
     transition, row = as_matrix(Phi, "Phi"), as_matrix(Cw, "Cw")
     count = transition.shape[0]
     if transition.shape != (count, count) or count == 0 or row.shape != (1, count):
@@ -173,8 +164,7 @@ def from_matrices(Phi: Any, Cw: Any) -> FaultModel:
             "same length.",
             path="fault_model",
         )
-    model = FaultModel(transition, row, f"given exosystem of order {count}", sampled=True)
-    return _observable(model)
+    return _observable(FaultModel(transition, row, f"given exosystem of order {count}", sampled=True))
 
 
 def summed(models: Sequence[FaultModel]) -> FaultModel:
@@ -187,13 +177,8 @@ def summed(models: Sequence[FaultModel]) -> FaultModel:
             path="fault_model",
         )
     description = " plus ".join(model.description for model in models)
-    whole = FaultModel(
-        block_diag(*(model.Phi for model in models)),
-        np.hstack([model.Cw for model in models]),
-        description,
-        models[0].sampled,
-    )
-    return _observable(whole)
+    phi, row = block_diag(*(model.Phi for model in models)), np.hstack([model.Cw for model in models])
+    return _observable(FaultModel(phi, row, description, models[0].sampled))
 
 
 def fault_model(data: Any) -> FaultModel:
@@ -253,8 +238,6 @@ def _observable(model: FaultModel) -> FaultModel:
 
 
 def _number(value: Any, what: str) -> float:
-    if not is_number(value):
-        raise SpecError(f"The {what} model needs a number, not {value!r}.", path="fault_model")
-    if not np.isfinite(value):
-        raise SpecError(f"The {what} model needs a finite number, not {value}.", path="fault_model")
+    if not is_finite_number(value):
+        raise SpecError(f"The {what} model needs a finite number, not {value!r}.", path="fault_model")
     return float(value)

@@ -19,16 +19,14 @@ from functools import cached_property
 from flint import fmpq, fmpq_mat, fmpq_poly, fmpz_mat, fmpz_poly, nmod_mat, nmod_poly
 
 from obsynth.numerics.arrays import FloatArray
-from obsynth.proofs.exact_matrices import (
+from obsynth.proofs.exact_arithmetic import (
+    RootLocation,
     blocks,
-    identity,
-    null_basis,
-    pivot_columns,
+    locate_roots,
+    primitive,
     with_integer_entries,
     written_matrix,
-    zeros_matrix,
 )
-from obsynth.proofs.root_location import RootLocation, locate_roots, primitive
 
 #: Primes for ranks that are only bounded from below.
 _PRIMES = ((1 << 61) - 1, 2305843009213693921, 2305843009213693907)
@@ -37,15 +35,11 @@ _COMPRESSION_SIZE = 1 << 12
 _SEED = 20150709
 #: Compressions after which a factor that all of them share is a factor of all minors.
 _MOST_COMPRESSIONS = 6
-__all__ = ["ExactPencil", "blocks", "identity", "null_basis", "pivot_columns", "system_pencil", "zeros_matrix"]
 
 
 @dataclass(frozen=True, eq=False)
 class ExactPencil:
-    """The pencil ``A - s E`` with rational matrices ``(m, n)``; its parts are computed once and kept.
-
-    Fields: E, A: ``(m, n)``.
-    """
+    """The pencil ``A - s E`` with rational matrices ``(m, n)``; its parts are computed once and kept."""
 
     E: fmpq_mat
     A: fmpq_mat

@@ -194,10 +194,7 @@ def _in_units(ball: Ball, units: FloatArray) -> Ball:
 def stacked_product(first: tuple[FloatArray, FloatArray], second: tuple[FloatArray, FloatArray]) -> tuple[
     FloatArray, FloatArray
 ]:  # fmt: skip
-    """Return midpoints and radii of the products of two stacks of balls ``(count, rows, n)``, ``(count, n, columns)``.
-
-    As `Ball` multiplies, many at once.
-    """
+    """Return the products of two stacks of balls ``(count, rows, n)``, ``(count, n, columns)``, as `Ball` does."""
     (a, ra), (b, rb) = first, second
     length = a.shape[2]
     size, other = np.abs(a), np.abs(b)

@@ -100,9 +100,7 @@ MOST_NAMED = 6
 class HiddenMotion:
     """States, unknown inputs and other faults that, with a fault of 1, leave every output at zero.
 
-    Fields: fault: The fault; point: All signals go like ``exp(point t)`` (``point^k`` for sampled plants); values: The
-    amplitudes that are not zero: unknown inputs and other faults first, then states; causes: How many of them, from the
-    first, are unknown inputs or other faults; dt: Of the plant, seconds.
+    All go like ``exp(point t)`` (``point^k``); ``values``: the amplitudes, first those of the ``causes`` (a count).
     """
 
     fault: str

@@ -128,7 +128,7 @@ def _dynamic_rows(
     yield _contraction_row(facts, proof)
     if proof is not None:
         yield bias_row(proof, ranks.condition)
-        yield covariance_row(stated, proof.last)
+        yield covariance_row(stated, observer, proof.last)
         yield from parameter_row(proof)
         yield from steady_rows(stated, design.gains, proof.last, ranks.condition)
     if observer.adaptation is not None:
