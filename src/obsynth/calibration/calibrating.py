@@ -17,13 +17,7 @@ from obsynth.calibration.plants import NonlinearPlant
 from obsynth.calibration.problem import Problem, calibration_problem, require_variation
 from obsynth.calibration.reporting import IntegrationError, integration_error, reported
 from obsynth.calibration.result import Calibration
-from obsynth.calibration.simulation_error import (
-    FIRST_ROWS,
-    Fit,
-    SimulationError,
-    simulation_fits,
-    with_seen_start,
-)
+from obsynth.calibration.simulation_error import FIRST_ROWS, Fit, SimulationError, simulation_fits, with_seen_start
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import chosen, is_whole, whole_number
 from obsynth.plants.dae.model import DAEModel

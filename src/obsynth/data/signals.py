@@ -124,12 +124,7 @@ class Signals:
     one: int | None = None  # number of the signal that is one in every row and has no column, if there is such a one
 
     @classmethod
-    def of(
-        cls,
-        engine: Engine,
-        columns: Mapping[str, str] | None,
-        scales: Mapping[str, float] | None,
-    ) -> Signals:
+    def of(cls, engine: Engine, columns: Mapping[str, str] | None, scales: Mapping[str, float] | None) -> Signals:
         """Return the signals that a running design reads."""
         names = engine.input_names + engine.output_names
         renamed, factors = dict(columns or {}), dict(scales or {})

@@ -115,13 +115,11 @@ class StepObserver(StepSettings, Generic[State, Known]):
     def _steps(self) -> Steps[State, Known]:
         """What follows from the observer alone."""
 
-    @abstractmethod
     def _allow(self, state: State) -> None:
         """Raise where no sample can follow."""
 
-    @abstractmethod
     def _trust(self, row: Known) -> None:
-        """Raise where a step cannot be trusted."""
+        """Raise where a step cannot be trusted, and does not say so itself."""
 
     @abstractmethod
     def _sample(self, state: State, y: ArrayLike, u: ArrayLike) -> tuple[FloatArray, FloatArray]:

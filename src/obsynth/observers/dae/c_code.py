@@ -27,11 +27,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import DEPENDENT_BOUND
 from obsynth.observers.dae.settings import initial_memory
 from obsynth.observers.dae.step_graph import ObserverGraph
-from obsynth.observers.dae.steps import (
-    PROJECTION_NOTICE,
-    PROJECTION_SHARE,
-    Steps,
-)
+from obsynth.observers.dae.steps import PROJECTION_NOTICE, PROJECTION_SHARE, Steps
 from obsynth.observers.outliers import LONGEST, OVERFLOW, RESET_WINDOW, chi_square_limit
 from obsynth.plants.dae import step as implicit_step
 from obsynth.plants.dae.functions import DAEFunctions

@@ -140,9 +140,6 @@ class DAEObserver(DAESettings, StepObserver[DAEState, DAERow]):
     def _steps(self) -> Steps:
         return self.steps
 
-    def _allow(self, state: DAEState) -> None:
-        """Raise nothing: a model has no horizon."""
-
     def _trust(self, row: DAERow) -> None:
         require_regular(self, row, row.conditions)
 

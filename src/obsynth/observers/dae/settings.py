@@ -20,24 +20,14 @@ from obsynth.plants.dae.functions import BUTCHER
 from obsynth.plants.dae.model import DAEModel
 
 Form: TypeAlias = Literal["forgetting", "random-walk", "augmented-kalman"]
-
-
 Guard: TypeAlias = Literal["regularise", "none"]
-
-
 Weight: TypeAlias = Literal["innovation", "paper"]
-
-
 Integration: TypeAlias = Literal["backward-euler", "radau"]
-
-
 _KINDS = {
     "form": Form, "guard": Guard, "weight": Weight, "integration": Integration, "forgetting": ForgettingFactor,
     "window": Count, "largest_move": Positive | None,
     "reset": Probability,
 }  # fmt: skip
-
-
 _DEFINITE = ("R", "initial_parameter_covariance")
 
 

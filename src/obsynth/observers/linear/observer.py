@@ -13,13 +13,7 @@ from numpy.typing import ArrayLike
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
 from obsynth.observers.estimates import Estimates
-from obsynth.observers.records import (
-    NAME_FIELDS,
-    checked_sample,
-    is_delay,
-    require_names,
-    whole_record,
-)
+from obsynth.observers.records import NAME_FIELDS, checked_sample, is_delay, require_names, whole_record
 from obsynth.observers.running import RunningObserver
 
 

@@ -19,13 +19,8 @@ from obsynth.observers.estimates import Estimates
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.records import batch_record, require_horizon
 from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.observers.recursive.parameter_steps import posterior_residual
-from obsynth.observers.recursive.step_model import (
-    EarlyConstraintSteps,
-    PreparedStep,
-    StepMatrices,
-    spreads,
-)
+from obsynth.observers.recursive.recursion import posterior_residual
+from obsynth.observers.recursive.step_model import EarlyConstraintSteps, PreparedStep, StepMatrices, spreads
 from obsynth.observers.running import named_estimates
 from obsynth.observers.sensor_timing import require_plain
 

@@ -22,18 +22,15 @@ from obsynth.numerics.ranks import UNDETERMINED_SHARE
 from obsynth.numerics.recursive_least_squares import ParameterState, start_of, update
 from obsynth.observers.outliers import checked_limit, has_jumped, no_refusals, robust_advance, with_surprise
 from obsynth.observers.recursive.estimates import RawEstimate, RecursiveState
-from obsynth.observers.recursive.parameter_steps import (
-    RandomWalkParameterSteps,
-    WalkingEarlySteps,
-    posterior_residual,
-)
 from obsynth.observers.recursive.settings import RecursiveSettings
 from obsynth.observers.recursive.step_model import (
     EarlyConstraintSteps,
     PlantSteps,
     PreparedStep,
+    RandomWalkParameterSteps,
     StepMatrices,
     StepModel,
+    WalkingEarlySteps,
     spreads,
 )
 
@@ -57,6 +54,36 @@ def step_model_of(settings: RecursiveSettings) -> StepModel:
         return early_steps(settings, early_rows(settings.plant, early=True))
     steps, walk = PlantSteps(settings.plant, settings.Q, settings.R), walk_of(settings)
     return steps if walk is None else RandomWalkParameterSteps(steps, walk)
+
+
+def posterior_residual(
+    found: LeastSquaresStep,
+    H: FloatArray,
+    S: FloatArray,
+    right: FloatArray,
+    ne: int,
+    *,
+    unknown: FloatArray,
+    columns: int = 1,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return what (18f) learns from: ``y - C x`` weighted by R, its regressor (18d), and a root of its covariance.
+
+    That covariance is not R but one of rank ``rank E + ny - nx`` (Moussa Ali et al. 2013, (18b), (18d), (18f)).
+    """
+    gaps = right[ne:] - H[ne:] @ found.estimate
+    triangle = np.asarray(np.linalg.qr(S[ne:].T, mode="r")).T
+    if not np.all(np.abs(np.diag(triangle)) > 0.0):
+        raise PreconditionError("The literal form (18) divides by R, which is singular: use form 'innovation'.",
+                                condition="R nonsingular")  # fmt: skip
+    data = np.eye(len(H))
+    gains = None if unknown.shape[1] else least_squares_step(H, S, data)
+    if gains is None:
+        # Undetermined directions lie in the null space of the outputs that are there: y - C xhat is what it is.
+        gains = rank_revealing_step(H, S, data, unknown, mapped=len(H))
+    spread = S[ne:] - H[ne:] @ gains.estimate @ S
+    weighted = np.linalg.solve(triangle, np.hstack((gaps, spread)))
+    regressor, end = slice(columns, gaps.shape[1]), gaps.shape[1]
+    return weighted[:, :columns], -weighted[:, regressor], weighted[:, end:]
 
 
 class Recursion:
