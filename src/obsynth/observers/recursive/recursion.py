@@ -31,6 +31,7 @@ from obsynth.observers.recursive.step_model import (
     StepMatrices,
     StepModel,
     WalkingEarlySteps,
+    right_side,
     spreads,
 )
 
@@ -184,8 +185,8 @@ class Recursion:
         theta = state.parameters.theta
         if state.k > 0:
             after, v, G = self._stepped(state, self.model.at(state.k - 1), y, u)
-        elif isinstance(self.model, EarlyConstraintSteps):
-            after, v, G = self._stepped(state, self.model.first(), np.zeros(0), u)
+        elif (first := self.model.first()) is not None:
+            after, v, G = self._stepped(state, first, np.zeros(0), u)
         else:
             after, v, G = state, np.zeros(0), np.zeros((0, state.Upsilon.shape[1]))
         gap = v - G @ theta if len(theta) else v
@@ -196,15 +197,8 @@ class Recursion:
         self, state: RecursiveState, step: StepMatrices, y: FloatArray, u: FloatArray
     ) -> tuple[RecursiveState, FloatArray, FloatArray]:
         """Take the step that ends at the sample ``y``; return also innovation and regressor."""
-        ne, nq = len(step.A), state.Upsilon.shape[1]
-        right = np.empty((len(step.H), 1 + nq), order="F")
-        right[:ne, 0] = step.A @ state.x + step.B @ state.u
-        right[ne : ne + len(y), 0] = y
-        if len(step.Dn):
-            right[ne + len(y) :, 0] = step.Dn @ u
-        if nq:
-            right[:ne, 1:] = step.A @ state.Upsilon + step.Phi
-            right[ne:, 1:] = -step.Psi
+        nq = state.Upsilon.shape[1]
+        right = right_side(step, state.x, state.Upsilon, state.u, y, u)
         found, lesson = None, None
         # The product is NaN exactly if a sample is.
         if not (self.literal or state.diffuse.shape[1] or math.isnan(y.dot(y))):
