@@ -46,7 +46,10 @@ class Stamps:
                 self.is_dated = False
                 return seconds
         if self.is_dated is not False:
-            found = _date(cell)
+            try:
+                found = datetime.fromisoformat(cell)
+            except ValueError:
+                found = None
             if found is not None:
                 return self._seconds(found, row, column)
         raise SpecError(
@@ -99,13 +102,6 @@ class Stamps:
         if self.is_dated is None:
             return f"give {_EXPECTED}"
         return "the rows before hold dates and times" if self.is_dated else "the rows before hold seconds"
-
-
-def _date(cell: str) -> datetime | None:
-    try:
-        return datetime.fromisoformat(cell)
-    except ValueError:
-        return None
 
 
 #: The column of time stamps, in seconds.

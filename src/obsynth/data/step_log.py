@@ -39,7 +39,12 @@ class SteppingEngine(Engine):
     """
 
     def __init__(self, design: ObserverDesign, *, warm_up: float | None = None, outliers: str | None = None) -> None:
-        self.observer, plant = _with_gate(design.observer, outliers), design.plant
+        observer: Any = design.observer
+        wanted = outliers or ("gate" if observer.outliers == "none" else observer.outliers)
+        self.observer: RecursiveObserver | DAEObserver = observer
+        if wanted != observer.outliers:
+            self.observer = changed(observer, outliers=wanted)
+        plant = design.plant
         super().__init__(self.observer, None, warm_up, 0.0)
         self.input_names, self.output_names = plant.input_names, plant.output_names
         self.is_recursive, self.may_restart = isinstance(self.observer, RecursiveObserver), True
@@ -204,11 +209,3 @@ class SteppingEngine(Engine):
 
     def _resume_own(self, data: dict[str, Any]) -> None:
         self.state, self.u = state_from_data(self.state, data["observer"]), data["u"]
-
-
-def _with_gate(observer: Any, outliers: str | None) -> RecursiveObserver | DAEObserver:
-    """Return an observer for logs: with a gate, unless it or ``outliers`` says otherwise."""
-    wanted = outliers or ("gate" if observer.outliers == "none" else observer.outliers)
-    found: RecursiveObserver | DAEObserver
-    found = observer if wanted == observer.outliers else changed(observer, outliers=wanted)
-    return found

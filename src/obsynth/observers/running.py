@@ -97,23 +97,13 @@ class StepSettings(ABC):
         return self.timing.is_plain and self.state_bounds is None
 
 
-class Steps(Protocol[State, Row]):
-    """The steps of an observer: what follows from it alone, made once for all runs."""
-
-    first: State
-
-    def advance(self, state: State, y: FloatArray, u: FloatArray) -> tuple[State, Row]:
-        """Return the state after a sample, and what is known at it."""
-        ...
-
-
 class StepObserver(StepSettings, Generic[State, Known]):
     """An observer of states and parameters, which takes missing samples itself and states deviations."""
 
     @property
     @abstractmethod
-    def _steps(self) -> Steps[State, Known]:
-        """What follows from the observer alone."""
+    def _steps(self) -> Any:
+        """What follows from the observer alone, made once for all runs: a state `first`, and `advance`."""
 
     def _allow(self, state: State) -> None:
         """Raise where no sample can follow."""
