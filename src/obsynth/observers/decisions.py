@@ -213,8 +213,7 @@ def _nis(estimates: Estimates, squares: FloatArray, false_alarms: float) -> Deci
 def _cusum(
     estimates: Estimates, along: FloatArray, squares: FloatArray, change: FloatArray, false_alarms: float
 ) -> Decision:
-    """Decide by sums of log likelihood ratios: ``along (samples, nq)``: scores at the nominal parameters; ``squares
-    (samples, nq)``: their variances."""
+    """Decide by sums of log likelihood ratios, from scores at the nominal parameters and their variances."""
     samples, nq = along.shape
     signs = np.concatenate([change, -change])
     steps = np.hstack([along, along]) * signs - 0.5 * np.hstack([squares, squares]) * signs**2

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.errors import SpecError
-from obsynth.numerics.arguments import is_number, is_whole, real_array, real_number
+from obsynth.numerics.arguments import is_number, real_array, real_number
 from obsynth.numerics.arrays import FloatArray, as_matrix, unmasked
 from obsynth.plants.dae.checks import finite_vector
 from obsynth.plants.validation import index_of
@@ -29,11 +29,6 @@ def require_names(names: Any, field: str) -> None:
         raise SpecError(
             f"{field} of the observer repeats {', '.join(map(repr, repeated))}: names must be unique.", path=field
         )
-
-
-def is_delay(delay: Any) -> bool:
-    """Whether ``delay`` is a whole number of samples, 0 or more."""
-    return is_whole(delay) and delay >= 0
 
 
 def require_horizon(horizon: int | None, samples: int, *, early: bool) -> None:

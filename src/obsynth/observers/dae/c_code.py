@@ -234,8 +234,7 @@ class DAELibrary:
         return state
 
     def record(self, state: ctypes.Array[ctypes.c_char], y: FloatArray, u: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Go on over some samples; return memory and row of each that could be taken: ``y (samples, ny)``, ``u
-        (samples, nu)``."""
+        """Go on over some samples; return memory and row of each that could be taken."""
         graph = self.steps.graph
         after, said = np.zeros((len(y), graph.memory.size)), np.zeros((len(y), graph.row.size))
         taken = self._library.record(state, len(y), *map(_pointer, (_plain(u), _plain(y), after, said)))

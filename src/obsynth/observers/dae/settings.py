@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, Literal, Self, TypeAlias
@@ -186,9 +186,6 @@ class Layout:
         import casadi as ca
 
         return ca.vertcat(*(ca.vec(ca.densify(arrays[name])) for name in self.shapes))
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.shapes)
 
 
 #: Arrays that stay matrices when they have one column.

@@ -53,8 +53,7 @@ class Steps:
         return self.graph.memory.part(state.memory, name)
 
     def advance(self, state: DAEState, y: FloatArray, u: FloatArray) -> tuple[DAEState, DAERow]:
-        """Return the state after a sample and what is said at it: ``y (ny,)`` with NaN for what is missing, ``u
-        (nu,)``."""
+        """Return the state after a sample and what is said at it; NaN in ``y (ny,)`` is what is missing."""
         take = self.watched if self.settings.reset else self.plain
         if self.settings.outliers == "none":
             after, row = take(state, y, u)

@@ -78,8 +78,10 @@ def _products(matrices: FloatArray, rows: FloatArray) -> FloatArray:
 
 
 def stacked_steps(step: StepMatrices, before: FloatArray, y: FloatArray, u: FloatArray) -> StepStack | None:
-    """Return steps with H factorised and everything rotated, up to the first H whose rank has to be decided: ``before
-    (steps, nu)``, ``y (steps, measured)``, ``u (steps, nu)``."""
+    """Return steps with H factorised and everything rotated, up to the first H whose rank has to be decided.
+
+    Shapes: ``before (steps, nu)``, ``y (steps, measured)``, ``u (steps, nu)``.
+    """
     ne, rows, n = step.A.shape[1], step.H.shape[1], step.H.shape[2]
     if rows < n:
         return None

@@ -123,8 +123,7 @@ class Recursion:
         self.regular = parameters.triangle if adaptation.guard == "regularise" else None
 
     def advance(self, state: RecursiveState, y: FloatArray, u: FloatArray) -> tuple[RecursiveState, RawEstimate]:
-        """Return the state after a sample and what is known at it: ``y (ny,)`` with NaN for what is missing, ``u
-        (nu,)``."""
+        """Return the state after a sample and what is known at it; NaN in ``y (ny,)`` is what is missing."""
         if self.settings.outliers == "none":
             return self.plain(state, y, u)
         foreseen = self.foreseen if state.k and self._constraints is not None else None

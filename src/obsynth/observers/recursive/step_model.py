@@ -80,8 +80,7 @@ def stacked_noise(first: FloatArray, second: FloatArray) -> FloatArray:
 
 
 def require_in_range(S: FloatArray, factor: FloatArray, k: int, state_names: Sequence[str]) -> None:
-    """Raise `PreconditionError` when deviations outgrow double precision on the way to sample ``k``: ``factor (nx or
-    more, any)``."""
+    """Raise `PreconditionError` when deviations outgrow double precision on the way to sample ``k``."""
     if float(np.max(np.abs(S), initial=0.0)) < OUTGROWN:
         return
     sizes = np.max(np.abs(np.nan_to_num(factor[: len(state_names)])), axis=1, initial=0.0)
@@ -200,9 +199,11 @@ class EarlyConstraintSteps(StepModel):
 
 @dataclass
 class RandomWalkParameterSteps(StepModel):
-    """The steps of a model with its parameters among the states, as a random walk. The state at k + 1 is ``[x(k+1);
-    theta(k)]``: the parameters that acted in the step that led there. Their increment then is noise of an equation of
-    its own, and no noise is correlated in time."""
+    """The steps of a model with its parameters among the states, as a random walk.
+
+    The state at k + 1 is ``[x(k+1); theta(k)]``: the parameters that acted in the step that led there.  Their increment
+    then is noise of an equation of its own, and no noise is correlated in time.
+    """
 
     model: StepModel  # with parameters
     walk: FloatArray  # ``(nq, nq)``: square root of the covariance of one step of the walk
@@ -214,9 +215,11 @@ class RandomWalkParameterSteps(StepModel):
 
 @dataclass
 class WalkingEarlySteps(EarlyConstraintSteps):
-    """Both at once: early constraints, and parameters that walk. An early equation of k + 1 holds for the parameters of
-    k + 1, so the state at k + 1 is ``[x(k+1); theta(k+1)]``. The outputs still hold theta(k), which is theta(k + 1)
-    without its last increment: that noise they share."""
+    """Both at once: early constraints, and parameters that walk.
+
+    An early equation of k + 1 holds for the parameters of k + 1, so the state at k + 1 is ``[x(k+1); theta(k+1)]``.  The
+    outputs still hold theta(k), which is theta(k + 1) without its last increment: that noise they share.
+    """
 
     walk: FloatArray  # ``(nq, nq)``: square root of the covariance of one step of the walk
 
@@ -259,8 +262,7 @@ class PreparedStep:
     step: StepMatrices  # which step it is
     projection: Projection | None  # of H; ``None`` where its rank has to be decided
     moved: FloatArray  # ``(rows, n)``: rotated A, empty without a projection
-    # ``(any, rows)``: the transpose of the rotated noise, empty without a projection; its triangular factor ``(rows,
-    # rows)`` from so many rows on
+    # The transpose of the rotated noise ``(any, rows)``, empty without a projection; of many rows its triangle.
     known: FloatArray
 
     @classmethod
@@ -280,8 +282,7 @@ class PreparedStep:
         return cls(step, projection, moved, known if len(rotation) < MANY_ROWS else noise_triangle(known))
 
     def taken(self, factor: FloatArray, right: FloatArray | None) -> LeastSquaresStep | None:
-        """Take the step, or return ``None`` where a rank has to be decided: ``factor (n, any)``, ``right (rows,
-        columns)``, ``None`` for the identity."""
+        """Take the step, or return ``None`` where a rank has to be decided; ``right`` is the identity by default."""
         if self.projection is None:
             return None
         rotation = self.projection.rotation
