@@ -165,8 +165,8 @@ def batch_record(
     trials, samples = outputs.shape[:2]
     known = np.zeros((samples, 0)) if u is None and not nu else real_array(u, "u")
     if known.shape not in ((samples, nu), (trials, samples, nu)):
-        raise SpecError(f"u has shape {known.shape}, but (samples, {nu}) or (trials, samples, {nu}) is needed, with "
-                        f"{trials} trials and {samples} samples.", path="u")  # fmt: skip
+        raise SpecError(f"u has shape {known.shape}, but {(samples, nu)} or {(trials, samples, nu)} is needed.",
+                        path="u")  # fmt: skip
     if not np.isfinite(known).all():
         *trial, k, i = np.argwhere(~np.isfinite(known))[0]
         where = f" of trial {trial[0]}" if trial else ""

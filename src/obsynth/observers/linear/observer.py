@@ -84,11 +84,8 @@ class LinearObserver:
         if not (math.isfinite(self.dt) and self.dt >= 0.0):
             raise SpecError(f"dt of the observer is {self.dt}: give seconds, or 0 for continuous time.", path="dt")
         for names, delays in ((self.state_names, self.state_delays), (self.fault_names, self.fault_delays)):
-            if (
-                not isinstance(delays, tuple)
-                or len(names) != len(delays)
-                or not all(is_whole(delay) and delay >= 0 for delay in delays)
-            ):
+            whole = isinstance(delays, tuple) and all(is_whole(delay) and delay >= 0 for delay in delays)
+            if not whole or len(names) != len(delays):
                 raise SpecError("The observer needs one delay >= 0, in samples, for each signal.", path="delays")
 
     @property

@@ -217,8 +217,8 @@ class RandomWalkParameterSteps(StepModel):
 class WalkingEarlySteps(EarlyConstraintSteps):
     """Both at once: early constraints, and parameters that walk.
 
-    An early equation of k + 1 holds for the parameters of k + 1, so the state at k + 1 is ``[x(k+1); theta(k+1)]``.  The
-    outputs still hold theta(k), which is theta(k + 1) without its last increment: that noise they share.
+    An early equation of k + 1 holds for the parameters of k + 1, so the state at k + 1 is ``[x(k+1); theta(k+1)]``.
+    The outputs still hold theta(k), which is theta(k + 1) without its last increment: that noise they share.
     """
 
     walk: FloatArray  # ``(nq, nq)``: square root of the covariance of one step of the walk
