@@ -12,10 +12,10 @@ from obsynth.analysis.transformations.elimination import eliminate_algebraic_sta
 from obsynth.analysis.transformations.linearisation import linearise as linearise
 from obsynth.analysis.transformations.sampling import discretise as discretise
 from obsynth.calibration.calibrating import calibrate as calibrate
+from obsynth.calibration.diagnostics import Validation as Validation
 from obsynth.calibration.result import CalibratedBox as CalibratedBox
 from obsynth.calibration.result import Calibration as Calibration
 from obsynth.calibration.validating import validate as validate
-from obsynth.calibration.validation import Validation as Validation
 from obsynth.calibration.validity import Validity as Validity
 from obsynth.calibration.validity import validity as validity
 from obsynth.comparison.comparing import compare as compare
@@ -88,8 +88,8 @@ from obsynth.observers.dae.observer import DAEObserver as DAEObserver
 from obsynth.observers.decisions import ParameterMonitor as ParameterMonitor
 from obsynth.observers.decisions import decide as decide
 from obsynth.observers.estimates import Estimates as Estimates
+from obsynth.observers.linear.derived import sample_observer as sample_observer
 from obsynth.observers.linear.observer import LinearObserver as LinearObserver
-from obsynth.observers.linear.sampling import sample_observer as sample_observer
 from obsynth.observers.recursive.observer import RecursiveObserver as RecursiveObserver
 from obsynth.observers.recursive.settings import Adaptation as Adaptation
 from obsynth.observers.running import RunningObserver as RunningObserver
