@@ -12,10 +12,10 @@ from obsynth.analysis.transformations.elimination import eliminate_algebraic_sta
 from obsynth.analysis.transformations.linearisation import linearise as linearise
 from obsynth.analysis.transformations.sampling import discretise as discretise
 from obsynth.calibration.calibrating import calibrate as calibrate
+from obsynth.calibration.diagnostics import Validation as Validation
 from obsynth.calibration.result import CalibratedBox as CalibratedBox
 from obsynth.calibration.result import Calibration as Calibration
 from obsynth.calibration.validating import validate as validate
-from obsynth.calibration.validation import Validation as Validation
 from obsynth.calibration.validity import Validity as Validity
 from obsynth.calibration.validity import validity as validity
 from obsynth.comparison.comparing import compare as compare
@@ -88,8 +88,8 @@ from obsynth.observers.dae.observer import DAEObserver as DAEObserver
 from obsynth.observers.decisions import ParameterMonitor as ParameterMonitor
 from obsynth.observers.decisions import decide as decide
 from obsynth.observers.estimates import Estimates as Estimates
+from obsynth.observers.linear.derived import sample_observer as sample_observer
 from obsynth.observers.linear.observer import LinearObserver as LinearObserver
-from obsynth.observers.linear.sampling import sample_observer as sample_observer
 from obsynth.observers.recursive.observer import RecursiveObserver as RecursiveObserver
 from obsynth.observers.recursive.settings import Adaptation as Adaptation
 from obsynth.observers.running import RunningObserver as RunningObserver
@@ -104,11 +104,11 @@ from obsynth.plants.uncertain_system import uncertain_system as uncertain_system
 from obsynth.plants.uncertainty import Uncertainty as Uncertainty
 from obsynth.report.page import html_report as html_report
 from obsynth.results.checks import Check as Check
+from obsynth.results.checks import VerificationReport as VerificationReport
 from obsynth.results.delta_scan import DeltaScan as DeltaScan
 from obsynth.results.design import Certificate as Certificate
 from obsynth.results.design import ObserverDesign as ObserverDesign
 from obsynth.results.gain_sets import load as load
-from obsynth.results.report import VerificationReport as VerificationReport
 from obsynth.simulation.dae import simulate_dae as simulate_dae
 from obsynth.simulation.failures import Gaussian as Gaussian
 from obsynth.simulation.failures import LostEffectiveness as LostEffectiveness

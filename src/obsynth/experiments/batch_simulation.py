@@ -13,8 +13,8 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.holds import driven, first_order_hold
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.estimates import Estimates
+from obsynth.observers.linear.derived import sample_observer
 from obsynth.observers.linear.observer import LinearObserver, split_rows
-from obsynth.observers.linear.sampling import sample_observer
 from obsynth.observers.recursive.observer import RecursiveObserver
 from obsynth.plants.validation import index_of
 from obsynth.results.design import ObserverDesign

@@ -16,7 +16,7 @@ from rich.text import Text
 from obsynth.analysis.structure import questions
 from obsynth.files.tables import html_table
 from obsynth.methods.registry import REGISTRY, method_spec
-from obsynth.observers.linear.warm_up import FORGOTTEN, transient
+from obsynth.observers.linear.derived import FORGOTTEN, transient
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem

@@ -23,8 +23,8 @@ from obsynth.errors import PreconditionError
 from obsynth.experiments.monitors.adaptive_bound import Start
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.holds import first_order_hold
+from obsynth.observers.linear.derived import sample_observer
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.observers.linear.sampling import sample_observer
 from obsynth.plants.constants import ConstantsBox
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.uncertainty import ELIMINATED, Uncertainty
