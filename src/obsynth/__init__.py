@@ -97,11 +97,10 @@ _NAMES = {
     "plants.uncertain_system": "uncertain_system",
     "plants.uncertainty": "Uncertainty",
     "report.page": "html_report",
-    "results.checks": "Check",
+    "results.checks": "Check VerificationReport",
     "results.delta_scan": "DeltaScan",
     "results.design": "Certificate ObserverDesign",
     "results.gain_sets": "load",
-    "results.report": "VerificationReport",
     "simulation.dae": "simulate_dae",
     "simulation.failures": "Gaussian LostEffectiveness Stuck Uniform",
     "simulation.profiles": "Drift Intermittent Ramp Sine Step",
@@ -125,6 +124,7 @@ _PACKAGES = ("plotting",)
 __all__ = sorted(_HOMES)
 
 provide({
+    "checks as text": "obsynth.results.layout:report_text",
     "design summary": "obsynth.report.summary:summary",
     "designs with model error": "obsynth.experiments.tolerant_designs:with_model_error",
 })  # fmt: skip
