@@ -17,7 +17,7 @@ algebraic equations; `restricted_equivalent` uses a T that is nonsingular by con
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -31,7 +31,7 @@ from obsynth.methods.fault_estimation_filter.detectability_indexes import (
 )
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import RANK_TOLERANCE, decide_rank
-from obsynth.numerics.scaling import Scaling, balance_system
+from obsynth.numerics.scaling import Scaling, balance_system, power_of_two_below
 from obsynth.plants.descriptor import DescriptorSystem
 
 
@@ -126,11 +126,19 @@ def _scaling(work: DescriptorSystem) -> Scaling:
         return balanced
     units = PlantUnits.of(work).rounded()
     natural = Scaling(units.equations, units.states, units.outputs)
-    return min(natural, balanced, key=lambda scaling: _condition(work, scaling))
+    # Where A is far larger than E, an equation is scaled by E: T would lose it beside an output of the same state.
+    sizes = np.linalg.norm(balanced.scale_dynamics(work.E), axis=1)
+    evened = replace(balanced, equations=balanced.equations / power_of_two_below(np.where(sizes > 0.0, sizes, 1.0)))
+    return min(natural, balanced, evened, key=lambda scaling: _condition(work, scaling))
 
 
 def _condition(work: DescriptorSystem, scaling: Scaling) -> float:
-    return float(np.linalg.cond(np.vstack([scaling.scale_dynamics(work.E), scaling.scale_output(work.C)])))
+    """Return how far ``[E; C]`` is from orthogonal columns, and the rows of E are from one size: T keeps both."""
+    e = scaling.scale_dynamics(work.E)
+    sizes = np.linalg.norm(e, axis=1)
+    sizes = sizes[sizes > 0.0]
+    uneven = float(np.max(sizes) / np.min(sizes)) if sizes.size else 1.0
+    return uneven * float(np.linalg.cond(np.vstack([e, scaling.scale_output(work.C)])))
 
 
 def prepare(plant: DescriptorSystem, s: FloatArray | None = None) -> PreparedPlant:
