@@ -32,8 +32,7 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.observers.linear.sampling import sample_observer
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
-from obsynth.simulation.failures import Random, Uniform
-from obsynth.simulation.profiles import Additive, sampled
+from obsynth.simulation.profiles import Additive, Random
 from obsynth.simulation.scenario import Scenario
 from obsynth.simulation.scenario_signals import resolve
 from obsynth.verification.error_system import ErrorSystem
@@ -270,21 +269,15 @@ def residual_model(
 def _disturbances(
     scenario: Scenario, names: tuple[str, ...], steps: int, dt: float
 ) -> tuple[FloatArray, FloatArray, FloatArray, tuple[bool, ...]]:
-    bounds, means, variances = np.zeros(len(names)), np.zeros(len(names)), np.zeros(len(names))
-    steady = []
+    totals, steady = np.zeros((3, len(names))), []
     for i, name in enumerate(names):
         fixed, calm = np.zeros(steps), True
         for profile in scenario.disturbances.get(name, ()):  # type: ignore[union-attr]
             if isinstance(profile, Random):
                 calm &= bool(profile.active(steps, dt).all())
-                means[i] += (profile.low + profile.high) / 2 if isinstance(profile, Uniform) else profile.mean
-                bounds[i] += max(abs(profile.low), abs(profile.high)) if isinstance(profile, Uniform) else np.inf
-                spread = (
-                    (profile.high - profile.low) ** 2 / 12 if isinstance(profile, Uniform) else profile.deviation**2
-                )
-                variances[i] += spread
+                totals[:, i] += profile.moments()
             else:
-                fixed, calm = fixed + sampled(cast(Additive, profile), steps, dt)[0], False
-        bounds[i] += np.max(np.abs(fixed))
+                fixed, calm = fixed + cast(Additive, profile).sampled(steps, dt)[0], False
+        totals[0, i] += np.max(np.abs(fixed))
         steady.append(calm)
-    return bounds, means, np.sqrt(variances), tuple(steady)
+    return totals[0], totals[1], np.sqrt(totals[2]), tuple(steady)
