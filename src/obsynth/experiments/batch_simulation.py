@@ -30,12 +30,10 @@ CONSISTENCY_TOLERANCE = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Runs:
-    """What happened in several runs, ``(steps, runs, signals)`` each.
+    """What happened in several runs, ``(steps, runs, signals)`` each; rows: the observer's states, faults, residuals.
 
-    Fields: states, outputs, inputs, faults, disturbances: Of the plant; outputs as measured (those of a time-varying
-    plant begin with y(1)); faults are the parameters of a plant that has some; rows: What the observer says: state
-    estimates, fault estimates, residuals; observer: Which; kept: The estimates of each run, of an observer that says
-    more than the rows.
+    Outputs are as measured; faults are the parameters of a plant that has some; ``kept``: estimates that say more than
+    rows.
     """
 
     states: FloatArray
@@ -59,9 +57,7 @@ class Runs:
 class Bench(ABC):
     """A design and a scenario, ready to run; it can be sent to another process, with a model that is data.
 
-    Fields: drive: Signals; observer: In discrete time; initial_state: ``(nx,)``, as asked for; fault_signals: Where the
-    faults are among the signals; estimated: Which of the true faults are estimated; notes: What a reader of a
-    simulation must know.
+    The observer is in discrete time; ``estimated``: which of the true faults are estimated; ``notes`` for readers.
     """
 
     drive: Drive
@@ -81,10 +77,7 @@ class Bench(ABC):
         return self.drive.first_fault(self.fault_signals)
 
     def warm_ups(self) -> tuple[int | None, int | None]:
-        """Return the samples at which the start no longer shows in the estimates of states, and of faults.
-
-        They are zero for observers that state deviations, which say from the start what is known.
-        """
+        """Return from when the start no longer shows in the estimates of states, and of faults; 0 with deviations."""
         observer, steps = self.observer, self.drive.steps
         if not isinstance(observer, LinearObserver):
             return 0, 0
@@ -106,11 +99,7 @@ class Bench(ABC):
 
 @dataclass(frozen=True, eq=False)
 class LinearBench(Bench):
-    """A linear design and a scenario.
-
-    Fields: stepper: Plant; observer_start: ``z(0)``; observer_ramp: ``(nz, nu + ny)``: what a first sample adds to the
-    state that a sampled observer keeps; sizes: ``nu, nf, nd``.
-    """
+    """A linear design and a scenario; ``observer_ramp (nz, nu + ny)``: what a first sample adds to the kept state."""
 
     observer: LinearObserver
     stepper: Stepper
@@ -132,10 +121,7 @@ class LinearBench(Bench):
         return Runs(states, outputs, inputs, faults, disturbances, rows, self.observer)
 
     def observed(self, outputs: FloatArray, inputs: FloatArray) -> FloatArray:
-        """Return what the observer says to records, ``(steps, runs, nx + nf + nr)``.
-
-        Shapes: ``outputs (steps, runs, ny)``, ``inputs (steps, runs, nu)``.
-        """
+        """Return what the observer says to ``outputs (steps, runs, ny)``, ``inputs (steps, runs, nu)``: its rows."""
         system = self.observer
         start = self.observer_start - np.concatenate([inputs[0], outputs[0]], axis=1) @ self.observer_ramp.T
         z = driven(system.Az, start, inputs @ system.Bu.T + outputs @ system.By.T)

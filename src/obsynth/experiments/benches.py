@@ -25,11 +25,7 @@ from obsynth.simulation.time_varying import varying_runs
 
 @dataclass(frozen=True, eq=False)
 class ParameterBench(Bench):
-    """A recursive or nonlinear design and a scenario.
-
-    Fields: drive: Signals, as they differ from their nominal values; inputs, parameters: ``(steps, nu)`` and ``(steps,
-    nq)``: the true signals.
-    """
+    """A recursive or nonlinear design and a scenario; true ``inputs (steps, nu)`` and ``parameters (steps, nq)``."""
 
     observer: RecursiveObserver | DAEObserver
     inputs: FloatArray
@@ -60,10 +56,7 @@ class ParameterBench(Bench):
         return self._runs(states, outputs, self._watched(observer, outputs))
 
     def _watched(self, observer: RecursiveObserver, outputs: FloatArray) -> tuple[Estimates, ...]:
-        """Return the estimates of every run; gains and covariances are those of the first, unless the observer resets.
-
-        They depend on no data: the other runs are one matrix product a step for all of them.
-        """
+        """Return the estimates of every run; gains and covariances depend on no data, unless the observer resets."""
         runs = outputs.shape[1]
         resets = observer.adaptation is not None and bool(observer.adaptation.reset)
         if runs == 1 or resets or not observer.is_plain:

@@ -17,10 +17,7 @@ SIGNALS = FileKind("a table of simulated signals", rb"\Atime,(?!status,)[^\n]*x(
 
 
 def named_columns(time: FloatArray, groups: Iterable[tuple[str, Sequence[str], FloatArray]]) -> dict[str, FloatArray]:
-    """Return every column by name; inputs and outputs go by their own names, unless those are taken.
-
-    Shapes: ``time (steps,)``.
-    """
+    """Return every column by name; inputs and outputs go by their own names, unless those are taken."""
     found = {"time": time}
     for form, names, values in groups:
         for i, name in enumerate(names):
@@ -30,10 +27,7 @@ def named_columns(time: FloatArray, groups: Iterable[tuple[str, Sequence[str], F
 
 
 def write_columns(table: Mapping[str, FloatArray], path: str | Path) -> Path:
-    """Write columns as comma-separated text, atomically, floats with all their digits; NaN is an empty cell.
-
-    Shapes: ``table (steps,)``.
-    """
+    """Write columns as comma-separated text, atomically, floats with all their digits; NaN is an empty cell."""
     text = io.StringIO()
     TableWriter(text, table).write(zip(*(column.tolist() for column in table.values()), strict=True))
     return write_atomically(path, text.getvalue())

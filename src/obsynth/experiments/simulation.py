@@ -245,10 +245,7 @@ def _simulated(design: ObserverDesign, scenario: Scenario) -> Simulation:
 
 
 def aligned_errors(estimates: FloatArray, truth: FloatArray, delays: tuple[int, ...]) -> FloatArray:
-    """Return estimate(k) less truth(k - delay); NaN where there is no truth yet.
-
-    Shapes: ``estimates (steps, ..., n)``, ``truth (steps, ..., n)``.
-    """
+    """Return ``estimates(k) - truth(k - delay)``, ``(steps, ..., n)``; NaN where there is no truth yet."""
     errors = np.full(estimates.shape, np.nan)
     for i, delay in enumerate(delays):
         errors[delay:, ..., i] = estimates[delay:, ..., i] - truth[: len(truth) - delay, ..., i]

@@ -1,9 +1,7 @@
 """Designs that know their tolerances: what a model's error does counts as noise, where thresholds get smaller by it.
 
-The directions that are to blame for the loop through the tolerances, rows of the plant and constants, are tried as
-noise of several weights, and as unknown inputs where those can be told from the faults.  What is shipped has the
-smallest mean threshold over a scenario without its faults; the plant of the design, and all that is claimed of it, stay
-the same.
+Directions to blame, rows of the plant and constants, are tried as noise, and as unknown inputs where the faults can be
+told from them; the smallest mean threshold over a scenario without its faults is shipped, for the plant itself.
 """
 
 from __future__ import annotations

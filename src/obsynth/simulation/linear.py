@@ -1,13 +1,8 @@
-"""Simulation of discrete linear descriptor systems of index 0 or 1.
-
-The algebraic equations are solved once, by `obsynth.eliminate_algebraic_states`; what is left is an ordinary
-recursion, and all states come back through the recovery of that elimination.
-
-Plants of index 0 or 1, many runs at once, and exact between samples.
+"""Simulation of linear descriptor systems of index 0 or 1: many runs at once, and exact between samples.
 
 The algebraic equations are solved first; what is left steps by a recursion (discrete plants) or by the matrix
-exponential over a sampling interval (continuous ones), which is exact for signals that are constant or linear between
-samples.  All arrays of runs are ``(steps, runs, signals)``.
+exponential (continuous ones), exact for signals that are constant or linear between samples.  Arrays of runs are
+``(steps, runs, signals)``.
 """
 
 from __future__ import annotations
@@ -38,10 +33,7 @@ def simulate_plant(
     w: ArrayLike | None = None,
     initial_state: ArrayLike | None = None,
 ) -> Trajectory:
-    """Simulate a discrete plant; every row satisfies its equations up to rounding.
-
-    Shapes: ``initial_state (nx,)``.
-    """
+    """Simulate a discrete plant from ``initial_state (nx,)``; every row satisfies its equations up to rounding."""
     if not plant.is_discrete:
         raise SpecError(
             "The plant is continuous: sample it first, with obsynth.discretise or transform: {sample_time: ...}.",
@@ -124,11 +116,10 @@ def _require_finite(states: FloatArray, advice: str, path: str) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Stepper:
-    """A plant as what steps from sample to sample; plain arrays, so that it can go to another process.
+    """A plant from sample to sample: ``x+ = transition x + held s + ramped (s_right - s_left) + noisy w``, s = [u; f; d].
 
-    Fields: transition, held, ramped, noisy: ``x+ = transition x + held s + ramped (s_right - s_left) + noisy w``, with
-    s = [u; f; d] and x the dynamic states; state_of, output_of: Plant states and outputs from x, s and w; start:
-    Dynamic states at the start; feedback: ``(nu, n)``: ``u = s_u - feedback x``, already inside the other matrices.
+    x are the dynamic states; ``state_of, output_of``: plant states and outputs from x, s and w; ``feedback (nu, n)``:
+    ``u = s_u - feedback x``, already inside the other matrices.
     """
 
     transition: FloatArray
@@ -143,11 +134,7 @@ class Stepper:
     def run(
         self, signals: FloatArray, differences: FloatArray, noise: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return states, outputs (free of sensor faults) and inputs' feedback part of all runs.
-
-        Shapes: ``signals (steps, runs, nu + nf + nd)``, ``differences (steps, runs, nu + nf + nd)``, ``noise (steps,
-        runs, nw)``.
-        """
+        """Return states, outputs (free of sensor faults) and inputs' feedback part of all runs."""
         drive = signals @ self.held.T + differences @ self.ramped.T + noise @ self.noisy.T
         x = driven(self.transition, self.start, drive)
         _require_finite(x, "shorten the horizon, or set stabilise", "horizon")
@@ -160,10 +147,7 @@ class Stepper:
 
 
 def make_stepper(plant: DescriptorSystem, drive: Drive, *, initial_state: FloatArray, stabilise: bool) -> Stepper:
-    """Return the stepper of ``plant`` for the sampling of ``drive``.
-
-    Shapes: ``initial_state (nx,)``.
-    """
+    """Return the stepper of ``plant`` for the sampling of ``drive``, from ``initial_state (nx,)``."""
     elimination = eliminate_algebraic_states(plant)
     reduced, recovery = elimination.plant, elimination.recovery
     start = dynamic_part(plant, recovery, initial_state)

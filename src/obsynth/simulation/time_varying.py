@@ -81,8 +81,7 @@ def varying_runs(
 ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
     """Simulate many runs at once, which differ in their noise: one factorisation a step serves all of them.
 
-    Shapes: ``parameters (samples, nq)``, ``inputs (samples, nu)``, ``initial_state (nx,)``, ``equation_noise (samples,
-    runs, ne)``, ``output_noise (samples - 1, runs, ny)``.
+    ``equation_noise (samples, runs, ne)``, ``output_noise (samples - 1, runs, ny)``; the rest as one run has it.
     """
     if plant.ne != plant.nx:
         raise SpecError(f"{plant.ne} equations do not determine {plant.nx} states.", path="E")

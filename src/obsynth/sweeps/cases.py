@@ -29,11 +29,9 @@ MOST_CASES = 100_000
 
 @dataclass(frozen=True, eq=False)
 class SweepCase:
-    """One design to be made.
+    """One design to be made: a spec and the changes to the plant in its file, or a plant, method and options in memory.
 
-    Fields: name: For tables; parameters: What was put in place, by name; key: digest of all that the design depends on;
-    source, document, plant_changes: a spec and the changes to the plant in its file; plant, method, options: or a plant
-    in memory.
+    ``key``: digest of all that the design depends on; ``parameters``: what was put in place, by name.
     """
 
     name: str

@@ -58,10 +58,7 @@ def carried_out(
     known: Callable[[_Item], _Result | None], kept: Callable[[_Item, _Outcome], _Result],
     told: Callable[[int, int], object] | None, at_start: bool = False,
 ) -> tuple[_Result, ...]:  # fmt: skip
-    """Return the result of every item, in their order; ``known`` ones are not worked on, others ``kept`` as they come.
-
-    ``told`` hears how many are done of all: after each, and, if asked for, before the first.
-    """
+    """Return the result of every item, in their order; ``known`` ones are not worked on, others ``kept`` as they come."""
     found = {i: result for i, item in enumerate(items) if (result := known(item)) is not None}
     waiting = [i for i in range(len(items)) if i not in found]
     if told is not None and at_start:

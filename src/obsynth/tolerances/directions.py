@@ -18,11 +18,7 @@ from obsynth.tolerances.exact_plant import is_sampled
 
 @dataclass(frozen=True)
 class Told:
-    """What the test says of one constant.
-
-    ``shares``: it acts where a fault acts, so that no observer can ever tell them apart; ``separable``: an observer
-    exists that no course of the constant's effect disturbs; ``reason`` otherwise.
-    """
+    """Whether a constant acts where a fault does (``shares``), or an observer exists that its effect does not disturb."""
 
     shares: bool
     separable: bool
@@ -32,8 +28,7 @@ class Told:
 def told_from_faults(plant: DescriptorSystem) -> dict[str, Told]:
     """Return the verdict for each constant with a tolerance, from the plant as written; empty without faults.
 
-    Exact decoupling exists where the pencil from the faults and the constant's directions to the outputs has full
-    normal rank and stable zeros.
+    Decoupling exists where the pencil from faults and directions to outputs has full normal rank and stable zeros.
     """
     uncertain = plant.uncertainty
     if uncertain is None or not plant.nf:

@@ -1,12 +1,11 @@
-r"""How an uncertain plant drives the error of a fixed observer: robust.md, sections 1, 2 and 8.
+"""How an uncertain plant drives the error of a fixed observer: robust.md, sections 1, 2 and 8.
 
-With ``eps = z - T E(q) x`` and the plant ``E x+ = A x + B u + Bd d``, ``y = C x + D u + Dd d``,
+With ``eps = z - T E(q) x`` and the plant ``E x+ = A x + B u + Bd d``, ``y = C x + D u + Dd d``, on every trajectory
 
     eps+ = Az eps + (Az T E + By C - T A) x + (Bu + By D - T B) u + (By Dd - T Bd) d
     xhat - x = Cx eps + (Cx T E + Dyx C + T0x A - I) x + ...      (fault estimates, residuals: without I)
 
-on every trajectory.  At the nominal plant the brackets vanish; over the box they are affine with remainders, and are
-driven by ``x = xhat - e``: by a signal that is known, and by the error itself through the channels collected here.
+The brackets vanish at the nominal plant; over the box ``x = xhat - e`` drives them: what is known, and the error.
 """
 
 from __future__ import annotations
@@ -33,10 +32,10 @@ ROUNDING_SHARE = 1e-9
 class ErrorStructure:
     """The error system over a box, in rows ``[eps; e; outputs]`` (nz, n, no) and columns of the state and the inputs.
 
-    ``state, inputs``: what multiplies x and u; ``disturbances``: what multiplies d, each within its bound.  What is
-    uncertain acts through channels, ``|c e|`` of a row c: those of constants first (``owner`` says whose), then one for
-    each state with a remainder; rows after the first ``single`` share one channel, the largest of them.  ``effects
-    (nz + n + no, m)`` is what a channel does.  ``reading`` takes xhat (and fhat) from the rows of the observer.
+    What is uncertain acts through channels, ``|c e|`` of a row c: those of constants first (``owner`` says whose), then
+    one for each state with a remainder; rows after the first ``single`` share one channel, the largest of them.
+    ``effects (nz + n + no, m)`` is what a channel does.  ``reading`` takes xhat (and fhat) from the rows of the
+    observer.
     """
 
     Az: FloatArray
@@ -86,16 +85,13 @@ def error_structure(
     observer: LinearObserver, affine: AffinePlant, tracking: Tracking, bounds: FloatArray, noise_bound: float, *,
     faults: bool = False, states: bool = False, reading: FloatArray | None = None, varying: bool = False,
 ) -> ErrorStructure:  # fmt: skip
-    """Return the error system of an observer over a box.
+    """Return the error system of an observer over a box; ``bounds (nd,)``, ``noise_bound`` in standard deviations.
 
-    With ``reading (n, states of the observer)`` the observer is that of a continuous design on samples: its identities
-    need not hold there, and what they miss counts as one more constant, the last one, whose value is known.
-
-    ``bounds (nd,)`` of the disturbances; ``noise_bound`` in standard deviations.  With ``faults``, faults are unknown
-    signals that are estimated like states, and the outputs are the errors of their estimates; else there is no fault,
-    and the outputs are fault estimates and residuals, or (``states``) the errors of the state estimates.  What a fault
-    that is estimated one sample late did in a plant whose constants are ``varying``, it did with those of that sample:
-    they count as further constants, after all others.
+    With ``faults`` these are unknown signals that are estimated like states, and outputs are the errors of their
+    estimates; else there is no fault, and outputs are fault estimates and residuals, or (``states``) errors of the
+    state estimates. ``reading (n, states of the observer)``: that of a continuous design on samples; what its
+    identities miss counts as one more constant, the last, of known value.  What a fault that is estimated late did in a
+    plant whose constants are ``varying``, it did with those of that sample: they count as further constants.
     """
     plant, count = affine.plant, affine.count
     t, t0 = tracking
@@ -176,10 +172,7 @@ def require_identities(state: AffineMatrix, known: AffineMatrix, sizes: FloatArr
 
 
 def _missed(matrix: AffineMatrix, offsets: FloatArray) -> FloatArray:
-    """Return what a matrix that should vanish at the nominal plant is there, at least.
-
-    Its affine part does not vanish there in a box whose middle is elsewhere: the remainder makes up for that.
-    """
+    """Return what a matrix that should vanish at the nominal plant is there, at least: its remainder may make up for it."""
     return np.maximum(np.abs(matrix.at(offsets)) - matrix.radius, 0.0) if offsets.any() else np.abs(matrix.center)
 
 
@@ -188,8 +181,7 @@ def _fault_columns(
 ) -> AffineMatrix:
     """Return the columns of faults as signals that are estimated, each at its delay: robust.md, correction 8.1.
 
-    A fault that is estimated one sample late counts as a state of the sample after it: what it does to eps by then is
-    taken out of eps.
+    What a fault that is estimated one sample late does to eps by then is taken out of eps.
     """
     nz, nf = observer.order, direct.shape[1]
     target = np.zeros((nz + len(c), nf))

@@ -16,10 +16,7 @@ from obsynth.plants.uncertainty import SAMPLED, UNCERTAIN_MATRICES, Uncertainty,
 
 
 def plant_at(plant: DescriptorSystem, values: Mapping[str, float]) -> DescriptorSystem:
-    """Return the plant for values of its constants: no family of matrices, but the one with these numbers.
-
-    Noise is that of the plant itself.
-    """
+    """Return the plant for values of its constants: no family of matrices, and with the noise of the plant itself."""
     uncertain = plant.uncertainty
     if uncertain is None:
         return plant

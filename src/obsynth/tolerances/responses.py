@@ -1,7 +1,4 @@
-"""Responses of an observer's error to its channels: finite sums with a proved tail, and the loop that they close.
-
-The loop that an error closes through the tolerances: largest common tolerance, and whom to blame.
-"""
+"""Responses of an observer's error to its channels: finite sums with a proved tail, and the loop that they close."""
 
 from __future__ import annotations
 
@@ -26,9 +23,8 @@ OUTWARD = 1.0 + 1e-12
 
 @dataclass(frozen=True, eq=False)
 class Responses:
-    """What channels do, sample by sample.
+    """What channels do: ``kernels (L, m, m + no + nz)`` to channels, outputs and eps, j + 1 samples later.
 
-    ``kernels (L, m, m + no + nz)``: what channel i adds to the channels, the outputs and eps, j + 1 samples later;
     ``same (m, m)`` and ``direct (no, m)``: at the same sample.  ``powers (L + 1, nz, nz)`` of Az.  What is older than L
     samples goes on through bounds of eps: ``tail_channels, tail_outputs, tail_eps``.
     """
@@ -74,7 +70,7 @@ class Responses:
 
 
 def power_rounding(left: FloatArray, powers: FloatArray) -> FloatArray:
-    """Return a bound of what rounding of the computed powers changes in ``left Az^j``, the same for all j.
+    """Return a bound of what rounding of the computed powers changes in ``left Az^j``, for all j.
 
     With ``P(j+1) = Az P(j) + F(j)`` as computed, ``Az^j - P(j)`` is the sum of ``Az^(j-1-i) F(i)``.
     """
@@ -212,10 +208,7 @@ def blame(responses: Responses) -> FloatArray:
 
 
 def blamed_rows(responses: Responses, tracking: FloatArray, parts: tuple[FloatArray, ...]) -> FloatArray:
-    """Return the share of each row of the plant ``(nx,)`` in the loop, by what the constants put into it.
-
-    ``parts``: affine parts ``(p, nx, n)`` of E and A.
-    """
+    """Return the share of each row of the plant ``(nx,)`` in the loop; ``parts (p, nx, n)`` of E and A."""
     structure = responses.structure
     left, right = _perron(responses.loop)
     own = len(structure.owner)

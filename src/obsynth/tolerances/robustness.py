@@ -204,10 +204,7 @@ def _values(box: ConstantsBox, found: BoxVerdict) -> dict[str, float]:
 
 
 def _stability(plant: DescriptorSystem, affine: AffinePlant) -> tuple[BoxVerdict, tuple[complex, ...]]:
-    """Return whether the plant is stable on the box, but for modes that no constant touches, and these.
-
-    For E that must be inverted, after that.
-    """
+    """Return whether the plant is stable on the box, but for modes that no constant touches, and these."""
     box, uncertain = affine.box, plant.uncertainty
     sampled = uncertain is not None and is_sampled(uncertain.steps)
     discrete = plant.is_discrete and not sampled

@@ -1,6 +1,6 @@
 """Statements about every matrix in a box, by cutting the box until each part is proved, or one point refutes it.
 
-Whether a plant is regular and of index 1 (or 0) at every point of its box: robust.md, 1 and correction 8.5.
+Whether a plant is stable, and of index 1 (or 0), at every point of its box: robust.md, 1 and correction 8.5.
 """
 
 from __future__ import annotations
@@ -49,8 +49,7 @@ def subdivided(
 ) -> BoxVerdict:  # fmt: skip
     """Cut the box along the constant that matters most.
 
-    ``build`` gives the matrix over a part of the box, made anew, so that its remainder shrinks with the part;
-    ``exact_at`` the true matrix at a point.
+    ``build``: the matrix over a part, made anew so that its remainder shrinks; ``exact_at``: the true one at a point.
     """
     if count <= MOST_VERTEX_CONSTANTS:
         for corner in itertools.product((-1.0, 1.0), repeat=count):

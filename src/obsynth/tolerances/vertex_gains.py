@@ -50,10 +50,7 @@ def vertex_gains(
 def _peak_gain(
     observer: LinearObserver, plant: DescriptorSystem, followed: FloatArray, basis: FloatArray
 ) -> FloatArray:
-    """Return the peak gain of plant and error in series, infinite where the series is unstable.
-
-    Directions of the state that reach neither error nor outputs are left out, whether or not they are stable.
-    """
+    """Return the peak gain of plant and error in series, without states that reach neither error nor outputs."""
     shown = slice(observer.fault_rows.start, len(observer.Cz))
     try:
         smooth = eliminate_algebraic_states(plant).plant

@@ -36,10 +36,7 @@ def adaptive_plan(
     design: ObserverDesign, bounds: FloatArray, noise_bound: float, *, initial_error: float | None,
     initial_set: Mapping[str, Any] | None, observer_state: FloatArray | None = None, sample_time: float | None = None,
 ) -> tuple[AdaptivePlan, AdaptivePlan]:  # fmt: skip
-    """Return the plan from the first start on, and the one after a later start; the design's plant has the tolerances.
-
-    Raises `PreconditionError` where there is no bound, with the reason.
-    """
+    """Return the plans from the first start on and after a later one, over the plant's box, if there is a bound."""
     plant, observer = design.linear
     require_regular(plant)
     if not plant.is_discrete:
@@ -139,10 +136,7 @@ def start_of(
 
 
 def initial_box(plant: DescriptorSystem, given: Mapping[str, Any]) -> tuple[FloatArray, FloatArray]:
-    """Return middle and half width of the box of the plant's state at the start, ``(nx,)`` each; deviations.
-
-    States that E does not see need no entry: an algebraic state follows from the others.
-    """
+    """Return middle and half width ``(nx,)`` of the plant's start; states that E does not see need no entry."""
     require_mapping(given, "initial_set")
     center, radius = np.zeros(plant.nx), np.zeros(plant.nx)
     needed = np.abs(plant.E).max(axis=0, initial=0.0) > 0.0

@@ -40,10 +40,7 @@ def noisy_design(design: ObserverDesign, scenario: Scenario | None) -> ObserverD
 
 @dataclass(frozen=True, eq=False)
 class AdaptiveMonitor(Monitor):
-    """A monitor whose threshold adapts to the signals; `threshold` is the nominal one, which it is never below.
-
-    Fields: plan: The bounds.
-    """
+    """A monitor whose threshold adapts to the signals; `threshold` is the nominal one, which it is never below."""
 
     plan: AdaptivePlan | None = None
 
@@ -134,10 +131,7 @@ def with_box(
     design: ObserverDesign, scenario: Scenario, nominal: Monitor, bounds: FloatArray, noise_bound: float | None, *,
     initial_error: float | None, initial_set: Mapping[str, Any] | None,
 ) -> AdaptiveMonitor:  # fmt: skip
-    """Return a pointwise monitor that holds over the box of the design's plant.
-
-    The start is the scenario's own, unless its error or a set is given.
-    """
+    """Return a pointwise monitor over the box of the design's plant, from the scenario's start unless one is given."""
     plant, observer = design.linear
     if not plant.is_discrete and scenario.inputs:
         raise PreconditionError(

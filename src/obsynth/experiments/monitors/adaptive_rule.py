@@ -1,7 +1,4 @@
-"""The rule of an adaptive threshold on a log: norm and rows of the residual, fault estimates, guaranteed intervals.
-
-The adaptive threshold sample by sample: the recursion of `adaptive_record` with its state as plain arrays.
-"""
+"""The adaptive threshold on a log, row by row: the recursion of `adaptive_record` with its state as plain arrays."""
 
 from __future__ import annotations
 
@@ -21,10 +18,9 @@ from obsynth.numerics.arrays import FloatArray
 
 @dataclass
 class AdaptiveState:
-    """What goes from sample to sample.
+    """What goes from sample to sample: sensitivities ``psi (p, nz)``, ``ring (L, w)``, ``eps (L, nz)``, oldest first.
 
-    ``psi (p, nz)`` sensitivities; ``ring (L, w)`` and ``eps (L, nz)``, oldest first; ``largest`` signals so far; for
-    varying constants ``past (L, nv)`` signals and ``moved (L, nz)`` bounds; ``k`` samples since the start.
+    For varying constants ``past (L, nv)`` signals and ``moved (L, nz)`` bounds; ``k`` samples since the start.
     """
 
     psi: FloatArray
@@ -133,10 +129,9 @@ FORGETTING_RINGS = 3
 
 @dataclass(frozen=True, eq=False)
 class AdaptivePlan:
-    """What an adaptive monitor of a design is made of; nothing in it changes online.
+    """What an adaptive monitor is made of: ``bound`` without a fault, ``faults`` of fault estimates during one.
 
-    ``bound`` of fault estimates and residuals without a fault; ``faults`` of the errors of fault estimates during one,
-    `None` where there is none (``reason`` says why), or ``same`` as those without; ``names`` of the constants.
+    ``faults`` is `None` where there is none (``reason`` says why), or where it is the ``same`` as without a fault.
     """
 
     bound: AdaptiveBound
@@ -287,10 +282,7 @@ class AdaptiveRule:
 def record_columns(
     plan: AdaptivePlan, rows: FloatArray, inputs: FloatArray, outputs: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return thresholds of the outputs, and intervals of the faults, over records from the start.
-
-    ``rows (runs, steps, rows of the observer)``; thresholds ``(runs, steps, no)``, intervals ``(runs, steps, nf, 2)``.
-    """
+    """Return thresholds ``(runs, steps, no)`` and intervals of faults ``(runs, steps, nf, 2)`` over whole records."""
     found = thresholds_of_records(plan.bound, rows @ plan.bound.structure.reading.T, inputs, outputs)
     nf, error = len(plan.fault_names), found
     if plan.faults is not None:

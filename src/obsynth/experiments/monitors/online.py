@@ -13,11 +13,7 @@ from obsynth.numerics.arrays import FloatArray
 
 
 class Seen(NamedTuple):
-    """What a monitor says of one row.
-
-    Fields: statistic, threshold: NaN where nothing is decided; alarm: Whether the threshold is passed; fault: The fault
-    that stands out; empty without an alarm, or without faults.
-    """
+    """What a monitor says of one row: NaN where nothing is decided; no fault stands out without an alarm."""
 
     statistic: float
     threshold: float
@@ -27,11 +23,9 @@ class Seen(NamedTuple):
 
 
 class Evidence(NamedTuple):
-    """What a recursive observer learnt from a sample.
+    """What a recursive observer learnt from a sample: theta ``(nq,)``, its covariance, innovation ``(m,)``, regressor.
 
-    Fields: theta, covariance: Parameters ``(nq,)`` and their covariance ``(nq, nq)``; innovation, regressor: ``(m,)``
-    and ``(m, nq)``: innovation less regressor times the true parameters is white, N(0, I); score, information: what
-    the sample says of the parameters, ``(nq,)`` and ``(nq, nq)``.
+    Innovation less regressor times the true parameters is white, N(0, I); ``score (nq,)`` and ``information (nq, nq)``.
     """
 
     theta: FloatArray
@@ -187,10 +181,9 @@ class OnlineMonitor:
 
 
 def share_of_look(look: int) -> float:
-    """Return the share of the probability of a false alarm that look number ``look`` (from 1) may take.
+    """Return the share of the probability of a false alarm that look ``look`` (from 1) may take; all sum up to one.
 
-    The shares of all looks sum up to at most one, however long a run is: looks ``2^j`` to ``2^(j+1) - 1`` share
-    ``6 / (pi (j + 1))^2`` evenly.
+    Looks ``2^j`` to ``2^(j+1) - 1`` share ``6 / (pi (j + 1))^2`` evenly.
     """
     epoch = look.bit_length() - 1
     return 6.0 / (math.pi * (epoch + 1.0)) ** 2 / 2.0**epoch

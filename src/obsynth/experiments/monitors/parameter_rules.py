@@ -35,12 +35,10 @@ _PARAMETER_STATEMENTS = {
 
 
 class ParameterRule:
-    """Parameters against their nominal values, or innovations against what noise explains.
+    """Parameters against their nominal values, or innovations against what noise explains, in a run of any length.
 
-    Fields: kind: ``chi-square`` of theta less nominal in the metric of its covariance; ``cusum`` of the innovations for
-    a change of given size; ``nis``, squares of the innovations over 20 samples, for all that the model does not
-    explain; nominal: ``(nq,)``; empty for a filter without parameters; change: ``(nq,)``: what ``cusum`` is tuned for,
-    in parameter units; false_alarms: Probability of a false alarm in a run, however long.
+    ``chi-square`` of theta in the metric of its covariance; ``cusum`` of the innovations for a ``change (nq,)``;
+    ``nis``, squares of the innovations over 20 samples, for all that the model does not explain.
     """
 
     def __init__(self, kind: str, nominal: FloatArray, change: FloatArray, false_alarms: float) -> None:

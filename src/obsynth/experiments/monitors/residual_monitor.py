@@ -184,10 +184,7 @@ def _statistical(
     kind: str, model: ResidualModel, degrees: int, start: float, window: int, false_alarms: float,
     *, white: bool,
 ) -> FloatArray:  # fmt: skip
-    """Return thresholds by Bonferroni's inequality over all looks (chi-square), or Ville's over all sums (cusum).
-
-    Ville's is for white residuals; sums of others are counted one by one, from each start to each end.
-    """
+    """Return thresholds by Bonferroni's inequality over all looks (chi-square), or Ville's over all white sums."""
     from scipy.special import chdtri
 
     threshold = np.full(model.steps, np.inf)

@@ -26,10 +26,8 @@ ROUNDING = 1e-9
 class NormRule:
     """The norm of the residual, or of a window of it, against a bound by the number of samples since the start.
 
-    Fields: table: The bound at each sample; limit: The bound after the table; window: Samples of which squares are
-    summed up; 1 for the norm itself; dt: Between samples; irregular: Continuous designs: table and limit that hold
-    where samples are not all ``dt`` apart, but none further; watched: Rows of the observer that take the place of the
-    residual; driven: Continuous designs: what known inputs add, as the observer does not follow them exactly.
+    Continuous designs: ``irregular`` holds where samples are not all ``dt`` apart, but none further; ``driven``: what
+    known inputs add.  ``watched``: rows of the observer that take the place of the residual.
     """
 
     def __init__(
@@ -119,12 +117,9 @@ class NormRule:
 
 
 class WhitenedRule:
-    """A window of residuals in the metric of its covariance: chi-square, or cumulative sums for small changes.
+    """A window of residuals in the metric of its covariance: chi-square, or cumulative sums for a ``change``.
 
-    Fields: whitener: ``(m, window nr)``, oldest sample first; mean: ``(nr,)``; window: Samples; change: Shift of the
-    whitened residual that the sums are tuned for; `None` for chi-square; false_alarms: Probability of a false alarm in
-    a run, however long; dt: Between samples; white: Whether what is summed up is white, see
-    `obsynth.experiments.monitors.whitening.cusum_whitener`.
+    ``whitener (m, window nr)``, oldest sample first; ``white``: see `whitening.cusum_whitener`.
     """
 
     def __init__(

@@ -57,20 +57,14 @@ def _felt(model: ResidualModel) -> list[bool]:
 
 
 def whitener_of(covariance: FloatArray) -> FloatArray:
-    """Return ``Wh (rank, n)`` with ``Wh S Wh' = I``; directions without any variance are left out.
-
-    Shapes: ``covariance (n, n)``.
-    """
+    """Return ``Wh (rank, n)`` with ``Wh S Wh' = I`` for ``S (n, n)``; directions without any variance are left out."""
     sizes, vectors = np.linalg.eigh((covariance + covariance.T) / 2.0)
     kept = sizes > CANCELLATION_TOLERANCE * max(float(sizes[-1]), np.finfo(np.float64).tiny)
     return np.asarray((vectors[:, kept] / np.sqrt(sizes[kept])).T)
 
 
 def innovation_whitener(covariance: FloatArray, count: int) -> FloatArray:
-    """Return ``Wh (m, n)``: the newest ``count`` residuals less their prediction from the others, white.
-
-    Shapes: ``covariance (n, n)``.
-    """
+    """Return ``Wh (m, n)``: the newest ``count`` residuals less their prediction from the others, white."""
     old = len(covariance) - count
     past = whitener_of(covariance[:old, :old]) if old else np.zeros((0, 0))
     predict = covariance[old:, :old] @ past.T @ past
@@ -84,10 +78,7 @@ def innovation_whitener(covariance: FloatArray, count: int) -> FloatArray:
 
 
 def correlation_left(model: ResidualModel, window: int, whitener: FloatArray) -> float:
-    """Return the norms of all correlations, at every lag, that whitened residuals still have, summed up.
-
-    Of a residual that remembers more than a window, a prediction from the window is not the best one.
-    """
+    """Return the norms of all correlations, at every lag, that residuals whitened by a window still have, summed up."""
     count, n = len(model.C), len(model.A)
     covariance = window_covariance(model, 2 * window)
     span = window * count
@@ -115,10 +106,7 @@ def correlation_left(model: ResidualModel, window: int, whitener: FloatArray) ->
 
 
 def cusum_whitener(model: ResidualModel, window: int) -> tuple[FloatArray, bool]:
-    """Return what cumulative sums add up, and whether it is white.
-
-    Where correlation is left, it is scaled down so that no sum of n samples has more variance than n.
-    """
+    """Return what cumulative sums add up, n samples of no more variance than n, and whether it is white."""
     whitener = innovation_whitener(window_covariance(model, window), len(model.C))
     left = correlation_left(model, window, whitener)
     return whitener / np.sqrt(1.0 + 2.0 * left), left <= WHITE_SHARE
