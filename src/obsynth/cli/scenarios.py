@@ -37,7 +37,7 @@ def run_simulate(options: argparse.Namespace) -> int:
     """Run ``simulate``: spec in, table of errors out, and every signal in a file if asked."""
     from obsynth.cli.commands import designed_or_loaded, spec_output
     from obsynth.cli.data_run import required_scenario
-    from obsynth.experiments.columns import SIGNALS
+    from obsynth.experiments.simulation import SIGNALS, simulate
     from obsynth.spec import load_spec
 
     with progress(quiet=options.quiet) as report_stage:
@@ -49,7 +49,6 @@ def run_simulate(options: argparse.Namespace) -> int:
         target = None if options.out is None else spec_output(options.out, SIGNALS, spec, options, option="--out")
         design = designed_or_loaded(spec, options.gains, report_stage)
         report_stage("simulating")
-        from obsynth.experiments.simulation import simulate
 
         found = simulate(design, scenario)
         written = None if target is None else str(found.write_csv(target))

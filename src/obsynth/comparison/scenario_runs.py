@@ -21,7 +21,7 @@ EXACT = (0.0, 1.0, -1.0)
 
 @dataclass(frozen=True, eq=False)
 class DrawnRuns:
-    """Outputs ``(runs, steps, ny)`` of drawn plants, with the scenario's faults and without any, and their known inputs."""
+    """Outputs ``(runs, steps, ny)`` of drawn plants with the scenario's faults and without any, and known inputs."""
 
     faulty: FloatArray
     faulty_u: FloatArray
@@ -87,7 +87,7 @@ def _outputs(
 
 
 def _drawn(plant: DescriptorSystem, tolerance: float, rng: np.random.Generator) -> DescriptorSystem:
-    """Return a plant with its constants within their tolerances, and parameters off by up to one; equal entries stay so."""
+    """Return a plant with its constants within their tolerances, and parameters off by up to one; equal stay equal."""
     if plant.uncertainty is not None:
         box = plant.uncertainty.box
         plant = plant_at(plant, box.values(rng.uniform(-1.0, 1.0, size=len(box.names))))

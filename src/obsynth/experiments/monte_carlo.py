@@ -11,8 +11,7 @@ from typing import Any, cast
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.experiments.batch_simulation import Bench, LinearBench, Runs, make_bench
-from obsynth.experiments.benches import bench_of
+from obsynth.experiments.benches import Bench, LinearBench, Runs, bench_of, make_bench
 from obsynth.experiments.intervals import Interval, mean, share
 from obsynth.experiments.monitors.monitor import Monitor
 from obsynth.experiments.simulation import aligned_errors

@@ -1,8 +1,9 @@
-"""A design on a scenario: the plant simulated, the observer beside it, and how far its estimates are off."""
+"""A design on a scenario: the plant simulated, the observer beside it, how far its estimates are off, as a table."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import io
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, cast, overload
@@ -11,9 +12,9 @@ import numpy as np
 
 from obsynth.analysis.transformations.recovery import Transformation, plant_and_recovery
 from obsynth.errors import SpecError
-from obsynth.experiments.batch_simulation import CONSISTENCY_TOLERANCE
-from obsynth.experiments.benches import bench_of
-from obsynth.experiments.columns import named_columns, root_mean_square, write_columns
+from obsynth.experiments.benches import CONSISTENCY_TOLERANCE, bench_of
+from obsynth.files.outputs import FileKind, write_atomically
+from obsynth.files.tables import TableWriter
 from obsynth.numerics.arguments import require_kind
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.estimates import BAND_WIDTH, Estimates
@@ -27,6 +28,32 @@ from obsynth.simulation.linear import simulate_plant
 from obsynth.simulation.scenario import Scenario
 from obsynth.simulation.time_varying import simulate_time_varying
 from obsynth.simulation.trajectory import Trajectory
+
+#: A table that `Simulation.write_csv` has written: signals of the plant beside time, and no status of rows.
+SIGNALS = FileKind("a table of simulated signals", rb"\Atime,(?!status,)[^\n]*x(hat)?\[")
+
+
+def named_columns(time: FloatArray, groups: Iterable[tuple[str, Sequence[str], FloatArray]]) -> dict[str, FloatArray]:
+    """Return every column by name; inputs and outputs go by their own names, unless those are taken."""
+    found = {"time": time}
+    for form, names, values in groups:
+        for i, name in enumerate(names):
+            plain = form[0] in "uy" and name not in found
+            found[name if plain else form.format(name)] = values[:, i]
+    return found
+
+
+def write_columns(table: Mapping[str, FloatArray], path: str | Path) -> Path:
+    """Write columns as comma-separated text, atomically, floats with all their digits; NaN is an empty cell."""
+    text = io.StringIO()
+    TableWriter(text, table).write(zip(*(column.tolist() for column in table.values()), strict=True))
+    return write_atomically(path, text.getvalue())
+
+
+def root_mean_square(errors: FloatArray) -> float:
+    """Return the root mean square of what is not NaN."""
+    known = errors[~np.isnan(errors)]
+    return float(np.sqrt(np.mean(known**2))) if known.size else float("nan")
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,10 +183,14 @@ class Simulation:
 
 @overload
 def simulate(design: ObserverDesign, scenario: Scenario) -> Simulation: ...
+
+
 @overload
 def simulate(
     design: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel | Transformation, **signals: Any
 ) -> Trajectory: ...
+
+
 def simulate(
     design: ObserverDesign | DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel | Transformation,
     scenario: Scenario | None = None,

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import SpecError
-from obsynth.experiments.batch_simulation import Runs, make_bench
+from obsynth.experiments.benches import Runs, make_bench
 from obsynth.experiments.monitors.monitor import Monitor
 from obsynth.experiments.monitors.residual_monitor import monitor
 from obsynth.numerics.arguments import is_whole, require_kind

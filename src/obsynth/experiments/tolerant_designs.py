@@ -13,7 +13,7 @@ import numpy as np
 
 from obsynth.analysis.transformations.uncertain_plant import AffinePlant, affine_plant
 from obsynth.errors import ObsynthError, SpecError
-from obsynth.experiments.batch_simulation import make_bench
+from obsynth.experiments.benches import make_bench
 from obsynth.experiments.monitors.residual_monitor import monitor
 from obsynth.methods.verifying import verify
 from obsynth.numerics.arrays import SMALLEST, FloatArray
@@ -21,7 +21,7 @@ from obsynth.numerics.ranks import ACTING_TOLERANCE
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario
-from obsynth.tolerances.directions import told_from_faults
+from obsynth.tolerances.exact_plant import told_from_faults
 from obsynth.tolerances.robustness import robustness
 
 #: Rows of the plant and constants whose directions are tried, those most to blame.

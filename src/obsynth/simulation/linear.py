@@ -116,7 +116,7 @@ def _require_finite(states: FloatArray, advice: str, path: str) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Stepper:
-    """A plant from sample to sample: ``x+ = transition x + held s + ramped (s_right - s_left) + noisy w``, s = [u; f; d].
+    """A plant that steps: ``x+ = transition x + held s + ramped (s_right - s_left) + noisy w``, s = [u; f; d].
 
     x are the dynamic states; ``state_of, output_of``: plant states and outputs from x, s and w; ``feedback (nu, n)``:
     ``u = s_u - feedback x``, already inside the other matrices.

@@ -172,7 +172,7 @@ def require_identities(state: AffineMatrix, known: AffineMatrix, sizes: FloatArr
 
 
 def _missed(matrix: AffineMatrix, offsets: FloatArray) -> FloatArray:
-    """Return what a matrix that should vanish at the nominal plant is there, at least: its remainder may make up for it."""
+    """Return what a matrix that should vanish at the nominal plant is there, at least; its remainder may explain it."""
     return np.maximum(np.abs(matrix.at(offsets)) - matrix.radius, 0.0) if offsets.any() else np.abs(matrix.center)
 
 

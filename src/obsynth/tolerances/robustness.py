@@ -24,9 +24,8 @@ from obsynth.plants.uncertain_system import uncertain_system
 from obsynth.plants.uncertainty import Uncertainty, matrices_of
 from obsynth.proofs.affine import AffineMatrix
 from obsynth.results.design import ObserverDesign
-from obsynth.tolerances.directions import told_from_faults
 from obsynth.tolerances.error_structure import ErrorStructure, error_structure
-from obsynth.tolerances.exact_plant import is_sampled, moving_at
+from obsynth.tolerances.exact_plant import is_sampled, labels_of, moving_at, told_from_faults, vertex_gains
 from obsynth.tolerances.responses import (
     Responses,
     blame,
@@ -39,7 +38,6 @@ from obsynth.tolerances.responses import (
 from obsynth.tolerances.result import EXACT_MODEL, Robustness
 from obsynth.tolerances.subdivision import MOST_BOXES, BoxVerdict, index_one_on_box, proved_stable, values_at
 from obsynth.tolerances.tracking import Tracking, tracking_of
-from obsynth.tolerances.vertex_gains import labels_of, vertex_gains
 
 #: Boxes for stability after which it is left open where most states are algebraic: each elimination takes long.
 FEW_BOXES = 40

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.experiments.batch_simulation import Runs
+from obsynth.experiments.benches import Runs
 from obsynth.experiments.monitors.adaptive_bound import THRESHOLD_ROUNDING
 from obsynth.experiments.monitors.adaptive_monitor import adaptive_plan, adaptive_statement
 from obsynth.experiments.monitors.adaptive_record import thresholds_of_records
