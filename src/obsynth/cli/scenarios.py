@@ -49,7 +49,6 @@ def run_simulate(options: argparse.Namespace) -> int:
         target = None if options.out is None else spec_output(options.out, SIGNALS, spec, options, option="--out")
         design = designed_or_loaded(spec, options.gains, report_stage)
         report_stage("simulating")
-
         found = simulate(design, scenario)
         written = None if target is None else str(found.write_csv(target))
     if options.json:
