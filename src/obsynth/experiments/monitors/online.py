@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Mapping
-from typing import Any, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -47,26 +49,43 @@ class LinearSample(NamedTuple):
 UNDECIDED = Seen(math.nan, math.nan, False, "")
 
 
-class Rule(Protocol):
-    """A statistic and its threshold, row by row."""
+class Rule(ABC):
+    """A statistic and its threshold, row by row; ``KEPT`` names what goes from row to row."""
 
+    KEPT: ClassVar[tuple[str, ...]] = ()
+    #: Where a saved state has the options of its monitor.
+    SAME: ClassVar[str] = "options"
+    #: Of an adaptive threshold: what it is made of, and cells of a row for its columns.
+    plan: Any = None
+    cells: tuple[float, ...] = ()
+
+    @abstractmethod
     def take(
         self, time: float, residuals: FloatArray, evidence: Any, *, deciding: bool
     ) -> tuple[float, float, int | None]:
         """Return statistic, threshold, and the number of the fault if the rule knows it."""
-        ...
 
+    @abstractmethod
     def restart(self) -> None:
         """Forget windows and sums: rows are missing."""
-        ...
+
+    @abstractmethod
+    def options(self) -> Any:
+        """Return what a saved state must share with the monitor that it is for."""
 
     def as_dict(self) -> dict[str, Any]:
         """Return the state that goes from row to row, as data."""
-        ...
+        kept = {name: getattr(self, name) for name in self.KEPT}
+        kept = {name: list(value) if isinstance(value, deque) else value for name, value in kept.items()}
+        return {**kept, self.SAME: self.options()}
 
     def resume(self, data: Mapping[str, Any]) -> None:
         """Go on from what `as_dict` returned."""
-        ...
+        if data[self.SAME] != self.options():
+            raise SpecError("The saved state is of a run whose monitor had other options: use the same.", path="state")
+        for name in self.KEPT:
+            own = getattr(self, name)
+            setattr(self, name, deque(data[name], own.maxlen) if isinstance(own, deque) else data[name])
 
 
 class OnlineMonitor:
@@ -97,14 +116,12 @@ class OnlineMonitor:
     @property
     def bound(self) -> Any:
         """Bound of an adaptive threshold, for exports; `None` for other monitors."""
-        plan = getattr(self._rule, "plan", None)
-        return None if plan is None else plan.bound
+        return None if self._rule.plan is None else self._rule.plan.bound
 
     @property
     def columns(self) -> tuple[str, ...]:
         """Columns of a run besides statistic, threshold and alarm: those of an adaptive threshold."""
-        plan = getattr(self._rule, "plan", None)
-        return () if plan is None else tuple(plan.columns)
+        return () if self._rule.plan is None else tuple(self._rule.plan.columns)
 
     def require_fit(self, residuals: int, fault_names: tuple[str, ...]) -> None:
         """Refuse a design that this monitor was not made for.
@@ -146,7 +163,7 @@ class OnlineMonitor:
             self._rule.restart()
         self._decided = deciding
         statistic, threshold, which = self._rule.take(time, residuals, evidence, deciding=deciding)
-        more = tuple(getattr(self._rule, "cells", ()))
+        more = self._rule.cells
         # A statistic that has overflowed has passed any threshold.
         if math.isnan(statistic) or not math.isfinite(threshold):
             return UNDECIDED._replace(more=more)

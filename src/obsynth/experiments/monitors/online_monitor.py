@@ -13,10 +13,9 @@ from obsynth.experiments.monitors.adaptive_records_monitor import noisy_design
 from obsynth.experiments.monitors.adaptive_rule import AdaptiveRule
 from obsynth.experiments.monitors.monitor import KINDS, statement_of
 from obsynth.experiments.monitors.online import OnlineMonitor, Rule
-from obsynth.experiments.monitors.parameter_rules import ANY_LENGTH, parameter_monitor
 from obsynth.experiments.monitors.residual_model import ResidualModel, residual_model, watches_estimates
 from obsynth.experiments.monitors.residual_monitor import bounds_of, require_options
-from obsynth.experiments.monitors.residual_rules import NormRule, WhitenedRule
+from obsynth.experiments.monitors.rules import ANY_LENGTH, NormRule, WhitenedRule, parameter_monitor
 from obsynth.experiments.monitors.thresholds import samples_of, scaled_inputs, unlimited_bound, unlimited_paper
 from obsynth.experiments.monitors.whitening import cusum_whitener, steady_mean, whitener_of, window_covariance
 from obsynth.numerics.arguments import is_finite_number, require_kind, require_mapping
