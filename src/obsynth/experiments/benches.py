@@ -29,8 +29,6 @@ from obsynth.simulation.time_varying import varying_runs
 
 #: Warm-up ends when the effect of an error at the start has shrunk to this share of its largest, for good.
 WARM_UP_SHARE = 0.01
-
-
 #: Notes on simulations.
 BETWEEN_SAMPLES = (
     "Between samples the plant is exact for signals that are constant or linear there; its observer is sampled by a "

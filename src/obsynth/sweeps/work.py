@@ -29,12 +29,8 @@ if TYPE_CHECKING:
 
 #: Keys of a spec; a parameter that begins with none of them is an option of the method.
 _SECTIONS = ("plant", "method", "scenario", "name", "description")
-
-
 #: What a section ``plant`` may hold beside a reference to a file; everything else is changed in that file.
 _REFERENCE = ("file", "transform")
-
-
 #: More cases than this are taken for a slip.
 MOST_CASES = 100_000
 
@@ -183,18 +179,10 @@ def _distinct(cases: list[SweepCase]) -> list[SweepCase]:
 
 #: What a piece of work came to, by the exit code of its error.
 STATUSES = {0: "designed", 2: "malformed", 3: "impossible", 4: "infeasible", 5: "unknown", 6: "unverified"}
-
-
 #: Digits of the digest of a piece of work in the names of its files.
 DIGITS = 16
-
-
 _Item = TypeVar("_Item")
-
-
 _Outcome = TypeVar("_Outcome")
-
-
 _Result = TypeVar("_Result")
 
 

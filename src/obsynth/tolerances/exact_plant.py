@@ -74,12 +74,8 @@ def drawn_points(count: int, runs: int, seed: int, *, vertices: float = 0.5) -> 
 
 #: Vertices beyond this number are drawn at random.
 MOST_VERTICES = 32
-
-
 #: Samples over which the gain at a vertex is summed up, at most.
 MOST_GAIN_SAMPLES = 5_000
-
-
 #: What is left of a response when its sum ends.
 _GAIN_LEFT = 1e-6
 

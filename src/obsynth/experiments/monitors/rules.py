@@ -23,12 +23,8 @@ from obsynth.plants.names import index_of
 
 #: Share of an interval by which the data's sampling may differ from the one that a threshold is for.
 FITTING_SHARE = 0.01
-
-
 #: Share of an interval within which two of them are the same: stamps are rounded.
 SAME_SHARE = 1e-6
-
-
 #: What rounding may take from a number of samples, as a share of it.
 ROUNDING = 1e-9
 
@@ -178,15 +174,9 @@ def _finite(values: FloatArray) -> FloatArray:
 
 
 PARAMETER_KINDS = ("chi-square", "cusum", "nis")
-
-
 #: Samples that the NIS sums up.
 NIS_WINDOW = 20
-
-
 ANY_LENGTH = " (the run may have any length)"
-
-
 _PARAMETER_STATEMENTS = {
     "chi-square": "distance of the parameters from their nominal values in the metric of their covariance: passed in a "
     "run without a change with at most the stated probability, for Gaussian noise as stated",
