@@ -10,7 +10,6 @@ The brackets vanish at the nominal plant; over the box ``x = xhat - e`` drives t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -76,10 +75,6 @@ class ErrorStructure:
             return sizes
         return np.concatenate([sizes[: self.single], sizes[self.single :].max(axis=0, keepdims=True)])
 
-    def effect(self, rows: slice) -> FloatArray:
-        """Return rows of the effects."""
-        return self.effects[rows]
-
 
 def error_structure(
     observer: LinearObserver, affine: AffinePlant, tracking: Tracking, bounds: FloatArray, noise_bound: float, *,
@@ -98,8 +93,7 @@ def error_structure(
     nz, n, nf = observer.order, plant.nx, plant.nf if faults else 0
     shown = observer.fault_rows
     back = 2.0 * np.eye(n) - affine.coordinates
-    watched = list(range(shown.start, shown.stop if faults else len(observer.Cz)))
-    watched = list(range(n)) if states else watched
+    watched = list(range(n) if states else range(shown.start, shown.stop if faults else len(observer.Cz)))
     picked = np.zeros((n + nf + len(watched), len(observer.Cz)))
     picked[:n, observer.state_rows] = back if reading is None else reading
     if faults:
@@ -120,7 +114,7 @@ def error_structure(
     sizes = _sizes(observer, affine, t, c, dy)
     offsets = affine.offsets
     if reading is None:
-        require_identities(state, known, sizes, offsets)
+        _require_identities(state, known, sizes, offsets)
     noise = AffineMatrix.exact(plant.Bw, count), AffineMatrix.exact(plant.Dw, count)
     disturbances = affine_block([[stacked(affine.Bd, affine.Dd), stacked(*noise)]])
     if faults:
@@ -154,13 +148,14 @@ def error_structure(
 
 def _sizes(observer: LinearObserver, affine: AffinePlant, t: FloatArray, c: FloatArray, dy: FloatArray) -> FloatArray:
     """Return the size of the terms of each row, ``(rows, 1)``."""
-    te, absolute = np.abs(t) @ affine.E.magnitude, np.abs
+    absolute = np.abs
+    te = absolute(t) @ affine.E.magnitude
     top = absolute(observer.Az) @ te + absolute(observer.By) @ affine.C.magnitude + absolute(t) @ affine.A.magnitude
     low = absolute(c) @ te + absolute(dy) @ affine.C.magnitude
     return np.asarray(np.vstack([top, low]).max(axis=1, initial=np.finfo(np.float64).tiny)[:, None])
 
 
-def require_identities(state: AffineMatrix, known: AffineMatrix, sizes: FloatArray, offsets: FloatArray) -> None:
+def _require_identities(state: AffineMatrix, known: AffineMatrix, sizes: FloatArray, offsets: FloatArray) -> None:
     """Raise `PreconditionError` where the observer is none of the nominal plant."""
     missed = float(np.max(_missed(state, offsets) / sizes, initial=0.0))
     missed = max(missed, float(np.max(_missed(known, offsets) / (sizes + known.magnitude), initial=0.0)))
@@ -232,8 +227,7 @@ def _about_nominal(matrix: AffineMatrix, offsets: FloatArray) -> tuple[FloatArra
 def _channels(parts: FloatArray, offsets: FloatArray) -> tuple[FloatArray, FloatArray, list[int], FloatArray]:
     """Return rows c, effects b (times how far a constant is from nominal) and owners; and what was left out."""
     rows_count, n = parts.shape[1:]
-    rows, effects, owner = [np.zeros((0, n))], [np.zeros((rows_count, 0))], []
-    left = np.zeros((rows_count, n))
+    rows, effects, owner, left = [np.zeros((0, n))], [np.zeros((rows_count, 0))], [], np.zeros((rows_count, n))
     for i, part in enumerate(parts):
         columns = np.flatnonzero(np.abs(part).sum(axis=0) > 0.0)
         if not len(columns):
@@ -264,9 +258,3 @@ def _remainder_channels(rest: FloatArray, sizes: FloatArray) -> tuple[FloatArray
         rows.append(np.eye(n)[small] * share[small][:, None])
         effects.append(rounded_up((rest[:, small] / share[small]).sum(axis=1, keepdims=True), len(small) + 2))
     return np.vstack(rows), len(large), np.hstack(effects)
-
-
-def owners(structure: ErrorStructure) -> Sequence[int]:
-    """Return whose each channel is; remainders belong to nobody, which is the number of constants."""
-    count = structure.state.count
-    return [*structure.owner, *([count] * (structure.channels - len(structure.owner)))]

@@ -30,32 +30,32 @@ def plant_at(plant: DescriptorSystem, values: Mapping[str, float]) -> Descriptor
     if uncertain is None:
         return plant
     if uncertain.written is None:
-        return _with_shift(plant.replace(**uncertain.filled(matrices_of(plant), values)), uncertain)
-    matrices = uncertain.filled(uncertain.written, values)
-    arguments: dict[str, Any] = {**matrices, "dt": 0.0 if is_sampled(uncertain.steps) else plant.dt}
-    bare = DescriptorSystem(**arguments)
-    for kind, size in uncertain.steps:
-        bare = discretise(bare, size).plant if kind == SAMPLED else eliminate_algebraic_states(bare).plant
-    return _with_shift(plant.replace(**{name: getattr(bare, name) for name in UNCERTAIN_MATRICES}), uncertain)
-
-
-def _with_shift(plant: DescriptorSystem, uncertain: Uncertainty) -> DescriptorSystem:
-    """Return a plant that is no family any more, but knows which of its inputs is one in every row, if one is."""
-    return (
-        plant.replace(uncertainty=Uncertainty(ConstantsBox({}), {}, shift=uncertain.shift))
-        if uncertain.shift
-        else plant
-    )
+        found = plant.replace(**uncertain.filled(matrices_of(plant), values))
+    else:
+        bare = _written_at(plant, uncertain, values)
+        for kind, size in uncertain.steps:
+            bare = discretise(bare, size).plant if kind == SAMPLED else eliminate_algebraic_states(bare).plant
+        found = plant.replace(**{name: getattr(bare, name) for name in UNCERTAIN_MATRICES})
+    # It is no family any more, but knows which of its inputs is one in every row, if one is.
+    shift = uncertain.shift
+    return found.replace(uncertainty=Uncertainty(ConstantsBox({}), {}, shift=shift)) if shift else found
 
 
 def moving_at(plant: DescriptorSystem, values: Mapping[str, float]) -> FloatArray:
     """Return A of the plant for values of its constants, reduced, and before it was sampled."""
-    uncertain = plant.uncertainty
-    if uncertain is None:
-        return eliminate_algebraic_states(plant).plant.A
-    matrices = uncertain.filled(matrices_of(plant) if uncertain.written is None else uncertain.written, values)
-    arguments: dict[str, Any] = {**matrices, "dt": 0.0 if is_sampled(uncertain.steps) else plant.dt}
-    return eliminate_algebraic_states(DescriptorSystem(**arguments)).plant.A
+    bare = plant if plant.uncertainty is None else _written_at(plant, plant.uncertainty, values)
+    return eliminate_algebraic_states(bare).plant.A
+
+
+def _written_at(plant: DescriptorSystem, uncertain: Uncertainty, values: Mapping[str, float]) -> DescriptorSystem:
+    """Return the plant as it was written, for values of its constants."""
+    matrices: dict[str, Any] = uncertain.filled(written_matrices(plant, uncertain), values)
+    return DescriptorSystem(**matrices, dt=0.0 if is_sampled(uncertain.steps) else plant.dt)
+
+
+def written_matrices(plant: DescriptorSystem, uncertain: Uncertainty) -> Mapping[str, FloatArray]:
+    """Return the matrices whose entries are written in the constants: the plant's own, unless it was transformed."""
+    return matrices_of(plant) if uncertain.written is None else uncertain.written
 
 
 def is_sampled(steps: tuple[tuple[str, float], ...]) -> bool:
@@ -162,7 +162,7 @@ def told_from_faults(plant: DescriptorSystem) -> dict[str, Told]:
     uncertain = plant.uncertainty
     if uncertain is None or not plant.nf:
         return {}
-    numbers = matrices_of(plant) if uncertain.written is None else uncertain.written
+    numbers = written_matrices(plant, uncertain)
     affine = uncertain.affine(numbers, uncertain.box)
     dt = 0.0 if is_sampled(uncertain.steps) else plant.dt
     found = {}
