@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, cast, overload
@@ -31,29 +31,6 @@ from obsynth.simulation.trajectory import Trajectory
 
 #: A table that `Simulation.write_csv` has written: signals of the plant beside time, and no status of rows.
 SIGNALS = FileKind("a table of simulated signals", rb"\Atime,(?!status,)[^\n]*x(hat)?\[")
-
-
-def named_columns(time: FloatArray, groups: Iterable[tuple[str, Sequence[str], FloatArray]]) -> dict[str, FloatArray]:
-    """Return every column by name; inputs and outputs go by their own names, unless those are taken."""
-    found = {"time": time}
-    for form, names, values in groups:
-        for i, name in enumerate(names):
-            plain = form[0] in "uy" and name not in found
-            found[name if plain else form.format(name)] = values[:, i]
-    return found
-
-
-def write_columns(table: Mapping[str, FloatArray], path: str | Path) -> Path:
-    """Write columns as comma-separated text, atomically, floats with all their digits; NaN is an empty cell."""
-    text = io.StringIO()
-    TableWriter(text, table).write(zip(*(column.tolist() for column in table.values()), strict=True))
-    return write_atomically(path, text.getvalue())
-
-
-def root_mean_square(errors: FloatArray) -> float:
-    """Return the root mean square of what is not NaN."""
-    known = errors[~np.isnan(errors)]
-    return float(np.sqrt(np.mean(known**2))) if known.size else float("nan")
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,19 +133,21 @@ class Simulation:
         An output with the name of an input is ``y[..]``.  Estimates ``xhat[..]``, ``fhat[..]``, standard deviations
         ``std xhat[..]``, ``std fhat[..]`` and residuals ``r[..]`` stand where the observer gave them.
         """
-        shown = self.estimates
+        shown, spread = self.estimates, self.estimates.has_deviations
         x, f = shown.state_names, shown.fault_names
-        truth = (
+        found = {"time": self.time}
+        for form, names, values in (
             ("u[{}]", self.input_names, self.inputs), ("y[{}]", self.output_names, self.outputs),
             ("x[{}]", x, self.states), ("f[{}]", f, self.faults[:, list(self.fault_columns)]),
-            ("d[{}]", self.disturbance_names, self.disturbances),
-        )  # fmt: skip
-        states, faults = ("xhat[{}]", x, shown.states), ("fhat[{}]", f, shown.faults)
-        if not shown.has_deviations:
-            residuals = ("r[{}]", shown.residual_names, shown.residuals)
-            return named_columns(self.time, (*truth, states, faults, residuals))
-        spreads = ("std xhat[{}]", x, shown.state_deviations), ("std fhat[{}]", f, shown.fault_deviations)
-        return named_columns(self.time, (*truth, states, spreads[0], faults, spreads[1]))
+            ("d[{}]", self.disturbance_names, self.disturbances), ("xhat[{}]", x, shown.states),
+            *([("std xhat[{}]", x, shown.state_deviations)] if spread else []), ("fhat[{}]", f, shown.faults),
+            ("std fhat[{}]", f, shown.fault_deviations) if spread else ("r[{}]", shown.residual_names, shown.residuals),
+        ):  # fmt: skip
+            for i, name in enumerate(names):
+                # Inputs and outputs go by their own names, unless those are taken.
+                plain = form[0] in "uy" and name not in found
+                found[name if plain else form.format(name)] = values[:, i]
+        return found
 
     def write_csv(self, path: str | Path) -> Path:
         """Write `columns` as comma-separated text, atomically, floats with all their digits.
@@ -178,7 +157,9 @@ class Simulation:
         path : path
             Of the file.
         """
-        return write_columns(self.columns(), path)
+        table, text = self.columns(), io.StringIO()
+        TableWriter(text, table).write(zip(*(column.tolist() for column in table.values()), strict=True))
+        return write_atomically(path, text.getvalue())
 
 
 @overload
@@ -284,5 +265,8 @@ def aligned_errors(estimates: FloatArray, truth: FloatArray, delays: tuple[int, 
 
 
 def _sizes(errors: FloatArray) -> dict[str, float]:
+    """Return root mean square and largest absolute value of what is not NaN."""
     known = errors[~np.isnan(errors)]
-    return {"rmse": root_mean_square(errors), "largest": float(np.max(np.abs(known))) if known.size else float("nan")}
+    if not known.size:
+        return {"rmse": float("nan"), "largest": float("nan")}
+    return {"rmse": float(np.sqrt(np.mean(known**2))), "largest": float(np.max(np.abs(known)))}

@@ -12,7 +12,7 @@ from obsynth.errors import SpecError
 from obsynth.experiments.benches import Runs, make_bench
 from obsynth.experiments.monitors.monitor import Monitor
 from obsynth.experiments.monitors.residual_monitor import monitor
-from obsynth.numerics.arguments import is_whole, require_kind
+from obsynth.numerics.arguments import require_kind, whole_number
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.plants.constants import tolerance_share
 from obsynth.plants.descriptor import DescriptorSystem
@@ -127,8 +127,7 @@ def tolerance_study(
     """
     require_kind(design, ObserverDesign, "design", "an ObserverDesign, such as obsynth.load(path)")
     require_kind(scenario, Scenario, "scenario", "an obsynth.Scenario")
-    if not is_whole(runs) or runs < 1:
-        raise SpecError(f"runs is {runs!r}: give a whole number, 1 or more.", path="runs")
+    whole_number(runs, "runs")
     plant, observer = design.linear
     known = _tolerance_of(plant)
     names = observer.fault_names

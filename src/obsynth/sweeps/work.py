@@ -8,7 +8,7 @@ import itertools
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor, as_completed
+from concurrent.futures import Executor
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -17,6 +17,7 @@ from obsynth.errors import SpecError
 from obsynth.files.inputs import input_file, read_json
 from obsynth.files.tables import TableWriter
 from obsynth.methods.designing import Plant
+from obsynth.observers.progress import as_they_come
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.names import index_of
 from obsynth.results.gain_sets import plain
@@ -223,28 +224,11 @@ def carried_out(
     waiting = [i for i in range(len(items)) if i not in found]
     if told is not None and at_start:
         told(len(found), len(items))
-    for place, outcome in _each(work, [items[i] for i in waiting], executor):
+    for place, outcome in as_they_come(work, [items[i] for i in waiting], executor):
         found[waiting[place]] = kept(items[waiting[place]], outcome)
         if told is not None:
             told(len(found), len(items))
     return tuple(found[i] for i in range(len(items)))
-
-
-def _each(
-    work: Callable[[_Item], _Outcome], items: Sequence[_Item], executor: Executor | None
-) -> Iterator[tuple[int, _Outcome]]:
-    """Yield the place of each item with what comes of it, as they come."""
-    if executor is None:
-        for place, item in enumerate(items):
-            yield place, work(item)
-        return
-    waiting = {executor.submit(work, item): place for place, item in enumerate(items)}
-    try:
-        for future in as_completed(waiting):
-            yield waiting[future], future.result()
-    finally:
-        for future in waiting:
-            future.cancel()
 
 
 def folder_for(folder: Path) -> Path:
