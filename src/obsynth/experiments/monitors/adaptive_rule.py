@@ -70,7 +70,7 @@ def adaptive_step(
     bound: AdaptiveBound, state: AdaptiveState, estimates: FloatArray, inputs: FloatArray, outputs: FloatArray
 ) -> AdaptiveStep:
     """Take one sample: ``estimates (n,)`` as `ErrorStructure.reading` gives them; the state is changed."""
-    _, nz, rows, m, no = bound.counts
+    *_, m, no = bound.counts
     v = np.concatenate([estimates, inputs])
     if bound.first is not None and state.k == 0:
         state.psi[-1] = bound.first @ inputs
@@ -89,7 +89,6 @@ def adaptive_step(
     state.ring[:-1], state.eps[:-1] = state.ring[1:], state.eps[1:]
     state.ring[-1], state.eps[-1] = h, older[m + no :]
     state.k += 1
-    del nz, rows
     return AdaptiveStep(total, first, shift, start[m:], rest)
 
 

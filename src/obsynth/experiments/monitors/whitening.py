@@ -28,9 +28,7 @@ def window_covariance(model: ResidualModel, window: int) -> FloatArray:
             "A disturbance that reaches the residual has a part that is not random or does not last: its covariance "
             "is not known. Use pointwise or window.", path="disturbances",
         )  # fmt: skip
-    b = np.hstack([model.Bd * model.deviations, model.Bw])
-    d = np.hstack([model.Dd * model.deviations, model.Dw])
-    spread = output_covariance(model.A, b, np.eye(len(model.A)), np.zeros((len(model.A), b.shape[1])))
+    b, d, spread = _driving(model)
     lagged = [model.C @ spread @ model.C.T + d @ d.T]
     ahead = model.A @ spread @ model.C.T + b @ d.T
     for _ in range(window - 1):
@@ -41,6 +39,13 @@ def window_covariance(model: ResidualModel, window: int) -> FloatArray:
     return np.block([
         [lagged[i - j] if i >= j else lagged[j - i].T for j in range(window)] for i in range(window)
     ])  # fmt: skip
+
+
+def _driving(model: ResidualModel) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return what random disturbances and noise do to error and residual, and the covariance of the error."""
+    b = np.hstack([model.Bd * model.deviations, model.Bw])
+    d = np.hstack([model.Dd * model.deviations, model.Dw])
+    return b, d, output_covariance(model.A, b, np.eye(len(model.A)), np.zeros((len(model.A), b.shape[1])))
 
 
 def _felt(model: ResidualModel) -> list[bool]:
@@ -82,14 +87,10 @@ def correlation_left(model: ResidualModel, window: int, whitener: FloatArray) ->
     count, n = len(model.C), len(model.A)
     covariance = window_covariance(model, 2 * window)
     span = window * count
-    near = [
-        whitener @ covariance[j * count : j * count + span, :span] @ whitener.T for j in range(1, window)
-    ]  # fmt: skip
+    near = (whitener @ covariance[j * count : j * count + span, :span] @ whitener.T for j in range(1, window))
     total = float(sum(np.linalg.norm(part, 2) for part in near))
     # Later ones are P A^k Q, k = 0, 1, ...
-    b = np.hstack([model.Bd * model.deviations, model.Bw])
-    d = np.hstack([model.Dd * model.deviations, model.Dw])
-    spread = output_covariance(model.A, b, np.eye(n), np.zeros((n, b.shape[1])))
+    b, d, spread = _driving(model)
     ahead = model.A @ spread @ model.C.T + b @ d.T
     blocks = [whitener[:, i * count : (i + 1) * count] for i in range(window)]
     shown, driven = np.zeros((len(whitener), n)), np.zeros((n, len(whitener)))
@@ -112,6 +113,13 @@ def cusum_whitener(model: ResidualModel, window: int) -> tuple[FloatArray, bool]
     return whitener / np.sqrt(1.0 + 2.0 * left), left <= WHITE_SHARE
 
 
+def whitened(kind: str, model: ResidualModel, window: int) -> tuple[FloatArray, bool]:
+    """Return the whitener of ``chi-square`` or ``cusum``, and whether what it makes is white."""
+    if kind == "chi-square":
+        return whitener_of(window_covariance(model, window)), True
+    return cusum_whitener(model, window)
+
+
 def steady_mean(model: ResidualModel) -> FloatArray:
     """Return the mean ``(nr,)`` of the residual in steady state."""
     state = np.linalg.solve(np.eye(len(model.A)) - model.A, model.Bd @ model.means)
@@ -122,10 +130,7 @@ def settled(model: ResidualModel, initial_error: float, window: int) -> int:
     """Return the first sample whose window is free of the start."""
     deviation = float(np.sqrt(np.max(np.diag(window_covariance(model, 1)))))
     # The covariance and the mean have to settle as well, from a start of about the size of their own states.
-    spread = output_covariance(
-        model.A, np.hstack([model.Bd * model.deviations, model.Bw]), np.eye(len(model.A)),
-        np.zeros((len(model.A), model.Bd.shape[1] + model.Bw.shape[1])),
-    )  # fmt: skip
+    spread = _driving(model)[2]
     mean = np.linalg.norm(np.linalg.solve(np.eye(len(model.A)) - model.A, model.Bd @ model.means))
     size = initial_error + float(np.sqrt(np.trace(spread))) + float(mean)
     effects = np.array([np.linalg.norm(model.C @ power, 2) for power in model.powers()]) * size
