@@ -8,19 +8,18 @@ exponential (continuous ones), exact for signals that are constant or linear bet
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from obsynth.analysis.transformations import StateRecovery, discretise, eliminate_algebraic_states
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.numerics.arguments import is_whole
-from obsynth.numerics.arrays import FloatArray, as_matrix
+from obsynth.numerics.arguments import real_vector, whole_number
+from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.holds import driven, first_order_hold
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.simulation.scenario_signals import Drive
-from obsynth.simulation.trajectory import Trajectory
+from obsynth.simulation.trajectory import Trajectory, signal_of
 
 
 def simulate_plant(
@@ -39,53 +38,24 @@ def simulate_plant(
             "The plant is continuous: sample it first, with obsynth.discretise or transform: {sample_time: ...}.",
             path="dt",
         )
-    if not is_whole(steps) or steps < 1:
-        raise SpecError(f"steps is {steps!r}: give a whole number of samples, 1 or more.", path="steps")
+    steps = whole_number(steps, "steps", "a whole number of samples")
     sizes = {"u": plant.nu, "f": plant.nf, "d": plant.nd, "w": plant.nw}
     given = {"u": u, "f": f, "d": d, "w": w}
-    signals = {name: _signal(given[name], name, (int(steps), size)) for name, size in sizes.items()}
-    start = np.zeros(plant.nx) if initial_state is None else _initial_state(initial_state, plant.nx)
+    signals = {name: signal_of(given[name], name, (steps, size)) for name, size in sizes.items()}
+    start = np.zeros(plant.nx) if initial_state is None else real_vector(initial_state, plant.nx, "initial_state")
     elimination = eliminate_algebraic_states(plant)
     reduced, recovery = elimination.plant, elimination.recovery
     drive = _sum_of(signals, {"u": reduced.B, "f": reduced.Bf, "d": reduced.Bd, "w": reduced.Bw})
     dynamic = driven(reduced.A, dynamic_part(plant, recovery, start), drive)
     _require_finite(dynamic, "simulate fewer steps", "steps")
-    states = dynamic @ recovery.from_state.T + _sum_of(
-        signals,
-        {
-            "u": recovery.from_input, "f": recovery.from_fault, "d": recovery.from_disturbance,
-            "w": recovery.from_noise,
-        },
-    )  # fmt: skip
+    following = {"u": recovery.from_input, "f": recovery.from_fault, "d": recovery.from_disturbance}
+    states = dynamic @ recovery.from_state.T + _sum_of(signals, {**following, "w": recovery.from_noise})
     outputs = states @ plant.C.T + _sum_of(signals, {"u": plant.D, "f": plant.Df, "d": plant.Dd, "w": plant.Dw})
     inconsistency = 0.0 if initial_state is None else float(np.linalg.norm(states[0] - start))
     return Trajectory(
         states, outputs, signals["u"], signals["f"], signals["d"], signals["w"],
         time=plant.dt * np.arange(steps, dtype=np.float64), inconsistency=inconsistency,
     )  # fmt: skip
-
-
-def _signal(value: Any, name: str, shape: tuple[int, int]) -> FloatArray:
-    if value is None:
-        return np.zeros(shape)
-    array = np.asarray(value)
-    matrix = as_matrix(array.reshape(-1, 1) if array.ndim == 1 and shape[1] == 1 else array, name)
-    if matrix.shape != shape:
-        raise SpecError(
-            f"{name} is {matrix.shape[0]} by {matrix.shape[1]}, but {shape[0]} by {shape[1]} is needed "
-            "(samples by signals).",
-            path=name,
-        )
-    return matrix
-
-
-def _initial_state(value: Any, nx: int) -> FloatArray:
-    array = np.asarray(value)
-    state = as_matrix(array.reshape(1, -1) if array.ndim == 1 else array, "initial_state")
-    if state.shape != (1, nx):
-        raise SpecError(f"initial_state needs {nx} numbers, one for each state.", path="initial_state")
-    row: FloatArray = state[0]
-    return row
 
 
 def _sum_of(signals: dict[str, FloatArray], matrices: dict[str, FloatArray]) -> FloatArray:
