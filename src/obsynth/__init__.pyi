@@ -1,21 +1,21 @@
 from obsynth import plotting as plotting
-from obsynth.analysis.diagnosis.banks import StructuredResidual as StructuredResidual
+from obsynth.analysis.dae_structure import Identifiability as Identifiability
+from obsynth.analysis.dae_structure import identifiability as identifiability
 from obsynth.analysis.diagnosis.decoupled import DecoupledPlant as DecoupledPlant
 from obsynth.analysis.diagnosis.decoupled import decouple as decouple
 from obsynth.analysis.diagnosis.diagnosing import diagnose as diagnose
 from obsynth.analysis.diagnosis.verdicts import Diagnosis as Diagnosis
 from obsynth.analysis.diagnosis.verdicts import FaultDiagnosis as FaultDiagnosis
-from obsynth.analysis.identifiability import Identifiability as Identifiability
-from obsynth.analysis.identifiability import identifiability as identifiability
+from obsynth.analysis.diagnosis.verdicts import StructuredResidual as StructuredResidual
 from obsynth.analysis.structure import analyse_structure as analyse_structure
-from obsynth.analysis.transformations import discretise as discretise
-from obsynth.analysis.transformations import eliminate_algebraic_states as eliminate_algebraic_states
+from obsynth.analysis.transformations.elimination import eliminate_algebraic_states as eliminate_algebraic_states
 from obsynth.analysis.transformations.linearisation import linearise as linearise
+from obsynth.analysis.transformations.sampling import discretise as discretise
 from obsynth.calibration.calibrating import calibrate as calibrate
+from obsynth.calibration.diagnostics import Validation as Validation
 from obsynth.calibration.result import CalibratedBox as CalibratedBox
 from obsynth.calibration.result import Calibration as Calibration
 from obsynth.calibration.validating import validate as validate
-from obsynth.calibration.validation import Validation as Validation
 from obsynth.calibration.validity import Validity as Validity
 from obsynth.calibration.validity import validity as validity
 from obsynth.comparison.comparing import compare as compare
@@ -52,14 +52,13 @@ from obsynth.experiments.tolerance_study import tolerance_study as tolerance_stu
 from obsynth.exporting.files import export as export
 from obsynth.importing.andes import from_andes as from_andes
 from obsynth.importing.fmu import from_fmu as from_fmu
-from obsynth.importing.matlab import from_matlab as from_matlab
-from obsynth.importing.matrices import from_pandas as from_pandas
-from obsynth.importing.matrices import from_sympy as from_sympy
-from obsynth.importing.modelica import from_modelica as from_modelica
-from obsynth.importing.state_space import from_control as from_control
-from obsynth.importing.state_space import from_scipy as from_scipy
+from obsynth.importing.model_files import from_matlab as from_matlab
+from obsynth.importing.model_files import from_modelica as from_modelica
+from obsynth.importing.python_objects import from_control as from_control
+from obsynth.importing.python_objects import from_pandas as from_pandas
+from obsynth.importing.python_objects import from_scipy as from_scipy
+from obsynth.importing.python_objects import from_sympy as from_sympy
 from obsynth.methods.adaptive_observer.public import adaptive_observer as adaptive_observer
-from obsynth.methods.choosing.figures import FaultFigures as FaultFigures
 from obsynth.methods.dae_adaptive_observer.public import dae_adaptive_observer as dae_adaptive_observer
 from obsynth.methods.descriptor_kalman.public import descriptor_kalman as descriptor_kalman
 from obsynth.methods.designing import check as check
@@ -68,6 +67,7 @@ from obsynth.methods.fault_estimation_filter.public import fault_estimation_filt
 from obsynth.methods.fault_estimation_filter.public import (
     fault_estimation_filter_from_gains as fault_estimation_filter_from_gains,
 )
+from obsynth.methods.fault_figures import FaultFigures as FaultFigures
 from obsynth.methods.functional_filter.detection import DetectionFilter as DetectionFilter
 from obsynth.methods.functional_filter.detection import detection_filter as detection_filter
 from obsynth.methods.functional_filter.public import functional_filter as functional_filter
@@ -88,8 +88,8 @@ from obsynth.observers.dae.observer import DAEObserver as DAEObserver
 from obsynth.observers.decisions import ParameterMonitor as ParameterMonitor
 from obsynth.observers.decisions import decide as decide
 from obsynth.observers.estimates import Estimates as Estimates
+from obsynth.observers.linear.derived import sample_observer as sample_observer
 from obsynth.observers.linear.observer import LinearObserver as LinearObserver
-from obsynth.observers.linear.sampling import sample_observer as sample_observer
 from obsynth.observers.recursive.observer import RecursiveObserver as RecursiveObserver
 from obsynth.observers.recursive.settings import Adaptation as Adaptation
 from obsynth.observers.running import RunningObserver as RunningObserver

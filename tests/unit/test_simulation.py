@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from obsynth.analysis import discretise, eliminate_algebraic_states
+from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
+from obsynth.analysis.transformations.sampling import discretise
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.plants import DescriptorSystem
+from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.simulation import Trajectory, simulate_plant
 from obsynth.simulation.time_varying import simulate_time_varying

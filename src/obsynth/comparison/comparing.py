@@ -12,9 +12,9 @@ from obsynth.analysis.transformations.recovery import Transformation, linear_pla
 from obsynth.comparison.result import ComparedMethod, Comparison, FaultComparison
 from obsynth.comparison.scenario_runs import DrawnRuns, alarms, drawn_runs, estimates, rms
 from obsynth.errors import SpecError
-from obsynth.methods.choosing.candidates import Candidate, candidate, linear_methods
-from obsynth.methods.choosing.figures import DECOUPLED, Held, held, on_the_clock, step_responses
+from obsynth.methods.automatic import Candidate, candidate, linear_methods
 from obsynth.methods.designing import design
+from obsynth.methods.fault_figures import DECOUPLED, Held, held, on_the_clock, step_responses
 from obsynth.methods.functional_filter.rates import settling_time
 from obsynth.numerics.arguments import (
     Count,

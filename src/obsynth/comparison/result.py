@@ -10,7 +10,7 @@ import numpy as np
 
 from obsynth.files.outputs import FileKind
 from obsynth.files.tables import html_table, text_table
-from obsynth.methods.choosing.figures import FaultFigures
+from obsynth.methods.fault_figures import FaultFigures
 from obsynth.numerics.arrays import FloatArray
 from obsynth.results.design import ObserverDesign
 

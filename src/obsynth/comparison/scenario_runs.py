@@ -42,7 +42,7 @@ def drawn_runs(
     feedback: FloatArray,
 ) -> DrawnRuns:
     """Return the runs; plants are drawn before they are sampled, and disturbances by a factor between -1 and 1."""
-    from obsynth.methods.choosing.figures import on_the_clock
+    from obsynth.methods.fault_figures import on_the_clock
 
     drive = resolve(sampled, scenario)
     nu, nf = sampled.nu, sampled.nf

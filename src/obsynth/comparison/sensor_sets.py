@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.analysis.diagnosis.additions import Sensor, state_sensors
 from obsynth.analysis.diagnosis.decoupled import fault_numbers
+from obsynth.analysis.diagnosis.explanations import Sensor, state_sensors
 from obsynth.analysis.diagnosis.sensor_search import GOALS, SensorSearch, Task, reached
 from obsynth.analysis.transformations.recovery import Transformation, linear_plant
 from obsynth.errors import ObsynthError, PreconditionError, SpecError

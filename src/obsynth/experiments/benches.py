@@ -14,12 +14,12 @@ from obsynth.numerics.covariances import covariance_factor
 from obsynth.numerics.holds import driven, first_order_hold
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.estimates import Estimates
+from obsynth.observers.linear.derived import sample_observer
 from obsynth.observers.linear.observer import LinearObserver, split_rows
-from obsynth.observers.linear.sampling import sample_observer
 from obsynth.observers.recursive.gain_schedule import run_batch
 from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.plants.names import index_of
 from obsynth.plants.sequences import MatrixSequence
+from obsynth.plants.validation import index_of
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.dae import simulate_dae
 from obsynth.simulation.linear import Stepper, make_stepper

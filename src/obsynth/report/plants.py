@@ -26,8 +26,7 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.report.designs import plant_facts
 from obsynth.results.checks import Check
-from obsynth.results.checks_table import checks_table
-from obsynth.results.layout import complex_numbers, facts_table, headed_table, name_list, print_section
+from obsynth.results.layout import checks_table, complex_numbers, facts_table, headed_table, name_list, print_section
 from obsynth.results.report import VerificationReport
 
 

@@ -204,8 +204,8 @@ class ObserverDesign:
         import control
         import numpy as np
 
+        from obsynth.observers.recursive.gain_schedule import steady_observer
         from obsynth.observers.recursive.observer import RecursiveObserver
-        from obsynth.observers.recursive.steady_state import steady_observer
 
         observer = (
             steady_observer(self.observer).observer if isinstance(self.observer, RecursiveObserver) else self.linear[1]

@@ -63,7 +63,7 @@ class VerificationReport:
 
     def __str__(self) -> str:
         """Return the table of the checks."""
-        from obsynth.results.checks_table import report_text
+        from obsynth.results.layout import report_text
 
         return report_text(self.checks)
 

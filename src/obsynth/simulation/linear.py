@@ -12,7 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from obsynth.analysis.transformations import StateRecovery, discretise, eliminate_algebraic_states
+from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
+from obsynth.analysis.transformations.recovery import StateRecovery
+from obsynth.analysis.transformations.sampling import discretise
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arguments import real_vector, whole_number
 from obsynth.numerics.arrays import FloatArray

@@ -10,7 +10,7 @@ from typing import Any
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_finite_number, is_whole
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.names import index_of
+from obsynth.plants.validation import index_of
 from obsynth.simulation.profiles import KINDS, Additive, Failure, Profile, Random
 
 _ADDITIVE = tuple(kind for kind in KINDS.values() if issubclass(kind, Additive))

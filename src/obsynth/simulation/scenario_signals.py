@@ -11,8 +11,8 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.names import index_of
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.plants.validation import index_of
 from obsynth.simulation.profiles import SAMPLE_SLACK, Additive, Failure, LostEffectiveness, Profile, Random, Stuck
 from obsynth.simulation.scenario import Scenario, profiles_of
 

@@ -158,9 +158,9 @@ class Sweep(ResultTable):
         SpecError
             No design claims that, or no such parameter was varied.
         """
-        from obsynth.plotting.sweep import plot_sweep
+        from obsynth.plotting.trade_off import plot_sweep
 
-        return plot_sweep(self, claim, parameter=parameter)
+        return plot_sweep(self.results, claim, parameter=parameter)
 
 
 def sweep(

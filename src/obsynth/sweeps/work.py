@@ -19,7 +19,7 @@ from obsynth.files.tables import TableWriter
 from obsynth.methods.designing import Plant
 from obsynth.observers.progress import as_they_come
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.names import index_of
+from obsynth.plants.validation import index_of
 from obsynth.results.gain_sets import plain
 from obsynth.spec.documents import read_yaml
 from obsynth.spec.loader import changed_document

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from obsynth.analysis.transformations import discretise
 from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
+from obsynth.analysis.transformations.sampling import discretise
 from obsynth.analysis.transformations.uncertain_plant import AffinePlant, untouched_states
 from obsynth.analysis.zeros import zeros_of_system
 from obsynth.errors import ObsynthError

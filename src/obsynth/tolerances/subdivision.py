@@ -206,8 +206,7 @@ def index_one_on_box(plant: DescriptorSystem) -> BoxVerdict:
 
 def compressed_rows(e: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return ``R1, R2``: rows of E that have full rank, and a rational basis of ``R2 E = 0``; numbers as written."""
-    from obsynth.proofs.exact_matrices import null_basis, pivot_columns
-    from obsynth.proofs.written_numbers import nearest_doubles, written_matrix
+    from obsynth.proofs.exact_arithmetic import nearest_doubles, null_basis, pivot_columns, written_matrix
 
     n = len(e)
     exact = written_matrix(e.T)

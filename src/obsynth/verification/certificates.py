@@ -31,10 +31,9 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.spectra import decay_rates, eigenvalues
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.proofs.balls import Enclosed, block
 from obsynth.proofs.contraction import prove_contraction
 from obsynth.proofs.definiteness import DefinitenessProof, prove_positive_definite, unproved
-from obsynth.proofs.extended_balls import enclosed_eigenvalues
+from obsynth.proofs.extended_balls import Enclosed, block, enclosed_eigenvalues
 from obsynth.results.checks import Check, CheckKind
 from obsynth.verification.error_system import LaggedPlant
 

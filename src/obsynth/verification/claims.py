@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from obsynth.analysis.transformations import StateRecovery
+from obsynth.analysis.transformations.recovery import StateRecovery
 from obsynth.numerics.arguments import is_number
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.checks import Check, information, upper_bound_check

@@ -13,8 +13,8 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.balls import Ball
 from obsynth.proofs.contraction import column_norms, prove_contraction
-from obsynth.proofs.exponentials import energy
 from obsynth.proofs.peak_sums import gathered, interval_pieces, peak_sums
+from obsynth.proofs.products import energy
 from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.remainder_channel import TrackedPlant
@@ -89,7 +89,7 @@ def _sampling_rows(
     )  # fmt: skip
     if not plant.nd:
         return
-    from obsynth.analysis.transformations import eliminate_algebraic_states
+    from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
 
     smooth = eliminate_algebraic_states(written).plant
     t = tracked.T[:, : plant.nx]

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from obsynth.numerics.spectra import certain_noise_covariance
-from obsynth.observers.linear.averaging import unaveraged
+from obsynth.observers.linear.derived import unaveraged
 from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import Certificate, ObserverDesign
 

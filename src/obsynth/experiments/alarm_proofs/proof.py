@@ -19,7 +19,7 @@ from obsynth.experiments.monitors.adaptive_record import thresholds_of_records
 from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.numerics.arguments import is_finite_number, is_whole
 from obsynth.numerics.arrays import FloatArray
-from obsynth.plants.names import index_of
+from obsynth.plants.validation import index_of
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import digest_of
 from obsynth.tolerances.result import EXACT_MODEL

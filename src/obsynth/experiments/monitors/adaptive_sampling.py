@@ -16,15 +16,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from obsynth.analysis.transformations import discretise
 from obsynth.analysis.transformations.elimination import algebraic_coordinates, eliminate_algebraic_states
+from obsynth.analysis.transformations.sampling import discretise
 from obsynth.analysis.transformations.uncertain_plant import AffinePlant, reduced_family
 from obsynth.errors import PreconditionError
 from obsynth.experiments.monitors.adaptive_bound import Start
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.holds import first_order_hold
+from obsynth.observers.linear.derived import sample_observer
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.observers.linear.sampling import sample_observer
 from obsynth.plants.constants import ConstantsBox
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.uncertainty import ELIMINATED, Uncertainty

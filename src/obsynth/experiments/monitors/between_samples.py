@@ -23,17 +23,18 @@ from functools import cached_property
 
 import numpy as np
 
-from obsynth.analysis.transformations import eliminate_algebraic_states
+from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import peak_gain
 from obsynth.numerics.holds import first_order_hold
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.proofs.balls import Ball, block, rounded_up
+from obsynth.proofs.balls import Ball, rounded_up
 from obsynth.proofs.contraction import Contraction, column_norms, prove_contraction
-from obsynth.proofs.exponentials import exponential
+from obsynth.proofs.extended_balls import block
 from obsynth.proofs.peak_sums import PeakSums, gathered, interval_pieces, peak_sums
+from obsynth.proofs.products import exponential
 
 #: Modes of the plant that decay by less than this exponent in a sample are not followed until they have died out.
 LEAST_DECAY = 1e-4

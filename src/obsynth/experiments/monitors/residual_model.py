@@ -15,15 +15,15 @@ from typing import cast
 
 import numpy as np
 
-from obsynth.analysis.transformations import discretise
+from obsynth.analysis.transformations.sampling import discretise
 from obsynth.errors import SpecError
 from obsynth.experiments.monitors.between_samples import BetweenSamples
 from obsynth.methods.pd_observer.realisation import with_faults_as_states
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.holds import first_order_hold
 from obsynth.numerics.norms import output_covariance
+from obsynth.observers.linear.derived import sample_observer
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.observers.linear.sampling import sample_observer
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.profiles import Additive, Random

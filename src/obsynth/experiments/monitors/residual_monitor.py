@@ -22,7 +22,7 @@ from obsynth.experiments.monitors.thresholds import (
 from obsynth.experiments.monitors.whitening import settled, steady_mean, whitened
 from obsynth.numerics.arguments import is_finite_number, is_whole, require_kind, require_mapping
 from obsynth.numerics.arrays import FloatArray
-from obsynth.plants.names import index_of
+from obsynth.plants.validation import index_of
 from obsynth.results.design import ObserverDesign
 from obsynth.simulation.scenario import Scenario
 

@@ -19,7 +19,7 @@ from obsynth.observers.alarms import alone
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.decisions import WALKING_FORMS
 from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.plants.names import index_of
+from obsynth.plants.validation import index_of
 
 #: Share of an interval by which the data's sampling may differ from the one that a threshold is for.
 FITTING_SHARE = 0.01

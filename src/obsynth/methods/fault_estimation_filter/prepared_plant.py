@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from obsynth.analysis.plant_units import PlantUnits
-from obsynth.analysis.transformations import augment_faults
+from obsynth.analysis.transformations.recovery import augment_faults
 from obsynth.errors import SpecError
 from obsynth.methods.fault_estimation_filter.detectability_indexes import (
     FaultDetectability,

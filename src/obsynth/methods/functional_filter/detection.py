@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from obsynth.analysis.transformations import eliminate_algebraic_states
+from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
 from obsynth.analysis.transformations.recovery import Transformation, linear_plant
 from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.methods.functional_filter.detection_proofs import Transfer, gain_is_proved, sensitivity_is_proved
