@@ -97,11 +97,10 @@ _NAMES = {
     "plants.uncertain_system": "uncertain_system",
     "plants.uncertainty": "Uncertainty",
     "report.page": "html_report",
-    "results.checks": "Check",
+    "results.checks": "Check VerificationReport",
     "results.delta_scan": "DeltaScan",
     "results.design": "Certificate ObserverDesign",
     "results.gain_sets": "load",
-    "results.report": "VerificationReport",
     "simulation.dae": "simulate_dae",
     "simulation.profiles": "Drift Gaussian Intermittent LostEffectiveness Ramp Sine Step Stuck Uniform",
     "simulation.scenario": "Scenario",
@@ -124,6 +123,7 @@ _PACKAGES = ("plotting",)
 __all__ = sorted(_HOMES)
 
 provide({
+    "checks as text": "obsynth.results.layout:report_text",
     "design summary": "obsynth.report.summary:summary",
     "designs with model error": "obsynth.experiments.tolerant_designs:with_model_error",
 })  # fmt: skip

@@ -104,11 +104,11 @@ from obsynth.plants.uncertain_system import uncertain_system as uncertain_system
 from obsynth.plants.uncertainty import Uncertainty as Uncertainty
 from obsynth.report.page import html_report as html_report
 from obsynth.results.checks import Check as Check
+from obsynth.results.checks import VerificationReport as VerificationReport
 from obsynth.results.delta_scan import DeltaScan as DeltaScan
 from obsynth.results.design import Certificate as Certificate
 from obsynth.results.design import ObserverDesign as ObserverDesign
 from obsynth.results.gain_sets import load as load
-from obsynth.results.report import VerificationReport as VerificationReport
 from obsynth.simulation.dae import simulate_dae as simulate_dae
 from obsynth.simulation.profiles import Drift as Drift
 from obsynth.simulation.profiles import Gaussian as Gaussian
