@@ -19,7 +19,6 @@ from obsynth.plants.sequences import (
     checked_constants,
     checked_horizon,
     completed,
-    missing,
     positive_dt,
 )
 from obsynth.plants.validation import Problems, checked_labels, checked_names
@@ -127,7 +126,7 @@ class TimeVaryingDescriptorSystem:
                 make = partial(MatrixSequence.of, asked[name], name, first=first, constants=known)
                 found[name] = problems.collect(make)
             elif name in ("A", "C"):
-                problems.collect(partial(missing, name))
+                problems.note(f"{name} is missing: a plant needs A and C.", name)
         problems.raise_if_any()
         values = completed(found, problems)
         problems.raise_if_any()

@@ -122,11 +122,15 @@ class Problems:
         """Return ``value``, or zeros of ``shape`` where it is missing or empty; note a wrong shape."""
         if value is None or (0 in value.shape and 0 in shape):
             return np.zeros(shape)
-        if value.shape != shape:
-            turned = value.shape[1] == shape[0] != value.shape[0]
-            hint = " Is it transposed?" if turned or value.shape == shape[::-1] else ""
-            self.note(f"{name} is {_by(value.shape)}, but {_by(shape)} is needed.{hint}", name)
+        self.require_shape(value.shape, name, shape)
         return value
+
+    def require_shape(self, found: tuple[int, ...], name: str, shape: tuple[int, int]) -> None:
+        """Note a wrong shape."""
+        if found != shape:
+            turned = found[1] == shape[0] != found[0]
+            hint = " Is it transposed?" if turned or found == shape[::-1] else ""
+            self.note(f"{name} is {_by(found)}, but {_by(shape)} is needed.{hint}", name)
 
     def raise_if_any(self) -> None:
         """Raise one `SpecError` with all problems noted so far."""
