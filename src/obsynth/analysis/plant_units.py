@@ -19,7 +19,7 @@ from obsynth.numerics.arrays import ComplexArray, FloatArray, read_only
 from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.numerics.scaling import LogBalance
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.exosystems import Exosystem
+from obsynth.plants.fault_models import Exosystem
 from obsynth.plants.origin import origin_of
 
 #: Given units in which the natural factors differ by more than this are no units to design in.

@@ -14,7 +14,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from obsynth.errors import PreconditionError, SpecError
-from obsynth.importing.fmu_instance import Instance, instance_of
+from obsynth.importing.fmu_instance import Instance
 from obsynth.importing.roles import plant_of
 from obsynth.numerics.arguments import is_finite_number, require_mapping
 from obsynth.numerics.arrays import FloatArray
@@ -96,7 +96,7 @@ def _instance(path: Path) -> Iterator[Instance]:
     description = _read(lambda: fmpy.read_model_description(str(path)), path)
     folder = _read(lambda: fmpy.extract(str(path)), path)
     try:
-        instance = _read(lambda: instance_of(fmpy, description, folder), path)
+        instance = _read(lambda: Instance(description, folder), path)
         try:
             yield instance
         finally:

@@ -140,8 +140,6 @@ def as_ball(content: flint.arb_mat) -> Ball:
 
 #: So many matrices are multiplied as balls before the coordinates move.
 AT_ONCE = 16
-
-
 #: No standard bounds the rounding of logarithms: a few units in the last place, and more than that.
 LOGARITHMS = 1e-14
 

@@ -28,7 +28,7 @@ from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.numerics.scaling import equilibrate_pencil
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.exosystems import Exosystem
+from obsynth.plants.fault_models import Exosystem
 from obsynth.proofs.exact_arithmetic import written_fraction
 
 #: Digits to which the direction of a witness is rounded, until the plant is within the tolerance.

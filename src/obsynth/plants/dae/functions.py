@@ -14,8 +14,6 @@ from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.dae.symbols import DAESymbols, symbols_of
 
 _ROOT = np.sqrt(6.0)
-
-
 #: Butcher matrices of the implicit methods whose last stage is the result (stiffly accurate).
 BUTCHER: dict[str, FloatArray] = {
     "backward-euler": np.array([[1.0]]),

@@ -6,7 +6,6 @@ input along a homotopy, or give up, the step is not to be trusted, and `Implicit
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -220,18 +219,13 @@ class ImplicitStep:
         return float(np.abs((stages - start) / self.sizes).max())
 
     def _newton(self, start: FloatArray, x: FloatArray, u: FloatArray, theta: FloatArray) -> NewtonResult:
-        return newton(self._evaluation(x, u, theta), start, self.sizes)
-
-    def _evaluation(
-        self, x: FloatArray, u: FloatArray, theta: FloatArray
-    ) -> Callable[[FloatArray], tuple[FloatArray, FloatArray]]:
         dt = np.array([self.dt])
 
         def evaluate(stages: FloatArray) -> tuple[FloatArray, FloatArray]:
             value, jacobian = self.functions.residual(stages, x, u, theta, dt)
             return value[:, 0], jacobian
 
-        return evaluate
+        return newton(evaluate, start, self.sizes)
 
     def _homotopy(
         self, start: FloatArray, x: FloatArray, before: FloatArray, u: FloatArray, theta: FloatArray, k: int

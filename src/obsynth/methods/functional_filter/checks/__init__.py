@@ -16,8 +16,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.scaling import balance_by_least_squares
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.exosystems import Exosystem
-from obsynth.plants.fault_models import stated_eigenvalues
+from obsynth.plants.fault_models import Exosystem, stated_eigenvalues
 from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.certificates import decay_row, prove_stable
