@@ -218,7 +218,7 @@ def named_estimates(observer: StepSettings, *, states: FloatArray, faults: Float
 
 def changed(observer: Robust, **options: Any) -> Robust:
     """Return the observer with other options; the steps of a nonlinear one are built once."""
-    found = replace(observer, **options)  # type: ignore[type-var]
+    found = replace(observer, **options)
     if "steps" in vars(observer):
         # What these options do stands outside of the compiled steps.
         vars(found)["steps"] = type(observer.steps)(found, observer.steps.graph)
