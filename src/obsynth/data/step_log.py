@@ -82,19 +82,24 @@ class SteppingEngine(Engine):
             )  # fmt: skip
         return values
 
-    def _taken(self, y: FloatArray, u: FloatArray, row: int) -> StepRow | SolverError | None:
-        """Take one sample, or return why the sample cannot be taken; `None` if numbers are not finite."""
+    def _taken(self, y: FloatArray, u: FloatArray, row: int) -> StepRow | None:
+        """Take one sample, or none of it: `None` where numbers are no finite ones any more."""
+        before = self.state
         try:
-            self.state, found = self.observer.accept(self.state, y, u)
+            with np.errstate(all="ignore"):
+                self.state, found = self.observer.accept(self.state, y, u)
         except SolverError as error:
-            return SolverError(f"Row {row}: {error}")
+            raise SolverError(f"Row {row}: {error}") from error
         except SpecError as error:
             raise SpecError(f"Row {row}: {error}", path=f"row {row}") from error
         except PreconditionError as error:
             raise PreconditionError(f"Row {row}: {error}", condition=error.condition) from error
         except (np.linalg.LinAlgError, ValueError):
             return None
-        return found if found.is_finite else None
+        if found.is_finite:
+            return found
+        self.state = before
+        return None
 
     def _values(self, found: StepRow) -> FloatArray:
         """Return a row: estimates, standard deviations, innovation at the parameters of one sample before."""
@@ -182,21 +187,15 @@ class SteppingEngine(Engine):
         return OK if outputs.all() else PARTIAL
 
     def _safe(self, y: FloatArray, u: FloatArray, row: int) -> StepRow | None:
-        """Take one sample, or none of it: what overflows leaves the state as it was."""
-        before = self.state
-        with np.errstate(all="ignore"):
-            found = self._taken(y, u, row)
-        if found is None or isinstance(found, SolverError):
-            self.state = before
+        """Take one sample, or none of it where there is no solution either."""
+        try:
+            return self._taken(y, u, row)
+        except SolverError:
             return None
-        return found
 
     def _required(self, u: FloatArray, row: int) -> StepRow:
         """Take one sample without outputs."""
-        with np.errstate(all="ignore"):
-            found = self._taken(np.full(len(self.output_names), np.nan), u, row)
-        if isinstance(found, SolverError):
-            raise found
+        found = self._taken(np.full(len(self.output_names), np.nan), u, row)
         if found is None:
             raise SpecError(
                 f"Row {row}: the estimates are no finite numbers any more: the model is unstable, or the inputs are "
