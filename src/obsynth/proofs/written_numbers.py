@@ -27,6 +27,10 @@ SHORT_BITS = 34
 FractionRows: TypeAlias = Sequence[Sequence[Fraction]]
 
 
+#: Bits of the whole number that, times a power of two, is a double.
+MANTISSA_BITS = 53
+
+
 def written_fraction(value: float) -> Fraction:
     """Return the rational number that a finite double was written as."""
     text = repr(float(value))
@@ -58,10 +62,14 @@ def written_matrix(matrix: FloatArray) -> fmpq_mat:
 
 def stored_matrix(matrix: FloatArray) -> fmpq_mat:
     """Return a matrix ``(m, n)`` of doubles as the rational numbers that are stored, whatever they stand for."""
-    from flint import fmpq_mat
+    from flint import fmpq_mat, fmpz, fmpz_mat
 
-    rows, columns = matrix.shape
-    return fmpq_mat(rows, columns, [_as_fmpq(Fraction(value)) for value in np.ravel(matrix).tolist()])
+    # Whole numbers of one power of two.
+    parts, exponents = np.frexp(matrix)
+    least = int(np.min(exponents, initial=0, where=matrix != 0.0)) - MANTISSA_BITS
+    whole, shifts = np.ldexp(parts, MANTISSA_BITS).astype(np.int64), exponents - MANTISSA_BITS - least
+    shifted = [value << shift for value, shift in zip(whole.ravel().tolist(), shifts.ravel().tolist(), strict=True)]
+    return fmpq_mat(fmpz_mat(*matrix.shape, shifted)) / fmpz(2) ** -least
 
 
 def rational_matrix(rows: FractionRows, columns: int) -> fmpq_mat:
