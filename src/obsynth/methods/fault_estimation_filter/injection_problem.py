@@ -61,8 +61,8 @@ class GainProblem:
 
     Fields: A, C, Z: ``(n, n)``, ``(m, n)``, ``(q, n)``; B, D, Zd: Disturbance: ``(n, nd)``, ``(m, nd)``, ``(q, nd)``;
     Bn, Dn, Zn: Noise of unit covariance: ``(n, nw)``, ``(m, nw)``, ``(q, nw)``; free_weight: Whether V ``(q, m)`` is
-    free; weight_limit: Bound on the weight that V is a part of; judged_exactly: Whether a filter reaches a level only
-    if no peak of its response can be above that, and not if none is found there.
+    free; weight_limit: Bound on the weight that V is a part of; judged_exactly: Whether the norms of filters
+    are told (of many states, that they are below a level), and not the largest peaks found.
     """
 
     A: FloatArray
@@ -151,12 +151,13 @@ class GainProblem:
     def reaches(self, solution: Injection, level: float) -> bool:
         """Return whether the norm d -> xi is at most ``level``."""
         if not self.judged_exactly:
-            return largest_peak(*self.closed_loop(solution), modes=self.modes(solution)) <= level
+            return self.achieved_gain(solution) <= level
         return norm_is_at_most(*self.closed_loop(solution), level, modes=self.modes(solution))
 
     def achieved_gain(self, solution: Injection) -> float:
-        """Return the H-infinity norm d -> xi with the given gains: for many states, the highest peak that is found."""
-        return highest_gain_found(*self.closed_loop(solution), modes=self.modes(solution))
+        """Return the H-infinity norm d -> xi with the given gains: the largest peak found, or the norm itself."""
+        judge = highest_gain_found if self.judged_exactly else largest_peak
+        return judge(*self.closed_loop(solution), modes=self.modes(solution))
 
 
 @dataclass(frozen=True, eq=False)
