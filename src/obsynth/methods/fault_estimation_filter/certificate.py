@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import chain, islice, product
+from itertools import islice, product
 
 import numpy as np
 
@@ -30,18 +30,18 @@ NEAR_ONE = 1.05
 
 def bounded_real_certificate(
     plant: DescriptorSystem, observer: LinearObserver, tracking: FloatArray, gain: float, *, core: int, lag: int,
-    start: FloatArray | None = None, tries: int | None = None,
+    tries: int | None = None,
 ) -> tuple[FloatArray, bool]:  # fmt: skip
     """Return Q ``(core, core)``, upper triangular with P = Q'Q, for the shipped observer at level ``gain``.
 
     The Riccati solution with the largest slack that gives a proof, and true; the last try when none does, for the
-    report, and false.  Coordinates are tried in turn, at most ``tries``, beginning with ``start (core, core)``.
+    report, and false.  At most ``tries`` coordinates are tried.
     """
     errors = ErrorSystem.of(plant, observer, tracking, lag)
     a, b = observer.Az[:core, :core], errors.disturbance[:core] / gain
     c, d = -errors.fault_output[0][:, :core], errors.fault_output[2] / gain
     best, spare = np.eye(core), None
-    for change in islice(chain(() if start is None else (start,), _changes(a, b, c, d)), tries):
+    for change in islice(_changes(a, b, c, d), tries):
         inverse = np.asarray(np.linalg.inv(change))
         moved_a, moved_b, moved_c = inverse @ a @ change, inverse @ b, c @ change
         weight = max(1.0, float(np.linalg.norm(moved_c, 2)) ** 2)
@@ -54,8 +54,6 @@ def bounded_real_certificate(
             if proof.in_double_precision:
                 return best, True
             spare = best if proof.proved and spare is None else spare
-            if change is start:
-                break  # coordinates of this filter do better
     return (best, False) if spare is None else (spare, True)
 
 

@@ -76,7 +76,7 @@ class GainProblem:
     Zn: FloatArray
     free_weight: bool
     weight_limit: WeightLimit | None = None
-    judged_exactly: bool = False
+    judged_exactly: bool = True
     _modes: WeakKeyDictionary[Injection, Modes] = field(default_factory=WeakKeyDictionary, init=False, repr=False)
 
     @property
@@ -139,8 +139,9 @@ class GainProblem:
         return float(np.trace(output_covariance(*self.noise_loop(solution))))
 
     def modes(self, solution: Injection) -> Modes:
-        """Return the modes of the closed loop, found once for each filter."""
+        """Return the modes of the closed loop; those of the last filter are kept."""
         if solution not in self._modes:
+            self._modes.clear()
             self._modes[solution] = Modes.of(self.A - solution.R @ self.C)
         return self._modes[solution]
 

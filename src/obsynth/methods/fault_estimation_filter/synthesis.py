@@ -27,7 +27,6 @@ from obsynth.analysis.conditions import Condition, require_all
 from obsynth.analysis.existence.numbers import decided
 from obsynth.errors import InfeasibleError
 from obsynth.methods.conic.lmi import FILTER_SOLVERS
-from obsynth.methods.fault_estimation_filter.central_filter import MOST_STATES_FOR_LEVELS
 from obsynth.methods.fault_estimation_filter.certificate import bounded_real_certificate
 from obsynth.methods.fault_estimation_filter.conditions import examine_fault_filter, fault_filter_conditions
 from obsynth.methods.fault_estimation_filter.filter_search import NOMINAL_GAIN, FoundGains, found_gains, found_within
@@ -161,11 +160,8 @@ class _Shipped(NamedTuple):
         gains = _gains(prepared, parts, found.chosen)
         observer, tracking, lag = realise_filter(plant, prepared.plant, gains, prepared.detectability)
         level = found.gamma if found.problem.disturbances else nominal
-        # Among many states each equation counts, and the coordinates of the search may do.
-        many = found.problem.order > MOST_STATES_FOR_LEVELS
-        start = prepared.scaling.states[:, None] * found.least.first.states if many else None
         factor, proved = bounded_real_certificate(
-            plant, observer, tracking, level, core=prepared.plant.nx, lag=lag, start=start, tries=tries
+            plant, observer, tracking, level, core=prepared.plant.nx, lag=lag, tries=tries
         )
         return cls(gains, observer, tracking, lag, level, factor, proved)
 
