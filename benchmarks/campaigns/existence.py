@@ -22,7 +22,7 @@ from benchmarks.campaigns.frame import Outcome
 from flint import fmpq, fmpq_mat
 
 import obsynth as ob
-from obsynth.methods.drowned_designs import own_shares
+from obsynth.methods.refusals import own_shares
 
 CASES = 12000
 LIMIT = 120.0  # s

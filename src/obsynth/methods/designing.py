@@ -11,15 +11,13 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from obsynth.analysis.conditions import Condition
-from obsynth.analysis.transformations import StateRecovery, eliminate_algebraic_states
-from obsynth.analysis.transformations.elimination import MANY_VARIABLES
-from obsynth.analysis.transformations.recovery import Transformation, plant_and_recovery
+from obsynth.analysis.transformations.elimination import MANY_VARIABLES, eliminate_algebraic_states
+from obsynth.analysis.transformations.recovery import StateRecovery, Transformation, plant_and_recovery
 from obsynth.errors import PreconditionError, SpecError, VerificationError
 from obsynth.extensions import extension
-from obsynth.methods.advice import with_advice
-from obsynth.methods.choosing.automatic import automatic_design
-from obsynth.methods.drowned_designs import require_above_rounding, rounding_notes
+from obsynth.methods.automatic import automatic_design
 from obsynth.methods.method_spec import MethodSpec, PlantKind, Synthesis
+from obsynth.methods.refusals import require_above_rounding, rounding_notes, with_advice
 from obsynth.methods.registry import AUTO, REGISTRY, method_spec, methods_for
 from obsynth.methods.verifying import verify
 from obsynth.numerics.failures import failed_computations
@@ -28,11 +26,11 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.results.checks import VerificationReport
 from obsynth.results.design import Certificate, ObserverDesign
 from obsynth.results.plant_source import source_of
-from obsynth.results.report import VerificationReport
 from obsynth.simulation.scenario import Scenario
-from obsynth.verification.means import before_the_mean
+from obsynth.verification.claims import before_the_mean
 from obsynth.verification.plant import condition_rows
 from obsynth.verification.stored_numbers import StoredErrors
 

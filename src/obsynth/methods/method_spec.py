@@ -11,7 +11,7 @@ from functools import cache
 from importlib import import_module
 from typing import Any, ClassVar, Literal, TypeAlias, cast, get_type_hints
 
-from obsynth.analysis.transformations import Transformation
+from obsynth.analysis.transformations.recovery import Transformation
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import problem_with
 from obsynth.numerics.arrays import FloatArray

@@ -210,11 +210,9 @@ class ConstantsBox:
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain data, as `constants_box` reads it."""
-        return {
-            "constants": {name: item.as_dict() for name, item in self.constants.items()}, "variation": self.variation,
-            "source": self.source, "level": self.level, "digest": self.digest,
-            **({"calibrated": list(self.calibrated)} if self.calibrated else {}),
-        }  # fmt: skip
+        plain = {name: getattr(self, name) for name in ("variation", "source", "level", "digest")}
+        constants = {name: item.as_dict() for name, item in self.constants.items()}
+        return {"constants": constants, **plain, **({"calibrated": list(self.calibrated)} if self.calibrated else {})}
 
 
 def tolerance_share(value: Any, path: str) -> float:
@@ -256,9 +254,8 @@ def constant_of(name: str, given: Any, *, nominal: float | None = None) -> Const
 
 
 def _with_range(name: str, given: Mapping[str, Any], middle: Any, unit: str) -> Constant:
-    path = f"constants.{name}"
-    if given.get("range") is not None:
-        ends = given["range"]
+    path, ends = f"constants.{name}", given.get("range")
+    if ends is not None:
         if given.get("tolerance") is not None:
             raise SpecError(f"{name!r} has both a tolerance and a range: give one of them.", path=path)
         if isinstance(ends, str) or not hasattr(ends, "__len__") or len(ends) != 2 or not all(map(is_number, ends)):

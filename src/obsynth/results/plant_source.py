@@ -35,7 +35,8 @@ class PlantSource:
 
     def derived(self) -> Transformation:
         """Return the elimination, and the sampling where there was one, done again."""
-        from obsynth.analysis.transformations import discretise, eliminate_algebraic_states
+        from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
+        from obsynth.analysis.transformations.sampling import discretise
 
         if self.sample_time is None:
             return eliminate_algebraic_states(self.plant)

@@ -27,11 +27,7 @@ SUBSPACE_STEPS = 3
 
 @dataclass(frozen=True, eq=False)
 class ActiveVariables:
-    """What is left of a plant without its idle variables.
-
-    Fields: rows, columns: Equations and variables that stay; dropped: Names of the variables that do not; equations:
-    Numbers, from 1, of the equations that do not.
-    """
+    """What is left of a plant without its idle variables; names of these, and numbers of their equations from 1."""
 
     rows: Indices
     columns: Indices
@@ -62,13 +58,9 @@ def active_variables(plant: DescriptorSystem) -> ActiveVariables:
         rows, columns = np.delete(rows, gone), np.delete(columns, unused)
     idle_rows, idle_columns = _idle(e[rows][:, columns], a[rows][:, columns], c[:, columns], plant, rows, columns)
     kept_rows, kept_columns = np.delete(rows, idle_rows), np.delete(columns, idle_columns)
-    left_out = np.setdiff1d(np.arange(plant.nx), kept_columns)
-    return ActiveVariables(
-        kept_rows,
-        kept_columns,
-        tuple(plant.state_names[i] for i in left_out),
-        tuple(int(i) + 1 for i in np.setdiff1d(np.arange(plant.nx), kept_rows)),
-    )
+    dropped, unneeded = (np.setdiff1d(np.arange(plant.nx), kept) for kept in (kept_columns, kept_rows))
+    names, numbers = tuple(plant.state_names[i] for i in dropped), tuple(int(i) + 1 for i in unneeded)
+    return ActiveVariables(kept_rows, kept_columns, names, numbers)
 
 
 def active_part(plant: DescriptorSystem, found: ActiveVariables) -> DescriptorSystem:

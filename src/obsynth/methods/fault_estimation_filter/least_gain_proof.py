@@ -70,8 +70,7 @@ class InvisiblePairs:
     @classmethod
     @lru_cache(maxsize=2)
     def _of(cls, *numbers: tuple[tuple[int, ...], bytes]) -> InvisiblePairs:
-        from obsynth.proofs.exact_matrices import blocks, null_basis, zeros_matrix
-        from obsynth.proofs.written_numbers import stored_matrix
+        from obsynth.proofs.exact_arithmetic import blocks, null_basis, stored_matrix, zeros_matrix
 
         t, n, feedback, w, upsilon, plain, c, bd, dd = (
             stored_matrix(np.frombuffer(data).reshape(shape)) for shape, data in numbers
@@ -100,7 +99,8 @@ class InvisiblePairs:
         """Return the lower bound that a certificate proves, rounded down; zero where it proves nothing."""
         import flint
 
-        from obsynth.proofs.written_numbers import stored_matrix
+        from obsynth.proofs.exact_arithmetic import stored_matrix
+        from obsynth.proofs.extended_balls import arb_matrix
 
         k, s, nd = int(self.top.ncols()), int(self.S.ncols()), int(self.Zd.ncols())
         empty = {PAIRS: np.zeros((k, 1)), LAST: np.zeros((nd, s)), ALONE: np.zeros((nd, 1))}
@@ -110,7 +110,7 @@ class InvisiblePairs:
         if len(f) != k or last.shape != (nd, s) or len(alone) != nd:
             return 0.0
         with flint.ctx.workprec(BITS):
-            mixed, later, direct = (_stored_balls(part) for part in (f, last, alone))
+            mixed, later, direct = (arb_matrix(part) for part in (f, last, alone))
             image, top = (_balls(part) * mixed for part in (self.image, self.top))
             slack = image * image.transpose() - top * top.transpose()
             shown, energy = _square(_balls(self.shown) * mixed), _square(_balls(self.bottom) * mixed)
@@ -166,13 +166,6 @@ def _balls(matrix: Any) -> Any:
     import flint
 
     return flint.arb_mat(int(matrix.nrows()), int(matrix.ncols()), [flint.arb(value) for value in matrix.entries()])
-
-
-def _stored_balls(matrix: FloatArray) -> Any:
-    import flint
-
-    rows, columns = matrix.shape
-    return flint.arb_mat(rows, columns, [flint.arb(value) for value in np.ravel(matrix).tolist()])
 
 
 def _rows(matrix: Any, start: int, end: int) -> Any:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from obsynth.analysis.transformations import sampling_zero_warnings
-from obsynth.analysis.transformations.sampling import SLOW_ZERO_RADIUS
+from obsynth.analysis.transformations.sampling import SLOW_ZERO_RADIUS, sampling_zero_warnings
 from obsynth.methods.fault_estimation_filter.detectability_indexes import WARN_CONDITION, FaultDetectability
 from obsynth.numerics.norms import spectral_radius
 from obsynth.observers.linear.observer import LinearObserver

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from obsynth.analysis.transformations import eliminate_algebraic_states
+from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
 from obsynth.analysis.transformations.recovery import Transformation, linear_plant
 from obsynth.errors import PreconditionError, SolverError, SpecError
 from obsynth.methods.functional_filter.detection_proofs import Transfer, gain_is_proved, sensitivity_is_proved
@@ -25,8 +25,7 @@ from obsynth.numerics.threads import on_one_thread_if_small
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.balls import Ball
-from obsynth.results.checks import Check
-from obsynth.results.report import VerificationReport
+from obsynth.results.checks import Check, VerificationReport
 from obsynth.verification.identities import Identity, equality
 
 #: The grid of frequencies begins at this share of its end, where the band begins at zero.

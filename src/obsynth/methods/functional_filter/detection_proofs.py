@@ -18,8 +18,9 @@ import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.scaling import balanced_matrix
-from obsynth.proofs.balls import Ball, Enclosed, block, rounded_up
+from obsynth.proofs.balls import Ball, rounded_up
 from obsynth.proofs.definiteness import prove_positive_definite
+from obsynth.proofs.extended_balls import Enclosed, block
 
 #: Strictness of the equation that proves a gain, relative to what drives it.
 STRICTNESS = 1e-9

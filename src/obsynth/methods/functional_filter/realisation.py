@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
-from typing import Any
 
 import numpy as np
 from scipy.linalg import block_diag, schur
@@ -24,6 +23,8 @@ from obsynth.numerics.ranks import CANCELLATION_TOLERANCE
 from obsynth.numerics.scaling import balanced_matrix
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.proofs.extended_balls import arb_matrix
+from obsynth.proofs.products import BITS, as_ball
 
 #: A matrix larger than its eigenvalues by this is given in coordinates in which it is triangular.
 FAR_FROM_NORMAL = 1e3
@@ -85,7 +86,10 @@ def filter_part(model: FilterModel, gain: KalmanGain, shown: FloatArray, *, dela
     innovation = Rows(-model.C, model.L, model.T0)
     count, nx = len(model.estimate), model.T.shape[1]
     row = Rows(model.estimate, np.zeros((count, model.L.shape[1])), np.zeros((count, nx)))
-    dynamics, innovation, row = _in_plain_coordinates(dynamics, innovation, row)
+    coordinates = _plain_coordinates(dynamics.A)
+    if coordinates is not None:
+        dynamics = _rounded_once(model, gain, coordinates)
+        innovation, row = (Rows(r.C @ coordinates, r.D, r.T0) for r in (innovation, row))
     corrections = [innovation.times(model.estimate @ part) for part in gain.lag]
     if corrections:
         row = row.plus(corrections[0])
@@ -100,22 +104,37 @@ def filter_part(model: FilterModel, gain: KalmanGain, shown: FloatArray, *, dela
     return FilterPart(dynamics, estimates, innovation.times(shown), model.faults, delay + (mean - 1) // 2)
 
 
-def _in_plain_coordinates(dynamics: Dynamics, *rows: Rows) -> tuple[Any, ...]:
-    """Return dynamics and rows in coordinates in which A is about as large as its eigenvalues, if it is not already.
+def _plain_coordinates(a: FloatArray) -> FloatArray | None:
+    """Return coordinates in which A is about as large as its eigenvalues; ``None`` if it is already.
 
     Of gains for noises of very different size the entries cancel each other: a real Schur form, balanced, has none that
     do.
     """
-    a = dynamics.A
     if not len(a) or not np.all(np.isfinite(a)):
-        return dynamics, *rows
+        return None
     largest = float(np.max(np.abs(np.linalg.eigvals(a))))
     if np.linalg.norm(balanced_matrix(a)[0], 2) <= FAR_FROM_NORMAL * largest:
-        return dynamics, *rows
+        return None
     triangular, turn = schur(a, output="real")
-    plain, factors = balanced_matrix(triangular)
-    back, there = turn.T / factors[:, None], turn * factors
-    return Dynamics(plain, back @ dynamics.B, back @ dynamics.T), *(Rows(r.C @ there, r.D, r.T0) for r in rows)
+    return np.asarray(turn * balanced_matrix(triangular)[1])
+
+
+def _rounded_once(model: FilterModel, gain: KalmanGain, coordinates: FloatArray) -> Dynamics:
+    """Return the dynamics in other coordinates, each entry computed with digits to spare.
+
+    The entries that cancelled would leave their rounding errors in the small rows.
+    """
+    import flint
+
+    with flint.ctx.workprec(BITS):
+        k, there = arb_matrix(gain.K), arb_matrix(coordinates)
+        back = there.inv()
+        parts = ((model.A, -model.C, there), (model.B, model.L, None), (model.T, model.T0, None))
+        found = []
+        for own, fed_back, right in parts:
+            part = back * (arb_matrix(own) + k * arb_matrix(fed_back))
+            found.append(part if right is None else part * right)
+    return Dynamics(*(as_ball(part).midpoint for part in found))
 
 
 def _registered(dynamics: Dynamics, row: Rows) -> tuple[Dynamics, Rows]:

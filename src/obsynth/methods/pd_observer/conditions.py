@@ -29,13 +29,14 @@ from obsynth.analysis.existence.verdicts import (
 from obsynth.analysis.far_zeros import equilibrated_at
 from obsynth.analysis.plant_units import PlantUnits, sized_plant
 from obsynth.analysis.structure import analyse_structure
-from obsynth.analysis.transformations import Transformation, eliminate_algebraic_states
+from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
+from obsynth.analysis.transformations.recovery import Transformation
 from obsynth.analysis.zeros import leading_names, system_pencil
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.ranks import decide_rank, equilibrate
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.proofs.written_numbers import computed_entries
+from obsynth.proofs.exact_arithmetic import computed_entries
 
 #: At most this many signals are named in a failed condition.
 MOST_NAMES = 4

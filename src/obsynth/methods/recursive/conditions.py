@@ -16,8 +16,7 @@ from obsynth.analysis.existence.verdicts import described_distance, needed_gain,
 from obsynth.analysis.time_varying import HorizonRanks, as_time_varying, early_rows, horizon_ranks, step_blocks
 from obsynth.analysis.zeros import are_outside, leading_names
 from obsynth.errors import SpecError
-from obsynth.methods.recursive.constant_plants import ConstantPlant
-from obsynth.methods.recursive.identifiability import identifiability_condition
+from obsynth.methods.recursive.identifiability import ConstantPlant, identifiability_condition
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.pencils import finite_zeros
 from obsynth.numerics.ranks import CANCELLATION_TOLERANCE, RANK_TOLERANCE

@@ -33,7 +33,7 @@ from obsynth.analysis.existence.verdicts import (
     zero_verdict,
 )
 from obsynth.analysis.plant_units import PlantUnits, sized_plant
-from obsynth.analysis.transformations import Transformation
+from obsynth.analysis.transformations.recovery import Transformation
 from obsynth.analysis.zeros import Zero, leading_names, zero_at, zeros_of_system
 from obsynth.methods.ui_pi_observer.augmented_plant import AugmentedPlant
 from obsynth.methods.ui_pi_observer.decoupling_condition import (
@@ -60,7 +60,7 @@ from obsynth.methods.ui_pi_observer.pencils import (
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.pencils import finite_zeros
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.exosystems import Exosystem
+from obsynth.plants.fault_models import Exosystem
 
 #: Drops of the augmented pencil this close to each other, relative to their size or one, may be one multiple mode.
 SCATTER = 1e-2

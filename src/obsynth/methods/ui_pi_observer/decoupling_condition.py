@@ -14,8 +14,12 @@ from obsynth.analysis.existence.distance import least_share
 from obsynth.analysis.existence.numbers import numbers_of
 from obsynth.analysis.existence.verdicts import rank_doubt, settled_rank
 from obsynth.analysis.plant_units import PlantUnits, sized_plant
-from obsynth.analysis.transformations import StateRecovery, Transformation, eliminate_algebraic_states
-from obsynth.analysis.transformations.elimination import dynamic_coordinates, eliminated_exactly
+from obsynth.analysis.transformations.elimination import (
+    dynamic_coordinates,
+    eliminate_algebraic_states,
+    eliminated_exactly,
+)
+from obsynth.analysis.transformations.recovery import StateRecovery, Transformation
 from obsynth.analysis.zeros import leading_names
 from obsynth.errors import PreconditionError
 from obsynth.methods.ui_pi_observer.pencils import MOST_NAMES

@@ -31,8 +31,9 @@ from obsynth.methods.placement.eigenstructure import place
 from obsynth.methods.placement.kalman import KalmanProblem, compromise
 from obsynth.methods.placement.region import Region, region_gain
 from obsynth.methods.riccati import lyapunov_factor
+from obsynth.methods.ui_pi_observer.augmented_plant import ObserverGains, combinations_seen, realise
 from obsynth.methods.ui_pi_observer.conditions import existence
-from obsynth.methods.ui_pi_observer.notes import elimination_note, fixed_mode_notes, slow_note
+from obsynth.methods.ui_pi_observer.notes import digits_note, elimination_note, fixed_mode_notes, slow_note
 from obsynth.methods.ui_pi_observer.options import UiPiOptions, checked_poles, plain
 from obsynth.methods.ui_pi_observer.pencils import number
 from obsynth.methods.ui_pi_observer.placement_problem import (
@@ -42,12 +43,20 @@ from obsynth.methods.ui_pi_observer.placement_problem import (
     placement_problem,
     with_faults,
 )
-from obsynth.methods.ui_pi_observer.realisation import ObserverGains, combinations_seen, realise
 from obsynth.numerics.arrays import ComplexArray, FloatArray, as_matrix
-from obsynth.numerics.spectra import abscissa, certain_noise_covariance, decay_rates, eigenvalues, farthest_pole
+from obsynth.numerics.spectra import (
+    PRINTED_DIGITS,
+    abscissa,
+    as_printed,
+    certain_noise_covariance,
+    decay_rates,
+    digits_needed,
+    eigenvalues,
+    farthest_pole,
+)
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.exosystems import Exosystem, exosystem
+from obsynth.plants.fault_models import Exosystem, exosystem
 from obsynth.proofs.extended_balls import enclosed_eigenvalues, middle_of
 from obsynth.results.design import Certificate
 from obsynth.verification.certificates import slowest_decay
@@ -93,6 +102,7 @@ def synthesise(plant: DescriptorSystem, asked: UiPiOptions, *, progress: Callabl
             *elimination_note(found.conditions, found.transformation is not None),
             *fixed_mode_notes(problem, asked, plant.dt),
             *slow_note(problem, asked, synthesis.certificate.claims.get("decay")),
+            *digits_note(synthesis.certificate.claims.get("digits")),
         ),
         found.transformation,
     )
@@ -244,6 +254,8 @@ def _assembled(
     }
     slowest = slowest_decay(observer.Az, plant.dt)
     claims = {"decay": slowest, "noise_amplification": noise_amplification(observer), **claims}
+    if not abscissa(as_printed(observer.Az, PRINTED_DIGITS), plant.dt) < (1.0 if plant.dt > 0.0 else 0.0):
+        claims["digits"] = float(digits_needed(observer.Az, plant.dt))
     finite = {name: value for name, value in claims.items() if np.isfinite(value)}
     return Synthesis({}, letters, observer, Certificate(matrices, finite))
 

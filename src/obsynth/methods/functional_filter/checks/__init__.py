@@ -16,8 +16,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.scaling import balance_by_least_squares
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.exosystems import Exosystem
-from obsynth.plants.fault_models import stated_eigenvalues
+from obsynth.plants.fault_models import Exosystem, stated_eigenvalues
 from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.certificates import decay_row, prove_stable
@@ -41,10 +40,11 @@ def noise_rows(design: ObserverDesign) -> Iterator[Check]:
     for name, (alone, total), (claimed, claimed_total) in zip(
         observer.fault_names, found, matrices["deviations"], strict=True
     ):
-        if np.isnan(alone):
+        if np.isnan(alone) or np.isnan(claimed):
             yield information(
                 f"noise in fhat[{name}]", "standard deviation under the stated noise", alone,
-                source="recomputed, Lyapunov equation", detail="all digits are rounding",
+                source="recomputed, Lyapunov equation",
+                detail="all digits are rounding" + (": no deviation is claimed" if np.isnan(claimed) else ""),
             )  # fmt: skip
             continue
         yield upper_bound_check(
@@ -115,7 +115,10 @@ def _model(plant: DescriptorSystem, matrices: Mapping[str, FloatArray]) -> Exosy
 
 def _fits(design: ObserverDesign) -> bool:
     (plant, observer), matrices = design.linear, design.certificate.matrices
-    if any(name not in matrices or not np.all(np.isfinite(matrices[name])) for name in _MATRICES):
+    if any(name not in matrices for name in _MATRICES):
+        return False
+    # A deviation of which all digits are rounding is claimed as NaN: not at all.
+    if not all(np.all(np.isfinite(matrices[name])) for name in _MATRICES if name != "deviations"):
         return False
     order, count = observer.order, len(matrices["Phi"])
     shapes = {

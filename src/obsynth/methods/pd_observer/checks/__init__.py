@@ -11,15 +11,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from obsynth.analysis.plant_units import PlantUnits
 from obsynth.methods.pd_observer.checks.certificate import fitting_claims, proof_rows, stacked_gains
 from obsynth.methods.pd_observer.checks.error_system import PdErrorSystem, norm_rows, solved
 from obsynth.methods.pd_observer.conditions import pd_observer_conditions
 from obsynth.methods.pd_observer.realisation import with_faults_as_states, with_sensor_noise
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.continuous import spectral_abscissa
-from obsynth.numerics.pencils import pencil_structure
-from obsynth.numerics.ranks import RANK_TOLERANCE
+from obsynth.numerics.ranks import RANK_TOLERANCE, rounding_rank
 from obsynth.numerics.scaling import balance_by_least_squares, balanced_matrix
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
@@ -186,18 +184,12 @@ def spectrum_text(matrix: FloatArray, most: int = 8) -> str:
 def _pencil_row(design: ObserverDesign, augmented: DescriptorSystem) -> Check:
     """Check the descriptor pair of the error from the listed gains: regular, impulse-free and stable."""
     gain_j, gain_l = stacked_gains(design)
-    n = augmented.nx
-    one, zero = np.eye(n), np.zeros((n, n))
-    # In units in which the error is near one: similarity by powers of two is exact.
-    states = PlantUnits.of(augmented).rounded().states
-    moved, shown = (
-        part * states / states[:, None] for part in (augmented.A - gain_j @ augmented.C, gain_l @ augmented.C)
-    )
-    found = pencil_structure(np.block([[one, zero], [zero, zero]]), np.block([[zero, one], [moved, -one - shown]]))
-    impulse_free = found.regular and found.infinite_block_sizes == (1,) * n
-    abscissa = float(np.max(found.finite_eigenvalues.real)) if impulse_free else float("nan")
+    # E* = [I 0; 0 0], A* = [0 I; A - J C, -(I + L C)]: impulse-free where the lower right block is nonsingular.
+    moved, shown = augmented.A - gain_j @ augmented.C, np.eye(augmented.nx) + gain_l @ augmented.C
+    impulse_free = rounding_rank(_balanced(shown)) == augmented.nx
+    abscissa = spectral_abscissa(_balanced(solved(shown, moved))) if impulse_free else float("nan")
     return _negative(
         "descriptor pair", "(E*, A*) of the listed gains is admissible: regular, impulse-free, stable", abscissa,
         source="Filasova et al., eqs. (38), (39), Definition 1",
-        detail=f"{len(found.finite_eigenvalues)} finite modes of {2 * n}",
+        detail=f"{augmented.nx} finite modes of {2 * augmented.nx}" if impulse_free else "I + L C is singular",
     )  # fmt: skip

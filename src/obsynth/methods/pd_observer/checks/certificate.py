@@ -28,8 +28,9 @@ from obsynth.methods.pd_observer.realisation import with_faults_as_states, with_
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.proofs.balls import Ball, Enclosed, block
+from obsynth.proofs.balls import Ball
 from obsynth.proofs.definiteness import DefinitenessProof, prove_positive_definite, unproved
+from obsynth.proofs.extended_balls import Enclosed, block
 from obsynth.results.checks import Check
 from obsynth.results.design import ObserverDesign
 
