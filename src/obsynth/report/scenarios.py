@@ -1,9 +1,4 @@
-"""Simulations, evaluations and comparisons for people: how far estimates were off, how often alarms were right.
-
-Methods side by side, as a table that fits the console.
-
-A simulation for people: how far each estimate was off, and when the start was forgotten.
-"""
+"""Simulations, evaluations and comparisons for people: how far estimates were off, how often alarms were right."""
 
 from __future__ import annotations
 

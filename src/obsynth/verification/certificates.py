@@ -39,10 +39,7 @@ def prove_bounded_real(
     *,
     lag: int,
 ) -> DefinitenessProof:
-    """Try to prove the bounded real inequality for the shipped observer.
-
-    Shapes: ``factor (core, core)``.
-    """
+    """Try to prove the bounded real inequality for the shipped observer; ``factor (core, core)``."""
     core = factor.shape[0]
     outside = (observer.Az[:core, core:], observer.Cz[observer.fault_rows, core:])
     # What follows the core must be a chain of delays: strictly lower triangular, hence stable.
@@ -111,10 +108,7 @@ RATE_TOLERANCE = 1e-4
 
 
 def prove_stable(a: FloatArray, factor: FloatArray, dt: float) -> DefinitenessProof:
-    """Try to prove that every mode of ``a`` dies out.
-
-    Shapes: ``a (n, n)``, ``factor (n, n)``.
-    """
+    """Try to prove that every mode of ``a (n, n)`` dies out; ``factor (n, n)``."""
     if factor.shape != a.shape or not np.all(np.isfinite(factor)) or not np.all(np.isfinite(a)):
         return unproved("the certificate does not fit, or a number is not finite")
     if a.shape[0] == 0:
@@ -138,11 +132,7 @@ def prove_stable(a: FloatArray, factor: FloatArray, dt: float) -> DefinitenessPr
 
 
 def decay_row(a: FloatArray, dt: float, claimed: float) -> Check:
-    """Return the row on a claimed decay (1/s): proved for all but `RATE_TOLERANCE` of it, whatever poles there are.
-
-    By a Lyapunov inequality shifted by the rate, or where multiple poles leave none, by an enclosure of each eigenvalue
-    of the stored numbers.
-    """
+    """Return the row on a claimed decay (1/s): proved for all but `RATE_TOLERANCE` of it, whatever poles there are."""
     slowest = float(np.min(decay_rates(eigenvalues(a), dt), initial=np.inf))
     wanted = claimed - RATE_TOLERANCE * abs(claimed)
     source, passed = "recomputed eigenvalues", bool(slowest >= wanted)

@@ -57,11 +57,9 @@ class LaggedPlant:
 
 @dataclass(frozen=True, eq=False)
 class ErrorSystem:
-    """The observer's error ``e = V E x - z`` and what it does to the estimates.
+    """The observer's error ``e = V E x - z``, its inputs ``V b - By d``, and what it does to the estimates.
 
-    Fields: Az: ``(nz, nz)``; fault, disturbance, noise: Inputs of the error ``V b - By d``: ``(nz, nf)``, ``(nz, nd)``,
-    ``(nz, nw)``; fault_output, residual_output: ``(Cf, Df, Dd, Dw)``: fault estimate (residual) = ``-Cf e + Df f + Dd d
-    + Dw w``; state_output: ``(Cx, Df, Dd, Dw)``: state error = ``Cx e - Df f - Dd d - Dw w``.
+    Outputs ``(C, Df, Dd, Dw)``: fault estimate or residual = ``-C e + Df f + Dd d + Dw w``; minus that for states.
     """
 
     Az: FloatArray
