@@ -214,10 +214,8 @@ def index_report(
     u = model.nominal_input if u is None else u
     theta = model.nominal_parameters if theta is None else theta
     functions = DAEFunctions(model)
-    matrices = []
-    for factor in SHORTENINGS:
-        _, jacobian = functions.residual(x, x, u, theta, np.array([factor * dt]))
-        matrices.append(ScaledMatrix.of(jacobian, model.state_scales))
+    jacobians = (functions.residual(x, x, u, theta, np.array([factor * dt]))[1] for factor in SHORTENINGS)
+    matrices = [ScaledMatrix.of(jacobian, model.state_scales) for jacobian in jacobians]
     conditions = tuple(matrix.condition for matrix in matrices)
     if not np.isfinite(conditions[0]) or conditions[0] > SINGULAR_CONDITION:
         return IndexReport(0, conditions, *involved(model, matrices[0].matrix))

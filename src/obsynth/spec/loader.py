@@ -12,8 +12,7 @@ from obsynth.numerics.threads import one_thread_if_small
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
-from obsynth.simulation.failures import KINDS
-from obsynth.simulation.profiles import Profile
+from obsynth.simulation.profiles import KINDS, Profile
 from obsynth.simulation.scenario import Scenario
 from obsynth.simulation.scenario_signals import check_parameters
 from obsynth.spec.checking import DocumentProblems, checked_plant, checked_spec
