@@ -79,7 +79,8 @@ def estimate_gains(design: ObserverDesign, *, to: str = "faults") -> EstimateGai
         raise SpecError(f"The design {what}.", path="observer")
     frequencies, points, to_estimate = _over_frequencies(observer, rows)
     inputs = {"faults": (plant.Bf, plant.Df), "disturbances": (plant.Bd, plant.Dd), "noise": (plant.Bw, plant.Dw)}
-    gains, least = {}, np.zeros(len(points))
+    gains: dict[str, FloatArray] = {}
+    least: FloatArray = np.zeros(len(points))
     for name, (b, d) in inputs.items():
         if not b.shape[1]:
             continue
@@ -87,8 +88,8 @@ def estimate_gains(design: ObserverDesign, *, to: str = "faults") -> EstimateGai
         if to == "states":
             truth = _delayed(observer, points) * states
             seen, terms = seen - truth, terms + _sizes(truth)
-        values = np.linalg.svd(seen, compute_uv=False)
-        values = np.where(values > ROUNDING_SHARE * terms[:, None], values, 0.0)
+        found = np.linalg.svd(seen, compute_uv=False)
+        values = np.asarray(np.where(found > ROUNDING_SHARE * terms[:, None], found, 0.0), dtype=np.float64)
         gains[name] = values[:, 0]
         if name == "faults":
             least = values[:, -1]

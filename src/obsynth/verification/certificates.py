@@ -48,8 +48,8 @@ def prove_bounded_real(
         return unproved("the states after the core are no chain of delays, or act on the core or the fault estimate")
     if not _is_triangular(factor) or not gain > 0.0:
         return unproved("the certificate is not triangular and nonsingular, or the gain is not positive")
-    inverse = _inverse(factor)
-    if inverse is None:
+    inverse = np.triu(np.linalg.inv(factor))
+    if not _is_invertible(inverse):
         return unproved("the certificate cannot be inverted")
 
     def formula(kind: type[Enclosed]) -> Enclosed:
@@ -63,9 +63,8 @@ def _is_triangular(factor: FloatArray) -> bool:
     return bool(np.all(np.tril(factor, -1) == 0.0) and np.all(np.diag(factor) != 0.0))
 
 
-def _inverse(factor: FloatArray) -> FloatArray | None:
-    inverse = np.triu(np.linalg.inv(factor))
-    return inverse if np.all(np.isfinite(inverse)) and np.all(np.diag(inverse) != 0.0) else None
+def _is_invertible(inverse: FloatArray) -> bool:
+    return bool(np.all(np.isfinite(inverse)) and np.all(np.diag(inverse) != 0.0))
 
 
 def _formed(
@@ -115,8 +114,8 @@ def prove_stable(a: FloatArray, factor: FloatArray, dt: float) -> DefinitenessPr
         return DefinitenessProof(True, np.inf, 0.0, "Cholesky")
     if not _is_triangular(factor):
         return unproved("the certificate is not triangular and nonsingular")
-    inverse = _inverse(factor)
-    if inverse is None:
+    inverse = np.triu(np.linalg.inv(factor))
+    if not _is_invertible(inverse):
         return unproved("the certificate cannot be inverted")
 
     def formula(kind: type[Enclosed]) -> Enclosed:
