@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
+from functools import cache
 from importlib import import_module
 from typing import Any, ClassVar, Literal, TypeAlias, cast, get_type_hints
 
@@ -48,6 +49,7 @@ class MethodOptions:
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
 
+@cache
 def option_types(options: type[MethodOptions]) -> dict[str, Any]:
     """Return name -> annotated type of every option."""
     hints = get_type_hints(options, include_extras=True)
