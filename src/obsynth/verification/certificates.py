@@ -136,6 +136,15 @@ def prove_stable(a: FloatArray, factor: FloatArray, dt: float) -> DefinitenessPr
     return prove_positive_definite(formula)
 
 
+def stability_row(a: FloatArray, factor: FloatArray, dt: float, source: str) -> Check:
+    """Return the row that every mode of ``a (n, n)`` dies out, by a Lyapunov factor."""
+    proof = prove_stable(a, factor, dt)
+    return Check(
+        "stability", "every error dies out: the Lyapunov inequality is positive definite", proof.lower_bound, 0.0,
+        proof.lower_bound, proof.proved, source, "proved", proof.text,
+    )  # fmt: skip
+
+
 def decay_row(a: FloatArray, dt: float, claimed: float) -> Check:
     """Return the row on a claimed decay (1/s): proved for all but `RATE_TOLERANCE` of it, whatever poles there are.
 

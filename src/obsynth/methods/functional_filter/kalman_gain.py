@@ -56,11 +56,11 @@ def filter_model(
 ) -> FilterModel:
     """Return the model for some faults, free of the unknown inputs and of the faults removed."""
     found = decoupled(plant, removed, faults)
-    used = _model_states(model, faults)
+    used = model_states(model, faults)
     return _with_fault_models(found, model.Phi[np.ix_(used, used)], model.Cw[np.ix_(list(faults), used)], tuple(faults))
 
 
-def _model_states(model: Exosystem, faults: Sequence[int]) -> list[int]:
+def model_states(model: Exosystem, faults: Sequence[int]) -> list[int]:
     """Return the states of the exosystem that some faults are made of."""
     reached = np.any(model.Cw[list(faults)] != 0.0, axis=0) if len(faults) else np.zeros(model.order, dtype=bool)
     for _ in range(model.order):

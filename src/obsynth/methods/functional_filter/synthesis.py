@@ -23,6 +23,7 @@ from obsynth.methods.functional_filter.kalman_gain import (
     KalmanGain,
     filter_model,
     kalman_gain,
+    model_states,
     require_noise,
     whitening,
 )
@@ -213,12 +214,7 @@ def _walks(model: Exosystem, models: Sequence[FilterModel], rates: Sequence[Floa
     """Return the walk of every state of the whole exosystem."""
     walks = np.zeros(model.order)
     for part, walk in zip(models, rates, strict=True):
-        states = np.flatnonzero(np.any(model.Cw[list(part.faults)] != 0.0, axis=0)) if part.faults else np.zeros(0, int)
-        reached = np.zeros(model.order, dtype=bool)
-        reached[states] = True
-        for _ in range(model.order):
-            reached = reached | np.any(model.Phi[reached] != 0.0, axis=0)
-        walks[np.flatnonzero(reached)] = walk
+        walks[model_states(model, part.faults)] = walk
     return walks
 
 
