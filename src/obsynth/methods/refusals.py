@@ -8,8 +8,7 @@ roundoff, whatever the units.  The observer's own numbers, right to their last d
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from fractions import Fraction
 from typing import Any, TypeAlias
 
@@ -29,6 +28,25 @@ from obsynth.proofs.balls import UNIT_ROUNDOFF
 MOST_FOR_PAIRS, MOST_FOR_ONE = 16, 48
 #: Conditions on the kind of plant, whose messages say what to do: no sensor changes it.
 OF_THE_KIND = ("continuous time", "discrete time", "plant of this kind")
+
+
+def require_all_told(conditions: Iterable[Condition]) -> None:
+    """Raise `PreconditionError` for the first condition that fails, and say which others fail too."""
+    failed = [condition for condition in conditions if not condition.holds]
+    if not failed:
+        return
+    first, *others = failed
+    try:
+        first.require()
+    except PreconditionError as error:
+        if not others:
+            raise
+        also = "; ".join(f"{other.name}: {other.detail}" for other in others)
+        raise PreconditionError(
+            f"{error} Also fails: {also}", condition=first.name,
+            mode=next((condition.mode for condition in failed if condition.mode is not None), None),
+            signals=tuple(dict.fromkeys(name for condition in failed for name in condition.signals)),
+        ) from None  # fmt: skip
 
 
 def with_advice(
@@ -54,16 +72,12 @@ def with_advice(
 
 def _asker(method: MethodSpec, options: Mapping[str, Any]) -> Callable[[DescriptorSystem], bool]:
     """Return what says whether all existence conditions of a method hold for a plant."""
-    judge: Callable[..., Sequence[Condition]] = method.load("conditions")
-    known = set(inspect.signature(judge).parameters)
-    given = {name: value for name, value in options.items() if name in known}
-    if "exactly" in known:
-        # What would help is told to be tried, not proved: the tried plant is decided exactly then.
-        given["exactly"] = False
 
     def holds(plant: DescriptorSystem) -> bool:
+        # What would help is told to be tried, not proved: the tried plant is decided exactly then.
+        judge = method.existence({**_fitting(options, plant), "exactly": False})
         try:
-            return all(condition.holds for condition in judge(plant, **_fitting(given, plant)))
+            return all(condition.holds for condition in judge(plant))
         except (ObsynthError, np.linalg.LinAlgError):
             return False
 
@@ -82,23 +96,16 @@ def _drops(plant: DescriptorSystem, holds: Callable[[DescriptorSystem], bool]) -
     """Return the unknown inputs and faults without any one of which the design exists."""
     if plant.nx > MOST_FOR_ONE:
         return []
+    kinds = {"unknown input": ("Bd", "Dd", "disturbance_names"), "fault": ("Bf", "Df", "fault_names")}
     found = []
-    for i, name in enumerate(plant.disturbance_names):
-        rest = [j for j in range(plant.nd) if j != i]
-        fewer = plant.replace(
-            Bd=plant.Bd[:, rest], Dd=plant.Dd[:, rest], disturbance_names=[plant.disturbance_names[j] for j in rest],
-            units={}, operating_point={},
-        )  # fmt: skip
-        if holds(fewer):
-            found.append(f"unknown input {name}")
-    for i, name in enumerate(plant.fault_names if plant.nf > 1 else ()):
-        rest = [j for j in range(plant.nf) if j != i]
-        fewer = plant.replace(
-            Bf=plant.Bf[:, rest], Df=plant.Df[:, rest], fault_names=[plant.fault_names[j] for j in rest], units={},
-            operating_point={},
-        )  # fmt: skip
-        if holds(fewer):
-            found.append(f"fault {name}")
+    for kind, (entering, direct, listed_names) in kinds.items():
+        names = getattr(plant, listed_names)
+        for i, name in enumerate(names if kind != "fault" or plant.nf > 1 else ()):
+            rest = [j for j in range(len(names)) if j != i]
+            fewer = {part: getattr(plant, part)[:, rest] for part in (entering, direct)}
+            fewer |= {listed_names: [names[j] for j in rest]}
+            if holds(plant.replace(**fewer, units={}, operating_point={})):
+                found.append(f"{kind} {name}")
     return found
 
 

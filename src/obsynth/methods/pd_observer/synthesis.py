@@ -116,18 +116,13 @@ def synthesise(plant: DescriptorSystem, asked: PdOptions, *, progress: Callable[
 
 def _resolved(asked: PdOptions, gains: PdGains, g: FloatArray | None) -> dict[str, Any]:
     return {
-        "theorem": asked.theorem,
+        **asked.as_given(),
         "delta": gains.asked_delta,
         "decay": gains.decay,
         "disk": None if asked.disk_numbers is None else list(asked.disk_numbers),
-        "gain_bound": asked.gain_bound,
-        "fault_rate_gain": asked.fault_rate_gain,
-        "noise_gain": asked.noise_gain,
         "adaptation_gain": None if g is None else g.tolist(),
         "adaptation_range": None if asked.range_numbers is None else list(asked.range_numbers),
         "delta_scan": None if asked.delta_scan is None else np.ravel(asked.delta_scan).tolist(),
-        "engine": asked.engine,
-        "solver": asked.solver,
     }
 
 
