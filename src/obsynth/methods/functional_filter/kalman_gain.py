@@ -7,7 +7,6 @@ The model that a Kalman filter is designed for: a plant without unknown inputs, 
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -16,7 +15,7 @@ import numpy as np
 
 from obsynth.analysis.diagnosis.decoupled import DecoupledPlant, decoupled
 from obsynth.errors import PreconditionError, SolverError
-from obsynth.methods.riccati import riccati_solution
+from obsynth.methods.riccati import continuous_solution, riccati_solution
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import RANK_TOLERANCE, rank_from
 from obsynth.numerics.scaling import balanced_matrix
@@ -206,14 +205,8 @@ def _discrete(
 def _continuous(
     model: FilterModel, process: FloatArray, measured: FloatArray, cross: FloatArray, decay: float
 ) -> tuple[FloatArray, tuple[FloatArray, ...], FloatArray] | None:
-    from scipy.linalg import solve_continuous_are
-
-    try:
-        with warnings.catch_warnings():
-            # What a badly conditioned equation gives is judged by its poles.
-            warnings.simplefilter("ignore")
-            p = solve_continuous_are((model.A + decay * np.eye(len(model.A))).T, model.C.T, process, measured, s=cross)
-    except (np.linalg.LinAlgError, ValueError):
+    p = continuous_solution(model.A + decay * np.eye(len(model.A)), model.C, process, measured, cross)
+    if p is None:
         return None
     gain = np.asarray(np.linalg.solve(measured, (p @ model.C.T + cross).T).T)
     closed = model.A - gain @ model.C

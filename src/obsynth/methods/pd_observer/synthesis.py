@@ -35,12 +35,16 @@ from obsynth.analysis.existence.numbers import decided
 from obsynth.errors import InfeasibleError, SolverError, SpecError
 from obsynth.methods.method_spec import Synthesis
 from obsynth.methods.pd_observer.certificate import explicit_certificate
-from obsynth.methods.pd_observer.checks.error_system import PdErrorSystem
 from obsynth.methods.pd_observer.conditions import explicit_form, pd_observer_conditions
 from obsynth.methods.pd_observer.gain_search import design_gains, gains_for
 from obsynth.methods.pd_observer.gains import PdGains
 from obsynth.methods.pd_observer.options import PdOptions, checked_adaptation_gain
-from obsynth.methods.pd_observer.realisation import realise_pd_observer, with_faults_as_states, with_sensor_noise
+from obsynth.methods.pd_observer.realisation import (
+    PdErrorSystem,
+    realise_pd_observer,
+    with_faults_as_states,
+    with_sensor_noise,
+)
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.numerics.continuous import spectral_abscissa
 from obsynth.observers.linear.observer import LinearObserver
