@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from fractions import Fraction
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
@@ -125,12 +125,9 @@ MOST_STATES = 150
 POINTS = (0.0, 1e-2, 1e-1, 1.0)
 
 
-_Shares: TypeAlias = Callable[[DescriptorSystem, LinearObserver, complex], FloatArray | None]
-
-
 def require_above_rounding(plant: DescriptorSystem, observer: LinearObserver) -> None:
     """Raise `PreconditionError` (unclear) where rounding of the outputs drowns the estimate of a unit fault."""
-    least = _least(plant, observer, _shares)
+    least = _least(plant, observer, own=False)
     if least is None:
         return
     worst = int(np.argmax(least))
@@ -189,7 +186,7 @@ def last_digits(plant: DescriptorSystem, observer: LinearObserver, fault: int, p
 
 def rounding_notes(plant: DescriptorSystem, observer: LinearObserver) -> tuple[str, ...]:
     """Return what rounding of the observer's own numbers may do to an estimate, where that matters."""
-    found = _least(plant, observer, own_shares)
+    found = _least(plant, observer, own=True)
     return () if found is None else tuple(
         f"The numbers of the observer cancel each other: their last digits alone may move the estimate of {name!r} by"
         f" {share:.2g} of the fault, and by more at some frequencies. State the noise of the sensors, or ask for a"
@@ -198,12 +195,12 @@ def rounding_notes(plant: DescriptorSystem, observer: LinearObserver) -> tuple[s
     )  # fmt: skip
 
 
-def _least(plant: DescriptorSystem, observer: LinearObserver, shares_at: _Shares) -> FloatArray | None:
+def _least(plant: DescriptorSystem, observer: LinearObserver, *, own: bool) -> FloatArray | None:
     """Return the least share of each fault over the points; ``None`` where it is not examined."""
     if not plant.nf or observer.order > MOST_STATES or plant.is_sparse or len(observer.fault_names) != plant.nf:
         return None
     with np.errstate(all="ignore"):
-        shares = [share for point in _points(plant) if (share := shares_at(plant, observer, point)) is not None]
+        shares = [share for point in _points(plant) if (share := _shares(plant, observer, point, own=own)) is not None]
     return np.asarray(np.min(shares, axis=0)) if shares else None
 
 
@@ -227,25 +224,16 @@ def _responses(
     return np.asarray(plant.C @ states + plant.Df, dtype=np.complex128), np.asarray(resolvent)
 
 
-def own_shares(plant: DescriptorSystem, observer: LinearObserver, point: complex) -> FloatArray | None:
-    """Return the share of each fault that rounding of the observer's own numbers may be at one point."""
+def _shares(plant: DescriptorSystem, observer: LinearObserver, point: complex, *, own: bool) -> FloatArray | None:
+    """Return the share of each fault that rounding of the outputs, or of the observer's ``own`` numbers, may be."""
     found = _responses(plant, observer, point)
     if found is None:
         return None
     outputs, resolvent = found
-    state, seen, rows = np.abs(resolvent @ observer.By @ outputs), np.abs(outputs), observer.fault_rows
-    moved = np.abs(resolvent) @ (np.abs(observer.Az) @ state + np.abs(observer.By) @ seen)
-    shares = UNIT_ROUNDOFF * np.diag(np.abs(observer.Cz[rows]) @ (moved + state) + np.abs(observer.Dy[rows]) @ seen)
+    rows, seen = observer.fault_rows, np.abs(outputs)
+    entering, state = np.abs(observer.By) @ seen, np.abs(resolvent @ observer.By @ outputs)
+    moved = (
+        np.abs(resolvent) @ (entering + np.abs(observer.Az) @ state) + state if own else np.abs(resolvent) @ entering
+    )
+    shares = UNIT_ROUNDOFF * np.diag(np.abs(observer.Cz[rows]) @ moved + np.abs(observer.Dy[rows]) @ seen)
     return np.asarray(shares) if np.all(np.isfinite(shares)) else None
-
-
-def _shares(plant: DescriptorSystem, observer: LinearObserver, point: complex) -> FloatArray | None:
-    """Return the share of each fault that rounding of the outputs may be at one point; ``None`` at a pole of either."""
-    responses = _responses(plant, observer, point)
-    if responses is None:
-        return None
-    outputs, resolvent = np.abs(responses[0]), responses[1]
-    rows = observer.fault_rows
-    sizes = np.abs(observer.Cz[rows]) @ (np.abs(resolvent) @ (np.abs(observer.By) @ outputs))
-    found = UNIT_ROUNDOFF * np.diag(sizes + np.abs(observer.Dy[rows]) @ outputs)
-    return np.asarray(found) if np.all(np.isfinite(found)) else None

@@ -26,13 +26,13 @@ from obsynth.analysis.existence.numbers import numbers_of, reconsidered
 from obsynth.analysis.existence.rational import SystemFacts
 from obsynth.analysis.existence.verdicts import (
     believed,
-    described_distance,
     in_own_time,
     needed_gain,
-    unclear_detail,
+    verdict_condition,
     zero_doubt,
     zero_verdict,
 )
+from obsynth.analysis.existence.witnesses import Unclear
 from obsynth.analysis.plant_units import PlantUnits, sized_plant
 from obsynth.analysis.transformations.recovery import Transformation
 from obsynth.analysis.zeros import Zero, leading_names, system_pencil, zero_at, zeros_of_system
@@ -152,24 +152,25 @@ def _zero_condition(given: DescriptorSystem, plant: DescriptorSystem, units: Pla
         terms = units.scaled_plant(terms)
         sizes = np.block([[terms.A, terms.Bd[:, kept]], [terms.C, terms.Dd[:, kept]]])
     verdict = zero_verdict(_timed(facts, units.rate), wide_e, wide_a, nx=plant.nx, discrete=plant.dt > 0.0, sizes=sizes)
-    if verdict.facts.outside:
-        zero = zero_at(plant.E, plant.A, verdict.facts.outside[0], inputs, plant.C, direct)
-        lost = _zero_failure(plant, units, zero, inputs, direct)
-        gain = needed_gain(given, units, units.eigenvalue(zero.value), inputs="Bd" if given.nd else "")
-        return replace(lost, detail=f"{lost.detail} {gain}".rstrip())
-    if verdict.answer == "unclear":
-        own = in_own_time(verdict, units.rate)
-        detail, layout = unclear_detail(own, "An observer"), [["A", "Bd"], ["C", "Dd"]]
-        doubt = zero_doubt(given, units, own, layout, kept={"Bd": kept, "Dd": kept}, what="observer")
+    holding = _zeros(True, facts.normal_rank, facts.columns, f"{len(verdict.facts.zeros)} stable zero(s)")
+    own = in_own_time(verdict, units.rate)
+
+    def lost(zeros: Sequence[complex]) -> Condition:
+        zero = zero_at(plant.E, plant.A, zeros[0], inputs, plant.C, direct)
+        return _zero_failure(plant, units, zero, inputs, direct)
+
+    def seen() -> list[complex]:
         _, _, outside = zeros_of_system(plant.E, plant.A, inputs, plant.C, direct, dt=plant.dt)
-        if outside:
-            lost = _zero_failure(plant, units, _worst(outside, plant.dt), inputs, direct)
-            lost = replace(lost, detail=f"{detail} In floating point, {lost.detail}")
-        else:
-            lost = _zeros(False, facts.normal_rank, facts.columns, detail)
-        return lost.in_doubt(doubt, given)
-    detail = f"{len(verdict.facts.zeros)} stable zero(s); {described_distance(in_own_time(verdict, units.rate))}"
-    return _zeros(True, facts.normal_rank, facts.columns, detail)
+        return [_worst(outside, plant.dt).value] if outside else []
+
+    def doubt() -> Unclear:
+        kept_columns = {"Bd": kept, "Dd": kept}
+        return zero_doubt(given, units, own, [["A", "Bd"], ["C", "Dd"]], kept=kept_columns, what="observer")
+
+    return verdict_condition(
+        own, holding, given, what="An observer", lost=lost, seen=seen, doubt=doubt,
+        gain=lambda mode: needed_gain(given, units, mode, inputs="Bd" if given.nd else ""),
+    )  # fmt: skip
 
 
 def _zeros(holds: bool, value: float, bound: float, detail: str) -> Condition:
