@@ -1,8 +1,6 @@
-"""The Kalman gain of a filter model: correlated noise, walks of the fault models, and gains for a fixed lag.
+"""Filter models (a plant without unknown inputs, fault models on it) and their Kalman gains, for a fixed lag too.
 
 A decoupled plant is driven by y itself, so the same noise stands in its states and in its outputs.
-
-The model that a Kalman filter is designed for: a plant without unknown inputs, and fault models on it.
 """
 
 from __future__ import annotations

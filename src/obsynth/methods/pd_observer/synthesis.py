@@ -17,8 +17,6 @@ Our deviations
        computed from the gains.
     9. For hundreds of states the gains come from a smaller inequality or in closed form (see
        `obsynth.methods.pd_observer.reduced_inequality`), with L = 0.
-
-A scan of delta: the same requirements solved for several values, measured on the true error system.
 """
 
 from __future__ import annotations

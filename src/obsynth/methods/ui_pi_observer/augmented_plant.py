@@ -214,10 +214,7 @@ class ObserverGains:
 def realise(
     plant: DescriptorSystem, model: Exosystem, gains: ObserverGains, seen: FloatArray
 ) -> tuple[LinearObserver, dict[str, FloatArray]]:
-    """Return the observer, and its matrices by the paper's letters.
-
-    Shapes: ``seen (nr, ny)``.
-    """
+    """Return the observer, and its matrices by the paper's letters; ``seen (nr, ny)``."""
     augmented = AugmentedPlant.of(plant, model)
     nx, na = plant.nx, augmented.order
     a_hat = gains.U @ augmented.A - gains.K @ augmented.C

@@ -1,6 +1,4 @@
-r"""The certificate of a PD observer: what it must hold, and the proofs of its inequalities.
-
-The matrix inequality of the PD observer, formed with guaranteed error bounds and proved.
+r"""The certificate of a PD observer: what it must hold, and proofs of its inequalities with all rounding bounded.
 
 Theorem 1 of Filasova, Krokavec, Serbak is, with ``D = I + L C`` and ``Ae = A - J C`` of the augmented plant,
 

@@ -1,9 +1,4 @@
-"""Numbers of a shipped observer, recomputed: stability, poles, rates, digits, noise.
-
-The letters of the gain set beside the realisation: what is listed must be what is shipped.
-
-Source: Share Pasand, Aliyari, Taghirad, eqs. (4), (12), (19), (20).
-"""
+"""Numbers of a shipped observer, recomputed: stability, poles, rates, digits, noise; and the letters of its gains."""
 
 from __future__ import annotations
 
