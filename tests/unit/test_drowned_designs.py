@@ -8,7 +8,7 @@ import pytest
 
 from obsynth import DescriptorSystem, PreconditionError, ui_pi_observer
 from obsynth.methods.refusals import last_digits, require_above_rounding
-from obsynth.proofs.exact_matrices import stored_matrix
+from obsynth.proofs.exact_arithmetic import stored_matrix
 
 PLANT = DescriptorSystem(None, [[-1.0, 0.5], [0.0, -2.0]], C=np.eye(2), Bf=[[1], [0]])
 

@@ -188,19 +188,15 @@ def _sensitivities(
 
 #: The step is shortened by these factors.  Short enough that dF/dx' rules, long enough that index 3 stays countable.
 SHORTENINGS = (1e-2, 1e-3)
-
-
 #: Equations and states with at least this share of the largest entry of a singular vector are named.
 LEADING_SHARE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class IndexReport:
-    """Index of a DAE at one point.
+    """Index of a DAE at one point: 1, 2, 3, ...; 0 where the matrix of (7) is singular for every step.
 
-    Fields: index: 1, 2, 3, ...; 0 where the matrix of (7) is singular for every step; conditions: Equilibrated
-    condition numbers of (7) at the shortened steps; equations, states: Those that are involved where the index is not
-    1.
+    ``conditions``: of (7), equilibrated, at the shortened steps; ``equations``, ``states``: involved where it is not 1.
     """
 
     index: int
@@ -213,18 +209,13 @@ def index_report(
     model: DAEModel, dt: float, *, x: FloatArray | None = None, u: FloatArray | None = None,
     theta: FloatArray | None = None,
 ) -> IndexReport:  # fmt: skip
-    """Find the index of a model: the condition of (7) grows by ``10^(index - 1)`` when the step falls to a tenth.
-
-    Shapes: ``x (nx,)``, ``u (nu,)``, ``theta (nq,)``.
-    """
+    """Find the index of a model: the condition of (7) grows by ``10^(index - 1)`` when the step falls to a tenth."""
     x = model.nominal_state if x is None else x
     u = model.nominal_input if u is None else u
     theta = model.nominal_parameters if theta is None else theta
     functions = DAEFunctions(model)
-    matrices = []
-    for factor in SHORTENINGS:
-        _, jacobian = functions.residual(x, x, u, theta, np.array([factor * dt]))
-        matrices.append(ScaledMatrix.of(jacobian, model.state_scales))
+    jacobians = (functions.residual(x, x, u, theta, np.array([factor * dt]))[1] for factor in SHORTENINGS)
+    matrices = [ScaledMatrix.of(jacobian, model.state_scales) for jacobian in jacobians]
     conditions = tuple(matrix.condition for matrix in matrices)
     if not np.isfinite(conditions[0]) or conditions[0] > SINGULAR_CONDITION:
         return IndexReport(0, conditions, *involved(model, matrices[0].matrix))
@@ -236,10 +227,7 @@ def index_report(
 
 
 def involved(model: DAEModel, matrix: FloatArray) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return equations and states of the least singular direction.
-
-    Shapes: ``matrix (stages * nx, stages * nx)``.
-    """
+    """Return equations and states of the least singular direction of ``matrix (stages * nx, stages * nx)``."""
     if not np.isfinite(matrix).all():
         bad = [i % model.nx for i, row in enumerate(matrix) if not np.isfinite(row).all()]
         return tuple(model.equation_names[i] for i in sorted(set(bad))), ()

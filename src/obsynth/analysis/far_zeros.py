@@ -17,13 +17,10 @@ NEWTON_STEPS = 4
 
 
 def system_zeros(E: FloatArray, A: FloatArray, *, nx: int) -> FiniteZeros:
-    """Return the finite zeros of a system pencil without those that are only nearly infinite.
+    """Return the finite zeros of a system pencil ``(nx + ny, nx + nu)`` without those that are only nearly infinite.
 
-    Far out a pencil with zeros at infinity is nearly singular everywhere, beside ``z E``: a chain of k states
-    shows with ``z^-k``.  A candidate there counts only when the pencil is singular to rounding in units that suit
-    its size.
-
-    Shapes: ``E (nx + ny, nx + nu)``, ``A (nx + ny, nx + nu)``.
+    Far out a pencil with zeros at infinity is nearly singular everywhere, beside ``z E``: a chain of k states shows
+    with ``z^-k``.  A candidate there counts only when the pencil is singular to rounding in units that suit its size.
     """
     found = finite_zeros(E, A, to_the_end=False)
     if not found.values.size:
@@ -69,8 +66,6 @@ def equilibrated_at(E: FloatArray, A: FloatArray, value: complex, *, nx: int) ->
     """Return the pencil with states, equations and outputs in units that suit a point of this modulus.
 
     Beside a large ``z E`` the inputs and outputs would vanish: the states are measured in the units that ``z x`` has.
-
-    Shapes: ``E (nx + ny, nx + nu)``, ``A (nx + ny, nx + nu)``.
     """
     size = float(power_of_two_below(np.array(max(1.0, abs(value)))))
     columns = np.where(np.arange(E.shape[1]) < nx, 1.0 / size, 1.0)

@@ -19,7 +19,7 @@ from obsynth.numerics.arrays import ComplexArray, FloatArray, read_only
 from obsynth.numerics.ranks import RANK_TOLERANCE
 from obsynth.numerics.scaling import LogBalance
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.exosystems import Exosystem
+from obsynth.plants.fault_models import Exosystem
 from obsynth.plants.origin import origin_of
 
 #: Given units in which the natural factors differ by more than this are no units to design in.
@@ -27,15 +27,15 @@ FAR_UNITS = 256.0
 #: Weight of inputs and outputs beside equations and states, which they scale only where A and E leave that open.
 SIGNALS_WEIGHT = 1e-3
 
+_KINDS = ("equations", "states", "outputs", "faults", "disturbances", "model")
+
 
 @dataclass(frozen=True, eq=False)
 class PlantUnits:
     """Factors between a plant as given and the scaled one.
 
-    Fields: time: The unit of time: tau, or the sample time; equations, states, outputs, faults, disturbances, model:
-    ``(nx,)``, ``(nx,)``, ``(ny,)``, ``(nf,)``, ``(nd,)``, ``(nw,)``: equations and outputs are multiplied by theirs; a
-    state, fault, disturbance or state of the fault model is its factor times the scaled one; discrete: Whether the
-    plant is sampled: its matrices have no unit of time then.
+    Equations ``(nx,)`` and outputs ``(ny,)`` are multiplied by theirs; a state ``(nx,)``, fault ``(nf,)``, disturbance
+    ``(nd,)`` or state of the fault model ``(nw,)`` is its factor times the scaled one; ``time``: tau or ``dt``.
     """
 
     time: float
@@ -77,10 +77,9 @@ class PlantUnits:
             for inner, direct in ((plant.Bf, plant.Df), (plant.Bd, plant.Dd))
         ]
         courses = _model_units(model, factors[fault_model], entering[0])
-        return cls(
-            plant.dt or float(factors[0]), read_only(factors[equations]), read_only(own), read_only(shown),
-            read_only(entering[0]), read_only(entering[1]), read_only(courses), plant.is_discrete,
-        )  # fmt: skip
+        found = (factors[equations], own, shown, *entering, courses)
+        parts = {kind: read_only(part) for kind, part in zip(_KINDS, found, strict=True)}
+        return cls(time=plant.dt or float(factors[0]), discrete=plant.is_discrete, **parts)
 
     @property
     def spread(self) -> float:
@@ -106,14 +105,9 @@ class PlantUnits:
     def rounded(self) -> PlantUnits:
         """Return the same with powers of two, with which scaling is exact."""
 
-        def nearest(factors: FloatArray) -> FloatArray:
-            return read_only(np.exp2(np.round(np.log2(factors))))
-
+        powers = {kind: read_only(np.exp2(np.round(np.log2(getattr(self, kind))))) for kind in _KINDS}
         time = self.time if self.discrete else float(np.exp2(np.round(np.log2(self.time))))
-        return PlantUnits(
-            time, nearest(self.equations), nearest(self.states), nearest(self.outputs), nearest(self.faults),
-            nearest(self.disturbances), nearest(self.model), self.discrete,
-        )  # fmt: skip
+        return PlantUnits(time=time, discrete=self.discrete, **powers)
 
     def for_decoupling(self, plant: DescriptorSystem) -> PlantUnits:
         """Return the same with each equation that holds a derivative scaled by its row of E.

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from obsynth.analysis.far_zeros import equilibrated_at, system_zeros
-from obsynth.numerics.arrays import ComplexArray, FloatArray
+from obsynth.numerics.arrays import ComplexArray, FloatArray, read_only
 from obsynth.numerics.pencil_points import FEW_COLUMNS, MOST_DIRECTIONS, PencilPoints, smallest_singular
 from obsynth.numerics.pencils import FiniteZeros
 from obsynth.numerics.ranks import (
@@ -34,11 +34,9 @@ _PATH_TO_BOUNDARY = (1.0, 0.75, 0.5, 0.25)
 
 @dataclass(frozen=True, eq=False)
 class Zero:
-    """An invariant zero and the direction that stays invisible there.
+    """An invariant zero and the direction ``(nx,)``, ``(nu,)``, of unit norm, that stays invisible there.
 
-    Fields: value: The point where the pencil loses rank; state_direction, input_direction: ``(nx,)`` and ``(nu,)``:
-    together of unit norm and in the null space of the pencil at ``value``; input_share: Size of the input part when the
-    pencil is equilibrated, so that units do not matter.
+    ``input_share``: size of the input part when the pencil is equilibrated, so that units do not matter.
     """
 
     value: complex
@@ -56,11 +54,8 @@ class Zero:
 class FaultZeros:
     """What faults a plant can hide from its outputs.
 
-    Fields: zeros: Invariant zeros of ``[A - z E, Bf; C, Df]``; outside: Those on or outside the boundary of stability:
-    such a fault grows or persists unseen; normal_rank_full: Whether the pencil has rank ``nx + nf`` at almost every
-    ``z``; if not, some combination of faults never shows at all; hidden_direction: ``(nf,)``, the fault part of the
-    never-visible direction at a generic point, where there is one; hidden_faults: Names of the faults that take part in
-    such directions; decisions: Every rank decided on the way.
+    ``zeros`` of ``[A - z E, Bf; C, Df]``; ``outside``: those not strictly stable; ``normal_rank_full``: rank nx + nf at
+    almost every z; if not, ``hidden_direction (nf,)`` of ``hidden_faults`` never shows.
     """
 
     zeros: tuple[Zero, ...]
@@ -72,11 +67,7 @@ class FaultZeros:
 
 
 def is_outside(value: complex, dt: float) -> bool:
-    """Whether an eigenvalue or zero counts as not strictly stable, by its distance alone.
-
-    True when its modulus is at least ``1 - BOUNDARY_TOLERANCE`` (``dt > 0``) or its real part at least
-    ``-BOUNDARY_TOLERANCE max(1, abs(value))`` (``dt == 0``).
-    """
+    """Whether an eigenvalue or zero counts as not strictly stable, by its distance from the boundary alone."""
     if dt > 0.0:
         return bool(abs(value) >= 1.0 - BOUNDARY_TOLERANCE)
     return bool(complex(value).real >= -BOUNDARY_TOLERANCE * max(1.0, abs(value)))
@@ -88,16 +79,15 @@ def are_outside(E: FloatArray, A: FloatArray, zeros: FiniteZeros, dt: float) -> 
     A zero of multiplicity k moves by ``eps^(1/k)`` under rounding, so distance alone may put a double
     zero on the boundary safely inside.  Near the boundary a zero therefore also counts as outside when
     the pencil itself is singular to working precision all the way to the nearest boundary point.
-
-    Shapes: ``E (m, n)``, ``A (m, n)``.
     """
     judged: PencilPoints | EquilibratedPencil | None = None
     found: dict[complex, bool] = {}
     for value in map(complex, zeros.values):
+        distance = abs(abs(value) - 1.0) if dt > 0.0 else abs(value.real)
         # Of a pair both are where the one before was found to be: the pencil is real.
         if (other := value.conjugate()) in found:
             found[value] = found[other]
-        elif is_outside(value, dt) or not _is_near_boundary(value, dt):
+        elif is_outside(value, dt) or distance > BOUNDARY_NEIGHBOURHOOD * max(1.0, abs(value)):
             found[value] = is_outside(value, dt)
         else:
             judged = _judged(E, A, zeros.normal_rank) if judged is None else judged
@@ -108,10 +98,7 @@ def are_outside(E: FloatArray, A: FloatArray, zeros: FiniteZeros, dt: float) -> 
 def invariant_zeros(
     E: FloatArray, A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray | None = None
 ) -> tuple[Zero, ...]:
-    """Return the finite zeros of ``[A - z E, B; C, D]`` with multiplicity, each with its direction.
-
-    Shapes: ``E (nx, nx)``, ``A (nx, nx)``, ``B (nx, nu)``, ``C (ny, nx)``, ``D (ny, nu)``.
-    """
+    """Return the finite zeros of ``[A - z E, B; C, D]`` with multiplicity, each with its direction."""
     wide_e, wide_a = system_pencil(E, A, B, C, D)
     return _with_directions(wide_e, wide_a, system_zeros(wide_e, wide_a, nx=E.shape[0]), nx=E.shape[0])
 
@@ -120,9 +107,8 @@ def fault_zeros(plant: DescriptorSystem) -> FaultZeros:
     """Return the invariant zeros from the faults of ``plant`` to its outputs."""
     plant = plant.dense()
     found, zeros, outside = zeros_of_system(plant.E, plant.A, plant.Bf, plant.C, plant.Df, dt=plant.dt)
-    e, a = system_pencil(plant.E, plant.A, plant.Bf, plant.C, plant.Df)
     missing = plant.nx + plant.nf - found.normal_rank
-    direction, names = _hidden(e, a, plant, missing=missing) if missing else (None, ())
+    direction, names = hidden_direction(plant, missing=missing) if missing else (None, ())
     return FaultZeros(zeros, outside, missing == 0, direction, names, found.decisions)
 
 
@@ -136,9 +122,21 @@ def zero_at(E: FloatArray, A: FloatArray, value: complex, B: FloatArray, C: Floa
 
 
 def hidden_direction(plant: DescriptorSystem, *, missing: int) -> tuple[FloatArray, tuple[str, ...]]:
-    """Return the faults that never show, for a pencil from faults to outputs of which ``missing`` ranks are lost."""
-    e, a = system_pencil(plant.E, plant.A, plant.Bf, plant.C, plant.Df)
-    return _hidden(e, a, plant, missing=missing)
+    """Return the faults that never show, for a pencil from faults to outputs of which ``missing`` ranks are lost.
+
+    The direction ``(nf,)`` is the one in the null space at a generic point with the largest fault part.
+    """
+    pencil = equilibrate_pencil(*system_pencil(plant.E, plant.A, plant.Bf, plant.C, plant.Df))
+    kernels = []
+    for point in _GENERIC_POINTS:
+        _, singular_values, right = np.linalg.svd(pencil.A - point * pencil.E)
+        kernels.append((float(singular_values[plant.nx + plant.nf - missing - 1]), right[-missing:].T))
+    _, kernel = max(kernels, key=lambda pair: pair[0])
+    ordered = _smallest_part_first(kernel, slice(plant.nx, None))
+    direction = pencil.columns[plant.nx :] * ordered[plant.nx :, -1]
+    size = float(np.linalg.norm(direction))
+    names = leading_names(np.linalg.norm(ordered[plant.nx :], axis=1), plant.fault_names)
+    return read_only(direction / size if size > 0.0 else direction), names
 
 
 def zeros_of_system(
@@ -160,11 +158,6 @@ def system_pencil(
     padded = np.zeros((E.shape[0] + C.shape[0], E.shape[1] + B.shape[1]))
     padded[: E.shape[0], : E.shape[1]] = E
     return padded, np.block([[A, B], [C, feedthrough]])
-
-
-def _is_near_boundary(value: complex, dt: float) -> bool:
-    distance = abs(abs(value) - 1.0) if dt > 0.0 else abs(value.real)
-    return distance <= BOUNDARY_NEIGHBOURHOOD * max(1.0, abs(value))
 
 
 def _judged(E: FloatArray, A: FloatArray, normal_rank: int) -> PencilPoints | EquilibratedPencil:
@@ -196,7 +189,9 @@ def _with_directions(E: FloatArray, A: FloatArray, found: FiniteZeros, *, nx: in
     zeros: list[Zero] = []
     for i, value in enumerate(values):
         if value.imag < 0.0:
-            zeros.append(_conjugate(zeros[-1]))  # pairs follow each other and are exact
+            # Pairs follow each other and are exact.
+            state, driving = (_frozen(part.conj()) for part in (zeros[-1].state_direction, zeros[-1].input_direction))
+            zeros.append(Zero(value, state, driving, zeros[-1].input_share))
             continue
         pencil = equilibrated_at(E, A, value, nx=nx)
         kernel = _kernel(pencil, value, least=pencil.A.shape[1] - found.normal_rank + 1)
@@ -234,38 +229,10 @@ def _zero_along(direction: NDArray[Any], value: complex, scale: FloatArray, *, n
     return Zero(value, _frozen(original[:nx]), _frozen(original[nx:]), share)
 
 
-def _conjugate(zero: Zero) -> Zero:
-    return Zero(
-        zero.value.conjugate(),
-        _frozen(zero.state_direction.conj()),
-        _frozen(zero.input_direction.conj()),
-        zero.input_share,
-    )
-
-
 def _frozen(vector: NDArray[Any]) -> ComplexArray:
     copy = np.array(vector, dtype=np.complex128)
     copy.setflags(write=False)
     return copy
-
-
-def _hidden(
-    E: FloatArray, A: FloatArray, plant: DescriptorSystem, *, missing: int
-) -> tuple[FloatArray, tuple[str, ...]]:
-    """Return the direction in the null space at a generic point with the largest fault part."""
-    pencil = equilibrate_pencil(E, A)
-    kernels = []
-    for point in _GENERIC_POINTS:
-        _, singular_values, right = np.linalg.svd(pencil.A - point * pencil.E)
-        kernels.append((float(singular_values[plant.nx + plant.nf - missing - 1]), right[-missing:].T))
-    _, kernel = max(kernels, key=lambda pair: pair[0])
-    ordered = _smallest_part_first(kernel, slice(plant.nx, None))
-    direction = pencil.columns[plant.nx :] * ordered[plant.nx :, -1]
-    size = float(np.linalg.norm(direction))
-    names = leading_names(np.linalg.norm(ordered[plant.nx :], axis=1), plant.fault_names)
-    result = np.array(direction / size if size > 0.0 else direction)
-    result.setflags(write=False)
-    return result, names
 
 
 def leading_names(shares: FloatArray, names: Sequence[str], *, most: int | None = None) -> tuple[str, ...]:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from obsynth.calibration.logs import Log, refused
+from obsynth.calibration.plants import CalibrationPlant
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import SMALLEST, FloatArray
 from obsynth.numerics.ranks import rounding_rank
@@ -29,7 +30,6 @@ EXACT = "exact"
 SIZED_SAMPLES = 50
 #: The least effect of a state on the outputs, as a share of the largest, by which it is sized.
 LEAST_EFFECT = 1e-6
-
 Known = Mapping[str, Any]
 
 
@@ -67,8 +67,10 @@ def _dense(rows: Sequence[Sequence[Any]], shape: tuple[int, int]) -> Any:
     return ca.vertcat(*(ca.horzcat(*row) for row in rows)) if all(shape) else ca.SX(*shape)
 
 
-class LinearPlant:
+class LinearPlant(CalibrationPlant):
     """A linear plant in one of three forms; its signals are inputs before and at the row, k, and varying matrices."""
+
+    has_levels = False
 
     def __init__(self, plant: DescriptorSystem | TimeVaryingDescriptorSystem, log: Log) -> None:
         matrices, values, continuous = (
@@ -96,6 +98,12 @@ class LinearPlant:
         self.nominal_signals = first[min(1, len(first) - 1)]
         self.state_scales = np.ones(self.nx)
         self.state_deviations = self._sizes(log, first)
+
+    def integration(self, asked: str) -> str:
+        """Return Radau unless something else is asked for; a discrete plant is stepped as it is."""
+        if self.integrations == (EXACT,):
+            return EXACT
+        return "radau" if asked == "auto" else asked
 
     def _algebraic(self, log: Log) -> list[int]:
         """Return the rows of E that are zero for every k of the log, of a discrete plant."""

@@ -128,7 +128,7 @@ def run_report(options: argparse.Namespace) -> int:
 
 def _target(options: argparse.Namespace) -> Path | TextIO:
     """Return where estimates go; refuse a hopeless place before any work is done."""
-    from obsynth.data.saved_state import STATE
+    from obsynth.data.job import STATE
     from obsynth.data.sinks import ESTIMATES
     from obsynth.data.sources import check_suffix
 

@@ -43,12 +43,10 @@ def _prepared(
 def run_simulate(options: argparse.Namespace) -> int:
     """Run ``simulate``: spec in, table of errors out, and every signal in a file if asked."""
     with progress(quiet=options.quiet) as report_stage:
-        from obsynth.experiments.columns import SIGNALS
+        from obsynth.experiments.simulation import SIGNALS, simulate
 
         spec, scenario, target, design = _prepared(options, report_stage, SIGNALS)
         report_stage("simulating")
-        from obsynth.experiments.simulation import simulate
-
         found = simulate(design, scenario)
         written = None if target is None else str(found.write_csv(target))
     from obsynth.report.scenarios import simulation_report

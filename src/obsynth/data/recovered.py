@@ -22,10 +22,6 @@ LATE = "recovered states"
 class RecoveredStates:
     """Estimates of the states that a transformation took away, all of one moment.
 
-    Fields: recovery: Of the design; engine: Whose estimates are used.
-
-    Notes
-    -----
     ``x_source = from_state x + from_input u + from_fault f``: what disturbances and noise add is not known.  Where the
     fault estimate lags more than that of the state, both are taken of the older moment.  Faults that the observer does
     not estimate count as zero.
@@ -67,10 +63,7 @@ class RecoveredStates:
         return found if found.names else None
 
     def take(self, row: Row, inputs: FloatArray) -> FloatArray:
-        """Return the recovered states, deviations; NaN where they are not known.
-
-        Shapes: ``inputs (nu,)``.
-        """
+        """Return the recovered states, deviations; NaN where they are not known: ``inputs (nu,)``."""
         if row.skipped:
             self._rows.clear()
         self._known = np.where(np.isfinite(inputs), inputs, self._known)

@@ -14,9 +14,9 @@ from obsynth.methods.fault_figures import DECOUPLED, FaultFigures, fault_figures
 from obsynth.methods.functional_filter.rates import settling_time
 from obsynth.methods.method_spec import MethodSpec
 from obsynth.methods.registry import REGISTRY, method_spec
+from obsynth.observers.linear.derived import sample_observer
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.observers.linear.sampling import sample_observer
-from obsynth.observers.recursive.steady_state import steady_observer
+from obsynth.observers.recursive.gain_schedule import steady_observer
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem

@@ -25,11 +25,11 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.results.checks import VerificationReport
 from obsynth.results.design import Certificate, ObserverDesign
 from obsynth.results.plant_source import source_of
-from obsynth.results.report import VerificationReport
 from obsynth.simulation.scenario import Scenario
-from obsynth.verification.means import before_the_mean
+from obsynth.verification.claims import before_the_mean
 from obsynth.verification.plant import condition_rows
 from obsynth.verification.stored_numbers import StoredErrors
 

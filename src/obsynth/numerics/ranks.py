@@ -75,6 +75,8 @@ PERFECT_PARITY = 1e-14
 SINGULAR_CONDITION = 1e13
 #: A value below this share of the largest of its range is zero but for rounding.
 ROUNDED_ZERO = 1e-12
+#: Bounds of states whose moves differ by less than this share are dependent.
+DEPENDENT_BOUND = 1e-13
 
 
 def rounding_rank(matrix: FloatArray) -> int:

@@ -19,7 +19,6 @@ from obsynth.plants.sequences import (
     checked_constants,
     checked_horizon,
     completed,
-    missing,
     positive_dt,
 )
 from obsynth.plants.validation import Problems, checked_labels, checked_names
@@ -127,7 +126,7 @@ class TimeVaryingDescriptorSystem:
                 make = partial(MatrixSequence.of, asked[name], name, first=first, constants=known)
                 found[name] = problems.collect(make)
             elif name in ("A", "C"):
-                problems.collect(partial(missing, name))
+                problems.note(f"{name} is missing: a plant needs A and C.", name)
         problems.raise_if_any()
         values = completed(found, problems)
         problems.raise_if_any()
@@ -227,8 +226,7 @@ class TimeVaryingDescriptorSystem:
         SpecError
             A matrix is a callable.
         """
-        data = {name: matrix.as_data() for name, matrix in self.matrices.items()}
-        return {**data, **self._labels()}
+        return {**{name: matrix.as_data() for name, matrix in self.matrices.items()}, **self._labels()}
 
     def replace(self, **changes: Any) -> TimeVaryingDescriptorSystem:
         """Return a plant with some fields changed, checked again as a whole.

@@ -39,10 +39,7 @@ def rounded_up(value: FloatArray, operations: int) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Ball:
-    """All real matrices within ``radius`` of ``midpoint``, entry by entry.
-
-    Fields: midpoint, radius: ``(rows, cols)`` each; the radius is not negative.
-    """
+    """All real matrices within ``radius`` (not negative) of ``midpoint``, entry by entry, ``(rows, cols)`` each."""
 
     midpoint: FloatArray
     radius: FloatArray

@@ -56,13 +56,11 @@ Means = Literal["Cholesky", "preconditioned Cholesky", "ball arithmetic", "none"
 
 @dataclass(frozen=True)
 class DefinitenessProof:
-    """The outcome of an attempt to prove positive definiteness.
+    """The outcome of an attempt to prove that every symmetric member of a ball is positive definite.
 
-    Fields: proved: Whether every symmetric member of the ball is proved positive definite; lower_bound: Proved lower
-    bound on the smallest eigenvalue after a congruence: scaling the diagonal near one or, where that leaves too little,
-    preconditioning to near the identity.  Without a proof, the computed eigenvalue less the error bounds, or zero;
-    error_bound: What rounding and forming could have contributed in double precision, on the same scale; means: What
-    proved it; reason: With ball arithmetic, its precision; without a proof, why there is none.
+    ``lower_bound``: proved, on the smallest eigenvalue after a congruence (scaling, or preconditioning to near the
+    identity); without a proof, the computed one less the error bounds, or zero; ``error_bound``: of rounding in double
+    precision and forming; ``reason``: with ball arithmetic its precision, else why there is none.
     """
 
     proved: bool

@@ -70,10 +70,7 @@ def rank_to_digits(rows: Rows) -> int:
 
 @dataclass(frozen=True, eq=False)
 class EnclosedPencil:
-    """The pencil ``A - z E``; E is rational, A enclosed.
-
-    Fields: E: ``(m, n)``; A: ``(m, n)``; bits: Precision of A.
-    """
+    """The pencil ``A - z E (m, n)``; E is rational, A enclosed in a precision of ``bits``."""
 
     E: fmpq_mat
     A: Rows

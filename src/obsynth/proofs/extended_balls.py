@@ -42,12 +42,7 @@ MOST_ROWS = 128
 
 @dataclass(frozen=True)
 class ExtendedProof:
-    """What ball arithmetic found out.
-
-    Fields: proved: Whether every symmetric member is positive definite; lower_bound: Below the smallest eigenvalue of
-    every member; zero without a proof; bits: Precision that decided, or the last that was tried; reason: Why there is
-    no proof; empty with one.
-    """
+    """What ball arithmetic found out: ``bits`` decided, or are the last that were tried; ``lower_bound`` is proved."""
 
     proved: bool
     lower_bound: float
@@ -61,10 +56,7 @@ MOST_ENCLOSED = 80
 
 
 def prove_by_ball_arithmetic(formula: Formula) -> ExtendedProof:
-    """Try to prove that every symmetric member of a matrix is positive definite, with as many digits as it takes.
-
-    Shapes: ``formula (n, n)``.
-    """
+    """Try to prove that every symmetric member of a matrix is positive definite, with as many digits as it takes."""
     reason = ""
     for bits in PRECISIONS:
         # A local precision: the one in python-flint's context is for the whole process.
@@ -146,10 +138,7 @@ def arb_matrix(matrix: FloatArray) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class ExtendedBall:
-    """All real matrices within radii of midpoints that have the digits of python-flint's current precision.
-
-    Fields: content: ``(rows, cols)``.
-    """
+    """All real matrices within radii of midpoints that have the digits of python-flint's current precision."""
 
     content: Any
 

@@ -36,10 +36,7 @@ LEFT_OF_GAINS, MOST_STEPS_OF_GAINS = 0.05, 1_024
 
 
 class PeakSums(NamedTuple):
-    """Upper bounds on partial and whole sums, one column for each input.
-
-    ``partial (steps, ..., m)`` holds the terms ``0 .. k``, ``whole (..., m)`` all of them.
-    """
+    """Upper bounds, a column per input: ``partial (steps, ..., m)`` on terms ``0 .. k``, ``whole (..., m)`` on all."""
 
     partial: FloatArray
     whole: FloatArray
@@ -110,10 +107,7 @@ def _norms(sizes: FloatArray) -> FloatArray:
 
 
 class Pieces(NamedTuple):
-    """Columns whose weighted norms, summed up, bound the integral over an interval of what inputs do.
-
-    ``columns (n, k)``, ``weights (k,)``, ``inputs (k,)``: to which input a column belongs.
-    """
+    """Columns ``(n, k)`` whose weighted norms bound the integral over an interval of what ``inputs (k,)`` do."""
 
     columns: Ball
     weights: FloatArray

@@ -140,8 +140,6 @@ def as_ball(content: flint.arb_mat) -> Ball:
 
 #: So many matrices are multiplied as balls before the coordinates move.
 AT_ONCE = 16
-
-
 #: No standard bounds the rounding of logarithms: a few units in the last place, and more than that.
 LOGARITHMS = 1e-14
 
@@ -194,10 +192,7 @@ def _in_units(ball: Ball, units: FloatArray) -> Ball:
 def stacked_product(first: tuple[FloatArray, FloatArray], second: tuple[FloatArray, FloatArray]) -> tuple[
     FloatArray, FloatArray
 ]:  # fmt: skip
-    """Return midpoints and radii of the products of two stacks of balls ``(count, rows, n)``, ``(count, n, columns)``.
-
-    As `Ball` multiplies, many at once.
-    """
+    """Return the products of two stacks of balls ``(count, rows, n)``, ``(count, n, columns)``, as `Ball` does."""
     (a, ra), (b, rb) = first, second
     length = a.shape[2]
     size, other = np.abs(a), np.abs(b)

@@ -17,11 +17,12 @@ from obsynth.methods.automatic import SAMPLES
 from obsynth.methods.fault_figures import FaultFigures, fault_figures, on_the_clock
 from obsynth.methods.functional_filter.rates import DelayCurve, delay_curve, settling_time
 from obsynth.methods.registry import REGISTRY, method_spec
+from obsynth.observers.linear.derived import sample_observer
 from obsynth.observers.linear.observer import LinearObserver
-from obsynth.observers.linear.sampling import sample_observer
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
+from obsynth.plotting.frequency import FaultGains, fault_gains
 from obsynth.results.delta_scan import DeltaScan
 from obsynth.results.design import ObserverDesign
 from obsynth.results.layout import facts_table, headed_table, name_list, number, print_checks, print_section
@@ -69,9 +70,15 @@ def plant_facts(plant: DescriptorSystem | TimeVaryingDescriptorSystem | DAEModel
 
 
 def design_report(design: ObserverDesign, *, console: Console) -> None:
-    """Print a design with its report; its fault estimates are a table of the summary."""
+    """Print a design with its report."""
     print_section(console, f"Design '{design.name}' by {design.method}", facts_table(plant_facts(design.plant)))
     print_section(console, "What is promised", facts_table(promises(design)))
+    if design.observer.fault_names:
+        headings, rows = fault_estimates(design, gains_if_linear(design))
+        table = headed_table(*headings)
+        for row in rows:
+            table.add_row(*map(Text, row))
+        print_section(console, f"{headings[0].capitalize()} estimates", table)
     for curve in delay_curves(design):
         print_section(console, f"Deviation of {curve.fault} against delay", delay_table(curve))
         console.print(Text(curve.sentence))
@@ -88,6 +95,8 @@ def design_report(design: ObserverDesign, *, console: Console) -> None:
         console.print(Text(f"Note: {note}"))
 
 
+#: The check without which observer and plant say nothing of one another.
+FITS = "fits the plant"
 #: Curves of at most so many faults; plants with more states have none, and no steps are followed there.
 MOST_CURVES, MOST_STATES = 3, 80
 
@@ -143,6 +152,39 @@ def promises(design: ObserverDesign) -> Iterator[tuple[str, str, str]]:
         if check.name == "H-infinity norm":
             yield "norm", number(check.value, digits=7), "the same gain recomputed by a second route"
     yield "observer order", str(design.observer.order), "states of the shipped realisation"
+
+
+def gains_if_linear(design: ObserverDesign) -> FaultGains | None:
+    """Return the gains of a linear design that estimates faults of its plant; a broken one has none."""
+    if not isinstance(design.plant, DescriptorSystem) or not design.observer.fault_names:
+        return None
+    return None if any(check.name == FITS for check in design.report.failures) else fault_gains(design)
+
+
+def fault_estimates(design: ObserverDesign, gains: FaultGains | None) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Return headings and one row for each fault, or parameter: delay, deviation, and what else reaches it."""
+    observer, plant, units = design.observer, design.plant, design.plant.units
+    deviations = {check.name: check.value for check in design.report.checks}
+
+    def deviation(name: str, missing: str) -> str:
+        value = deviations.get(f"noise in fhat[{name}]")
+        return missing if value is None else f"{number(value)} {units.get(name, '')}".strip()
+
+    if gains is None or not isinstance(plant, DescriptorSystem):
+        when = "after the nominal run" if isinstance(plant, DAEModel) else "at the end of the horizon"
+        return ("parameter", f"std {when}"), [(name, deviation(name, "-")) for name in observer.fault_names]
+    linear = design.linear[1]
+    none, noise = "by sampling" if plant.nw else "none stated", "deviation" if plant.is_discrete else "dev. at 1 s"
+    delays = ("samples late", "s late") if plant.is_discrete else ()
+    rows: list[tuple[str, ...]] = []
+    for name, late, leaks in zip(linear.fault_names, linear.fault_delays, gains.leaks, strict=True):
+        delay = (str(late), number(late * plant.dt)) if plant.is_discrete else ()
+        row = (name, *delay, deviation(name, none))
+        if plant.nd:
+            leak = float(leaks.max())
+            row += (f"{number(leak)} of {plant.disturbance_names[int(leaks.argmax())]}" if leak else "none",)
+        rows.append(row)
+    return ("fault", *delays, noise, *(("worst leak",) if plant.nd else ())), rows
 
 
 #: Without a scenario steps are followed for so many settling times of the plant, at most so many samples.

@@ -11,8 +11,11 @@ from obsynth.data.run import DataRun
 from obsynth.files.outputs import FileKind, write_atomically
 from obsynth.methods.registry import REGISTRY, method_spec
 from obsynth.report.designs import (
+    FITS,
     delay_curves,
     delay_table,
+    fault_estimates,
+    gains_if_linear,
     plant_facts,
     promises,
     recovered_states,
@@ -21,11 +24,11 @@ from obsynth.report.designs import (
 from obsynth.report.logs import agreement_section, data_section
 from obsynth.report.page_tables import check_rows, copied_table, fact_rows, matrix_rows, table_lines, value_text
 from obsynth.report.pictures import pictures_of
-from obsynth.report.summary import FITS, fault_estimates, gains_if_linear, summary
+from obsynth.report.summary import summary
+from obsynth.results.checks import VerificationReport
 from obsynth.results.design import ObserverDesign
 from obsynth.results.gain_sets import gain_set_digest
 from obsynth.results.layout import verdict_line
-from obsynth.results.report import VerificationReport
 from obsynth.simulation.scenario import Scenario
 
 #: A page that `html_report` has written; the second mark is that of its first pages.

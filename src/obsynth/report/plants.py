@@ -25,9 +25,8 @@ from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.report.designs import plant_facts
-from obsynth.results.checks import Check
+from obsynth.results.checks import Check, VerificationReport
 from obsynth.results.layout import checks_table, complex_numbers, facts_table, headed_table, name_list, print_section
-from obsynth.results.report import VerificationReport
 
 
 def check_report(

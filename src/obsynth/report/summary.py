@@ -16,12 +16,12 @@ from rich.text import Text
 from obsynth.analysis.structure import questions
 from obsynth.files.tables import html_table
 from obsynth.methods.registry import REGISTRY, method_spec
-from obsynth.observers.linear.warm_up import FORGOTTEN, transient
+from obsynth.observers.linear.derived import FORGOTTEN, transient
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
-from obsynth.plotting.frequency import FaultGains, fault_gains
-from obsynth.report.designs import Followed, design_warnings, followed_steps
+from obsynth.plotting.frequency import FaultGains
+from obsynth.report.designs import Followed, design_warnings, fault_estimates, followed_steps, gains_if_linear
 from obsynth.results.design import ObserverDesign
 from obsynth.results.layout import number, verdict_line
 
@@ -32,8 +32,6 @@ NEAR_ONE = 0.5
 #: An estimate follows a step if in the end it misses it by no more than this share.
 FOLLOWS = 0.1
 _LABEL = 10
-#: The check without which observer and plant say nothing of one another.
-FITS = "fits the plant"
 #: Claims that say what a design is worth; the others are for -v.
 _PROMISES = ("gamma", "decay")
 
@@ -188,39 +186,6 @@ def _assumptions(design: ObserverDesign) -> Iterator[str]:
     if isinstance(design.plant, DescriptorSystem):
         noisy = sum(bool(row.any()) for row in design.plant.Dw)
         yield f"white noise on {noisy} of {design.plant.ny} sensors" if noisy else "no sensor noise stated"
-
-
-def gains_if_linear(design: ObserverDesign) -> FaultGains | None:
-    """Return the gains of a linear design that estimates faults of its plant; a broken one has none."""
-    if not isinstance(design.plant, DescriptorSystem) or not design.observer.fault_names:
-        return None
-    return None if any(check.name == FITS for check in design.report.failures) else fault_gains(design)
-
-
-def fault_estimates(design: ObserverDesign, gains: FaultGains | None) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """Return headings and one row for each fault, or parameter: delay, deviation, and what else reaches it."""
-    observer, plant, units = design.observer, design.plant, design.plant.units
-    deviations = {check.name: check.value for check in design.report.checks}
-
-    def deviation(name: str, missing: str) -> str:
-        value = deviations.get(f"noise in fhat[{name}]")
-        return missing if value is None else f"{number(value)} {units.get(name, '')}".strip()
-
-    if gains is None or not isinstance(plant, DescriptorSystem):
-        when = "after the nominal run" if isinstance(plant, DAEModel) else "at the end of the horizon"
-        return ("parameter", f"std {when}"), [(name, deviation(name, "-")) for name in observer.fault_names]
-    linear = design.linear[1]
-    none, noise = "by sampling" if plant.nw else "none stated", "deviation" if plant.is_discrete else "dev. at 1 s"
-    delays = ("samples late", "s late") if plant.is_discrete else ()
-    rows: list[tuple[str, ...]] = []
-    for name, late, leaks in zip(linear.fault_names, linear.fault_delays, gains.leaks, strict=True):
-        delay = (str(late), number(late * plant.dt)) if plant.is_discrete else ()
-        row = (name, *delay, deviation(name, none))
-        if plant.nd:
-            leak = float(leaks.max())
-            row += (f"{number(leak)} of {plant.disturbance_names[int(leaks.argmax())]}" if leak else "none",)
-        rows.append(row)
-    return ("fault", *delays, noise, *(("worst leak",) if plant.nd else ())), rows
 
 
 def _warnings(design: ObserverDesign, gains: FaultGains | None, steps: Followed) -> Iterator[str]:

@@ -13,9 +13,9 @@ from obsynth.extensions import extension
 from obsynth.numerics.arrays import FloatArray, read_only
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.results.checks import VerificationReport
 from obsynth.results.gain_set_writing import save
 from obsynth.results.plant_source import PlantSource
-from obsynth.results.report import VerificationReport
 
 if TYPE_CHECKING:
     import control
@@ -204,8 +204,8 @@ class ObserverDesign:
         import control
         import numpy as np
 
+        from obsynth.observers.recursive.gain_schedule import steady_observer
         from obsynth.observers.recursive.observer import RecursiveObserver
-        from obsynth.observers.recursive.steady_state import steady_observer
 
         observer = (
             steady_observer(self.observer).observer if isinstance(self.observer, RecursiveObserver) else self.linear[1]

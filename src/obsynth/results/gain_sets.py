@@ -20,6 +20,7 @@ from obsynth.errors import SpecError
 from obsynth.files.inputs import input_file, json_data, read_json
 from obsynth.numerics.arguments import is_number
 from obsynth.numerics.arrays import FloatArray
+from obsynth.results.checks import VerificationReport
 from obsynth.results.design import Certificate, ObserverDesign
 from obsynth.results.gain_set_writing import (
     ARRAYS,
@@ -40,7 +41,6 @@ from obsynth.results.gain_set_writing import (
     types_of,
 )
 from obsynth.results.plant_source import PlantSource
-from obsynth.results.report import VerificationReport
 
 __all__ = [
     "GAIN_SET", "SCHEMA_VERSION", "design_as_dict", "digest_of", "gain_set_bytes", "gain_set_digest", "load", "loaded",

@@ -16,7 +16,7 @@ from obsynth.spec.documents import described
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
-    from obsynth.spec.schema import DAEDocument, PlantDocument, SpecDocument, TimeVaryingDocument
+    from obsynth.spec.schema import DAESection, PlantSection, SpecDocument, TimeVaryingSection
 
     Model = TypeVar("Model", bound=BaseModel)
 
@@ -26,11 +26,7 @@ MAXIMUM_PROBLEMS = 25
 
 @dataclass(frozen=True)
 class DocumentProblems:
-    """Collects the problems of one document, to raise them together.
-
-    Fields: source: The document; what: What the document should be, for the message, such as ``spec``; found: Path and
-    text of each problem so far.
-    """
+    """Collects path and text of each problem of one document, which is to be a ``what``, to raise them together."""
 
     source: Path
     what: str
@@ -55,8 +51,8 @@ class DocumentProblems:
 def checked_spec(document: Mapping[str, Any], source: Path) -> tuple[SpecDocument, dict[str, Any]]:
     """Check a whole spec, and the options of its method."""
     from obsynth.methods.registry import AUTO, REGISTRY
-    from obsynth.spec.options import options_schema
     from obsynth.spec.schema import SpecDocument
+    from obsynth.spec.schema_values import options_schema
 
     problems = DocumentProblems(source, what="spec")
     _check_version(document, problems)
@@ -85,7 +81,7 @@ def checked_spec(document: Mapping[str, Any], source: Path) -> tuple[SpecDocumen
 def _options_of_any(given: dict[str, Any], source: Path) -> dict[str, Any]:
     """Return options as the first method reads them that has them all; `auto` decides between those that do."""
     from obsynth.methods.registry import REGISTRY
-    from obsynth.spec.options import options_schema
+    from obsynth.spec.schema_values import options_schema
 
     if not given:
         return {}
@@ -100,23 +96,18 @@ def _options_of_any(given: dict[str, Any], source: Path) -> dict[str, Any]:
     )  # fmt: skip
 
 
-def checked_plant(document: Mapping[str, Any], source: Path) -> PlantDocument | TimeVaryingDocument | DAEDocument:
+def checked_plant(document: Mapping[str, Any], source: Path) -> PlantSection | TimeVaryingSection | DAESection:
     """Check a plant in a file of its own."""
-    from obsynth.spec.schema import DAEDocument, PlantDocument, TimeVaryingDocument
+    from obsynth.spec.schema import PLANT_DOCUMENTS
 
     problems = DocumentProblems(source, what="plant")
     _check_version(document, problems)
-    checked: PlantDocument | TimeVaryingDocument | DAEDocument | None
-    if document.get("kind") == "time-varying":
-        checked = _validated(TimeVaryingDocument, document, problems)
-    elif document.get("kind") == "dae":
-        checked = _validated(DAEDocument, document, problems)
-    else:
-        checked = _validated(PlantDocument, document, problems)
+    kind = document.get("kind")
+    known = PLANT_DOCUMENTS.get(kind if isinstance(kind, str) else None, PLANT_DOCUMENTS[None])
+    checked: Any = _validated(known, document, problems)
     problems.raise_if_any()
-    if checked is None:
-        raise SpecError(f"{source} is no valid plant.", path=str(source))
-    return checked
+    found: PlantSection | TimeVaryingSection | DAESection = checked
+    return found
 
 
 def _check_version(document: Mapping[str, Any], problems: DocumentProblems) -> None:
@@ -151,28 +142,30 @@ def _explained(item: Any, model: type[BaseModel], prefix: str) -> tuple[str, str
     in_stack = "<stack>" in item["loc"]
     in_rows = in_stack or "<rows>" in item["loc"]
     key = names[-1] if names else ""
-    if kind == "extra_forbidden":
+    if kind == "invalid_key" or "[key]" in location:
+        text, numbers = f"a key must be a non-empty text, not {described(value)}.", []
+    elif kind == "extra_forbidden":
         known = _known_keys(item["loc"]) if len(names) > 1 else list(model.model_fields)
         text = f"unknown key.{_suggestion(key, known)}"
     elif kind == "missing":
-        text = "this key is missing."
-        if key == "dt":
-            text = "this key is missing: give the seconds between samples, or 0 for a plant in continuous time."
-    elif kind == "invalid_key" or "[key]" in location:
-        text, numbers = f"a key must be a non-empty text, not {described(value)}.", []
+        needed = ": give the seconds between samples, or 0 for a plant in continuous time"
+        text = f"this key is missing{needed if key == 'dt' else ''}."
+    elif kind in ("ragged_rows", "stack_shapes"):
+        text = f"{item['msg']}."
+    elif kind == "finite_number":
+        text = f"must be a finite number, not {value}."
     elif kind == "entry_of_k":
         text = f"{item['msg']}, not {described(value)}."
-    elif kind in ("ragged_rows", "stack_shapes", "finite_number"):
-        text = f"{item['msg']}." if kind != "finite_number" else f"must be a finite number, not {value}."
     elif kind == "string_pattern_mismatch":
         text = f"use letters, digits, '.', '_' and '-' only (at most 100), not {described(value)}."
     else:
         wanted = "a list of numbers" if in_rows and kind in ("list_type", "too_short") else _wanted(kind, context)
         wanted = "a list of rows, such as [[1, 0], [0, 1]]" if in_rows and not numbers else wanted
-        text = f"must be {wanted}, not {_found(kind, value)}."
+        found = "an empty one" if kind in ("too_short", "string_too_short") else described(value)
+        text = f"must be {wanted}, not {found}."
     words = ("matrix", "row", "column") if in_stack else ("row", "column") if in_rows else ("entry",)
-    place = _position(numbers, words)
-    return ".".join([*([prefix] if prefix else []), *names]), f"{place}{text}"
+    place = ", ".join(f"{word} {number}" for word, number in zip(words, numbers, strict=False))
+    return ".".join([*([prefix] if prefix else []), *names]), f"{place} {text}" if place else text
 
 
 def _wanted(kind: str, context: Mapping[str, Any]) -> str:
@@ -190,38 +183,21 @@ def _wanted(kind: str, context: Mapping[str, Any]) -> str:
     return plain.get(kind, f"valid ({kind.replace('_', ' ')})")
 
 
-def _found(kind: str, value: Any) -> str:
-    return "an empty one" if kind in ("too_short", "string_too_short") else described(value)
-
-
-def _position(numbers: Sequence[int], words: Sequence[str]) -> str:
-    place = ", ".join(f"{word} {number}" for word, number in zip(words, numbers, strict=False))
-    return f"{place} " if place else ""
-
-
 def _known_keys(location: Sequence[str | int]) -> list[str]:
     """Return the keys that the section around the last part of ``location`` may have."""
     from obsynth.spec import schema
     from obsynth.spec.schema_values import MatrixFile
 
-    by_tag: dict[str, type[BaseModel]] = {
-        "<file>": MatrixFile,
-        "<inline>": schema.PlantSection,
-        "<varying>": schema.TimeVaryingSection,
-        "<dae>": schema.DAESection,
-        "<one>": schema.ProfileSection,
-    }
-    by_name: dict[str, type[BaseModel]] = {
-        "method": schema.MethodSection,
-        "transform": schema.TransformSection,
-        "scenario": schema.ScenarioSection,
-    }
+    sections: dict[str, type[BaseModel]] = {
+        "<file>": MatrixFile, "<inline>": schema.PlantSection, "<varying>": schema.TimeVaryingSection,
+        "<dae>": schema.DAESection, "<one>": schema.ProfileSection, "method": schema.MethodSection,
+        "transform": schema.TransformSection, "scenario": schema.ScenarioSection,
+    }  # fmt: skip
     if "<pick>" in location:
         return ["outputs" if {"C", "Df", "Dd"} & set(location) else "states", "file"]
     if "<list>" in location and location[0] == "scenario":
         return list(schema.ProfileSection.model_fields)
-    around = location[-2]
-    section: type[BaseModel] | None = by_tag.get(str(around)) or by_name.get(str(around))
+    section = sections.get(str(location[-2]))
     return list(section.model_fields) if section is not None else []
 
 

@@ -97,12 +97,6 @@ class ErrorSystem:
             fault, disturbance, noise = (direct @ d - added @ b for b, d in seen)
             return observer.Cz[rows], fault, disturbance, noise
 
-        return cls(
-            observer.Az,
-            driven(plant.Bf, plant.Df),
-            driven(plant.Bd, plant.Dd),
-            driven(plant.Bw, plant.Dw),
-            output(observer.fault_rows),
-            output(observer.residual_rows),
-            output(observer.state_rows),
-        )
+        inputs = (driven(b, d) for b, d in ((plant.Bf, plant.Df), (plant.Bd, plant.Dd), (plant.Bw, plant.Dw)))
+        rows = (observer.fault_rows, observer.residual_rows, observer.state_rows)
+        return cls(observer.Az, *inputs, *map(output, rows))

@@ -18,8 +18,7 @@ from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.ranks import REST_TOLERANCE
 from obsynth.numerics.threads import on_one_thread_if_small
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.exosystems import Exosystem, exosystem
-from obsynth.plants.fault_models import stated_eigenvalues
+from obsynth.plants.fault_models import Exosystem, exosystem, stated_eigenvalues
 
 #: Zeros that are named in a sentence; the others are counted.
 MOST_ZEROS = 4

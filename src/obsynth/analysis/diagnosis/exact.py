@@ -17,18 +17,21 @@ from obsynth.analysis.diagnosis.decoupled import unknowns_pencil
 from obsynth.analysis.diagnosis.fault_columns import Question
 from obsynth.numerics.arrays import ComplexArray
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.proofs.exact_matrices import (
+from obsynth.proofs.exact_arithmetic import (
+    Root,
+    RootLocation,
     blocks,
     computed_entries,
     identity,
+    locate_roots,
     null_basis,
     pivot_columns,
+    primitive,
     written_fraction,
     written_matrix,
     zeros_matrix,
 )
 from obsynth.proofs.exact_pencils import ExactPencil
-from obsynth.proofs.root_location import Root, RootLocation, locate_roots, primitive
 
 #: Plants with more unknowns are decided in floating point.
 MOST_UNKNOWNS = 70

@@ -17,8 +17,6 @@ from obsynth.plants.descriptor import DescriptorSystem
 
 #: Plants with more states are not searched for pairs.
 MOST_FOR_PAIRS = 24
-
-
 #: Plants with more states are not searched for suggestions at all.
 MOST_FOR_ONE = 120
 
@@ -90,8 +88,6 @@ def listed(sets: Sequence[Sequence[str]], most: int = 6) -> str:
 
 #: A motion is stated where it cancels the fault to this, relative to the fault's own column.
 EXACTNESS = 1e-8
-
-
 #: Signals of a motion that are named; the others are counted.
 MOST_NAMED = 6
 
@@ -100,9 +96,7 @@ MOST_NAMED = 6
 class HiddenMotion:
     """States, unknown inputs and other faults that, with a fault of 1, leave every output at zero.
 
-    Fields: fault: The fault; point: All signals go like ``exp(point t)`` (``point^k`` for sampled plants); values: The
-    amplitudes that are not zero: unknown inputs and other faults first, then states; causes: How many of them, from the
-    first, are unknown inputs or other faults; dt: Of the plant, seconds.
+    All go like ``exp(point t)`` (``point^k``); ``values``: the amplitudes, first those of the ``causes`` (a count).
     """
 
     fault: str

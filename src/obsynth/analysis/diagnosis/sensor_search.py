@@ -32,10 +32,7 @@ SHOWN = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class SensorResponses:
-    """Rows: the plant's outputs, then candidates; columns: unknown inputs, then faults; one table per point.
-
-    Fields: tables ``(points, rows, nd + nf)``; outputs: how many rows are outputs; nd.
-    """
+    """Rows: outputs, then candidates; columns: unknown inputs, then faults; ``tables (points, rows, nd + nf)``."""
 
     tables: ComplexArray
     outputs: int
@@ -113,10 +110,9 @@ class Task:
 
 @dataclass(frozen=True, eq=False)
 class SensorSearch:
-    """A search over sets of candidate sensors.
+    """A search over sets of candidate sensors, for the columns ``faults``.
 
-    Fields: faults: columns that count; may_fail: every added sensor brings a fault of its own, to be told as well;
-    copies: how often a candidate may be taken.
+    ``may_fail``: an added sensor brings a fault of its own, to be told as well; ``copies``: how often it may be taken.
     """
 
     plant: DescriptorSystem

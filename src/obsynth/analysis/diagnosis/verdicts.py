@@ -53,8 +53,8 @@ def residual_bank(plant: DescriptorSystem, exactly: bool) -> tuple[StructuredRes
         orders = [one.residual_order for one in asked]
         known = [order for order in orders if order is not None]
         sets = (kept, removed, [one.number for one in asked if one.shows_at_rest])
-        names = (tuple(plant.fault_names[i] for i in chosen) for chosen in sets)
-        found.append(StructuredResidual(*names, max(known) if len(known) == len(orders) else None))
+        sees, blind, at_rest = (tuple(plant.fault_names[i] for i in chosen) for chosen in sets)
+        found.append(StructuredResidual(sees, blind, at_rest, max(known) if len(known) == len(orders) else None))
     return tuple(sorted(found, key=lambda residual: len(residual.sees)))
 
 

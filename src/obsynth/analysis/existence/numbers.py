@@ -102,7 +102,7 @@ class _Content:
 @lru_cache(maxsize=8)
 def _numbers_of(content: _Content, uncleaned: bool) -> PlantNumbers | None:
     plant = content.plant
-    from obsynth.proofs.exact_matrices import computed_entries, rational_matrix, written_matrix
+    from obsynth.proofs.exact_arithmetic import computed_entries, rational_matrix, written_matrix
 
     origin = origin_of(plant)
     if origin is not None:

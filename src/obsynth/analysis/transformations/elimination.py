@@ -26,7 +26,7 @@ from obsynth.numerics.threads import one_thread_if_small
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.origin import note_source, with_origin
 from obsynth.plants.uncertainty import ELIMINATED
-from obsynth.proofs.exact_matrices import computed_entries
+from obsynth.proofs.exact_arithmetic import computed_entries
 
 #: Arrays of plants from this size on, with at most this share of entries that are not zero, are treated as sparse.
 MANY_VARIABLES = 500

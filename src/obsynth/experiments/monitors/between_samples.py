@@ -52,9 +52,8 @@ FINITE = 1e-12
 class BetweenSamples:
     """A continuous design on samples: ``s+ = M s``, ``r = c s``, ``s = [x; eps]`` with the part of x that is forgotten.
 
-    Fields: plant: Without algebraic states; M: ``(n + nz, n + nz)``; c: ``(nr, n + nz)``; into: How q enters s,
-    ``(n + nz, n)``; first, second: How ``y (ny)`` of a sample enters s at that sample and at the next; direct: ``(nr,
-    ny)``; left: ``(nr,)``: what the modes that are not forgotten add per unit of each state, at most.
+    ``into (n + nz, n)``: how q enters s; ``first, second``: how ``y`` of a sample enters it at that sample and the
+    next; ``left (nr,)``: what the modes that are not forgotten add per unit of each state, at most.
     """
 
     plant: DescriptorSystem
@@ -114,10 +113,7 @@ class BetweenSamples:
         cls, written: DescriptorSystem, plant: DescriptorSystem, observer: LinearObserver, tracking: FloatArray,
         *, rows: slice,
     ) -> BetweenSamples:  # fmt: skip
-        """Return a design for a sampled plant, whose states are those of ``written`` without its algebraic ones.
-
-        The identities hold at the samples, so that the plant's state does not enter: ``eps+ = Az eps - T q + By Dd d``.
-        """
+        """Return a design for a sampled plant, with states of ``written``: ``eps+ = Az eps - T q + By Dd d``."""
         smooth = eliminate_algebraic_states(written).plant
         n, nz, exact = smooth.nx, observer.order, Ball.exact
         m = block([[exact(np.zeros((n, n))), exact(np.zeros((n, nz)))], [exact(np.zeros((nz, n))), exact(observer.Az)]])

@@ -29,9 +29,9 @@ from obsynth.exporting.fmu.description import (
 from obsynth.exporting.realisation import Realisation
 from obsynth.files.outputs import write_atomically
 from obsynth.numerics.arguments import chosen
-from obsynth.observers.dae.compiled_library import FLAGS, compiler
+from obsynth.observers.dae.c_code import FLAGS, compiler
 from obsynth.observers.dae.observer import DAEObserver
-from obsynth.observers.linear.warm_up import checked_warm_up, transient
+from obsynth.observers.linear.derived import checked_warm_up, transient
 from obsynth.results.design import ObserverDesign
 
 VERSIONS = ("2.0", "3.0")

@@ -34,7 +34,7 @@ from obsynth.methods.fault_estimation_filter.output_nulling import (
 )
 from obsynth.numerics.arrays import FloatArray
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.proofs.exact_matrices import nearest_doubles
+from obsynth.proofs.exact_arithmetic import nearest_doubles
 
 #: A dual point must be positive definite by this margin, where the point of `strict_point` is the identity, and beat
 #: the level by this relative one.

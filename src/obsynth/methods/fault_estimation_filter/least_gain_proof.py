@@ -60,7 +60,7 @@ class InvisiblePairs:
     @classmethod
     def of(cls, work: DescriptorSystem, gains: Mapping[str, FloatArray]) -> InvisiblePairs | None:
         """Return the pairs of a plant with its sensor faults as states; ``None`` where there are too many states."""
-        from obsynth.proofs.exact_matrices import blocks, null_basis, stored_matrix, zeros_matrix
+        from obsynth.proofs.exact_arithmetic import blocks, null_basis, stored_matrix, zeros_matrix
 
         if work.nx > MOST_STATES or not work.nd:
             return None
@@ -90,7 +90,7 @@ class InvisiblePairs:
         """Return the lower bound that a certificate proves, rounded down; zero where it proves nothing."""
         import flint
 
-        from obsynth.proofs.exact_matrices import stored_matrix
+        from obsynth.proofs.exact_arithmetic import stored_matrix
         from obsynth.proofs.extended_balls import arb_matrix
 
         k, s, nd = int(self.top.ncols()), int(self.S.ncols()), int(self.Zd.ncols())

@@ -38,7 +38,7 @@ from obsynth.methods.fault_estimation_filter.prepared_plant import PreparedPlant
 from obsynth.methods.fault_estimation_filter.realisation import realise_filter
 from obsynth.methods.method_spec import Synthesis
 from obsynth.numerics.arrays import FloatArray, as_matrix
-from obsynth.observers.linear.averaging import averaged
+from obsynth.observers.linear.derived import averaged
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.design import Certificate
 

@@ -20,7 +20,7 @@ from obsynth.analysis.existence.verdicts import DECIDER
 from obsynth.analysis.plant_units import PlantUnits
 from obsynth.methods.functional_filter.options import FunctionalFilterOptions
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.exosystems import Exosystem, exosystem
+from obsynth.plants.fault_models import Exosystem, exosystem
 from obsynth.plants.origin import origin_of
 
 _SOURCE = "left null space of [A - sE, Bd, Bf; C, Dd, Df]"

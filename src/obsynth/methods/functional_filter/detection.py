@@ -25,8 +25,7 @@ from obsynth.numerics.threads import on_one_thread_if_small
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.balls import Ball
-from obsynth.results.checks import Check
-from obsynth.results.report import VerificationReport
+from obsynth.results.checks import Check, VerificationReport
 from obsynth.verification.identities import Identity, equality
 
 #: The grid of frequencies begins at this share of its end, where the band begins at zero.

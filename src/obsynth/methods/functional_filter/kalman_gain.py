@@ -19,7 +19,7 @@ from obsynth.numerics.ranks import RANK_TOLERANCE, rank_from
 from obsynth.numerics.scaling import balanced_matrix
 from obsynth.numerics.spectra import abscissa
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.exosystems import Exosystem
+from obsynth.plants.fault_models import Exosystem
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,7 @@ from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.ranks import decide_rank
 from obsynth.numerics.spectra import speeds
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.exosystems import exosystem
+from obsynth.plants.fault_models import exosystem
 from obsynth.verification.certificates import slowest_decay
 
 #: Modes slower than this share of the fastest one never settle.

@@ -37,7 +37,7 @@ from obsynth.methods.ui_pi_observer.options import checked_poles
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import rounding_rank
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.exosystems import Exosystem, exosystem
+from obsynth.plants.fault_models import Exosystem, exosystem
 from obsynth.results.design import Certificate
 from obsynth.verification.certificates import slowest_decay
 

@@ -35,7 +35,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.ranks import decide_rank, equilibrate
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.proofs.exact_matrices import computed_entries
+from obsynth.proofs.exact_arithmetic import computed_entries
 
 #: At most this many signals are named in a failed condition.
 MOST_NAMES = 4

@@ -26,8 +26,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import RANK_TOLERANCE, decide_rank
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.exosystems import Exosystem
-from obsynth.plants.fault_models import stated_eigenvalues
+from obsynth.plants.fault_models import Exosystem, stated_eigenvalues
 
 
 @dataclass(frozen=True, eq=False)

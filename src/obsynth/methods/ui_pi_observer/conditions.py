@@ -61,7 +61,7 @@ from obsynth.methods.ui_pi_observer.pencils import (
 from obsynth.numerics.arrays import ComplexArray, FloatArray
 from obsynth.numerics.pencils import finite_zeros
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.exosystems import Exosystem
+from obsynth.plants.fault_models import Exosystem
 
 #: Drops of the augmented pencil this close to each other, relative to their size or one, may be one multiple mode.
 SCATTER = 1e-2

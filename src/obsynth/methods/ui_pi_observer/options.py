@@ -15,7 +15,7 @@ from obsynth.methods.ui_pi_observer.placement_problem import NoiseWeights
 from obsynth.numerics.arguments import NonNegative, Positive, WrittenAs, problem_with
 from obsynth.numerics.arrays import ComplexArray
 from obsynth.numerics.spectra import decay_rates
-from obsynth.plants.exosystems import Exosystem
+from obsynth.plants.fault_models import Exosystem
 
 #: Poles given as numbers count as a conjugate pair when they agree to this, relative to their size.
 PAIR_TOLERANCE = 1e-9

@@ -14,7 +14,7 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import RANK_TOLERANCE, decide_rank
 from obsynth.numerics.scaling import equilibrate_pencil
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.exosystems import Exosystem
+from obsynth.plants.fault_models import Exosystem
 
 if TYPE_CHECKING:
     from flint import fmpz_poly
@@ -150,8 +150,7 @@ def exact_loss(plant: DescriptorSystem, model: Exosystem, value: complex) -> int
 
 
 def _augmented(numbers: PlantNumbers, plant: DescriptorSystem, model: Exosystem) -> PlantNumbers:
-    from obsynth.proofs.exact_matrices import written_matrix
-    from obsynth.proofs.exact_pencils import blocks, identity, zeros_matrix
+    from obsynth.proofs.exact_arithmetic import blocks, identity, written_matrix, zeros_matrix
 
     count, nx = model.order, plant.nx
     own = numbers.as_own
@@ -171,8 +170,7 @@ def _augmented(numbers: PlantNumbers, plant: DescriptorSystem, model: Exosystem)
 
 def _factor_of(model: Exosystem, value: complex) -> fmpz_poly | None:
     """Return the irreducible polynomial of Phi as written of which the value is a root."""
-    from obsynth.proofs.exact_matrices import written_matrix
-    from obsynth.proofs.root_location import primitive
+    from obsynth.proofs.exact_arithmetic import primitive, written_matrix
 
     polynomial = primitive(written_matrix(model.Phi).charpoly())
     factors = [factor for factor, _ in polynomial.factor()[1]]

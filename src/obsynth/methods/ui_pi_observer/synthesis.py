@@ -57,7 +57,7 @@ from obsynth.numerics.spectra import (
 )
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.exosystems import Exosystem, exosystem
+from obsynth.plants.fault_models import Exosystem, exosystem
 from obsynth.proofs.extended_balls import enclosed_eigenvalues, middle_of
 from obsynth.results.design import Certificate
 from obsynth.verification.certificates import slowest_decay

@@ -12,7 +12,8 @@ from obsynth.analysis.dae_structure import involved
 from obsynth.errors import SolverError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import SINGULAR_CONDITION
-from obsynth.observers.estimates import Estimates, named_estimates
+from obsynth.observers.estimates import Estimates
+from obsynth.observers.running import named_estimates
 
 if TYPE_CHECKING:
     from obsynth.observers.dae.settings import DAESettings
@@ -21,22 +22,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class DAERow:
-    """What the graph of an observer gave at one sample, or (with a leading axis) at several in a row.
+    """What the graph of an observer gave at one sample, or (with a leading axis) at several in a row."""
 
-    Fields: graph: Which laid it out; k: Number of the (first) sample; memory, said: What is carried on, and what is
-    said besides; seen: ``(ny,)``, of bool: which outputs were there; moved: ``(nx,)``: how far the state was put onto
-    its constraint; zeros but at k = 0.
-    """
-
-    graph: ObserverGraph
-    k: int
-    memory: FloatArray
+    graph: ObserverGraph  # which laid it out
+    k: int  # number of the (first) sample
+    memory: FloatArray  # memory, said: what is carried on, and what is said besides
     said: FloatArray
-    seen: NDArray[np.bool_]
-    moved: FloatArray
+    seen: NDArray[np.bool_]  # ``(ny,)``, of bool: which outputs were there
+    moved: FloatArray  # ``(nx,)``: how far the state was put onto its constraint; zeros but at k = 0
 
     def part(self, name: str) -> FloatArray:
-        """Return one array by its name in the layouts `obsynth.observers.dae.memory_layout`."""
+        """Return one array by its name in the layouts `obsynth.observers.dae.settings`."""
         layout, values = (self.graph.memory, self.memory) if name in self.graph.memory.shapes else (
             self.graph.row, self.said)  # fmt: skip
         return layout.part(values, name)
@@ -82,9 +78,7 @@ class DAERow:
     @property
     def whitened(self) -> FloatArray:
         """An innovation of the same length in units of its covariance ``(degrees,)``, of one sample; to first order.
-
-        Only its length counts for decisions.
-        """
+        Only its length counts for decisions."""
         white = np.zeros(self.degrees)
         white[:1] = np.sqrt(max(float(self.nis), 0.0))
         return white
@@ -150,10 +144,7 @@ class DAERow:
 
 
 class GatheredRows:
-    """What the estimates keep of the rows of a record, while it is being run.
-
-    Fields: observer: Whose rows they are.
-    """
+    """What the estimates keep of the rows of a record, while it is being run."""
 
     def __init__(self, observer: DAESettings) -> None:
         self.observer = observer
@@ -173,10 +164,7 @@ class GatheredRows:
         require_regular(self.observer, rows, self.parts[-1]["conditions"])
 
     def estimates(self, informations: FloatArray | None = None) -> Estimates:
-        """Return what was gathered.
-
-        Shapes: ``informations (any, nq, nq)``.
-        """
+        """Return what was gathered: ``informations (any, nq, nq)``."""
         whole = {name: np.concatenate([part[name] for part in self.parts]) for name in self.parts[0]}
         seen = whole["informations"]
         levels = _excitation(self.observer, seen if informations is None else informations)
@@ -187,10 +175,7 @@ class GatheredRows:
 
 
 def require_regular(observer: DAESettings, rows: DAERow, conditions: FloatArray) -> None:
-    """Raise `SolverError` where the matrix of (7) was singular to working precision.
-
-    Shapes: ``conditions (samples,)``.
-    """
+    """Raise `SolverError` where the matrix of (7) was singular to working precision: ``conditions (samples,)``."""
     if not len(conditions) or conditions.max() <= SINGULAR_CONDITION:
         return
     rows, i = rows.several, int(np.argmax(conditions > SINGULAR_CONDITION))

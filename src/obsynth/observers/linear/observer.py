@@ -24,12 +24,9 @@ from obsynth.observers.running import RunningObserver
 
 
 class LinearState(NamedTuple):
-    """The state of a linear observer.
+    """The state of a linear observer."""
 
-    Fields: z: ``(nz,)``, before the next sample.
-    """
-
-    z: FloatArray
+    z: FloatArray  # ``(nz,)``, before the next sample
 
 
 @dataclass(frozen=True, eq=False)

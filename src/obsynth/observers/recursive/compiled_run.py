@@ -22,25 +22,22 @@ from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.covariances import covariance_factor
 from obsynth.numerics.least_squares_step import DEPENDENT_COLUMN, SUSPECT_PARITY
-from obsynth.observers.estimates import Estimates, named_estimates
-from obsynth.observers.recursive.estimates import received_in, recursive_estimates
-from obsynth.observers.recursive.recursion import RawEstimate, Recursion, RecursiveState
+from obsynth.observers.estimates import Estimates
+from obsynth.observers.recursive.estimates import RawEstimate, RecursiveState, received_in
+from obsynth.observers.recursive.recursion import Recursion
 from obsynth.observers.recursive.settings import RecursiveSettings
 from obsynth.observers.recursive.step_model import PlantSteps, StepMatrices, StepModel, stacked_noise
+from obsynth.observers.running import named_estimates
 from obsynth.plants.sequences import MatrixSequence
 
 
 class StepStack(NamedTuple):
-    """Steps as `obsynth.numerics.compiled_steps.square_root_steps` takes them.
+    """Steps as `obsynth.numerics.compiled_steps.square_root_steps` takes them."""
 
-    Fields: moved: ``(1 or steps, n, rows)``; known: ``(1 or steps, any, rows)``; head: ``(1 or steps, n, n)``; data:
-    ``(steps, rows)``: as many steps as have an H of full rank, from the first one.
-    """
-
-    moved: FloatArray
-    known: FloatArray
-    head: FloatArray
-    data: FloatArray
+    moved: FloatArray  # ``(1 or steps, n, rows)``
+    known: FloatArray  # ``(1 or steps, any, rows)``
+    head: FloatArray  # ``(1 or steps, n, n)``
+    data: FloatArray  # ``(steps, rows)``: as many steps as have an H of full rank, from the first one
 
 
 def stacked_matrices(model: StepModel, first: int, count: int) -> StepMatrices:
@@ -82,10 +79,8 @@ def _products(matrices: FloatArray, rows: FloatArray) -> FloatArray:
 
 
 def stacked_steps(step: StepMatrices, before: FloatArray, y: FloatArray, u: FloatArray) -> StepStack | None:
-    """Return steps with H factorised and everything rotated, up to the first H whose rank has to be decided.
-
-    Shapes: ``before (steps, nu)``, ``y (steps, measured)``, ``u (steps, nu)``.
-    """
+    """Return steps with H factorised and everything rotated, up to the first H whose rank has to be decided: ``before
+    (steps, nu)``, ``y (steps, measured)``, ``u (steps, nu)``."""
     ne, rows, n = step.A.shape[1], step.H.shape[1], step.H.shape[2]
     if rows < n:
         return None
@@ -115,11 +110,6 @@ CHUNK = 4096
 SHORT_STRETCH = 8
 
 
-def kernel_covers(observer: RecursiveSettings) -> bool:
-    """Return whether the kernel knows the recursion: that of a filter, with parameters as a random walk or none."""
-    return observer.form in ("", "random-walk")
-
-
 def kernel_is_chosen(observer: RecursiveSettings, samples: int, compiled: bool | None) -> bool:
     """Return whether a record goes through the kernel."""
     if compiled is False:
@@ -129,7 +119,8 @@ def kernel_is_chosen(observer: RecursiveSettings, samples: int, compiled: bool |
             raise SpecError("compiled=True: the kernel knows no outliers: leave it out, or take outliers='none'.",
                             path="compiled")  # fmt: skip
         return False
-    covered, installed = kernel_covers(observer), importlib.util.find_spec("numba") is not None
+    # The recursion of a filter, with parameters as a random walk or none.
+    covered, installed = observer.form in ("", "random-walk"), importlib.util.find_spec("numba") is not None
     if compiled is None:
         return covered and installed and samples >= LONG_RECORD and observer.order <= SMALL_ORDER
     if not installed:
@@ -143,20 +134,6 @@ def kernel_is_chosen(observer: RecursiveSettings, samples: int, compiled: bool |
             "'innovation' and 'literal' run without it: leave the option out.", path="compiled",
         )  # fmt: skip
     return True
-
-
-def run_record(recursion: Recursion, y: FloatArray, u: FloatArray, compiled: bool | None) -> Estimates:
-    """Run over a whole record.
-
-    Shapes: ``y (samples, ny)``, ``u (samples, nu)``.
-    """
-    if kernel_is_chosen(recursion.settings, len(y), compiled):
-        return run_compiled(recursion, y, u)
-    state, rows = recursion.first, []
-    for k in range(len(y)):
-        state, row = recursion.advance(state, y[k], u[k])
-        rows.append(row)
-    return recursive_estimates(recursion.settings, rows)
 
 
 @dataclass
@@ -200,10 +177,8 @@ class _Record:
 
 
 def run_compiled(recursion: Recursion, y: FloatArray, u: FloatArray) -> Estimates:
-    """Run over a whole record with the kernel; single steps where samples are missing or a rank has to be decided.
-
-    Shapes: ``y (samples, ny)``, ``u (samples, nu)``.
-    """
+    """Run over a whole record with the kernel; single steps where samples are missing or a rank has to be decided: ``y
+    (samples, ny)``, ``u (samples, nu)``."""
     state, observer = recursion.first, recursion.settings
     plant = observer.plant
     nq = 0 if observer.adaptation is None else plant.nq

@@ -1,10 +1,6 @@
-"""Steps of the parameters of a recursive observer: as a random walk, reset after a jump, or as (18) is printed.
+"""Steps of the parameters of a recursive observer: as a random walk, or as (18) is printed.
 
 They are the parameters of the equations that led to x(k + 1), or, with early constraints, those of x(k + 1) itself.
-
-The adaptive observer (18) as printed: what it learns from, and where it never learns.
-
-Detect and reset: when innovations are too large for what is known of the parameters, less is known.
 """
 
 from __future__ import annotations
@@ -16,22 +12,17 @@ import numpy as np
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.least_squares_step import LeastSquaresStep, least_squares_step, rank_revealing_step
-from obsynth.numerics.recursive_least_squares import ParameterState
 from obsynth.observers.recursive.step_model import EarlyConstraintSteps, StepMatrices, StepModel
 
 
 @dataclass
 class RandomWalkParameterSteps:
-    """The steps of a model with its parameters among the states, as a random walk.
+    """The steps of a model with its parameters among the states, as a random walk. The state at k + 1 is ``[x(k+1);
+    theta(k)]``: the parameters that acted in the step that led there. Their increment then is noise of an equation of
+    its own, and no noise is correlated in time."""
 
-    The state at k + 1 is ``[x(k+1); theta(k)]``: the parameters that acted in the step that led there.  Their
-    increment then is noise of an equation of its own, and no noise is correlated in time.
-
-    Fields: model: With parameters; walk: ``(nq, nq)``: square root of the covariance of one step of the walk.
-    """
-
-    model: StepModel
-    walk: FloatArray
+    model: StepModel  # with parameters
+    walk: FloatArray  # ``(nq, nq)``: square root of the covariance of one step of the walk
 
     def at(self, k: int) -> StepMatrices:
         """Return the matrices of the step from k to k + 1."""
@@ -40,15 +31,11 @@ class RandomWalkParameterSteps:
 
 @dataclass
 class WalkingEarlySteps(EarlyConstraintSteps):
-    """Both at once: early constraints, and parameters that walk.
+    """Both at once: early constraints, and parameters that walk. An early equation of k + 1 holds for the parameters of
+    k + 1, so the state at k + 1 is ``[x(k+1); theta(k+1)]``. The outputs still hold theta(k), which is theta(k + 1)
+    without its last increment: that noise they share."""
 
-    An early equation of k + 1 holds for the parameters of k + 1, so the state at k + 1 is ``[x(k+1); theta(k+1)]``.
-    The outputs still hold theta(k), which is theta(k + 1) without its last increment: that noise they share.
-
-    Fields: walk: ``(nq, nq)``: square root of the covariance of one step of the walk.
-    """
-
-    walk: FloatArray
+    walk: FloatArray  # ``(nq, nq)``: square root of the covariance of one step of the walk
 
     def at(self, k: int) -> StepMatrices:
         """Return the matrices of the step from k to k + 1."""
@@ -81,10 +68,7 @@ class WalkingEarlySteps(EarlyConstraintSteps):
 
 
 def with_walking_parameters(step: StepMatrices, walk: FloatArray) -> StepMatrices:
-    """Return one step with its parameters among the states.
-
-    Shapes: ``walk (nq, nq)``.
-    """
+    """Return one step with its parameters among the states: ``walk (nq, nq)``."""
     ne, nx, nq = *step.A.shape, step.Phi.shape[1]
     E, C = step.H[:ne], step.H[ne:]
     H = np.block([[E, -step.Phi], [np.zeros((nq, nx)), np.eye(nq)], [C, step.Psi]])
@@ -130,45 +114,3 @@ def posterior_residual(
     weighted = np.linalg.solve(triangle, np.hstack((gaps, spread)))
     regressor, end = slice(columns, gaps.shape[1]), gaps.shape[1]
     return weighted[:, :columns], -weighted[:, regressor], weighted[:, end:]
-
-
-#: Samples whose squared innovations are summed up.
-RESET_WINDOW = 20
-
-
-class ParameterReset:
-    """Sums up normalised innovations, and starts S and the covariance again when they are too large.
-
-    Fields: probability: That the threshold is passed at a sample although nothing has changed; start: Whose triangle
-    and spread are taken back.
-    """
-
-    def __init__(self, probability: float, start: ParameterState) -> None:
-        self.probability, self.start = probability, start
-        self.thresholds: dict[int, float] = {}
-
-    def surprises(self, before: FloatArray, state: ParameterState, v: FloatArray, G: FloatArray) -> FloatArray:
-        """Return the latest normalised squares with their degrees of freedom, that of this sample last.
-
-        Shapes: ``before (any, 2)``, ``v (m,)``, ``G (m, nq)``.
-        """
-        gap, seen = v - G @ state.theta, G @ state.spread
-        covariance = np.eye(len(v)) + seen @ seen.T
-        latest = [float(gap @ np.linalg.solve(covariance, gap)), float(len(v))]
-        return np.vstack([before, latest])[-RESET_WINDOW:]
-
-    def is_due(self, surprises: FloatArray) -> bool:
-        """Return whether the innovations are too large for what is known of the parameters."""
-        total, degrees = float(sum(surprises[:, 0])), int(sum(surprises[:, 1]))
-        return degrees > 0 and total > self._threshold(degrees)
-
-    def forgetful(self, state: ParameterState) -> ParameterState:
-        """Return the same estimate, known no better than at the start."""
-        return ParameterState(state.theta, self.start.triangle, self.start.spread)
-
-    def _threshold(self, degrees: int) -> float:
-        from scipy.special import chdtri
-
-        if degrees not in self.thresholds:
-            self.thresholds[degrees] = float(chdtri(degrees, self.probability))
-        return self.thresholds[degrees]

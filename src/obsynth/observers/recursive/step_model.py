@@ -34,20 +34,15 @@ MANY_ROWS = 100
 
 
 class StepMatrices(NamedTuple):
-    """One step ``E x(k+1) = A x(k) + B u(k) + Phi theta + q``, ``[y(k+1); Dn u(k+1)] = C x(k+1) + Psi theta + r``.
+    """One step ``E x(k+1) = A x(k) + B u(k) + Phi theta + q``, ``[y(k+1); Dn u(k+1)] = C x(k+1) + Psi theta + r``."""
 
-    Fields: H: ``(ne + ny, nx)``: E above C; A, B, Phi: ``(ne, nx)``, ``(ne, nu)``, ``(ne, nq)``; Psi: ``(ny, nq)``; Dn:
-    ``(ny - measured, nu)``: outputs that are made of the next input; noise: ``(ne + ny, any)``: square root of the
-    covariance of q and r.
-    """
-
-    H: FloatArray
-    A: FloatArray
+    H: FloatArray  # ``(ne + ny, nx)``: E above C
+    A: FloatArray  # A, B, Phi: ``(ne, nx)``, ``(ne, nu)``, ``(ne, nq)``
     B: FloatArray
     Phi: FloatArray
-    Psi: FloatArray
-    Dn: FloatArray
-    noise: FloatArray
+    Psi: FloatArray  # ``(ny, nq)``
+    Dn: FloatArray  # ``(ny - measured, nu)``: outputs that are made of the next input
+    noise: FloatArray  # ``(ne + ny, any)``: square root of the covariance of q and r
 
 
 class StepModel(Protocol):
@@ -66,10 +61,8 @@ def stacked_noise(first: FloatArray, second: FloatArray) -> FloatArray:
 
 
 def require_in_range(S: FloatArray, factor: FloatArray, k: int, state_names: Sequence[str]) -> None:
-    """Raise `PreconditionError` when deviations outgrow double precision on the way to sample ``k``.
-
-    Shapes: ``factor (nx or more, any)``.
-    """
+    """Raise `PreconditionError` when deviations outgrow double precision on the way to sample ``k``: ``factor (nx or
+    more, any)``."""
     if float(np.max(np.abs(S), initial=0.0)) < OUTGROWN:
         return
     sizes = np.max(np.abs(np.nan_to_num(factor[: len(state_names)])), axis=1, initial=0.0)
@@ -81,15 +74,24 @@ def require_in_range(S: FloatArray, factor: FloatArray, k: int, state_names: Seq
     )  # fmt: skip
 
 
+def spreads(
+    step: StepMatrices, factor: FloatArray, diffuse: FloatArray, k: int, state_names: Sequence[str]
+) -> tuple[FloatArray, FloatArray]:
+    """Return a root ``(rows, any)`` of the covariance of a step's data, and what is unknown in them ``(rows, r)``."""
+    ne, rows, width = len(step.A), len(step.H), factor.shape[1]
+    S = np.zeros((rows, max(width + step.noise.shape[1], rows)))
+    S[:ne, :width] = step.A @ factor
+    S[:, width : width + step.noise.shape[1]] = step.noise
+    require_in_range(S, factor, k, state_names)
+    return S, np.vstack([step.A @ diffuse, np.zeros((rows - ne, diffuse.shape[1]))])
+
+
 @dataclass
 class PlantSteps:
-    """The steps of a plant as it is.
+    """The steps of a plant as it is."""
 
-    Fields: plant: The plant; Q, R: ``(ne, ne)`` and ``(ny, ny)`` for each k.
-    """
-
-    plant: TimeVaryingDescriptorSystem
-    Q: MatrixSequence
+    plant: TimeVaryingDescriptorSystem  # the plant
+    Q: MatrixSequence  # Q, R: ``(ne, ne)`` and ``(ny, ny)`` for each k
     R: MatrixSequence
 
     def __post_init__(self) -> None:
@@ -122,16 +124,12 @@ class PlantSteps:
 
 @dataclass
 class EarlyConstraintSteps:
-    """The steps of a plant with its algebraic equations used as outputs one step earlier.
+    """The steps of a plant with its algebraic equations used as outputs one step earlier."""
 
-    Fields: plant: The plant; Q, R: Covariances; Q must not couple algebraic equations with the others; rows: The
-    algebraic equations, see `obsynth.analysis.time_varying.algebraic_rows`.
-    """
-
-    plant: TimeVaryingDescriptorSystem
-    Q: MatrixSequence
+    plant: TimeVaryingDescriptorSystem  # the plant
+    Q: MatrixSequence  # Q, R: covariances; Q must not couple algebraic equations with the others
     R: MatrixSequence
-    rows: IntArray
+    rows: IntArray  # the algebraic equations, see `obsynth.analysis.time_varying.algebraic_rows`
 
     def __post_init__(self) -> None:
         if not self.rows.size:
@@ -184,16 +182,13 @@ class EarlyConstraintSteps:
 
 @dataclass(frozen=True, eq=False)
 class PreparedStep:
-    """One step with its factorisation.
+    """One step with its factorisation."""
 
-    Fields: step: Which step it is; projection: Of H; ``None`` where its rank has to be decided; moved: ``(rows, n)``:
-    rotated A, empty without a projection; known: ``(any, rows)``: the transpose of the rotated noise, empty without a
-    projection; its triangular factor ``(rows, rows)`` from so many rows on.
-    """
-
-    step: StepMatrices
-    projection: Projection | None
-    moved: FloatArray
+    step: StepMatrices  # which step it is
+    projection: Projection | None  # of H; ``None`` where its rank has to be decided
+    moved: FloatArray  # ``(rows, n)``: rotated A, empty without a projection
+    # ``(any, rows)``: the transpose of the rotated noise, empty without a projection; its triangular factor ``(rows,
+    # rows)`` from so many rows on
     known: FloatArray
 
     @classmethod
@@ -213,10 +208,8 @@ class PreparedStep:
         return cls(step, projection, moved, known if len(rotation) < MANY_ROWS else noise_triangle(known))
 
     def taken(self, factor: FloatArray, right: FloatArray | None) -> LeastSquaresStep | None:
-        """Take the step, or return ``None`` where a rank has to be decided.
-
-        Shapes: ``factor (n, any)``, ``right (rows, columns)``, ``None`` for the identity.
-        """
+        """Take the step, or return ``None`` where a rank has to be decided: ``factor (n, any)``, ``right (rows,
+        columns)``, ``None`` for the identity."""
         if self.projection is None:
             return None
         rotation = self.projection.rotation

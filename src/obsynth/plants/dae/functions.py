@@ -1,9 +1,4 @@
-"""Compiled evaluation of a DAE: the residual of one implicit step and the outputs, with exact derivatives.
-
-Many samples in one call, and single samples where such a call cannot go on.
-
-A nonlinear plant and its exact derivatives at one point, with derivatives of the states in place of those stored.
-"""
+"""Compiled evaluation of a DAE with exact derivatives: one implicit step, outputs, and its equations at one point."""
 
 from __future__ import annotations
 
@@ -19,8 +14,6 @@ from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.dae.symbols import DAESymbols, symbols_of
 
 _ROOT = np.sqrt(6.0)
-
-
 #: Butcher matrices of the implicit methods whose last stage is the result (stiffly accurate).
 BUTCHER: dict[str, FloatArray] = {
     "backward-euler": np.array([[1.0]]),
@@ -33,10 +26,7 @@ BUTCHER: dict[str, FloatArray] = {
 
 
 class Compiled:
-    """A CasADi function that is called on float arrays without conversion.
-
-    Fields: function: Of columns, with dense results.
-    """
+    """A CasADi function of columns that is called on float arrays without conversion."""
 
     def __init__(self, function: Any) -> None:
         # CasADi's own annotations of these two do not fit what they return.
@@ -66,10 +56,7 @@ class Compiled:
 
 
 class DAEFunctions:
-    """What an observer or a simulation needs of a model, compiled.
-
-    Fields: model: The model; method: The implicit method.
-    """
+    """What an observer or a simulation needs of a model, compiled, for an implicit method."""
 
     def __init__(self, model: DAEModel, method: str = "backward-euler") -> None:
         if method not in BUTCHER:
@@ -82,10 +69,7 @@ class DAEFunctions:
         self.residual, self._outputs = Compiled(self.residual_function), Compiled(self.output_function)
 
     def outputs(self, x: FloatArray, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return ``y (ny,)``, ``H = dh/dx (ny, nx)`` and ``L = dh/dtheta (ny, nq)``.
-
-        Shapes: ``x (nx,)``, ``theta (nq,)``.
-        """
+        """Return ``y (ny,)``, ``H = dh/dx (ny, nx)`` and ``L = dh/dtheta (ny, nq)`` at ``x (nx,)``, ``theta (nq,)``."""
         y, H, L = self._outputs(x, theta)
         return y[:, 0], H, L
 

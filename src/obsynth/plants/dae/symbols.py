@@ -71,10 +71,9 @@ class DAEFields:
 
 @dataclass(frozen=True, eq=False)
 class DAESymbols:
-    """``F(q', x, u, theta) = 0`` and ``y = h(x, theta)`` with ``q = q(x, theta)``, as CasADi SX columns.
+    """``F(q', x, u, theta) = 0`` and ``y = h(x, theta)`` with ``q = q(x, theta)``, as columns of CasADi's SX.
 
-    Fields: rates, x, u, theta: The free symbols; ``rates`` ``(nq,)`` stands for q'; equations: ``(n,)``; stored:
-    ``(nq,)``: the quantities whose derivatives occur; outputs: ``(ny,)``.
+    ``rates`` stands for q'; ``stored``: the quantities q whose derivatives occur.
     """
 
     rates: Any

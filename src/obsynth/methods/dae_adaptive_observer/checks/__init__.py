@@ -16,11 +16,17 @@ from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.covariances import covariance_factor
 from obsynth.numerics.newton import LARGEST_RESIDUAL
 from obsynth.numerics.ranks import SINGULAR_CONDITION
-from obsynth.observers.dae.batch import run_dae_batch
-from obsynth.observers.dae.building import OPTIONS, dae_observer_from_options, resolved_options
-from obsynth.observers.dae.nominal_run import NOMINAL_STEPS, DAEFacts, dae_facts
+from obsynth.observers.batches import run_dae_batch
+from obsynth.observers.dae.building import (
+    NOMINAL_STEPS,
+    OPTIONS,
+    DAEFacts,
+    dae_facts,
+    dae_observer_from_options,
+    resolved_options,
+)
 from obsynth.observers.dae.observer import DAEObserver
-from obsynth.observers.robustness import plain_recursion
+from obsynth.observers.running import plain_recursion
 from obsynth.proofs.balls import Ball
 from obsynth.proofs.contraction import proved_rate
 from obsynth.proofs.definiteness import prove_positive_definite

@@ -23,15 +23,14 @@ from obsynth.methods.recursive.checks.steady_state import steady_rows
 from obsynth.methods.recursive.conditions import recursive_conditions
 from obsynth.numerics.arrays import FloatArray
 from obsynth.observers.dae.observer import DAEObserver
-from obsynth.observers.recursive.building import observer_from_options
 from obsynth.observers.recursive.gain_schedule_summary import (
     STEPS_TO_CONTRACT,
     GainScheduleSummary,
     gain_schedule_summary,
     looked_at,
 )
-from obsynth.observers.recursive.observer import RecursiveObserver
-from obsynth.observers.robustness import plain_recursion
+from obsynth.observers.recursive.observer import RecursiveObserver, observer_from_options
+from obsynth.observers.running import plain_recursion
 from obsynth.plants.sequences import MatrixSequence
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.results.checks import Check, information, upper_bound_check
@@ -129,7 +128,7 @@ def _dynamic_rows(
     yield _contraction_row(facts, proof)
     if proof is not None:
         yield bias_row(proof, ranks.condition)
-        yield covariance_row(stated, proof.last)
+        yield covariance_row(stated, observer, proof.last)
         yield from parameter_row(proof)
         yield from steady_rows(stated, design.gains, proof.last, ranks.condition)
     if observer.adaptation is not None:

@@ -229,17 +229,34 @@ def parameter_row(proof: HorizonProof) -> Iterator[Check]:
     )  # fmt: skip
 
 
-def covariance_row(stated: RecursiveObserver, last: GainStep) -> Check:
+def covariance_row(stated: RecursiveObserver, shipped: RecursiveObserver, last: GainStep) -> Check:
     """Return the row that the covariance of the state after the last step is definite, as it is with definite noise."""
     factor = last.factor[: stated.plant.nx]
     root = Ball.exact(factor / _deviations(factor)[:, None])
     proof = prove_positive_definite(root @ root.T)
     claim = "the covariance of the states after the last step is positive definite, in units of their deviations"
-    if proof.proved or noise_is_definite(stated):
+    definite = noise_is_definite(stated)
+    if definite and not proof.proved and noise_is_definite(shipped):
+        return definite_by_its_noise("covariance", claim, last.gain, last.step.H, natural_units(stated))
+    if definite or proof.proved:
         return Check("covariance", claim, proof.lower_bound, 0.0, proof.lower_bound, proof.proved,
                      "recomputed, the square root as computed", "proved", proof.text)  # fmt: skip
     return information("covariance", claim, proof.lower_bound, source="recomputed", detail="not definite, or not "
                        "proved to be: Q or R is singular, and what they hold exact is known exactly")  # fmt: skip
+
+
+def definite_by_its_noise(name: str, claim: str, gain: FloatArray, H: FloatArray, units: FloatArray) -> Check:
+    """Return the row that errors are never less than the last noise makes them: ``P >= [L K] diag(Q, R) [L K]'``.
+
+    Where Q and R are definite, that is definite if ``[L K]`` has full row rank, as it has with ``[L K] H`` near I.
+    """
+    units = units[: len(gain)]
+    missed = Ball.exact(gain) @ Ball.exact(H) - Ball.exact(np.eye(len(gain)))
+    scale = units[None, :] / units[:, None]  # powers of two
+    least = 1.0 - Ball(missed.midpoint * scale, rounded_up(missed.radius * scale, 1)).frobenius_norm
+    return Check(name, claim, least, 0.0, least, least > 0.0, "P >= L Q L' + K R K' with definite Q and R, outward "
+                 "rounded", "proved", "value: least singular value of [L K] [E; C] in natural units, which is to be "
+                 "above zero; the covariance as computed is too near a singular one to tell")  # fmt: skip
 
 
 def noise_is_definite(stated: RecursiveObserver) -> bool:

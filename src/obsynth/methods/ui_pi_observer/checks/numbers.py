@@ -22,7 +22,7 @@ from obsynth.numerics.spectra import (
 )
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
-from obsynth.plants.exosystems import Exosystem
+from obsynth.plants.fault_models import Exosystem
 from obsynth.proofs.extended_balls import enclosed_eigenvalues, middle_of
 from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign

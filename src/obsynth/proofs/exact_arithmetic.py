@@ -1,18 +1,24 @@
-"""Rational numbers and matrices: what a stored double was written as, blocks, null spaces, integer entries.
+"""Exact arithmetic: what a stored double was written as, matrices of rational numbers, and roots of polynomials.
 
 A double holds a decimal of up to 15 digits without loss, and ``repr`` gives that decimal back.  A double with more
 digits is a short multiple of a power of two (data scaled by powers of two are exact), or it was computed: then the
 shortest decimal that rounds to it stands for it, known only to its last digit.
+
+A root on the boundary is also a root of the mirrored polynomial, ``p(-s)`` or ``z^n p(1/z)``; so is every pair of
+roots that mirror each other, of which one is unstable.  So the greatest common divisor of both decides whether there is
+any such root, and all others are told from the boundary by isolating them in enough digits.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from fractions import Fraction
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
+import flint
 import numpy as np
-from flint import fmpq, fmpq_mat, fmpz, fmpz_mat
+from flint import fmpq, fmpq_mat, fmpq_poly, fmpz, fmpz_mat, fmpz_poly
 from numpy.typing import NDArray
 
 from obsynth.numerics.arrays import FloatArray
@@ -22,12 +28,8 @@ def blocks(parts: list[list[fmpq_mat]]) -> fmpq_mat:
     """Return the block matrix with these rows of blocks."""
     height = sum(row[0].nrows() for row in parts)
     width = sum(part.ncols() for part in parts[0])
-    entries: list[fmpq] = []
-    for row in parts:
-        for i in range(row[0].nrows()):
-            for part in row:
-                entries += [part[i, j] for j in range(part.ncols())]
-    return fmpq_mat(height, width, entries)
+    lines = (line for row in parts for line in zip(*(part.tolist() for part in row), strict=True))
+    return fmpq_mat(height, width, [value for line in lines for piece in line for value in piece])
 
 
 def zeros_matrix(rows: int, columns: int) -> fmpq_mat:
@@ -87,12 +89,8 @@ def _common_factor(values: NDArray[np.object_]) -> fmpq:
 
 #: Decimals of so many digits survive the way into a double and back.
 LOSSLESS_DIGITS = 15
-
-
 #: Odd parts of fewer bits are data that were multiplied by a power of two.
 SHORT_BITS = 34
-
-
 #: Rows of rational numbers.
 FractionRows: TypeAlias = Sequence[Sequence[Fraction]]
 
@@ -108,9 +106,7 @@ def written_fraction(value: float) -> Fraction:
 
 def is_computed(value: float) -> bool:
     """Whether a double has so many digits that it was computed, and is known only to its last digit."""
-    if _digits(repr(float(value))) <= LOSSLESS_DIGITS:
-        return False
-    return _odd_part(Fraction(value)).bit_length() > SHORT_BITS
+    return _digits(repr(float(value))) > LOSSLESS_DIGITS and _odd_part(Fraction(value)).bit_length() > SHORT_BITS
 
 
 def computed_entries(matrix: FloatArray) -> int:
@@ -120,14 +116,17 @@ def computed_entries(matrix: FloatArray) -> int:
 
 def written_matrix(matrix: FloatArray) -> fmpq_mat:
     """Return a matrix ``(m, n)`` of doubles as the rational numbers that were written."""
-    rows, columns = matrix.shape
-    return fmpq_mat(rows, columns, [_as_fmpq(written_fraction(value)) for value in np.ravel(matrix).tolist()])
+    return _converted(matrix, written_fraction)
 
 
 def stored_matrix(matrix: FloatArray) -> fmpq_mat:
     """Return a matrix ``(m, n)`` of doubles as the rational numbers that are stored, whatever they stand for."""
+    return _converted(matrix, Fraction)
+
+
+def _converted(matrix: FloatArray, convert: Callable[[float], Fraction]) -> fmpq_mat:
     rows, columns = matrix.shape
-    return fmpq_mat(rows, columns, [_as_fmpq(Fraction(value)) for value in np.ravel(matrix).tolist()])
+    return fmpq_mat(rows, columns, [_as_fmpq(convert(value)) for value in np.ravel(matrix).tolist()])
 
 
 def rational_matrix(rows: FractionRows, columns: int) -> fmpq_mat:
@@ -167,3 +166,105 @@ def _digits(text: str) -> int:
 def _odd_part(value: Fraction) -> int:
     numerator = abs(value.numerator)
     return numerator >> ((numerator & -numerator).bit_length() - 1) if numerator else 0
+
+
+#: Digits (binary) in which roots are isolated first, and how often they are doubled.
+FIRST_BITS = 106
+
+
+MOST_DOUBLINGS = 7
+
+
+@dataclass(frozen=True)
+class Root:
+    """One root: its value to double precision, how often, and which side of the stability boundary it is on."""
+
+    value: complex
+    multiplicity: int
+    side: str
+
+
+@dataclass(frozen=True)
+class RootLocation:
+    """The roots of a polynomial, by decreasing instability; `side` is 'stable', 'boundary' or 'unstable'."""
+
+    roots: tuple[Root, ...]
+
+    @property
+    def stable(self) -> bool:
+        """Whether every root is strictly inside the region of stability."""
+        return all(root.side == "stable" for root in self.roots)
+
+    @property
+    def outside(self) -> tuple[Root, ...]:
+        """Those on or outside its boundary."""
+        return tuple(root for root in self.roots if root.side != "stable")
+
+
+def locate_roots(polynomial: fmpz_poly, *, discrete: bool) -> RootLocation:
+    """Return the roots of a nonzero polynomial and where they are: exact, however close to the boundary.
+
+    ``discrete`` takes the open unit disk as the region of stability, and the open left half plane otherwise.
+    """
+    if polynomial.degree() <= 0:
+        return RootLocation(())
+    coefficients = polynomial.coeffs()
+    at_minus = [(-1) ** power * coefficient for power, coefficient in enumerate(coefficients)]
+    mirror = fmpz_poly(coefficients[::-1] if discrete else at_minus)
+    common = polynomial.gcd(mirror)
+    found: list[Root] = []
+    # Origin: under the mirror of the unit circle it goes to infinity, and reversing has dropped it.
+    others = primitive(fmpq_poly(polynomial) / fmpq_poly(common)) if common.degree() > 0 else polynomial
+    for part, may_lie_on_boundary in ((common, True), (others, False)):
+        found += _isolated(part, discrete=discrete, may_lie_on_boundary=may_lie_on_boundary)
+    found.sort(key=lambda root: -(abs(root.value) if discrete else root.value.real))
+    return RootLocation(tuple(found))
+
+
+def primitive(polynomial: fmpq_poly) -> fmpz_poly:
+    """Return a multiple with coprime integer coefficients and a positive leading one."""
+    numerator = polynomial.numer()
+    if numerator.is_zero():
+        return numerator
+    content = numerator.content()
+    sign = -1 if int(numerator.leading_coefficient()) < 0 else 1
+    return fmpz_poly([sign * coefficient // content for coefficient in numerator.coeffs()])
+
+
+def _isolated(polynomial: fmpz_poly, *, discrete: bool, may_lie_on_boundary: bool) -> list[Root]:
+    """Return the roots with their sides; more digits until each is told from the boundary, or shown to be on it."""
+    if polynomial.degree() <= 0:
+        return []
+    bits = FIRST_BITS
+    found: list[tuple[flint.acb, int, str]] = []
+    for _ in range(MOST_DOUBLINGS):
+        with flint.ctx.workprec(bits):
+            pairs: Any = polynomial.complex_roots()
+            found = [(root, int(times), _side(root, discrete)) for root, times in pairs]
+        if all(side != "boundary" for _, _, side in found):
+            break
+        # What mirrors itself within so many digits cannot be one of a pair: those are further apart.
+        if may_lie_on_boundary and bits > _separation_bits(polynomial):
+            break
+        bits *= 2
+    return [Root(_value(root, side, discrete), times, side) for root, times, side in found]
+
+
+def _side(root: flint.acb, discrete: bool) -> str:
+    distance = root.real * root.real + root.imag * root.imag - 1 if discrete else root.real
+    return "unstable" if distance > 0 else "stable" if distance < 0 else "boundary"
+
+
+def _separation_bits(polynomial: fmpz_poly) -> int:
+    """Return digits in which two different roots differ for certain (Mahler 1964), generously."""
+    degree = polynomial.degree()
+    return int(degree * (degree.bit_length() + 2) + degree * (polynomial.height_bits() + degree.bit_length()))
+
+
+def _value(root: flint.acb, side: str, discrete: bool) -> complex:
+    # Roots are isolated far beyond double precision: a part that may be zero is.
+    real, imaginary = (0.0 if part.contains(0) else float(part.mid()) for part in (root.real, root.imag))
+    value = complex(real, imaginary)
+    if side == "boundary":
+        value = value / abs(value) if discrete else complex(0.0, imaginary)
+    return value

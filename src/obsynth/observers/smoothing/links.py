@@ -1,4 +1,4 @@
-"""The chain of an observer of a nonlinear plant: linearised along what the observer found, as the observer is itself.
+"""The chains of observers: the steps of each again, with the way back.
 
 Constant parameters (form ``forgetting``): states at given parameters, which are estimated from both sides.  Parameters
 that walk are states of the chain.
@@ -6,53 +6,52 @@ that walk are states of the chain.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from typing import NamedTuple
 
 import numpy as np
 
+from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.covariances import covariance_factor
 from obsynth.numerics.square_root_smoothing import joint_step
 from obsynth.observers.dae.estimates import DAERow
+from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.dae.steps import DAEState, Steps
-from obsynth.observers.recursive.step_model import stacked_noise
+from obsynth.observers.recursive.estimates import RawEstimate, RecursiveState
+from obsynth.observers.recursive.observer import RecursiveObserver
+from obsynth.observers.recursive.recursion import Recursion
+from obsynth.observers.recursive.step_model import EarlyConstraintSteps, StepMatrices, stacked_noise
 from obsynth.observers.smoothing.chain import Lesson, Links, Node
 
 
-def dae_links(steps: Steps) -> Links:
-    """Return how a chain is made of the steps of an observer of a nonlinear plant."""
-    settings = steps.settings
-    own: _DAELinks
-    if settings.form == "forgetting":
-        own, forgetting = _ConstantLinks(steps), settings.forgetting
-    else:
-        own, forgetting = _WalkingLinks(steps), 1.0
-    return Links(own.first, own.next, own.begun, forgetting, settings.state_bounds, settings.lower, settings.upper)
+def links_of(observer: RecursiveObserver | DAEObserver) -> Links:
+    """Return how a chain is made of the steps of an observer."""
+    if isinstance(observer, RecursiveObserver):
+        return _RecursiveLinks(observer.recursion)
+    return (_ConstantLinks if observer.form == "forgetting" else _WalkingLinks)(observer.steps)
 
 
 class _Sample(NamedTuple):
-    """One sample of an observer at the point where its step was linearised.
+    """One sample of an observer at the point where its step was linearised."""
 
-    Fields: x, theta: Before the measurement; F, G, noise: Of the step; e, H, L, R: Innovation, derivatives and
-    covariance of the outputs that are there.
-    """
-
-    x: FloatArray
+    x: FloatArray  # x, theta: before the measurement
     theta: FloatArray
-    F: FloatArray
+    F: FloatArray  # F, G, noise: of the step
     G: FloatArray
     noise: FloatArray
-    e: FloatArray
+    e: FloatArray  # e, H, L, R: innovation, derivatives and covariance of the outputs that are there
     H: FloatArray
     L: FloatArray
     R: FloatArray
 
 
-class _DAELinks(ABC):
+class _DAELinks(Links):
+    """Those of an observer of a nonlinear plant: linearised along what it found, as the observer is itself."""
+
     def __init__(self, steps: Steps) -> None:
         self.steps, settings = steps, steps.settings
         self.nx, self.nq = settings.model.nx, settings.model.nq
+        self.bounds, self.lower, self.upper = settings.state_bounds, settings.lower, settings.upper
         self.Q = covariance_factor(settings.Q, "Q")
         self.walk = covariance_factor(settings.random_walk, "random_walk") if self.nq else np.zeros((0, 0))
 
@@ -70,18 +69,6 @@ class _DAELinks(ABC):
         return _Sample(x, theta, row.part("F"), row.part("G"), row.part("noise") @ self.Q, row.innovation[seen],
                        H[seen], L[seen], R)  # fmt: skip
 
-    def first(self, after: DAEState, row: DAERow, u: FloatArray) -> Node:
-        """Return the node of k = 0."""
-        return self.begun(after)
-
-    @abstractmethod
-    def begun(self, state: DAEState) -> Node:
-        """Return the node of a state from which a chain begins."""
-
-    @abstractmethod
-    def next(self, node: Node, before: DAEState, after: DAEState, row: DAERow, u: FloatArray) -> Node:
-        """Return the node of the next sample."""
-
     def through(self, state: DAEState) -> FloatArray:
         """Return the derivative of the state after the measurement by the parameters."""
         K, H, L, Upsilon = (self.steps.part(state, name) for name in ("K", "H", "L", "Upsilon"))
@@ -98,6 +85,10 @@ class _DAELinks(ABC):
 
 class _ConstantLinks(_DAELinks):
     """States at given parameters, and what each sample says of the parameters."""
+
+    def __init__(self, steps: Steps) -> None:
+        super().__init__(steps)
+        self.forgetting = steps.settings.forgetting
 
     def begun(self, state: DAEState) -> Node:
         """Return the node of a state from which a chain begins; y(0) corrects the states alone."""
@@ -198,3 +189,67 @@ class _WalkingLinks(_DAELinks):
         found = joint_step(rows, known, stacked_noise(noise, root), right, np.zeros((len(rows), 0)))
         # The observer's own estimate, which keeps to the bounds.
         return Node(self._posterior(after)[:, None], found.factor, found.diffuse, found.back)
+
+
+class _RecursiveLinks(Links):
+    """Those of a recursive observer."""
+
+    def __init__(self, recursion: Recursion) -> None:
+        if recursion.literal:
+            raise PreconditionError(
+                "Form 'literal' learns from residuals that are correlated in time, of which no smoother exists: use "
+                "form 'innovation' or 'random-walk'.", condition="white residuals",
+            )  # fmt: skip
+        self.recursion, self.start, settings = recursion, recursion.first, recursion.settings
+        self.forgetting = 1.0 if settings.adaptation is None else settings.adaptation.forgetting
+        self.bounds = settings.state_bounds
+
+    def first(self, after: RecursiveState, row: RawEstimate, u: FloatArray) -> Node:
+        """Return the node of k = 0."""
+        start = self.start
+        origin = np.column_stack((start.x, start.Upsilon))
+        node = Node(origin, start.factor, np.zeros((len(start.x), 0)), None)
+        if isinstance(self.recursion.model, EarlyConstraintSteps):
+            step = self.recursion.model.first()
+            node = self._linked(node, step, np.zeros(0), np.zeros(0), u)._replace(back=None)
+        return node._replace(lesson=self._lesson(start, after, row))
+
+    def begun(self, state: RecursiveState) -> Node:
+        """Return the node of a state from which a chain begins."""
+        known, nq = state.parameters, len(state.parameters.theta)
+        lesson = None
+        if nq:
+            lesson = Lesson(known.theta, known.triangle, known.spread, np.zeros(0), np.zeros((0, nq)), np.zeros((0, 0)))
+        return Node(np.column_stack((state.x, state.Upsilon)), state.factor, state.diffuse, None, lesson)
+
+    def next(self, node: Node, before: RecursiveState, after: RecursiveState, row: RawEstimate, u: FloatArray) -> Node:
+        """Return the node of the next sample."""
+        step = self.recursion.model.at(before.k - 1)
+        return self._linked(node, step, before.u, row.y, u)._replace(lesson=self._lesson(before, after, row))
+
+    def _linked(self, node: Node, step: StepMatrices, before: FloatArray, y: FloatArray, u: FloatArray) -> Node:
+        """Take a step from inputs ``before`` to the sample ``y`` with inputs ``u``."""
+        ne, columns = len(step.A), node.origin.shape[1]
+        right = np.empty((len(step.H), columns))
+        right[:ne] = step.A @ node.origin
+        right[:ne, 0] += step.B @ before if len(before) else 0.0
+        right[ne : ne + len(y), 0] = y
+        right[ne + len(y) :, 0] = step.Dn @ u
+        if columns > 1:
+            right[:ne, 1:] += step.Phi
+            right[ne:, 1:] = -step.Psi
+        known, unknown = (np.zeros((len(step.H), part.shape[1])) for part in (node.factor, node.diffuse))
+        known[:ne], unknown[:ne] = step.A @ node.factor, step.A @ node.diffuse
+        kept = ~np.isnan(right[:, 0])
+        parts = (step.H, known, step.noise, right, unknown)
+        complete = bool(kept.all())
+        found = joint_step(*(parts if complete else tuple(part[kept] for part in parts)), complete=complete)
+        return Node(found.estimate, found.factor, found.diffuse, found.back)
+
+    def _lesson(self, before: RecursiveState, after: RecursiveState, row: RawEstimate) -> Lesson | None:
+        known = after.parameters
+        if not len(known.theta):
+            return None
+        G = row.regressor if row.regressor.size else np.zeros((len(row.innovation), len(known.theta)))
+        return Lesson(known.theta, known.triangle, known.spread, row.innovation, G, np.eye(len(row.innovation)),
+                      after.resets > before.resets)  # fmt: skip
