@@ -79,8 +79,6 @@ def _only(observer: LinearObserver, rows: list[int]) -> LinearObserver:
 
 #: The regulator equation may miss by this much, relative to its terms: its solution is no part of the gains.
 TRACKING_TOLERANCE = 1e-8
-
-
 #: Claimed deviations may be missed by this share: two ways through a Lyapunov equation.
 DEVIATION_TOLERANCE = 1e-4
 
@@ -115,8 +113,6 @@ def noise_rows(design: ObserverDesign) -> Iterator[Check]:
 
 
 _MATRICES = ("T", "T0", "Phi", "Cw", "walks", "stability", "tracking", "deviations")
-
-
 _SOURCE = "identities of the error z - T E x, ours"
 
 

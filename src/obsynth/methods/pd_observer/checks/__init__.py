@@ -26,6 +26,7 @@ from obsynth.verification.identities import equality, relative_tolerance, residu
 from obsynth.verification.plant import condition_rows, plant_information
 from obsynth.verification.remainder_channel import TrackedPlant
 
+_ALIKE = ("input_names", "output_names", "state_names", "fault_names", "dt")
 _IDENTITIES = {
     "dynamics": ("unbiased: dynamics", "Az + By C = A, with the faults as states", "Filasova et al., eq. (29)"),
     "inputs": ("unbiased: inputs", "Bu + By D = B", "Filasova et al., eq. (4)"),
@@ -79,13 +80,9 @@ def _fits(plant: DescriptorSystem, observer: LinearObserver) -> bool:
     return bool(
         np.array_equal(plant.E, np.eye(plant.nx))
         and not plant.is_discrete
-        and observer.dt == 0.0
         and observer.order == plant.nx + plant.nf
-        and observer.input_names == plant.input_names
-        and observer.output_names == plant.output_names
         and observer.residual_names == plant.output_names
-        and observer.state_names == plant.state_names
-        and observer.fault_names == plant.fault_names
+        and all(getattr(observer, name) == getattr(plant, name) for name in _ALIKE)
         and not any((*observer.state_delays, *observer.fault_delays))
     )
 

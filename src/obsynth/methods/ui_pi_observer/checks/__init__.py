@@ -28,6 +28,7 @@ from obsynth.verification.remainder_channel import TrackedPlant
 #: Estimates at a frequency may miss by this much, relative to terms that pass through the inverse of ``sI - Az``.
 DECOUPLING_TOLERANCE = 1e-8
 _PAPER = "Share Pasand, eq. (19)"
+_ALIKE = ("input_names", "output_names", "state_names", "fault_names", "dt")
 _MATRICES = ("tracking", "Phi", "Cw", "poles", "stability")
 
 
@@ -107,11 +108,7 @@ def _fits(design: ObserverDesign) -> bool:
     return bool(
         all(matrices[name].shape == shape and np.all(np.isfinite(matrices[name])) for name, shape in shapes.items())
         and observer.order == plant.nx + order
-        and observer.input_names == plant.input_names
-        and observer.output_names == plant.output_names
-        and observer.state_names == plant.state_names
-        and observer.fault_names == plant.fault_names
-        and observer.dt == plant.dt
+        and all(getattr(observer, name) == getattr(plant, name) for name in _ALIKE)
         and all(delay == 0 for delay in (*observer.state_delays, *observer.fault_delays))
     )
 
