@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from functools import partial
+from functools import cache, partial
 from importlib import import_module
 from inspect import signature
 from typing import Any, ClassVar, Literal, TypeAlias, cast, get_type_hints
@@ -66,6 +66,7 @@ def plain(value: Any) -> Any:
     return [plain(part) for part in value] if isinstance(value, (list, tuple)) else value
 
 
+@cache
 def option_types(options: type[MethodOptions]) -> dict[str, Any]:
     """Return name -> annotated type of every option."""
     hints = get_type_hints(options, include_extras=True)
