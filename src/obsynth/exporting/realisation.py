@@ -36,12 +36,7 @@ STEADY = (
 
 @dataclass(frozen=True, eq=False)
 class Realisation:
-    """The observer of a design, ready to be handed on.
-
-    Fields: design: Linear, or recursive for a time-invariant plant; observer: Its observer, sampled if that was asked
-    for, or the steady state of its recursion; digest: sha256 of the gain set; start: ``z(0)``; note: What a reader must
-    know; may be empty.
-    """
+    """The observer of a design, sampled if that was asked for, or the steady state of its recursion; from ``z(0)``."""
 
     design: ObserverDesign
     observer: LinearObserver

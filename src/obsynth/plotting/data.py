@@ -16,13 +16,13 @@ from obsynth.plotting.panels import (
     BAND_STYLE,
     ESTIMATE_STYLE,
     LINE_COLOURS,
-    MARK_STYLE,
     PANEL_HEIGHT,
     RESIDUAL_STYLE,
     THRESHOLD_STYLES,
     TRUE_STYLE,
     WIDTH,
     legend_above,
+    mark,
     new_panels,
     short_dates,
     tidy,
@@ -164,8 +164,7 @@ def _mark_alarm(panel: Axes, run: DataRun, column: str, times: Any, values: Any)
     """Mark where a threshold is first passed, with its time."""
     table: Any = run.table
     row = int(table["alarm"].astype(str).str.contains(column, regex=False).to_numpy().argmax())
-    panel.plot([times.iloc[row]], [values[row]], marker="o", color="black",
-               label=f"alarm at {run.stamps.shown(run.alarms[column])}", **MARK_STYLE)  # fmt: skip
+    mark(panel, times.iloc[row], values[row], f"alarm at {run.stamps.shown(run.alarms[column])}")
 
 
 def _draw_residuals(panel: Axes, run: DataRun, _: str, units: dict[str, str], __: Any) -> None:
@@ -190,8 +189,7 @@ def _draw_statistic(panel: Axes, run: DataRun, _: str, __: dict[str, str], ___: 
     own = [run.alarms[name] for name in run.alarms if name not in run.thresholds]
     if passed.size and own:
         first = int(passed[0])
-        panel.plot([table["time"].iloc[first]], [values[first]], marker="o", color="black",
-                   label=f"first alarm at {run.stamps.shown(own[0])}", **MARK_STYLE)  # fmt: skip
+        mark(panel, table["time"].iloc[first], values[first], f"first alarm at {run.stamps.shown(own[0])}")
     level = float(np.nanmax(levels, initial=0.0))
     if level > 0.0 and np.nanmax(values, initial=0.0) > _FAR * level:
         panel.set_yscale("symlog", linthresh=level)

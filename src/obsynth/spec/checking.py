@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_whole
+from obsynth.plants.validation import suggestion
 from obsynth.spec.documents import described
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ def checked_spec(document: Mapping[str, Any], source: Path) -> tuple[SpecDocumen
         problems.raise_if_any()
         return checked, _options_of_any(raw_options, source)
     if isinstance(identifier, str) and identifier not in (*REGISTRY, AUTO):
-        close = _suggestion(identifier, list(REGISTRY))
+        close = suggestion(identifier, list(REGISTRY))
         known = ", ".join(sorted([*REGISTRY, AUTO]))
         problems.add("method.id", f"unknown method {identifier!r}; the known methods are: {known}.{close}")
     elif isinstance(identifier, str) and identifier != AUTO and isinstance(raw_options, dict):
@@ -146,7 +146,7 @@ def _explained(item: Any, model: type[BaseModel], prefix: str) -> tuple[str, str
         text, numbers = f"a key must be a non-empty text, not {described(value)}.", []
     elif kind == "extra_forbidden":
         known = _known_keys(item["loc"]) if len(names) > 1 else list(model.model_fields)
-        text = f"unknown key.{_suggestion(key, known)}"
+        text = f"unknown key.{suggestion(key, known)}"
     elif kind == "missing":
         needed = ": give the seconds between samples, or 0 for a plant in continuous time"
         text = f"this key is missing{needed if key == 'dt' else ''}."
@@ -199,8 +199,3 @@ def _known_keys(location: Sequence[str | int]) -> list[str]:
         return list(schema.ProfileSection.model_fields)
     section = sections.get(str(location[-2]))
     return list(section.model_fields) if section is not None else []
-
-
-def _suggestion(name: str, known: Sequence[str]) -> str:
-    close = difflib.get_close_matches(name, known, n=2)
-    return f" Did you mean {' or '.join(map(repr, close))}?" if close else ""

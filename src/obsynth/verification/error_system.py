@@ -57,11 +57,9 @@ class LaggedPlant:
 
 @dataclass(frozen=True, eq=False)
 class ErrorSystem:
-    """The observer's error ``e = V E x - z`` and what it does to the estimates.
+    """The observer's error ``e = V E x - z``, its inputs ``V b - By d``, and what it does to the estimates.
 
-    Fields: Az: ``(nz, nz)``; fault, disturbance, noise: Inputs of the error ``V b - By d``: ``(nz, nf)``, ``(nz, nd)``,
-    ``(nz, nw)``; fault_output, residual_output: ``(Cf, Df, Dd, Dw)``: fault estimate (residual) = ``-Cf e + Df f + Dd d
-    + Dw w``; state_output: ``(Cx, Df, Dd, Dw)``: state error = ``Cx e - Df f - Dd d - Dw w``.
+    Outputs ``(C, Df, Dd, Dw)``: fault estimate or residual = ``-C e + Df f + Dd d + Dw w``; minus that for states.
     """
 
     Az: FloatArray
@@ -97,6 +95,7 @@ class ErrorSystem:
             fault, disturbance, noise = (direct @ d - added @ b for b, d in seen)
             return observer.Cz[rows], fault, disturbance, noise
 
-        inputs = (driven(b, d) for b, d in ((plant.Bf, plant.Df), (plant.Bd, plant.Dd), (plant.Bw, plant.Dw)))
-        rows = (observer.fault_rows, observer.residual_rows, observer.state_rows)
-        return cls(observer.Az, *inputs, *map(output, rows))
+        return cls(
+            observer.Az, driven(plant.Bf, plant.Df), driven(plant.Bd, plant.Dd), driven(plant.Bw, plant.Dw),
+            output(observer.fault_rows), output(observer.residual_rows), output(observer.state_rows),
+        )  # fmt: skip

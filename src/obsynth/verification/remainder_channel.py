@@ -17,7 +17,7 @@ Source: `robust.md`, theorem 1, with the corrections 3 and 7.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -56,6 +56,11 @@ class TrackedPlant:
     ) -> TrackedPlant:
         """Return a linear plant without decoupled disturbances."""
         return cls(plant.E, plant.A, plant.B, plant.C, plant.D, tracking, goal, plant.state_names, T0)
+
+    def equals(self, other: TrackedPlant) -> bool:
+        """Whether all numbers are the same."""
+        pairs = ((getattr(self, field.name), getattr(other, field.name)) for field in fields(self))
+        return all(a is b or (a is not None and b is not None and np.array_equal(a, b)) for a, b in pairs)
 
 
 @dataclass(frozen=True, eq=False)

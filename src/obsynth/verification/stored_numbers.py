@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from obsynth.numerics.arrays import SMALLEST, ComplexArray, FloatArray
+from obsynth.numerics.arrays import SMALLEST, ComplexArray, FloatArray, remembered
 from obsynth.numerics.norms import MOST_ENTRIES_AT_ONCE, resolved
 from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.ranks import BOUNDARY_TOLERANCE
@@ -62,6 +62,16 @@ class StoredErrors:
     @classmethod
     def of(cls, tracked: TrackedPlant, observer: LinearObserver) -> StoredErrors | None:
         """Return the bounds; ``None`` where no contraction of the observer can be proved."""
+        # A design is given them, and verified: the same realisation on the same plant is looked at once.
+        known = _bounds_of(observer)
+        for other, found in known:
+            if other.equals(tracked):
+                return found
+        known.append((tracked, cls._found(tracked, observer)))
+        return known[-1][1]
+
+    @classmethod
+    def _found(cls, tracked: TrackedPlant, observer: LinearObserver) -> StoredErrors | None:
         contraction = contraction_of(observer)
         if contraction is None:
             return None
@@ -74,6 +84,11 @@ class StoredErrors:
     def witnesses(self) -> dict[str, FloatArray]:
         """Return what a certificate claims of them, by name; what has no column is left out."""
         return {name: bound for name, bound in zip(_WITNESSES, self.bounds, strict=True) if bound.shape[1]}
+
+
+@remembered
+def _bounds_of(_observer: LinearObserver) -> list[tuple[TrackedPlant, StoredErrors | None]]:
+    return []
 
 
 def stored_number_rows(design: ObserverDesign, tracked: TrackedPlant, gamma: float | None = None) -> Iterator[Check]:
@@ -214,39 +229,35 @@ class _Composite:
         return np.asarray(kept[:MOST_ANGLES], dtype=np.float64)
 
     def gains(self, frequencies: FloatArray) -> FloatArray:
-        """Return `gain` at many frequencies, those that take little memory at once."""
+        """Return the largest singular values at frequencies (rad per sample, or rad/s), a few of them at once."""
         dt = self.plant.dt
         points = boundary_points(frequencies / dt if dt > 0.0 else frequencies, dt)
-        at_once = max(1, MOST_ENTRIES_AT_ONCE // max(self.driven.size, self.K.shape[1] * self.plant.nd, 1))
+        at_once = max(1, MOST_ENTRIES_AT_ONCE // max(self.plant.E.size, self.K.size, 1))
+        parts = [points[i : i + at_once] for i in range(0, len(points), at_once)]
         try:
-            parts = [self._gains_at(points[i : i + at_once]) for i in range(0, len(points), at_once)]
+            return np.concatenate([self._gains_at(part) for part in parts])
         except np.linalg.LinAlgError:
-            return np.array([self.gain(float(frequency)) for frequency in frequencies])
-        return np.concatenate(parts)
+            return np.array([self._gain_at(point) for point in points])
 
-    def _gains_at(self, points: ComplexArray) -> FloatArray:
-        x = np.concatenate([*resolved(self.plant.E, self.plant.A, self.plant.Bd, points)])
-        one = np.eye(self.observer.order)
-        left = np.concatenate([*resolved(one, self.observer.Az.T, self.shown.T, points)])
-        stacked = np.concatenate([x * points[:, None, None] ** -age for age in range(self.lags)], axis=1)
-        whole = left.transpose(0, 2, 1) @ (self.K @ stacked + self.driven) + self.J @ stacked + self.direct
-        finite = np.all(np.isfinite(whole), axis=(1, 2))
-        return np.where(finite, np.linalg.norm(np.where(finite[:, None, None], whole, 0.0), 2, axis=(1, 2)), 0.0)
-
-    def gain(self, frequency: float) -> float:
-        """Return the largest singular value at a frequency (rad per sample, or rad/s); zero at a pole of the plant."""
-        dt = self.plant.dt
-        point = complex(boundary_points(np.array([frequency / dt if dt > 0.0 else frequency]), dt)[0])
+    def _gain_at(self, point: complex) -> float:
+        """Return the largest singular value at a point; zero at a pole of the plant."""
         try:
-            x = np.linalg.solve(point * self.plant.E - self.plant.A, self.plant.Bd.astype(complex))
-            stacked = np.vstack([x * point**-age for age in range(self.lags)])
-            inner = np.linalg.solve(
-                point * np.eye(self.observer.order) - self.observer.Az, self.K @ stacked + self.driven
-            )
+            return float(self._gains_at(np.array([point]))[0])
         except np.linalg.LinAlgError:
             return 0.0
-        whole = self.shown @ inner + self.J @ stacked + self.direct
-        return float(np.linalg.norm(whole, 2)) if np.all(np.isfinite(whole)) else 0.0
+
+    def _gains_at(self, points: ComplexArray) -> FloatArray:
+        # From the left, where the rows of fault errors are fewer than the disturbances.
+        left = np.concatenate([*resolved(np.eye(self.observer.order), self.observer.Az.T, self.shown.T, points)])
+        left = left.transpose(0, 2, 1)
+        ages = np.split(left @ self.K + self.J, self.lags, axis=2)
+        seen = sum(part * points[:, None, None] ** -age for age, part in enumerate(ages))
+        through = np.linalg.solve(
+            points[:, None, None] * self.plant.E.T - self.plant.A.T, np.asarray(seen).transpose(0, 2, 1)
+        )
+        whole = through.transpose(0, 2, 1) @ self.plant.Bd + left @ self.driven + self.direct
+        finite = np.all(np.isfinite(whole), axis=(1, 2))
+        return np.where(finite, np.linalg.norm(np.where(finite[:, None, None], whole, 0.0), 2, axis=(1, 2)), 0.0)
 
 
 def _when_it_matters(system: _Composite, level: float, unit: float, beyond: float) -> tuple[str, float]:
@@ -273,7 +284,7 @@ def _when_it_matters(system: _Composite, level: float, unit: float, beyond: floa
         ), seconds
     last = SLOWEST
     for frequency in () if np.isfinite(seconds) else SLOWER:
-        if system.gain(frequency * unit) > level:
+        if system.gains(np.array([frequency * unit]))[0] > level:
             seconds = per_unit / frequency
             break
         last = frequency

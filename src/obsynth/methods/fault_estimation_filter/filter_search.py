@@ -50,6 +50,7 @@ def bisected_gain(
 
 def search_by_bisection(problem: GainProblem, *, tolerance: float, solver: str, polish: bool = True) -> LeastGain:
     """Minimise the gain by bisection (the paper's Algorithm 1, made to end)."""
+    problem = replace(problem, judged_exactly=True)
     normalised = coordinates(problem, solver=solver)
     gain = normalised.start_gain
     if problem.measured == 0 or gain == 0.0:

@@ -45,7 +45,7 @@ def synthesis_from_gains(
     gains |= {"Psi": detectability.Psi, "Upsilon": detectability.Upsilon}
     observer, tracking, lag = realise_filter(plant, work, gains, detectability)
     level = 1.0 if gamma is None else gamma
-    factor = bounded_real_certificate(plant, observer, tracking, level, core=work.nx, lag=lag)
+    factor, _ = bounded_real_certificate(plant, observer, tracking, level, core=work.nx, lag=lag)
     claims = {"state_lag": float(lag)} | ({"gamma": level} if plant.nd else {})
     doubts = () if indexes is not None else _lost_indexes(plant, detectability)
     return Synthesis(

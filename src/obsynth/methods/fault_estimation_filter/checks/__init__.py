@@ -56,7 +56,7 @@ def checks(design: ObserverDesign, printed_digits: int | None) -> Iterator[Check
     (plant, observer), claims = design.linear, design.certificate.claims
     structure = pencil_structure(plant.E, plant.A)
     yield from plant_information(plant, structure)
-    yield from condition_rows(fault_filter_conditions(plant, structure=structure))
+    yield from condition_rows(fault_filter_conditions(plant))
     yield from claim_rows(plant, claims)
     yield from recovery_rows(plant, design.recovery)
     tracking, factor = design.certificate.matrices.get("tracking"), design.certificate.matrices.get("P_factor")
