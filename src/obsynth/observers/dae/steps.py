@@ -125,7 +125,7 @@ class Steps:
         self, state: DAEState, y: FloatArray, u: FloatArray, run: Callable[..., tuple[FloatArray, ...]]
     ) -> tuple[DAEState, DAERow]:
         """Advance over samples until a step is not solved, by `ObserverGraph.whole` over that many samples. Return what
-        was reached, which may be nothing. Shapes: ``y (samples, ny)``, ``u (samples, nu)``."""
+        was reached, which may be nothing. Shapes (``y (samples, ny)``, ``u (samples, nu)``)."""
         seen = ~np.isnan(y)
         arriving = np.hstack([u, np.where(seen, y, 0.0), seen])
         after, said = (found.T for found in run(state.memory, arriving.ravel()))
