@@ -1,7 +1,7 @@
 """What the stored numbers of a linear design add to the errors, whatever the identities are in exact arithmetic.
 
 The identities hold to rounding, not exactly: what they miss is driven by the plant's state and its known inputs (see
-`obsynth.verification.remainder_channel`).  The rows bound the errors per unit of each; where the plant does not forget,
+`obsynth.verification.error_system`).  The rows bound the errors per unit of each; where the plant does not forget,
 its state has no bound, no finite gain from the disturbances exists, and what can be said is after how long it matters.
 """
 
@@ -21,7 +21,7 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
-from obsynth.verification.remainder_channel import (
+from obsynth.verification.error_system import (
     RemainderChannel,
     TrackedPlant,
     contraction_of,

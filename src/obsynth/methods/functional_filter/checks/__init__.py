@@ -20,9 +20,9 @@ from obsynth.plants.fault_models import Exosystem, stated_eigenvalues
 from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.certificates import decay_row, prove_stable
+from obsynth.verification.error_system import TrackedPlant
 from obsynth.verification.identities import Identity, equality, relative_tolerance
 from obsynth.verification.plant import condition_rows, plant_information
-from obsynth.verification.remainder_channel import TrackedPlant
 
 #: The regulator equation may miss by this much, relative to its terms: its solution is no part of the gains.
 TRACKING_TOLERANCE = 1e-8
