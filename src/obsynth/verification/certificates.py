@@ -130,6 +130,18 @@ def prove_stable(a: FloatArray, factor: FloatArray, dt: float) -> DefinitenessPr
     return prove_positive_definite(formula)
 
 
+def stability_row(a: FloatArray, factor: FloatArray, dt: float, source: str) -> Check:
+    """Return the row that every mode of ``a (n, n)`` dies out, by a Lyapunov factor."""
+    claim = "every error dies out: the Lyapunov inequality is positive definite"
+    return proof_row("stability", claim, prove_stable(a, factor, dt), source)
+
+
+def proof_row(name: str, claim: str, proof: DefinitenessProof, source: str) -> Check:
+    """Return the row of a proof that a matrix is positive definite."""
+    bound = proof.lower_bound
+    return Check(name, claim, bound, 0.0, bound, proof.proved, source, "proved", proof.text)
+
+
 def decay_row(a: FloatArray, dt: float, claimed: float) -> Check:
     """Return the row on a claimed decay (1/s): proved for all but `RATE_TOLERANCE` of it, whatever poles there are."""
     slowest = float(np.min(decay_rates(eigenvalues(a), dt), initial=np.inf))
