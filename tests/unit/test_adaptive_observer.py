@@ -318,6 +318,13 @@ class TestReset:
             run_batch(observer_for(varying(), adapt={"reset": 0.01}), np.zeros((2, 5, 2)), np.zeros((5, 1)))
 
 
+def test_a_batch_whose_inputs_are_of_another_number_of_trials_is_refused() -> None:
+    """It used to end in an error of numpy, which names no argument."""
+    with pytest.raises(SpecError, match=r"u has shape \(3, 5, 1\), but \(5, 1\) or \(2, 5, 1\) is needed") as found:
+        run_batch(observer_for(varying()), np.zeros((2, 5, 2)), np.zeros((3, 5, 1)))
+    assert found.value.path == "u"
+
+
 def test_the_random_walk_has_no_regressors_to_report_an_excitation_of() -> None:
     """Zero would say that nothing is excited."""
     plant = varying()

@@ -1,8 +1,6 @@
-"""The commands ``design`` and ``obsynth``: arguments in, exit code out.
+"""The commands ``design`` and ``obsynth``: arguments in, exit code out; streams may be closed or full.
 
 Nothing heavy is imported here, so that ``--help`` answers at once.
-
-The process around a verb: standard streams that may be closed or full, and what numbers can do to a computation.
 """
 
 from __future__ import annotations

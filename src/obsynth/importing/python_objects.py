@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -15,6 +14,7 @@ from obsynth.numerics.arguments import is_finite_number, require_mapping
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.libraries import imported
 from obsynth.plants.descriptor import DescriptorSystem
+from obsynth.plants.validation import suggestion
 
 _MATRICES = ("E", "A", "B", "C", "D", "Bf", "Df", "Bd", "Dd", "Bw", "Dw")
 _NAMES = ("state_names", "input_names", "output_names", "fault_names", "disturbance_names", "noise_names")
@@ -205,9 +205,8 @@ def _require_values(free: set[str], values: Mapping[str, float]) -> None:
                         path="parameters")  # fmt: skip
     unused = sorted(set(values) - free)
     if unused:
-        close = difflib.get_close_matches(unused[0], sorted(free), n=1)
-        hint = f" Did you mean {close[0]!r}?" if close else ""
-        raise SpecError(f"No matrix holds the symbol {unused[0]!r}.{hint}", path="parameters")
+        raise SpecError(f"No matrix holds the symbol {unused[0]!r}.{suggestion(unused[0], sorted(free))}",
+                        path="parameters")  # fmt: skip
     wrong = [name for name, value in values.items() if not is_finite_number(value)]
     if wrong:
         raise SpecError(f"The parameter {wrong[0]!r} is {values[wrong[0]]!r}: give a finite number.", path="parameters")

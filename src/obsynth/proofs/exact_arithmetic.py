@@ -118,7 +118,8 @@ def computed_entries(matrix: FloatArray) -> int:
 
 def written_matrix(matrix: FloatArray) -> fmpq_mat:
     """Return a matrix ``(m, n)`` of doubles as the rational numbers that were written."""
-    return fmpq_mat(*matrix.shape, [_as_fmpq(written_fraction(value)) for value in np.ravel(matrix).tolist()])
+    rows, columns = matrix.shape
+    return fmpq_mat(rows, columns, [_as_fmpq(written_fraction(value)) for value in np.ravel(matrix).tolist()])
 
 
 def stored_matrix(matrix: FloatArray) -> fmpq_mat:
@@ -128,7 +129,9 @@ def stored_matrix(matrix: FloatArray) -> fmpq_mat:
     least = int(np.min(exponents, initial=0, where=matrix != 0.0)) - MANTISSA_BITS
     whole, shifts = np.ldexp(parts, MANTISSA_BITS).astype(np.int64), exponents - MANTISSA_BITS - least
     shifted = [value << shift for value, shift in zip(whole.ravel().tolist(), shifts.ravel().tolist(), strict=True)]
-    return fmpq_mat(fmpz_mat(*matrix.shape, shifted)) / fmpz(2) ** -least
+    rows, columns = matrix.shape
+    found: fmpq_mat = fmpq_mat(fmpz_mat(rows, columns, shifted)) / fmpz(2) ** -least
+    return found
 
 
 def rational_matrix(rows: FractionRows, columns: int) -> fmpq_mat:

@@ -141,17 +141,6 @@ def _smoothed(links: Links, node: Node, known: Gaussian, later: LaterLessons) ->
     return Smoothed(estimate, factor, diffuse, theta, spread)
 
 
-def all_smoothed(links: Links, nodes: Sequence[Node], lag: int | None) -> list[Smoothed]:
-    """Return every sample, from the whole chain or from ``lag`` samples after it."""
-    last = len(nodes) - 1
-    if not nodes:
-        return []
-    if lag is None or lag >= last:
-        return smoothed_from(links, nodes, 0, last)
-    found = [smoothed_from(links, nodes, i, i + lag)[0] for i in range(last - lag)]
-    return found + smoothed_from(links, nodes, last - lag, last)
-
-
 def deviations_in(factor: FloatArray, diffuse: FloatArray) -> FloatArray:
     """Return standard deviations ``(n,)``, infinite where a state is undetermined."""
     deviations = np.sqrt(np.einsum("ij,ij->i", factor, factor))

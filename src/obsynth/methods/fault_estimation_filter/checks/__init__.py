@@ -27,10 +27,9 @@ from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.certificates import prove_bounded_real
 from obsynth.verification.claims import UNCERTAIN, claim_rows, claimed, recovery_rows
-from obsynth.verification.error_system import ErrorSystem, LaggedPlant
+from obsynth.verification.error_system import ErrorSystem, LaggedPlant, TrackedPlant
 from obsynth.verification.identities import equality, tracking_identities
 from obsynth.verification.plant import condition_rows, plant_information
-from obsynth.verification.remainder_channel import TrackedPlant
 
 _IDENTITIES = {
     "dynamics": ("unbiased: dynamics", "Az V E + By C = V A", "Wang 2015, eqs. (7), (26)"),
