@@ -17,8 +17,7 @@ from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 from obsynth.plants.uncertain_system import with_expressions
 from obsynth.plants.uncertainty import UNCERTAIN_MATRICES, Entry
 from obsynth.plants.validation import index_of
-from obsynth.spec.checking import DocumentProblems
-from obsynth.spec.documents import read_names
+from obsynth.spec.documents import DocumentProblems, read_names
 from obsynth.spec.matrices import read_matrices, read_matrix
 
 if TYPE_CHECKING:

@@ -94,6 +94,12 @@ class LinearObserver:
         return int(self.Az.shape[0])
 
     @property
+    def row_names(self) -> tuple[str, ...]:
+        """Names of the rows of ``Cz``: ``xhat[...]``, ``fhat[...]``, ``r[...]``."""
+        kinds = (("xhat", self.state_names), ("fhat", self.fault_names), ("r", self.residual_names))
+        return tuple(f"{kind}[{name}]" for kind, names in kinds for name in names)
+
+    @property
     def state_rows(self) -> slice:
         """Rows of ``Cz`` that hold the state estimates."""
         return slice(0, len(self.state_names))
