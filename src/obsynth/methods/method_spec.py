@@ -67,7 +67,7 @@ def plain(value: Any) -> Any:
 
 
 @cache
-def option_types(options: type[MethodOptions]) -> dict[str, Any]:
+def option_types(options: type[Any]) -> dict[str, Any]:
     """Return name -> annotated type of every option."""
     hints = get_type_hints(options, include_extras=True)
     return {field.name: hints[field.name] for field in fields(options)}
