@@ -10,7 +10,7 @@ from time_varying_plants import maximum_likelihood, observer_for, printed, recor
 from obsynth import PreconditionError, SpecError, run_batch, simulate_time_varying
 from obsynth.analysis.time_varying import horizon_ranks
 from obsynth.methods.recursive.conditions import residual_condition
-from obsynth.numerics.recursive_least_squares import ParameterState, start_of, update
+from obsynth.numerics.square_root_estimation import ParameterState, start_of, update
 from obsynth.observers.recursive.estimates import RawEstimate
 
 SAMPLES = 40

@@ -12,7 +12,7 @@ from obsynth.errors import SpecError
 from obsynth.importing.roles import plant_of
 from obsynth.numerics.arguments import is_finite_number, require_mapping
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.extras import imported
+from obsynth.numerics.libraries import imported
 from obsynth.plants.descriptor import MATRICES, SIGNAL_NAMES, DescriptorSystem
 from obsynth.plants.validation import suggestion
 

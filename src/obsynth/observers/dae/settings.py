@@ -12,7 +12,7 @@ import numpy as np
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import Count, ForgettingFactor, Positive, Probability, checked_value
 from obsynth.numerics.arrays import FloatArray, as_matrix, read_only
-from obsynth.numerics.covariances import covariance_factor, is_definite
+from obsynth.numerics.ranks import covariance_factor, is_definite
 from obsynth.observers.outliers import Outliers
 from obsynth.observers.running import StepSettings
 from obsynth.plants.dae.checks import finite_vector, step_length

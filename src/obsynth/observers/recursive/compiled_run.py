@@ -19,8 +19,8 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.covariances import covariance_factor
 from obsynth.numerics.least_squares_step import DEPENDENT_COLUMN, SUSPECT_PARITY
+from obsynth.numerics.ranks import covariance_factor
 from obsynth.observers.estimates import Estimates
 from obsynth.observers.recursive.estimates import RecursiveState, received_in
 from obsynth.observers.recursive.recursion import Recursion

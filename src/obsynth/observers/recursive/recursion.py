@@ -10,7 +10,6 @@ import numpy as np
 from obsynth.analysis.time_varying import IntArray, early_rows
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.covariances import covariance_factor
 from obsynth.numerics.least_squares_step import (
     DEPENDENT_COLUMN,
     SUSPECT_COLUMN,
@@ -18,8 +17,8 @@ from obsynth.numerics.least_squares_step import (
     least_squares_step,
     rank_revealing_step,
 )
-from obsynth.numerics.ranks import UNDETERMINED_SHARE
-from obsynth.numerics.recursive_least_squares import ParameterState, start_of, update
+from obsynth.numerics.ranks import UNDETERMINED_SHARE, covariance_factor
+from obsynth.numerics.square_root_estimation import ParameterState, start_of, update
 from obsynth.observers.outliers import checked_limit, has_jumped, no_refusals, robust_advance, with_surprise
 from obsynth.observers.recursive.estimates import RawEstimate, RecursiveState
 from obsynth.observers.recursive.settings import RecursiveSettings

@@ -16,7 +16,6 @@ from obsynth.analysis.time_varying import IntArray
 from obsynth.analysis.zeros import leading_names
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.covariances import covariance_factor
 from obsynth.numerics.least_squares_step import (
     OUTGROWN,
     LeastSquaresStep,
@@ -25,6 +24,7 @@ from obsynth.numerics.least_squares_step import (
     projected_step,
     projection_of,
 )
+from obsynth.numerics.ranks import covariance_factor
 from obsynth.plants.sequences import MatrixSequence
 from obsynth.plants.time_varying import TimeVaryingDescriptorSystem
 

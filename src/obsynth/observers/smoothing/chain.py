@@ -10,7 +10,7 @@ import numpy as np
 
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.ranks import UNDETERMINED_SHARE
-from obsynth.numerics.square_root_smoothing import Gaussian, WayBack, nothing_later, stepped_back
+from obsynth.numerics.square_root_estimation import Gaussian, WayBack, nothing_later, stepped_back
 from obsynth.observers.outliers import projected
 
 

@@ -12,8 +12,8 @@ import numpy as np
 
 from obsynth.errors import PreconditionError
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.covariances import covariance_factor
-from obsynth.numerics.square_root_smoothing import joint_step
+from obsynth.numerics.ranks import covariance_factor
+from obsynth.numerics.square_root_estimation import joint_step
 from obsynth.observers.dae.estimates import DAERow
 from obsynth.observers.dae.observer import DAEObserver
 from obsynth.observers.dae.steps import DAEState, Steps

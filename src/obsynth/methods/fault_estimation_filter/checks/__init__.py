@@ -10,9 +10,8 @@ from collections.abc import Generator, Iterator
 import numpy as np
 
 from obsynth.errors import PreconditionError
-from obsynth.methods.fault_estimation_filter.checks.faults import fault_rows
+from obsynth.methods.fault_estimation_filter.checks.faults import Equations, fault_rows
 from obsynth.methods.fault_estimation_filter.checks.gains import gain_rows, gains_fit, printed_allowances
-from obsynth.methods.fault_estimation_filter.checks.realisation import Equations
 from obsynth.methods.fault_estimation_filter.conditions import fault_filter_conditions
 from obsynth.methods.fault_estimation_filter.least_gain_proof import WITNESSES, least_gain_row
 from obsynth.methods.fault_estimation_filter.prepared_plant import with_sensor_faults_as_states
