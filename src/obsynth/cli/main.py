@@ -66,7 +66,7 @@ def told_error(error: Exception) -> ObsynthError | None:
         is_ours = (error.name or "").startswith("obsynth")
         text = f"This needs the library {error.name or error}, which cannot be loaded: install it with pip."
         return None if is_ours else SpecError(text)
-    from obsynth.numerics.failures import failure_of
+    from obsynth.numerics.libraries import failure_of
 
     return failure_of(error)
 

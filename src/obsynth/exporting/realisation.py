@@ -78,9 +78,7 @@ class Realisation:
     @property
     def outputs(self) -> tuple[str, ...]:
         """Names of the outputs, ``xhat[...]``, ``fhat[...]``, ``r[...]``."""
-        observer = self.observer
-        kinds = (("xhat", observer.state_names), ("fhat", observer.fault_names), ("r", observer.residual_names))
-        return tuple(f"{kind}[{name}]" for kind, names in kinds for name in names)
+        return self.observer.row_names
 
     @property
     def operating_point(self) -> tuple[FloatArray, FloatArray]:

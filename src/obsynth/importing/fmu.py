@@ -17,7 +17,7 @@ from obsynth.importing.fmu_instance import Instance
 from obsynth.importing.roles import plant_of
 from obsynth.numerics.arguments import is_finite_number, require_mapping
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.extras import imported
+from obsynth.numerics.libraries import imported
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.validation import suggestion
 

@@ -19,8 +19,7 @@ from obsynth.methods.method_spec import MethodSpec, PlantKind, Synthesis
 from obsynth.methods.refusals import require_above_rounding, rounding_notes, with_advice
 from obsynth.methods.registry import AUTO, REGISTRY, method_spec, methods_for
 from obsynth.methods.verifying import verify
-from obsynth.numerics.failures import failed_computations
-from obsynth.numerics.threads import one_thread_if_small
+from obsynth.numerics.libraries import failed_computations, one_thread_if_small
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.dae.model import DAEModel
 from obsynth.plants.descriptor import DescriptorSystem

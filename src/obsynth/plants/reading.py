@@ -1,7 +1,4 @@
-"""From what a caller gives for a linear plant to its fields: frames, names for rows, noise of sensors.
-
-Labelled frames (pandas.DataFrame) as matrices: rows and columns in one order, labels as names.
-"""
+"""From what a caller gives for a linear plant to its fields: labelled frames, names for rows, noise of sensors."""
 
 from __future__ import annotations
 
@@ -38,7 +35,7 @@ _FIELDS = {"x": "state_names", "u": "input_names", "y": "output_names", "f": "fa
 def _without_frames(
     matrices: Mapping[str, Any], names: Mapping[str, Sequence[str] | None]
 ) -> tuple[dict[str, Any], dict[str, Sequence[str] | None]]:
-    """Return matrices and names ``{"state_names": ...}`` in which the frames' labels are used, in one order.
+    """Return matrices and names ``{"state_names": ...}`` in which the labels of pandas' frames are used, in one order.
 
     The rows of the dynamics are the equations of the states of the same name.  Numbered labels are no names.
     """

@@ -18,7 +18,7 @@ from obsynth.analysis.transformations.sampling import discretise
 from obsynth.errors import PreconditionError, SpecError
 from obsynth.numerics.arguments import real_vector, whole_number
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.holds import driven, first_order_hold
+from obsynth.numerics.continuous import driven, first_order_hold
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.simulation.scenario_signals import Drive
 from obsynth.simulation.trajectory import Trajectory, signal_of

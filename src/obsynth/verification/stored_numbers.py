@@ -1,7 +1,7 @@
 """What the stored numbers of a linear design add to the errors, whatever the identities are in exact arithmetic.
 
 The identities hold to rounding, not exactly: what they miss is driven by the plant's state and its known inputs (see
-`obsynth.verification.remainder_channel`).  The rows bound the errors per unit of each; where the plant does not forget,
+`obsynth.verification.error_system`).  The rows bound the errors per unit of each; where the plant does not forget,
 its state has no bound, no finite gain from the disturbances exists, and what can be said is after how long it matters.
 """
 
@@ -21,7 +21,7 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
-from obsynth.verification.remainder_channel import (
+from obsynth.verification.error_system import (
     RemainderChannel,
     TrackedPlant,
     contraction_of,
@@ -118,15 +118,10 @@ def stored_number_rows(design: ObserverDesign, tracked: TrackedPlant, gamma: flo
 def _per_unit(
     observer: LinearObserver, kind: str, bound: FloatArray, claimed: FloatArray | None, labels: tuple[str, ...]
 ) -> Check:
-    rows = (
-        *(f"xhat[{name}]" for name in observer.state_names),
-        *(f"fhat[{name}]" for name in observer.fault_names),
-        *(f"r[{name}]" for name in observer.residual_names),
-    )
     shown = bound[observer.fault_rows] if observer.fault_names else bound
     first = observer.fault_rows.start if observer.fault_names else 0
     i, j = np.unravel_index(int(np.argmax(shown)), shown.shape)
-    text = f"largest to {rows[first + int(i)]}: {shown[i, j]:.2g} per unit of {labels[int(j)]}"
+    text = f"largest to {observer.row_names[first + int(i)]}: {shown[i, j]:.2g} per unit of {labels[int(j)]}"
     what = f"error of an estimate per unit of the plant's {kind}, from rounding of the stored numbers"
     name, source = f"stored numbers: {kind}", "the residuals of the identities, outward rounded"
     if claimed is None:

@@ -14,9 +14,9 @@ from obsynth.analysis.diagnosis.verdicts import Diagnosis, FaultDiagnosis, resid
 from obsynth.analysis.transformations.recovery import Transformation, linear_plant
 from obsynth.errors import SpecError
 from obsynth.numerics.arguments import is_finite_number
+from obsynth.numerics.libraries import on_one_thread_if_small
 from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.ranks import REST_TOLERANCE
-from obsynth.numerics.threads import on_one_thread_if_small
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import Exosystem, exosystem, stated_eigenvalues
 

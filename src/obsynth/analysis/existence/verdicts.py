@@ -25,9 +25,8 @@ from obsynth.analysis.existence.named_pencils import named_pencil, unclear
 from obsynth.analysis.existence.numbers import numbers_of
 from obsynth.analysis.existence.rational import SystemFacts
 from obsynth.analysis.existence.witnesses import Unclear
-from obsynth.analysis.far_zeros import system_zeros
 from obsynth.analysis.plant_units import PlantUnits
-from obsynth.analysis.zeros import are_outside, is_outside
+from obsynth.analysis.zeros import are_outside, is_outside, system_zeros
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.pencils import finite_zeros
 from obsynth.numerics.ranks import NAMED_SHARE, RANK_TOLERANCE, RankDecision

@@ -17,9 +17,8 @@ from obsynth.errors import SpecError
 from obsynth.methods.fault_estimation_filter.certificate import bounded_real_certificate
 from obsynth.methods.fault_estimation_filter.conditions import fault_filter_conditions
 from obsynth.methods.fault_estimation_filter.detectability_indexes import FaultDetectability, fault_detectability
-from obsynth.methods.fault_estimation_filter.notes import notes
 from obsynth.methods.fault_estimation_filter.prepared_plant import prepare, with_sensor_faults_as_states
-from obsynth.methods.fault_estimation_filter.realisation import realise_filter
+from obsynth.methods.fault_estimation_filter.realisation import notes, realise_filter
 from obsynth.methods.method_spec import Synthesis
 from obsynth.numerics.arguments import is_whole
 from obsynth.numerics.arrays import FloatArray, as_matrix

@@ -33,10 +33,9 @@ from obsynth.methods.fault_estimation_filter.filter_search import NOMINAL_GAIN, 
 from obsynth.methods.fault_estimation_filter.gamma_lower_bound import least_gain_certificate
 from obsynth.methods.fault_estimation_filter.inequality_solutions import null_basis
 from obsynth.methods.fault_estimation_filter.injection_problem import GainProblem, Injection, WeightLimit
-from obsynth.methods.fault_estimation_filter.notes import notes
 from obsynth.methods.fault_estimation_filter.options import FilterOptions
 from obsynth.methods.fault_estimation_filter.prepared_plant import PreparedPlant, prepare
-from obsynth.methods.fault_estimation_filter.realisation import realise_filter
+from obsynth.methods.fault_estimation_filter.realisation import notes, realise_filter
 from obsynth.methods.method_spec import Synthesis
 from obsynth.numerics.arrays import FloatArray, as_matrix
 from obsynth.observers.linear.derived import averaged

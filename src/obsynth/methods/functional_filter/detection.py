@@ -18,10 +18,10 @@ from obsynth.methods.functional_filter.detection_proofs import Transfer, gain_is
 from obsynth.methods.riccati import continuous_solution
 from obsynth.numerics.arguments import is_finite_number
 from obsynth.numerics.arrays import FloatArray
+from obsynth.numerics.libraries import on_one_thread_if_small
 from obsynth.numerics.norms import response
 from obsynth.numerics.ranks import decide_rank
 from obsynth.numerics.spectra import abscissa
-from obsynth.numerics.threads import on_one_thread_if_small
 from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.proofs.balls import Ball

@@ -25,12 +25,11 @@ from obsynth.analysis.existence.verdicts import (
     zero_doubt,
     zero_verdict,
 )
-from obsynth.analysis.far_zeros import equilibrated_at
 from obsynth.analysis.plant_units import PlantUnits, sized_plant
 from obsynth.analysis.structure import analyse_structure
 from obsynth.analysis.transformations.elimination import eliminate_algebraic_states
 from obsynth.analysis.transformations.recovery import Transformation
-from obsynth.analysis.zeros import leading_names, system_pencil
+from obsynth.analysis.zeros import equilibrated_at, leading_names, system_pencil
 from obsynth.numerics.arrays import FloatArray
 from obsynth.numerics.pencils import pencil_structure
 from obsynth.numerics.ranks import decide_rank, equilibrate

@@ -13,7 +13,7 @@ import numpy as np
 
 from obsynth.errors import SpecError
 from obsynth.numerics.arrays import FloatArray, read_only
-from obsynth.numerics.extras import imported
+from obsynth.numerics.libraries import imported
 from obsynth.plants.dae.checks import (
     check_distinct,
     check_structure,

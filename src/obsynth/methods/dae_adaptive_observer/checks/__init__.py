@@ -13,9 +13,8 @@ from obsynth.errors import ObsynthError
 from obsynth.methods.dae_adaptive_observer.conditions import dae_conditions
 from obsynth.methods.recursive.checks import claims_row, listed_gains, refinement_rows
 from obsynth.numerics.arrays import FloatArray
-from obsynth.numerics.covariances import covariance_factor
 from obsynth.numerics.newton import LARGEST_RESIDUAL
-from obsynth.numerics.ranks import SINGULAR_CONDITION
+from obsynth.numerics.ranks import SINGULAR_CONDITION, covariance_factor
 from obsynth.observers.batches import run_dae_batch
 from obsynth.observers.dae.building import (
     NOMINAL_STEPS,

@@ -19,9 +19,9 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
 from obsynth.verification.certificates import decay_row, stability_row
+from obsynth.verification.error_system import TrackedPlant
 from obsynth.verification.identities import Identity, equality, relative_tolerance
 from obsynth.verification.plant import condition_rows, plant_information
-from obsynth.verification.remainder_channel import TrackedPlant
 
 #: Estimates at a frequency may miss by this much, relative to terms that pass through the inverse of ``sI - Az``.
 LEAK_TOLERANCE = 1e-7

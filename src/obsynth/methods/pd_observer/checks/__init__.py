@@ -22,9 +22,9 @@ from obsynth.observers.linear.observer import LinearObserver
 from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.results.checks import Check, information, lower_bound_check, upper_bound_check
 from obsynth.results.design import ObserverDesign
+from obsynth.verification.error_system import TrackedPlant
 from obsynth.verification.identities import equality, relative_tolerance, residual, tracking_identities, worst
 from obsynth.verification.plant import condition_rows, plant_information
-from obsynth.verification.remainder_channel import TrackedPlant
 
 _ALIKE = ("input_names", "output_names", "state_names", "fault_names", "dt")
 _IDENTITIES = {

@@ -21,9 +21,9 @@ from obsynth.plants.descriptor import DescriptorSystem
 from obsynth.plants.fault_models import Exosystem
 from obsynth.results.checks import Check, information, upper_bound_check
 from obsynth.results.design import ObserverDesign
+from obsynth.verification.error_system import TrackedPlant
 from obsynth.verification.identities import Residual, equality, relative_tolerance, residual
 from obsynth.verification.plant import condition_rows, plant_information
-from obsynth.verification.remainder_channel import TrackedPlant
 
 #: Estimates at a frequency may miss by this much, relative to terms that pass through the inverse of ``sI - Az``.
 DECOUPLING_TOLERANCE = 1e-8
